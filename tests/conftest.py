@@ -101,7 +101,7 @@ def no_heartbeat() -> Iterator[None]:
     loaded the machine is. What is told of it has tests of its own.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("twin.run.cli.TICK_SECONDS", 3600.0)
+        patch.setattr("twin.framework.cli.TICK_SECONDS", 3600.0)
         yield
 
 

@@ -59,8 +59,8 @@ COMMANDS = {"analysis.mtf.__main__", "analysis.mtf.mtf_command"}
 LIBRARY = re.compile(r"twin|twin\.scripting\..*|twin\.study\.scripted")
 """What other people's programs import."""
 TERMINALS = {"typer", "rich"}
-"""What options, exit codes and progress are made of: the layer of the commands, ``twin.run.cli`` and
-``twin.run.command``, begins there.
+"""What options, exit codes and progress are made of: the layer of the commands, ``twin.framework.cli`` and
+``twin.framework.command``, begins there.
 """
 ROOMS = [
     *re.findall(
@@ -214,7 +214,7 @@ def test_the_library_knows_no_commands() -> None:
     library = [name for name in modules() if LIBRARY.fullmatch(name)]
     assert set(library) >= {"twin", "twin.scripting.procedures", "twin.scripting.results", "twin.study.scripted"}
     assert [" imports ".join(way) for name in library if (way := way_to(TERMINALS, name, every_import()))] == []
-    assert way_to(TERMINALS, "twin.run.command", every_import())
+    assert way_to(TERMINALS, "twin.framework.command", every_import())
 
 
 def test_source_knows_rooms_that_stand_above_its_own() -> None:

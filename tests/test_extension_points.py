@@ -64,6 +64,11 @@ from tests.twin.commands import invoke
 from tests.twin.path_bench import IDEAL
 from tests.twin.study_bench import write_study as write_study_file
 from tests.twin.test_target_images import F_NUMBER, PITCH, REGION, identity, line_ccd
+from twin.framework.artefact import Table
+from twin.framework.data_files import FrameFacts
+from twin.framework.page import RunFacts, write_test
+from twin.framework.report import Report, Section
+from twin.framework.run_folder import RunFolder, write_manifest
 from twin.live.live_bench import LiveBench
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth
@@ -72,11 +77,6 @@ from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import RaySource
 from twin.path_tracing.stray_light import monitor_families
 from twin.path_tracing.tracer import PathTracer
-from twin.run.artefact import Table
-from twin.run.data_files import FrameFacts
-from twin.run.page import RunFacts, write_test
-from twin.run.report import Report, Section
-from twin.run.run_folder import RunFolder, write_manifest
 from twin.sensors.area_detector import EmvaDetector
 from twin.study import scripted
 from twin.study.report.study_report import write_report
@@ -215,8 +215,8 @@ def test_a_noise_term(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 ESTIMATORS = "analysis.monitor.estimators.ESTIMATORS"
 TARGETS = "optics.targets.target_shapes.TARGETS"
-SECTIONS = "twin.run.report.SECTIONS"
-FRAMES = "twin.run.data_files.FRAME_FORMATS"
+SECTIONS = "twin.framework.report.SECTIONS"
+FRAMES = "twin.framework.data_files.FRAME_FORMATS"
 BAR = (8, 60)
 """Width and length of the toy target, pixels."""
 
@@ -617,13 +617,13 @@ def test_a_sampler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert json_schema("study")["$defs"]["DesignSpec"]["properties"]["kind"]["enum"][-1] == "middle"
 
 
-@extends("twin.run.data_files.TABLE_FORMATS")
+@extends("twin.framework.data_files.TABLE_FORMATS")
 @pytest.mark.second
 def test_an_output_format_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Names and units of the columns alone: chosen by its name, written for every table and listed."""
     text = "; ".join
     form: Callable[[Any], bytes] = lambda table: text(f"{c.name} in {c.unit}" for c in table.columns).encode()  # noqa: E731
-    add(monkeypatch, "twin.run.data_files.TABLE_FORMATS", "heads", form)
+    add(monkeypatch, "twin.framework.data_files.TABLE_FORMATS", "heads", form)
     study_folder(tmp_path, "monte_carlo")
     done = invoke(twin.export.__main__.app, tmp_path / "run", "--tables", "heads", "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output

@@ -13,7 +13,7 @@ import pytest
 
 from docs.site.command_pages import commands, programs
 from tests.tiers import quick
-from twin.run.console import COMPLETE, PROGRAMS
+from twin.framework.console import COMPLETE, PROGRAMS
 
 ROOT = Path(__file__).resolve().parents[1]
 CONSOLE = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]["camtwin"]

@@ -21,7 +21,7 @@ from docs.site.spec_keys import flow
 from scenes.schema import MODELS, json_schema
 from scenes.yaml.yaml_file import parse_yaml
 from tests.twin.study_bench import REFUSED
-from twin.run.page import checksum
+from twin.framework.page import checksum
 
 ROOT = Path(__file__).resolve().parent.parent
 

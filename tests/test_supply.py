@@ -19,7 +19,7 @@ from docs.supply.audit import findings
 from docs.supply.licences import read_carried, read_table
 from docs.supply.make_lock import EXTRAS, SupplyError, direct
 from twin import doctor
-from twin.run.lock_file import FOLDER, LAYERS, LockError, differences, normal, parse, read_layer, read_lock
+from twin.framework.lock_file import FOLDER, LAYERS, LockError, differences, normal, parse, read_layer, read_lock
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = "space-camera-twin"
@@ -101,8 +101,8 @@ def test_what_differs_from_the_lock_is_told(lock: Path, monkeypatch: pytest.Monk
     assert f"jinja2 {version}, locked 99.1" in found.other
     assert "no-such-package==1.0" in found.missing
     assert found.equal == before.equal - 1
-    monkeypatch.setattr("twin.run.lock_file.FOLDER", lock)
-    monkeypatch.setattr("twin.run.lock_file.differences", lambda own: found)
+    monkeypatch.setattr("twin.framework.lock_file.FOLDER", lock)
+    monkeypatch.setattr("twin.framework.lock_file.differences", lambda own: found)
     (line,) = doctor._lock()
     assert line.status == "failed"
     assert "99.1" in line.detail

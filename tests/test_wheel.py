@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from twin.run.provenance import program_digest
+from twin.framework.provenance import program_digest
 
 ROOT = Path(__file__).resolve().parent.parent
 _FOUND = importlib.util.spec_from_file_location("wheel_backend", ROOT / "docs/wheel/wheel_backend.py")

@@ -51,7 +51,7 @@ def run_probe(arguments: list[str], timeout_s: float = PROBE_TIMEOUT_S) -> dict[
     """Run Python with these arguments in a child process and return the JSON object on its last line of stdout.
 
     Args:
-        arguments: what follows the interpreter, for instance ["-m", "twin.run.probe", "kernel"].
+        arguments: what follows the interpreter, for instance ["-m", "twin.framework.probe", "kernel"].
         timeout_s: the child is killed after this many seconds.
 
     Raises:
@@ -205,7 +205,7 @@ def _lock() -> list[Check]:
     """Whether all that is installed, also by what the dependencies need, is what setup.sh installs; nothing where there
     are no lock files, as beside an installed wheel.
     """
-    from twin.run.lock_file import FOLDER, LockError, differences
+    from twin.framework.lock_file import FOLDER, LockError, differences
 
     if not FOLDER.is_dir():
         return []

@@ -11,7 +11,7 @@ if __name__ == "__main__":
 
 import typer
 
-from twin.run.command import add_tests
+from twin.framework.command import add_tests
 
 app = typer.Typer(
     add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True

@@ -16,9 +16,9 @@ from rich.console import Console
 from scenes.specs.file_kinds import read_for
 from scenes.yaml.named import Named
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
-from twin.run import cli
-from twin.run.command import Result, run_command
-from twin.run.procedure import Session
+from twin.framework import cli
+from twin.framework.command import Result, run_command
+from twin.framework.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.resolved import ResolvedJob

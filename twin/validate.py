@@ -19,11 +19,11 @@ from rich.table import Column
 from rich.text import Text
 
 from scenes.yaml.standard_output import FAILURE, Terminal, print_json, to_stdout
-from twin.run import cli
-from twin.run.durable import exit_on_terminate
+from twin.framework import cli
+from twin.framework.durable import exit_on_terminate
 
 if TYPE_CHECKING:  # all that the checks compute with is imported when one is asked for
-    from twin.run.run_folder import RunFolder
+    from twin.framework.run_folder import RunFolder
     from twin.validation.registry import Selection
     from twin.validation.runner import Validation
 
@@ -110,7 +110,7 @@ def main(
             with to_stdout(errors):
                 _print_list(selections, fast, as_json)
             return
-        from twin.run.run_folder import RunFolder
+        from twin.framework.run_folder import RunFolder
         from twin.validation.check import FAILED
 
         folder = None if out is None else RunFolder(out, force)
@@ -142,7 +142,7 @@ def _run(
     errors: Console,
 ) -> Validation:
     from optics.numerics.backend import load_backend
-    from twin.run.provenance import program_digest
+    from twin.framework.provenance import program_digest
     from twin.validation.runner import rough_seconds, run_checks
     from twin.validation.validation_report import write_validation
 

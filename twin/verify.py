@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
-from twin.run import cli, durable
+from twin.framework import cli, durable
 
 if TYPE_CHECKING:  # what computes is imported when it is needed
     from twin.compare.folder_state import FolderState
@@ -101,7 +101,7 @@ def main(
 
 def _whole(state: FolderState, keep: Path | None, silent: bool) -> Repetition:
     from twin.compare.verification import repeat
-    from twin.run.owned_files import scratch
+    from twin.framework.owned_files import scratch
 
     if keep is not None:
         return repeat(state, keep, silent)

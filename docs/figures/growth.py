@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.run.svg import BLUE, GREY, INK, look, new_figure, to_svg
+from twin.framework.svg import BLUE, GREY, INK, look, new_figure, to_svg
 
 ROOT = Path(__file__).resolve().parents[2]
 FILE = Path(__file__).with_name("growth.json")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from twin.run.page import NOTHING, checksum, policy
+from twin.framework.page import NOTHING, checksum, policy
 
 OWN = "'self' file:"
 """Files of the site, on a server or in a folder; not every browser takes a folder for one origin."""

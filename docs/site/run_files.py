@@ -19,8 +19,8 @@ from docs.site.spec_keys import attributes, summary
 from scenes.specs.study import UNITS, unit_of
 from scenes.yaml.yaml_file import read_yaml
 from tests.golden.jobs import ALL
-from twin.run.quantity import Record
-from twin.run.run_folder import Manifest
+from twin.framework.quantity import Record
+from twin.framework.run_folder import Manifest
 
 ROOT = Path(__file__).resolve().parents[2]
 Tree = dict[str, Any]

@@ -20,7 +20,7 @@ from docs.site.run_files import (
     shown_path,
     unit,
 )
-from twin.run.reference_frames import FRAMES
+from twin.framework.reference_frames import FRAMES
 
 FOLDER = "reference/run_folders"
 

@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from docs.supply.make_lock import SupplyError, make_lock
-from twin.run.lock_file import LAYERS, LockError
+from twin.framework.lock_file import LAYERS, LockError
 
 app = typer.Typer(
     add_completion=False,

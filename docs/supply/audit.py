@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from docs.supply.make_lock import SupplyError
-from twin.run.lock_file import FOLDER
+from twin.framework.lock_file import FOLDER
 
 SERVICES = ("pypi", "osv")
 

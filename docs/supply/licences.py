@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from docs.supply.make_lock import PLATFORM, PYTHONS, SupplyError, run_uv
-from twin.run.lock_file import FOLDER, Locked, normal, read_lock
+from twin.framework.lock_file import FOLDER, Locked, normal, read_lock
 
 TABLE = Path(__file__).with_name("licences.csv")
 CARRIED = Path(__file__).with_name("carried.csv")

@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from twin.run.lock_file import FOLDER, Locked, normal, parse, read_layer
+from twin.framework.lock_file import FOLDER, Locked, normal, parse, read_layer
 
 ROOT = Path(__file__).resolve().parents[2]
 EXTRAS: Mapping[str, tuple[str, ...] | None] = {"runtime": (), "live": ("live",), "test": None}

@@ -3,7 +3,7 @@ of other people's packages. The source tree keeps them at its top, and an editab
 
 Imports are rewritten, and the command lines in help and messages; nothing else in the packages names a module of
 theirs. What is inserted is always ``PREFIX`` and a dot, so that the program's digest
-(`twin.run.provenance`) can leave it out again.
+(`twin.framework.provenance`) can leave it out again.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ class Procedure:
         setup: class of the simulated test with all it refers to, an `ExperimentSetup`.
         run: set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
-        report: run -> `twin.run.report.Report`.
+        report: run -> `twin.framework.report.Report`.
         measured: class of the test on measurements, chosen by the keys of the file; None where there is none.
         export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
         files: kinds of file that it reads beside those in file_kinds.csv; their command is known from the list.
@@ -36,7 +36,7 @@ class Procedure:
         judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
         seeded: whether anything is drawn at random; config.yaml then states the seed.
         about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
-        frames: quantity of KIND.json -> what it refers to, where `twin.run.reference_frames.FRAMES` does not say it.
+        frames: quantity of KIND.json -> what it refers to, where `twin.framework.reference_frames` does not say it.
     """
 
     kind: str

@@ -10,8 +10,8 @@ from analysis.block.block_adjustment import adjust_block
 from analysis.block.processes import Law
 from tests.analysis.drawn_blocks import ARCSEC, PITCH, Plan, draw, without_errors_in_images
 from tests.analysis.refusals import refuses
+from twin.framework.cluster import ClusterError
 from twin.orbit.block.point_workers import point_workers
-from twin.run.cluster import ClusterError
 
 LAWS = (
     Term(Law("tracker bias", "constant", (3 * ARCSEC,) * 3), "tracker"),

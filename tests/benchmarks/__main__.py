@@ -18,9 +18,9 @@ from optics.numerics.backend import cores
 from tests.benchmarks.beside import compared, print_pairs, ratios, sources_of
 from tests.benchmarks.number import Speed, shown
 from tests.benchmarks.workbench import Workbench
-from twin.run.cli import InputErrorText, explained, print_whole
-from twin.run.durable import exit_on_terminate
-from twin.run.provenance import Provenance
+from twin.framework.cli import InputErrorText, explained, print_whole
+from twin.framework.durable import exit_on_terminate
+from twin.framework.provenance import Provenance
 
 BENCHMARKS = {
     "study": ("a study of ten thousand states", 300),

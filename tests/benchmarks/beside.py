@@ -23,7 +23,7 @@ from rich.table import Table
 
 from scenes.yaml.standard_output import BAD_INPUT
 from tests.benchmarks.number import shown
-from twin.run.cli import InputErrorText, print_whole
+from twin.framework.cli import InputErrorText, print_whole
 
 ROOT = Path(__file__).resolve().parents[2]
 

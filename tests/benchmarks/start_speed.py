@@ -16,8 +16,8 @@ from pathlib import Path
 
 from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.workbench import Workbench
+from twin.framework.console import PROGRAMS as ALL_PROGRAMS
 from twin.monitor.calibration_cache import VARIABLE
-from twin.run.console import PROGRAMS as ALL_PROGRAMS
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = tuple(module for module, _ in ALL_PROGRAMS.values())

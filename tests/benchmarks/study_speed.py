@@ -13,7 +13,7 @@ from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import processor_s
 from tests.benchmarks.workbench import Workbench
 from tests.twin.study_bench import write_study
-from twin.run.cluster import local_workers
+from twin.framework.cluster import local_workers
 from twin.study.runs.blocks import BLOCKS, Engine, journal_of
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study

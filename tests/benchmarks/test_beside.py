@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from tests.benchmarks.__main__ import BENCHMARKS, app
 from tests.benchmarks.beside import ROOT, compared, numbers_of, ratios, sources_of
-from twin.run.cli import InputErrorText
+from twin.framework.cli import InputErrorText
 
 OLD = Path("/old")
 

@@ -222,13 +222,13 @@ def test_golden_files_are_small_and_one_for_each_job() -> None:
     assert sum(path.stat().st_size for path in FOLDER.glob("*.json")) < 3e6
 
 
-NO_RESULT = {"twin.doctor": "it tells what this machine has", "twin.run.probe": "the doctor's own"}
+NO_RESULT = {"twin.doctor": "it tells what this machine has", "twin.framework.probe": "the doctor's own"}
 """Programs without a golden run, and why."""
 
 
 def test_every_command_has_a_golden_run() -> None:
     """Every module that can be started, and of those with subcommands each of them."""
-    from twin.run.console import PROGRAMS, parser
+    from twin.framework.console import PROGRAMS, parser
 
     root = FOLDER.parents[1]
     started = {module for module, _ in PROGRAMS.values()}

@@ -14,7 +14,7 @@ import tifffile
 
 from analysis.spots.photon_transfer import photon_transfer
 from scenes.specs.load import load_detector
-from twin.run.data_files import FrameFacts, tiff
+from twin.framework.data_files import FrameFacts, tiff
 from twin.sensors.area_detector import EmvaDetector
 
 # not imported here: each process that runs tests collects this file

@@ -20,7 +20,7 @@ import yaml
 from scenes.specs.load import SCENES
 from tests.robustness.case import JOBS, Case, file_of
 from tests.robustness.file_cases import MADE, pass_cases
-from twin.run.console import PROGRAMS
+from twin.framework.console import PROGRAMS
 
 DEFAULT = {"out": "out/run", "weight": 1.0, "whole": 0, "starts": False}
 

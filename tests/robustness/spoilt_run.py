@@ -31,7 +31,7 @@ from typer.testing import CliRunner
 from optics.numerics.backend import LIMIT
 from tests.robustness.case import Case, Reached, cut
 from tests.robustness.mutate import Mutant, mutate
-from twin.run.run_folder import is_run_folder
+from twin.framework.run_folder import is_run_folder
 
 SECONDS = {"soon": 20.0, "built": 60.0, "whole": 120.0}
 """Of a processor for one file, by how far the command goes."""

@@ -20,7 +20,7 @@ from scenes.yaml.yaml_file import parse_yaml
 from tests.own_trace import OwnCamera
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.first_order_data import FIRST_ORDER, first_order_data
-from twin.run import cli
+from twin.framework import cli
 
 PETZVAL = """
   A: {z: 0 m, radius: 61 mm, light: refracts, index: 1.52}

@@ -247,10 +247,10 @@ def check_files(
 
 def match_files(folder: Path, flown: Any) -> dict[str, object]:
     """Files of a simulated pass as `match` reads them, and its specification as it stands in YAML."""
+    from twin.framework.data_files import FrameFacts, tiff
     from twin.orbit.flight.platform_table import PlatformTable
     from twin.orbit.images.simulate_report import map_facts
     from twin.orbit.measured.measurement_tables import _csv
-    from twin.run.data_files import FrameFacts, tiff
 
     table = PlatformTable.sampled(flown.measured, 1.0, 0.125)
     orbit = {"time [s]": table.orbit_time, **dict(zip(("x [m]", "y [m]", "z [m]"), table.position.T, strict=True))}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from html.parser import HTMLParser
 
-from twin.run.page import checksum
+from twin.framework.page import checksum
 
 LOADS = ("src", "srcset", "data", "poster", "background", "action", "formaction", "manifest", "ping")
 

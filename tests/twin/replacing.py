@@ -14,8 +14,8 @@ import sys
 import threading
 from pathlib import Path
 
-from twin.run.durable import exit_on_terminate
-from twin.run.run_folder import RunFolder, is_run_folder, read_manifest, unlisted, write_manifest
+from twin.framework.durable import exit_on_terminate
+from twin.framework.run_folder import RunFolder, is_run_folder, read_manifest, unlisted, write_manifest
 
 STEPS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "ctypes.dlopen", "os.listdir")
 FILES = 24

@@ -22,10 +22,10 @@ from optics.raytrace.reflectors import REFLECTORS
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from scenes.yaml.spec import Spec
+from twin.framework import provenance
 from twin.monitor import calibration_cache
 from twin.monitor.calibration_cache import ENDING, OFF, VARIABLE, CacheEntry, cache_folder
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.run import provenance
 
 PIECES = """
 import sys

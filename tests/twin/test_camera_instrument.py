@@ -29,12 +29,12 @@ from tests.twin.study_bench import refusals
 from twin.camera import camera_run
 from twin.camera.__main__ import app as camera_app
 from twin.camera.camera_optics import CameraOptics
+from twin.framework.procedure import silent
 from twin.main_job import render_job
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.image_quality import image_quality
 from twin.monitor.truth import LineSight, trace_truth
 from twin.path_tracing.stray_light import NominalPathLost
-from twin.run.procedure import silent
 from twin.study.gradient.study_gradient import AD, TRACED, Gradient, study_gradient
 from twin.study.runs.setup import resolve_study
 

@@ -15,8 +15,8 @@ from twin.compare import compare_report
 from twin.compare.__main__ import app
 from twin.compare.compare_report import compare, verdict
 from twin.compare.folder_difference import array_difference, sigma_of
+from twin.framework.run_folder import RunFolder, write_manifest
 from twin.main_job.render_job import render_job
-from twin.run.run_folder import RunFolder, write_manifest
 from twin.scripting.instrument_twin import load
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from twin.run.data_files import WRITER, FrameFacts, csv_table, frame_files, tiff
+from twin.framework.data_files import WRITER, FrameFacts, csv_table, frame_files, tiff
 
 FRAMES = np.arange(3 * 5 * 4, dtype=np.uint16).reshape(3, 5, 4)
 FACTS = FrameFacts("forward, left area CCD", 5.5e-6, 0.01, (0.0, 720.0, 1800.0), "perturbed")

@@ -26,7 +26,7 @@ from twin.design.__main__ import app
 from twin.design.design_run import HELD_BY, _held_text, run_design
 from twin.design.layout_bench import BeamFacts
 from twin.design.layout_search import journal_of
-from twin.run.run_folder import RunFolderError
+from twin.framework.run_folder import RunFolderError
 
 EXAMPLE = EXAMPLES / "design_gf7_short.yaml"
 

@@ -28,11 +28,11 @@ from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED
+from twin.framework import frame_store
+from twin.framework.data_files import FrameFacts, preview_png, tiff
+from twin.framework.frame_store import frame_room, in_file, kept_bytes, largest_of, let_go, mean_of
 from twin.main_job.render_job import render_job
 from twin.render import app
-from twin.run import frame_store
-from twin.run.data_files import FrameFacts, preview_png, tiff
-from twin.run.frame_store import frame_room, in_file, kept_bytes, largest_of, let_go, mean_of
 from twin.sensors import area_detector, exposure_kernel
 from twin.sensors.area_detector import (
     EmvaDetector,

@@ -26,11 +26,11 @@ from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
 from tests.twin.study_bench import REFUSED
+from twin.framework.procedure import BenchError
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import CLOSED_FORMS, SimulatedDistortion, measure, reduce
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import run_turntable
-from twin.run.procedure import BenchError
 
 UM, NM = 1e-6, 1e-9
 FALSE_ALARM = 1e-4

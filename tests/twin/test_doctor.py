@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 
 from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
 from twin import doctor
-from twin.run import lock_file, probe
+from twin.framework import lock_file, probe
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,7 +55,7 @@ ABORTS = "import os, sys; sys.stderr.write('LLVM ERROR: Cannot select: fmaximum\
         (("-c", ABORTS), "needs LLVM 17 or newer.*Cannot select"),
         (("-c", "import time; time.sleep(60)"), "no answer after 1 s"),
         (("-c", "raise SystemExit(3)"), "exit code 3 and no answer"),
-        (("-m", "twin.run.probe", "render", "no_such_variant"), "no_such_variant"),
+        (("-m", "twin.framework.probe", "render", "no_such_variant"), "no_such_variant"),
     ],
 )
 def test_a_child_that_fails_is_told(words: tuple[str, ...], told: str) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from tests.twin.replacing import FILES, Moments, replace_run, standing
 from tests.twin.study_bench import ROOT
-from twin.run.run_folder import RunFolderError
+from twin.framework.run_folder import RunFolderError
 
 
 def hidden(place: Path) -> set[str]:

@@ -16,13 +16,13 @@ from tests.twin.commands import invoke
 from tests.twin.line_scanner_model import LineScannerModel
 from tests.twin.study_bench import REFUSED
 from tests.twin.test_simulate import write
+from twin.framework.data_files import FrameFacts, tiff
 from twin.orbit.export import line_scanner as line_scanning
 from twin.orbit.export.line_scanner import line_scanner
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.images.simulate_run import fly_simulation
-from twin.run.data_files import FrameFacts, tiff
 
 run = partial(invoke, command.app)
 CSM = Path(__file__).parent / "csm"

@@ -15,13 +15,13 @@ import twin.orbit.__main__ as command
 from tests.twin.commands import files, invoke
 from tests.twin.dimap_bench import Scene, rpc, write
 from tests.twin.study_bench import REFUSED
+from twin.framework.data_files import FrameFacts, tiff
 from twin.orbit.export import ground_accuracy, line_scanner
 from twin.orbit.export.export_report import _warnings as export_warnings
 from twin.orbit.export.export_report import quality_warnings
 from twin.orbit.export.export_run import Controlled, Quality
 from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
 from twin.orbit.measured.dimap_sensor import read_scene
-from twin.run.data_files import FrameFacts, tiff
 
 run = partial(invoke, command.app)
 SCENE = Scene(lines=4000, pixels=6000)

@@ -12,6 +12,7 @@ from rasterio.transform import from_origin
 from scenes.specs.orbit.measurements import GroundFileSpec, RasterFileSpec
 from scenes.yaml.errors import Problem
 from tests.twin import orbit_file_bench as bench
+from twin.framework.data_files import tiff
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Raster
@@ -19,7 +20,6 @@ from twin.orbit.images.simulate_report import map_facts
 from twin.orbit.measured.datum import Geoid
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
 from twin.orbit.measured.map_part import UserMap
-from twin.run.data_files import tiff
 
 HEADS = ("point", "latitude [deg]", "longitude [deg]", "height [m]")
 SIGMAS = ("sigma_east [m]", "sigma_north [m]", "sigma_up [m]")

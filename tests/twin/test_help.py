@@ -6,7 +6,7 @@ import shlex
 from scenes.specs.file_kinds import kind_of
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.study_bench import ROOT
-from twin.run.console import parser
+from twin.framework.console import parser
 from twin.validation import registry
 
 TAUGHT = (

@@ -27,8 +27,8 @@ from twin.design import monitor_design
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts, _OutsideLimitsError
 from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
 from twin.design.layout_search import Candidate, End, Found, merit, optima, spread
+from twin.framework.procedure import BenchError
 from twin.monitor.information import Information
-from twin.run.procedure import BenchError
 
 FILES = Path(__file__).with_name("layouts_differentiated")
 STATED_NAME = "mirrors.yaml"

@@ -14,6 +14,7 @@ from optics.geometry.tree import Motion
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
+from twin.framework.provenance import program_digest
 from twin.live.camera_pictures import CameraPictures
 from twin.live.computer import Answers
 from twin.live.knobs import KINDS, knob_name, perturbation
@@ -23,7 +24,6 @@ from twin.live.recording import course_text, job_text
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.monitor.time_series import series_states
-from twin.run.provenance import program_digest
 
 M2, PLANE = "base/forward/M2", "base/backward/focal_plane"
 

@@ -10,9 +10,9 @@ import pytest
 
 from scenes.specs.resolved import resolve
 from tests.twin.live_page import CHROMIUM, FLAGS, Command, Page, running
+from twin.framework.run_folder import RunFolder, write_manifest
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
-from twin.run.run_folder import RunFolder, write_manifest
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 

@@ -19,6 +19,7 @@ from scenes.specs.orbit.setup import AngleSetup, MonitorSetup
 from scenes.specs.resolved import TurntableSetup, resolve, resolve_camera
 from scenes.yaml.errors import InputError
 from tests.twin.study_bench import REFUSED
+from twin.framework.run_folder import RunFolder, write_manifest
 from twin.live.camera_pictures import _with_targets
 from twin.live.live_bench import LiveBench
 from twin.live.messages import MOST_FRAMES, AskedState
@@ -28,7 +29,6 @@ from twin.main_job.job_tables import config_text
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.orbit.monitoring.monitor_series import states_of
-from twin.run.run_folder import RunFolder, write_manifest
 from twin.scripting.instrument_twin import InstrumentTwin
 from twin.study.runs.base_job import with_values
 from twin.study.runs.plan import Plan

@@ -18,12 +18,12 @@ pytest.importorskip("websockets.sync.client", reason="the extra `live` is not in
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
+from twin.framework.cli import InputErrorText
 from twin.live.__main__ import TOKEN, _serve
 from twin.live.clients import BAD_MESSAGES, Client, Goodbye
 from twin.live.computer import CannotStart, ComputerLost
 from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, read_message
 from twin.live.server import LiveServer
-from twin.run.cli import InputErrorText
 from twin.serving.guard import BadToken, Guard, new_token
 from twin.serving.server import listen
 

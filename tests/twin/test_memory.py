@@ -21,13 +21,13 @@ from scenes.yaml.errors import InputError
 from tests.limits.extremes import STUDIES_BEYOND, Extreme
 from tests.twin.commands import files, invoke
 from tests.twin.study_bench import REFUSED
+from twin.framework import memory
+from twin.framework.console import PROGRAMS
+from twin.framework.memory import LIMIT, amount_text, free_memory, largest
 from twin.main_job.render_job import render_job
 from twin.monitor import monitor_memory
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import MonitorSize, require_memory
-from twin.run import memory
-from twin.run.console import PROGRAMS
-from twin.run.memory import LIMIT, amount_text, free_memory, largest
 from twin.sensors.area_detector import ReadNoise
 from twin.study.runs.plan import require_study_memory, study_bytes
 from twin.study.runs.setup import resolve_study

@@ -35,10 +35,10 @@ from twin.design.__main__ import app
 from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, touching
 from twin.design.layout_search import journal_of
 from twin.design.monitor_design import LAYOUTS, MonitorDesignRun, run_monitor_design
+from twin.framework.run_folder import RunFolderError
 from twin.monitor.information import Information, spot_noise
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
-from twin.run.run_folder import RunFolderError
 from twin.uncertainty.monitor_limits import expected_covariance, find_limits
 
 FILES = Path(__file__).with_name("layouts")

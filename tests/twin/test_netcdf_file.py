@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 from scenes.specs.study import UNITS
-from twin.run.data_files import COUNTS, SPELT, GridData, follow_cf, netcdf
+from twin.framework.data_files import COUNTS, SPELT, GridData, follow_cf, netcdf
 
 UDUNITS = {
     *("arcsec", "arcmin", "milliarcsec", "degree", "rad", "urad", "mrad", "pm", "nm", "um", "mm", "m", "km"),

@@ -15,6 +15,7 @@ from scenes.specs.operation import OperationSpec, RequirementSpec
 from tests.twin.commands import invoke
 from tests.twin.operation_records import START, entries_of, given, life_of, plan_of, record_of
 from tests.twin.study_bench import REFUSED
+from twin.framework.provenance import negative_verdicts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.following import AGAIN, Break, Following, FoundJump, SensorState, alarms_of, raise_alarms
@@ -22,7 +23,6 @@ from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.operation_model import keep_plan
 from twin.operate.record.entries import MICRO, Entry, utc_text
 from twin.operate.record.history import History
-from twin.run.provenance import negative_verdicts
 
 DAY = 86_400 * MICRO
 EVERY, DAYS = 4, 120

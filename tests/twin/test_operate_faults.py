@@ -26,6 +26,7 @@ from tests.twin.record_bench import (
     temperatures,
 )
 from tests.twin.test_durability import mounted
+from twin.framework.data_files import TABLE_FORMATS
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.estimate.operation import Operation
@@ -33,7 +34,6 @@ from twin.operate.record import FILE, RecordFailed
 from twin.operate.record.entries import Alarm
 from twin.operate.record.history import History, initialised
 from twin.operate.record.record_tables import tables
-from twin.run.data_files import TABLE_FORMATS
 
 FILES, ROWS = 12, 400
 

@@ -17,6 +17,7 @@ from tests.twin.commands import invoke
 from tests.twin.operate_bench import COUNT, DAY, EVIL, HOUR, StandIn, filled, lived, monitor_entry
 from tests.twin.policed_page import breaches
 from tests.twin.record_bench import START, given, made
+from twin.framework.page import report_page
 from twin.operate import daily_report as daily
 from twin.operate.__main__ import app
 from twin.operate.daily_report import _warnings, daily_report, end_of_day, state_table
@@ -26,7 +27,6 @@ from twin.operate.estimate.operation_model import kept_plan
 from twin.operate.overview import Overview, coverage, points_of, readings, span_of, spread, trend
 from twin.operate.record.entries import Alarm, Entry, micros
 from twin.operate.record.history import History, content_of, initialised
-from twin.run.page import report_page
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ from scenes.specs.course import CourseSpec
 from scenes.specs.orbit.monitor import CorrectionSpec, LoopImagesSpec, MotionSpec
 from scenes.specs.orbit.setup import MonitorSetup
 from scenes.specs.resolved import line_detector
+from twin.framework.provenance import negative_verdicts
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.monitoring import closed_loop
@@ -21,7 +22,6 @@ from twin.orbit.monitoring.loop_run import LoopRun
 from twin.orbit.monitoring.monitoring_numbers import CORRECTION, LOOP
 from twin.orbit.monitoring.monitoring_report import monitor_report
 from twin.orbit.monitoring.monitoring_run import run_monitor
-from twin.run.provenance import negative_verdicts
 
 ARCSEC = np.pi / 648000.0
 

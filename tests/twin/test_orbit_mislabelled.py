@@ -10,12 +10,12 @@ from analysis.calibration.adjustment import FarPointsError
 from scenes.specs.procedures import PROCEDURES
 from tests.tiers import quick
 from tests.twin.orbit_files import FIELDS, edit, export, flown, read_back, set_keys, small
+from twin.framework.procedure import BenchError
 from twin.orbit.calibration.calibration_run import run_calibration
 from twin.orbit.calibration.campaign import campaign_of
 from twin.orbit.calibration.screening import mislabelled
 from twin.orbit.measured.measurement_tables import read_measurements
 from twin.orbit.measured.pass_measurements import duplicates
-from twin.run.procedure import BenchError
 
 
 @pytest.fixture(scope="module")

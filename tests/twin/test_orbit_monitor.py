@@ -10,11 +10,11 @@ from scipy.stats import chi2
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, intersect_pair
 from optics.geometry.tree import Motion
 from scenes.specs.orbit.setup import MonitorSetup
+from twin.framework.procedure import silent
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
 from twin.orbit.monitoring.monitoring_run import run_monitor
 from twin.orbit.monitoring.pair_flight import rms
-from twin.run.procedure import silent
 
 ARCSEC = np.pi / 648000
 FALSE_ALARM = 1e-6

@@ -49,6 +49,10 @@ from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import edited_copy, invoke, refused
 from tests.twin.orbit_files import REFUSALS
 from tests.twin.pushbroom_bench import lines, lost
+from twin.framework.cli import InputErrorText
+from twin.framework.cluster import ClusterError
+from twin.framework.data_files import FrameFacts, tiff
+from twin.framework.procedure import BenchError
 from twin.laboratory.distortion_run import _check_angles
 from twin.orbit.angle.angle_flight import angle_camera
 from twin.orbit.angle.angle_run import SimulatedAngleRun
@@ -81,10 +85,6 @@ from twin.orbit.measured.pass_measurements import GroundPoints
 from twin.orbit.measured.platform_files import platform_table, read_platform
 from twin.orbit.monitoring import closed_loop, loop_run, monitoring_run
 from twin.orbit.monitoring.monitor_series import MonitorSeries
-from twin.run.cli import InputErrorText
-from twin.run.cluster import ClusterError
-from twin.run.data_files import FrameFacts, tiff
-from twin.run.procedure import BenchError
 
 ROOT = Path(__file__).resolve().parents[2]
 JOBS = [one for job in REFUSALS["jobs"] for one in quick(job["quick"], [(job, *case) for case in job["cases"]])]
@@ -397,7 +397,7 @@ def test_what_is_refused(case: tuple[Any, ...], tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.parametrize("warnings", [[], ["another version of NumPy"]])
 def test_what_is_to_be_known_of_a_cluster_is_told(warnings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin.run.cluster.remote_workers", lambda *_: nullcontext(Ns(warnings=warnings, count=1)))
+    monkeypatch.setattr("twin.framework.cluster.remote_workers", lambda *_: nullcontext(Ns(warnings=warnings, count=1)))
     told: list[str] = []
     with point_workers.point_workers(None, "tcp://localhost:1", told.append):
         assert told == warnings

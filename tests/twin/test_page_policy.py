@@ -10,11 +10,11 @@ from markupsafe import escape
 
 from tests.twin.policed_page import Policed, breaches
 from tests.twin.study_bench import REFUSED
+from twin.framework.artefact import Marked, SvgFigure, Table, Text
+from twin.framework.page import FIGURES, RunFacts, checksum, inline, page_policy, render_report
+from twin.framework.report import Report, Section
+from twin.framework.svg import look, new_figure, to_svg
 from twin.pictures.scene_file import viewer_programs, viewer_scripts
-from twin.run.artefact import Marked, SvgFigure, Table, Text
-from twin.run.page import FIGURES, RunFacts, checksum, inline, page_policy, render_report
-from twin.run.report import Report, Section
-from twin.run.svg import look, new_figure, to_svg
 
 EVIL = (
     "<script>alert(1)</script>",

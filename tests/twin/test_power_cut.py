@@ -29,10 +29,17 @@ import pytest
 
 from tests.twin import record_bench, replacing
 from tests.twin.commands import invoke
+from twin.framework import owned_files
+from twin.framework.journal import Journal
+from twin.framework.run_folder import (
+    KeptWork,
+    RunFolder,
+    RunFolderError,
+    read_manifest,
+    remove_replaced,
+    write_manifest,
+)
 from twin.operate.__main__ import app
-from twin.run import owned_files
-from twin.run.journal import Journal
-from twin.run.run_folder import KeptWork, RunFolder, RunFolderError, read_manifest, remove_replaced, write_manifest
 
 pytestmark = pytest.mark.second
 ROOT = Path(__file__).resolve().parents[2]

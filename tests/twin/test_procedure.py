@@ -26,13 +26,13 @@ from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
 from tests.twin.commands import files, invoke
 from tests.twin.test_blurred_cameras import gf7_with
-from twin.run import cli, reference_frames
-from twin.run.artefact import PngFigure, SvgFigure, Table
-from twin.run.cli import heartbeat
-from twin.run.command import add_test, progress_shown
-from twin.run.procedure import Advance, BenchError
-from twin.run.quantity import plain_data
-from twin.run.report import Report, Section, answer
+from twin.framework import cli, reference_frames
+from twin.framework.artefact import PngFigure, SvgFigure, Table
+from twin.framework.cli import heartbeat
+from twin.framework.command import add_test, progress_shown
+from twin.framework.procedure import Advance, BenchError
+from twin.framework.quantity import plain_data
+from twin.framework.report import Report, Section, answer
 from twin.study.runs.base_job import Failure, ProcedureBase, Run
 
 FILE = "name: levels\nreadings: 5\nsigma_arcsec: 0.5\nseed: 3\n"

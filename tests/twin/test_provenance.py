@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import tifffile
 
-from twin.run import provenance
-from twin.run.provenance import Provenance, SelfCheck, checks_in, inputs_in
+from twin.framework import provenance
+from twin.framework.provenance import Provenance, SelfCheck, checks_in, inputs_in
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def digest_with(root: Path) -> str:
-    code = "from twin.run.provenance import program_digest; print(program_digest())"
+    code = "from twin.framework.provenance import program_digest; print(program_digest())"
     ran = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
     return ran.stdout.strip()
 
@@ -29,7 +29,7 @@ def test_the_digest_is_of_all_files_and_follows_each(tmp_path):
     """Copies without what Git, editors and Python leave have the same one; a line of the library changes it."""
     for package in provenance.SOURCES:
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "twin/run/notes.txt~").write_text("an editor's")
+    (tmp_path / "twin/framework/notes.txt~").write_text("an editor's")
     assert digest_with(tmp_path) == provenance.program_digest()
     sheet = tmp_path / "scenes/library/detectors/monitor_ccd.yaml"
     sheet.write_text(sheet.read_text("utf-8") + "\n", "utf-8")

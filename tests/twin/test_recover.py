@@ -31,6 +31,7 @@ from scenes.yaml.errors import InputError, Issue
 from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED, ROOT
+from twin.framework.data_files import FrameFacts, tiff
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -41,7 +42,6 @@ from twin.recover.channel_measurement import ChannelMeasurement
 from twin.recover.measured_frames import ChannelFrames, StateFrames, order_warnings
 from twin.recover.recover_report import recover_numbers, recover_report
 from twin.recover.recover_run import RecoverRun, run_recover
-from twin.run.data_files import FrameFacts, tiff
 
 JOB = ROOT / "scenes/examples/perturb.yaml"
 HEAD = "instrument: gf7_pair\ndisturbances: launch\n"

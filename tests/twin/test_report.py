@@ -10,6 +10,7 @@ import pytest
 from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
 from scenes.specs.resolved import resolve
 from tests.twin.policed_page import breaches
+from twin.framework.artefact import FAR, Text, decimals_for, fixed, plain, residual_text, significant
 from twin.main_job.crosstalk_sections import is_wrong
 from twin.main_job.render_folder import render_report
 from twin.main_job.render_job import render_job
@@ -17,7 +18,6 @@ from twin.main_job.render_results import RenderRun
 from twin.main_job.result_sections import residual_section
 from twin.main_job.systematics import systematics
 from twin.pictures.scene_file import write_scene
-from twin.run.artefact import FAR, Text, decimals_for, fixed, plain, residual_text, significant
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import rasterio
 from analysis.orbit.image_correction import Kind, image_correction
 from tests.tiers import quick
 from tests.twin.dimap_bench import Scene, rpc, write
+from twin.framework.data_files import FrameFacts, tiff
 from twin.orbit.export.rational_polynomial import (
     RationalPolynomial,
     controlled,
@@ -19,7 +20,6 @@ from twin.orbit.export.rational_polynomial import (
 )
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.measured.dimap_sensor import read_scene
-from twin.run.data_files import FrameFacts, tiff
 
 SCENE = Scene()
 HEIGHTS = (0.0, 2000.0)

@@ -19,12 +19,7 @@ from tests.twin.commands import files, invoke
 from tests.twin.study_bench import ROOT
 from twin.export.__main__ import app
 from twin.export.export_run import RecordedFrames, expected_fits, frames_fits, read_frames
-from twin.main_job.monitor_reading import stated
-from twin.main_job.render_files import write_data
-from twin.main_job.render_job import render_job
-from twin.recover.recover_report import recover_numbers
-from twin.recover.recover_run import run_recover
-from twin.run.data_files import (
+from twin.framework.data_files import (
     TABLE_FORMATS,
     DataColumn,
     DataTable,
@@ -34,7 +29,12 @@ from twin.run.data_files import (
     csv_table,
     tiff,
 )
-from twin.run.run_folder import RunFolder, write_manifest
+from twin.framework.run_folder import RunFolder, write_manifest
+from twin.main_job.monitor_reading import stated
+from twin.main_job.render_files import write_data
+from twin.main_job.render_job import render_job
+from twin.recover.recover_report import recover_numbers
+from twin.recover.recover_run import run_recover
 
 JOB = ROOT / "tests/golden/jobs/perturb.yaml"
 SEED, FRAMES = 5, 3

@@ -17,10 +17,10 @@ import pytest
 import xarray as xr
 
 from tests.twin.study_bench import ROOT
-from twin.run import durable, run_folder
-from twin.run.owned_files import LOCK, MANIFEST, OLD, PARTIAL, Unfinished, scratch
-from twin.run.provenance import versions
-from twin.run.run_folder import KeptWork, Numbered, RunFolder, RunFolderError, is_run_folder
+from twin.framework import durable, run_folder
+from twin.framework.owned_files import LOCK, MANIFEST, OLD, PARTIAL, Unfinished, scratch
+from twin.framework.provenance import versions
+from twin.framework.run_folder import KeptWork, Numbered, RunFolder, RunFolderError, is_run_folder
 
 
 def everything(folder: Path) -> set[str]:
@@ -331,7 +331,7 @@ def test_runs_that_start_together_get_a_number_each(tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from twin.run.run_folder import RunFolder
+from twin.framework.run_folder import RunFolder
 with RunFolder(Path(sys.argv[1]), force=True) as folder:
     folder.write_text("half.txt", "half")
     {act}
@@ -359,7 +359,7 @@ def test_what_a_living_run_has_is_left_alone(tmp_path):
         folder.write_text("a.txt", "mine")
         a_run(tmp_path / "other")
         # another process sees the lock as well
-        code = "import sys; from pathlib import Path; from twin.run.run_folder import RunFolder\n"
+        code = "import sys; from pathlib import Path; from twin.framework.run_folder import RunFolder\n"
         code += "with RunFolder(Path(sys.argv[1])) as f: f.write_text('x', 'y')"
         subprocess.run([sys.executable, "-c", code, str(tmp_path / "third")], cwd=ROOT, timeout=60, check=True)
     assert (tmp_path / "run" / "a.txt").read_text() == "mine"
@@ -382,7 +382,7 @@ def test_a_run_that_was_being_replaced_is_put_back(tmp_path):
 
 LEFT = """
 import os, signal
-from twin.run.owned_files import scratch
+from twin.framework.owned_files import scratch
 with scratch("twin-own") as folder:
     (folder / "sub").mkdir()
     os.kill(os.getpid(), signal.SIGKILL)
@@ -413,7 +413,7 @@ def test_scratch_of_a_killed_process_goes_and_that_of_others_stays(tmp_path, mon
 def test_a_run_that_has_changed_places_with_the_old_one(tmp_path):
     """Killed just after that: what stands under the new one's hidden name is the old one, with what was put there."""
     target = a_run(tmp_path / "run")
-    act = "from twin.run import run_folder as r; (folder.target / 'late.txt').write_text('mine'); "
+    act = "from twin.framework import run_folder as r; (folder.target / 'late.txt').write_text('mine'); "
     act += "r.write_manifest(folder, 'twin.test', 1.0, 1.0); "
     act += "os.rename(folder.path / r._WAITING, folder.path / r.MANIFEST); r.put_in_place.__globals__['exchange']("
     kill_a_run(target, act + "folder.path, folder.target)")

@@ -14,8 +14,8 @@ import numpy as np
 import psutil
 import pytest
 
-import twin.run.second_process as module
-from twin.run.second_process import MOST_TASKS, SecondProcess
+import twin.framework.second_process as module
+from twin.framework.second_process import MOST_TASKS, SecondProcess
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -163,7 +163,7 @@ def test_nothing_is_left_behind() -> None:
 def test_it_ends_with_a_command_that_is_killed() -> None:
     """Also its copy of what the command had open, so that a reader of the output sees the end and a lock is free."""
     code = (
-        "import os, time; import twin.run.second_process as m; m.cores = lambda: 2\n"
+        "import os, time; import twin.framework.second_process as m; m.cores = lambda: 2\n"
         "with m.SecondProcess(lambda: None) as beside:\n"
         "    print(beside._child, flush=True)\n"
         "    time.sleep(600)\n"

@@ -20,11 +20,11 @@ import pytest
 from scenes.specs.file_kinds import FILE_KINDS
 from tests.tiers import quick
 from tests.twin.study_bench import ROOT
-from twin.run import cluster
-from twin.run.cli import InputErrorText
-from twin.run.cluster import _children_deaf_to_ctrl_c
-from twin.run.console import PROGRAMS as ALL_PROGRAMS
-from twin.run.durable import ending_later
+from twin.framework import cluster
+from twin.framework.cli import InputErrorText
+from twin.framework.cluster import _children_deaf_to_ctrl_c
+from twin.framework.console import PROGRAMS as ALL_PROGRAMS
+from twin.framework.durable import ending_later
 
 HEAVY = set(
     "cv2 dask distributed drjit erfa h5netcdf h5py jinja2 matplotlib mitsuba networkx pandas pint pyproj scipy skfem"
@@ -70,10 +70,10 @@ def test_help_waits_for_nothing_that_computes_or_reads() -> None:
     # last the schemas, whose generator is pydantic's
     names = sorted((module for module, _ in ALL_PROGRAMS.values()), key=lambda name: name == "scenes.schema")
     found = loaded(
-        f"from twin.run.console import parser\nfor name in {names}:\n"
+        f"from twin.framework.console import parser\nfor name in {names}:\n"
         " more = {'pydantic': 'pydantic' in sys.modules}\n parser(name)"
     )
-    assert {"typer", "twin.run.cli", "twin.study.__main__", "analysis.mtf.__main__"} <= set(found["modules"])
+    assert {"typer", "twin.framework.cli", "twin.study.__main__", "analysis.mtf.__main__"} <= set(found["modules"])
     assert (packages(found["modules"]) & HEAVY, found["pydantic"]) == (set(), False)
 
 

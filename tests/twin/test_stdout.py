@@ -14,7 +14,7 @@ from rich.console import Console
 
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from tests.twin.study_bench import ROOT
-from twin.run.durable import exit_on_terminate
+from twin.framework.durable import exit_on_terminate
 
 FULL = "/dev/full"
 SCHEMA = ("scenes.schema", "--out", "{tmp}")

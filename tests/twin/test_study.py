@@ -21,8 +21,8 @@ import xarray as xr
 import twin.study.__main__ as command
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT, alive, blocks, children, same_bytes, start, wait_for, write_study
-from twin.run import cluster
-from twin.run.cluster import local_workers
+from twin.framework import cluster
+from twin.framework.cluster import local_workers
 from twin.study.runs.blocks import Engine, journal_of
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study

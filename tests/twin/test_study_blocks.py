@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import twin.run.provenance
+import twin.framework.provenance
 import twin.study.__main__ as command
 from tests.twin.commands import invoke
 from tests.twin.study_bench import write_study
-from twin.run.cli import Incomplete
-from twin.run.provenance import source_digest, sources
-from twin.run.run_folder import RunFolderError
+from twin.framework.cli import Incomplete
+from twin.framework.provenance import source_digest, sources
+from twin.framework.run_folder import RunFolderError
 from twin.study.runs.base_job import BlockResult
 from twin.study.runs.blocks import BLOCKS, Engine, OtherProgramError, Task, evaluate, journal_of
 from twin.study.runs.plan import Plan
@@ -116,7 +116,7 @@ def test_other_code_is_not_mixed_in(setup, kept, monkeypatch, change) -> None:
         del other["twin/sensors/area_detector.py"]
     else:
         other["twin/sensors/area_detector.py" if change == "edited" else "twin/new.py"] = "0" * 16
-    monkeypatch.setattr(twin.run.provenance, "sources", lambda: other)
+    monkeypatch.setattr(twin.framework.provenance, "sources", lambda: other)
     named = "twin/new.py" if change == "new" else "twin/sensors/area_detector.py"
     with pytest.raises(RunFolderError, match=rf"another version of the program.*changed: {named}.*--resume.*--out"):
         opened(setup, kept)
@@ -125,8 +125,8 @@ def test_other_code_is_not_mixed_in(setup, kept, monkeypatch, change) -> None:
 
 
 def test_another_version_of_a_package_is_named(setup, kept, monkeypatch) -> None:
-    other = twin.run.provenance.versions() | {"numpy": "1.0"}
-    monkeypatch.setattr("twin.run.provenance.versions", lambda: other)
+    other = twin.framework.provenance.versions() | {"numpy": "1.0"}
+    monkeypatch.setattr("twin.framework.provenance.versions", lambda: other)
     with pytest.raises(RunFolderError, match=r"numpy was [0-9.]+ and is 1\.0"):
         opened(setup, kept)
 
@@ -135,7 +135,7 @@ def test_sources_change_with_the_files(tmp_path, monkeypatch) -> None:
     for name in ("optics/a.py", "twin/b.py", "twin/validation/c.py", "scenes/d.yaml"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("x = 1\n")
-    monkeypatch.setattr(twin.run.provenance, "ROOT", tmp_path)
+    monkeypatch.setattr(twin.framework.provenance, "ROOT", tmp_path)
     read = sources.__wrapped__
     first = read()
     assert set(first) == {"optics/a.py", "twin/b.py"}

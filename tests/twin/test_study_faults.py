@@ -12,8 +12,8 @@ from optics.numerics.array_math import PhysicalError
 from scenes.specs.procedures import Procedure
 from tests.twin.commands import invoke
 from tests.twin.study_bench import write_study
-from twin.run import cluster
-from twin.run.cli import Incomplete
+from twin.framework import cluster
+from twin.framework.cli import Incomplete
 from twin.sensors.area_detector import EmvaDetector
 from twin.study.runs.base_job import BlockResult, Failure, ProcedureBase, Run
 from twin.study.runs.blocks import Engine, Pilot, journal_of

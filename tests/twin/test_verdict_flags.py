@@ -22,13 +22,13 @@ from scenes.specs.study import UNITS, unit_of
 from tests.golden.digest import expanded
 from tests.twin.commands import invoke
 from tests.twin.test_procedure import FILE, LEVEL
+from twin.framework import reference_frames
+from twin.framework.command import add_test
+from twin.framework.provenance import VERDICT, negative_verdicts
+from twin.framework.quantity import Quantity, Record
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
 from twin.main_job.verdict import judge, recovered_numbers
-from twin.run import reference_frames
-from twin.run.command import add_test
-from twin.run.provenance import VERDICT, negative_verdicts
-from twin.run.quantity import Quantity, Record
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 WARNED_ELSEWHERE = {

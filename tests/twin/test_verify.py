@@ -36,9 +36,9 @@ from twin.compare.verification import (
     redrawn,
     repeat_block,
 )
-from twin.run.data_files import FrameFacts, netcdf, preview_png, tiff
-from twin.run.owned_files import MANIFEST
-from twin.run.run_folder import RunFolder, write_manifest
+from twin.framework.data_files import FrameFacts, netcdf, preview_png, tiff
+from twin.framework.owned_files import MANIFEST
+from twin.framework.run_folder import RunFolder, write_manifest
 from twin.study.runs.base_job import BlockResult
 from twin.study.runs.blocks import BLOCKS, Engine, journal_of
 from twin.study.runs.plan import Plan
@@ -107,7 +107,7 @@ def test_a_changed_config_is_not_run_again(folder) -> None:
 def test_inputs_that_changed_or_are_gone_are_named(tmp_path) -> None:
     for name in ("first.tiff", "second.tiff", "third.tiff"):
         (tmp_path / name).write_text(name)
-    from twin.run.provenance import inputs_in
+    from twin.framework.provenance import inputs_in
 
     with RunFolder(tmp_path / "run") as made:
         made.write_text("config.yaml", "a: 1\n")

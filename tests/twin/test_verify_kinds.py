@@ -11,7 +11,7 @@ import pytest
 
 from tests.golden.jobs import BY_NAME, ROOT, SET, UNSET, run
 from twin.compare.folder_state import folder_state
-from twin.run.owned_files import MANIFEST
+from twin.framework.owned_files import MANIFEST
 
 
 @pytest.mark.second

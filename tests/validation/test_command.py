@@ -12,7 +12,7 @@ import pytest
 import twin.validate as command
 from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED
-from twin.run.artefact import Data, PngFigure, SvgFigure, Table
+from twin.framework.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation import registry
 from twin.validation.check import (
     CONFIRMED,

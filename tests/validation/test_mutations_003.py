@@ -18,9 +18,9 @@ from analysis.calibration import normal_equations
 from analysis.orbit import calibration_parameters, forward_intersection
 from optics.numerics.backend import load_backend
 from tests.validation.mutated import break_it, undrawn, with_fields
+from twin.framework.random_streams import stream
 from twin.orbit.calibration import schemes as calibration_schemes
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
-from twin.run.random_streams import stream
 from twin.validation import registry
 from twin.validation.paper_003 import fields, model
 from twin.validation.paper_003.model import FIELDS, changed, setup_of, without_light

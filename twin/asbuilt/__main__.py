@@ -12,7 +12,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from twin.run.command import add_tests
+from twin.framework.command import add_tests
 
 
 class _Estimate(TyperGroup):

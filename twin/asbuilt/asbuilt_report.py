@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from optics.numerics.number_tree import FrozenMap
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
-from twin.run.artefact import CameraFile, Cell, CsvFile, OwnDecimals, SvgFigure, Table, plain, significant
-from twin.run.report import Report, Section, answer
-from twin.run.svg import (
+from twin.framework.artefact import CameraFile, Cell, CsvFile, OwnDecimals, SvgFigure, Table, plain, significant
+from twin.framework.report import Report, Section, answer
+from twin.framework.svg import (
     BLUE,
     GREEN,
     GREY,

@@ -15,10 +15,10 @@ from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.tolerance import MeritSpec, amount_text
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
 from twin.asbuilt.next_step import Advice, advice
-from twin.run.memory import Lowered, require_memory
-from twin.run.procedure import Advance, silent
-from twin.run.quantity import Quantity, Record
-from twin.run.random_streams import stream
+from twin.framework.memory import Lowered, require_memory
+from twin.framework.procedure import Advance, silent
+from twin.framework.quantity import Quantity, Record
+from twin.framework.random_streams import stream
 from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 
 LEVELS = (0.025, 0.16, 0.5, 0.84, 0.975)

@@ -16,10 +16,10 @@ from scenes.specs.asbuilt import AsBuiltSetup
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
 from twin.asbuilt.measured_kinds import UNKNOWN_FOCUS, MeasuredKind, WavefrontReadings
 from twin.asbuilt.wavefront_files import read_coefficients, stated_orientation
-from twin.run.artefact import Cell, Table
-from twin.run.procedure import Advance, silent
-from twin.run.quantity import Quantity, Record
-from twin.run.report import Report, Section, answer
+from twin.framework.artefact import Cell, Table
+from twin.framework.procedure import Advance, silent
+from twin.framework.quantity import Quantity, Record
+from twin.framework.report import Report, Section, answer
 
 FREE_FOCUS = 100.0 * UNKNOWN_FOCUS
 """Standard deviation that stands for a focus that is free, metres."""

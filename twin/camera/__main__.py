@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet
-from twin.run.command import Result, finished, run_command
-from twin.run.procedure import Session
+from twin.framework.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet
+from twin.framework.command import Result, finished, run_command
+from twin.framework.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.resolved import CameraSetup
@@ -95,7 +95,7 @@ def main(
         from scenes.models.camera_sharpness import blur_warnings
         from twin.camera.camera_report import camera_report
         from twin.camera.camera_run import CAMERA, camera_data, run_camera
-        from twin.run.data_files import netcdf
+        from twin.framework.data_files import netcdf
 
         run = run_camera(setup, session.backend, refocus, turned, session.advance)
         # what a refocused camera's file lacked has been done; how good it is now its verdict says

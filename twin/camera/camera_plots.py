@@ -13,8 +13,8 @@ from scenes.models.camera_sharpness import BLURRED, FIELDS
 from twin.camera.camera_results import Field
 from twin.camera.camera_run import GRID, SHARP, CameraRun
 from twin.camera.camera_view import LINE, TRACK, draw_mtf, draw_spot, draw_wavefront
-from twin.run.artefact import plain
-from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, new_figure, plain_axes
+from twin.framework.artefact import plain
+from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, new_figure, plain_axes
 
 MICRO = "\N{MICRO SIGN}m"
 _FIELD_COLOURS = (INK, SKY, BLUE, VERMILION, ORANGE)

@@ -16,9 +16,9 @@ from twin.camera.camera_run import CameraRun, built_text, perturbed_text, refocu
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, unstated_shadows
 from twin.camera.layout_plot import layout_figure
-from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
-from twin.run.report import Report, Section, answer
-from twin.run.svg import look, to_svg
+from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
+from twin.framework.report import Report, Section, answer
+from twin.framework.svg import look, to_svg
 
 _TOLD_TERMS = 15
 """Zernike terms in the table of fields; the others are in optics.json and optics.nc."""

@@ -10,7 +10,7 @@ import numpy as np
 from analysis.arrays import shows
 from optics.geometry import zernike
 from optics.numerics.array_math import hold_below, hold_equal, hold_within
-from twin.run.reference_frames import frames_text
+from twin.framework.reference_frames import frames_text
 
 if TYPE_CHECKING:  # takes half a second with pandas, and only who asks for a data set needs it
     import xarray as xr

@@ -23,7 +23,7 @@ from matplotlib.patches import Circle
 
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
-from twin.run.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, look, plain_axes, to_svg
+from twin.framework.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, look, plain_axes, to_svg
 
 LINE, TRACK = BLUE, VERMILION
 """Colours of the direction along the line, and along the track."""

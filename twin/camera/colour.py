@@ -27,7 +27,7 @@ from scenes.models.camera_sharpness import FocalPlane
 from scenes.specs.spectrum import SpectrumSpec
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field, Mtf
-from twin.run.quantity import Quantity, Record
+from twin.framework.quantity import Quantity, Record
 from twin.targets.target_images import wavelengths_enough
 
 FIRST_RULE = 5

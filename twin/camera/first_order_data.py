@@ -26,7 +26,7 @@ from scenes.models.camera_axis import LINE_AXIS, axis_data, pupil_diameter
 from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction, focal_plane_body
 from scenes.specs.camera import BandSpec, CameraSpec, LineSpec
 from twin.camera.camera_optics import CameraOptics, rim
-from twin.run.quantity import Quantity, Record
+from twin.framework.quantity import Quantity, Record
 
 EARLIER = 6.0
 """How far before its launch point light is looked at for what stands in it, metres."""

@@ -11,8 +11,8 @@ from optics.numerics.backend import Backend
 from scenes.models.camera_model import IMAGE, CameraModel
 from twin.camera.camera_optics import INSIDE
 from twin.camera.first_order_data import obstacles, ray_paths
-from twin.run.artefact import plain
-from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, VERMILION, new_figure, plain_axes
+from twin.framework.artefact import plain
+from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, VERMILION, new_figure, plain_axes
 
 _END_COLOURS = (BLUE, GREEN, VERMILION)
 """Colours of the negative end of the field, its middle, its positive end."""

@@ -14,9 +14,9 @@ from typing import Annotated
 import typer
 
 from scenes.yaml.yaml_file import dump_yaml
-from twin.run.cli import AsJson, Force, Options, Out, Quiet
-from twin.run.command import Result, finished, run_command
-from twin.run.procedure import Session
+from twin.framework.cli import AsJson, Force, Options, Out, Quiet
+from twin.framework.command import Result, finished, run_command
+from twin.framework.procedure import Session
 
 DIFFERENT = 1
 """Exit code where results differ, as that of diff."""

@@ -15,10 +15,10 @@ from scenes.yaml.units import split_quantity, unit_ratio
 from scenes.yaml.yaml_file import read_yaml
 from twin.compare import folder_difference as difference
 from twin.compare.folder_difference import NOISE, ArrayDifference, Leaf, NumberDifference, is_sigma
-from twin.run.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, significant
-from twin.run.report import Report, Section, answer
-from twin.run.run_folder import Manifest, finished_manifest
-from twin.run.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
+from twin.framework.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, significant
+from twin.framework.report import Report, Section, answer
+from twin.framework.run_folder import Manifest, finished_manifest
+from twin.framework.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
 
 MOST_BARS = 30
 """Changes of a figure: the largest for their sigma."""

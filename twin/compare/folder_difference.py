@@ -28,7 +28,7 @@ from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.input_file import parse_json, why_unreadable
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
-from twin.run.data_files import read_netcdf
+from twin.framework.data_files import read_netcdf
 
 Leaf = float | int | str | bool | None
 LEFT_OUT = frozenset(

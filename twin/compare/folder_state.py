@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from scenes.yaml.errors import InputError, Issue
-from twin.run import run_folder
-from twin.run.owned_files import MANIFEST, PARTIAL, digest, every_file
-from twin.run.provenance import Provenance
-from twin.run.run_folder import Manifest
+from twin.framework import run_folder
+from twin.framework.owned_files import MANIFEST, PARTIAL, digest, every_file
+from twin.framework.provenance import Provenance
+from twin.framework.run_folder import Manifest
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,10 @@ from scenes.yaml.input_file import read_json
 from twin.compare import folder_difference as difference
 from twin.compare.folder_difference import ArrayDifference, FileDifference, Leaf, NumberDifference
 from twin.compare.folder_state import Elsewhere, FolderState, elsewhere
+from twin.framework import provenance, report, run_folder
+from twin.framework.journal import read_pieces
+from twin.framework.owned_files import first_names
 from twin.monitor.calibration_cache import recomputed
-from twin.run import provenance, report, run_folder
-from twin.run.journal import read_pieces
-from twin.run.owned_files import first_names
 from twin.study.runs import blocks, setup
 from twin.study.runs.base_job import BlockResult
 from twin.study.runs.plan import Plan

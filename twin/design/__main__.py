@@ -18,8 +18,8 @@ from scenes.specs.file_kinds import kind_of
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import read_yaml
-from twin.run.cli import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed
-from twin.run.command import add_test, run_test
+from twin.framework.cli import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed
+from twin.framework.command import add_test, run_test
 
 PROGRAM = "twin.design"
 
@@ -92,7 +92,7 @@ def monitor(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    from twin.run.run_folder import KeptWork
+    from twin.framework.run_folder import KeptWork
 
     count = cores() if workers is None else workers
     procedure = PROCEDURES["design monitor"]

@@ -13,9 +13,9 @@ from optics.design.merit_function import Evaluation, trace_beams
 from optics.design.optimiser import Attempt, Design, rms_error
 from scenes.models.camera_design import prescription_of
 from twin.design.design_run import DESIGN, DesignRun, agreement, verdict
-from twin.run.artefact import CameraFile, SvgFigure, Table
-from twin.run.report import Report, Section, answer
-from twin.run.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
+from twin.framework.artefact import CameraFile, SvgFigure, Table
+from twin.framework.report import Report, Section, answer
+from twin.framework.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
 
 
 def design_report(run: DesignRun) -> Report:

@@ -22,10 +22,10 @@ from optics.numerics.backend import one_blas_thread
 from scenes.models.monitor_layout import Beam, changed_beam, drawn_beam, kinds_of, start_beams
 from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, Seen, bench_of, combined, touching
 from twin.design.layout_refinement import Ask, LayoutNumber, Slope, ratios, refined, slope_of
-from twin.run import cluster
-from twin.run.cli import Incomplete
-from twin.run.journal import Journal
-from twin.run.procedure import Advance
+from twin.framework import cluster
+from twin.framework.cli import Incomplete
+from twin.framework.journal import Journal
+from twin.framework.procedure import Advance
 
 FIRST_STEP = 0.15
 """Size of the first change of a beam, relative to the range of each number."""

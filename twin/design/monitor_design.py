@@ -17,10 +17,10 @@ from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.design.layout_bench import LayoutBench, LayoutFacts
 from twin.design.layout_search import Found, Search, merit, optima
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.quantity import Quantity, Record
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.stray_light import GHOSTS, Ghost, ghosts, stray_light
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.quantity import Quantity, Record
 
 MOST_POINTS = 6
 """Layouts that are drawn and written, at most."""

@@ -14,11 +14,11 @@ from scenes.models.monitor_layout import layout_spec, number_of
 from twin.design.layout_bench import LayoutFacts
 from twin.design.layout_search import ALIKE, optima
 from twin.design.monitor_design import GOAL_NAMES, UNITS, MonitorDesignRun, Point, verdict
+from twin.framework.artefact import CameraFile, Cell, SvgFigure, Table, decimals_for, shown_unit
+from twin.framework.report import Report, Section, answer
+from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.main_job.light_path_plots import side_view_svg
 from twin.pictures.light_paths import trace_light_paths
-from twin.run.artefact import CameraFile, Cell, SvgFigure, Table, decimals_for, shown_unit
-from twin.run.report import Report, Section, answer
-from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.sensors.area_detector import coarse_warnings
 
 _MOST_CAUSES = 6

@@ -14,12 +14,12 @@ import typer
 
 from scenes.yaml.errors import nearest
 from scenes.yaml.yaml_file import dump_yaml
-from twin.run.cli import AsJson, Force, InputErrorText, Options, Out, Quiet
-from twin.run.command import Result, finished, run_command
-from twin.run.procedure import Session
+from twin.framework.cli import AsJson, Force, InputErrorText, Options, Out, Quiet
+from twin.framework.command import Result, finished, run_command
+from twin.framework.procedure import Session
 
 if TYPE_CHECKING:
-    from twin.run.run_folder import Manifest
+    from twin.framework.run_folder import Manifest
 
 PROGRAM = "twin.export"
 
@@ -57,7 +57,7 @@ def main(
 
     def read() -> Manifest:
         from twin.export.export_run import FRAMES, NONE, read_source
-        from twin.run.data_files import TABLE_FORMATS
+        from twin.framework.data_files import TABLE_FORMATS
 
         for option, value, allowed in (("--frames", frames, FRAMES), ("--tables", tables, (*TABLE_FORMATS, NONE))):
             if value not in allowed:

@@ -27,11 +27,11 @@ from scenes.specs.resolved import ResolvedJob, resolve
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.input_file import is_file, why_unreadable
 from twin.export.result_tables import result_tables
-from twin.run.artefact import Cell, Table
-from twin.run.data_files import TABLE_FORMATS, WRITER, DataTable, MissingPackage, ascii_text, read_netcdf
-from twin.run.procedure import Advance
-from twin.run.report import Report, Section
-from twin.run.run_folder import Manifest, RunFolder, altered, finished_manifest
+from twin.framework.artefact import Cell, Table
+from twin.framework.data_files import TABLE_FORMATS, WRITER, DataTable, MissingPackage, ascii_text, read_netcdf
+from twin.framework.procedure import Advance
+from twin.framework.report import Report, Section
+from twin.framework.run_folder import Manifest, RunFolder, altered, finished_manifest
 
 Card = tuple[str, str | int | float, str]
 """Keyword, value, and what it is with its unit in brackets."""

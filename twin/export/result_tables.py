@@ -19,8 +19,8 @@ from analysis.monitor import parameters
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.study import unit_of
 from scenes.yaml.input_file import read_json
-from twin.run.data_files import DataColumn, DataTable
-from twin.run.owned_files import MANIFEST
+from twin.framework.data_files import DataColumn, DataTable
+from twin.framework.owned_files import MANIFEST
 
 POINTS = "artefacts/points.csv"
 NUMBERS = "numbers"

@@ -29,9 +29,9 @@ from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import TransferTable, transfer
 from scenes.models.camera_model import ROOT, build_camera_under_test
 from scenes.specs.resolved import DistortionSetup
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.random_streams import stream
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.random_streams import stream
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath
 

@@ -9,11 +9,11 @@ import numpy as np
 from analysis.arrays import ARCSEC, MM_PER_M, Array
 from analysis.orientation.interior import LINE_TERMS, InteriorOrientation, LineOrientation
 from analysis.turntable.dividing_error import DividingCompensation, expected_rejections
+from twin.framework.quantity import Quantity, Record
 from twin.laboratory import turntable_numbers
 from twin.laboratory.distortion_run import DistortionRun, Estimate, SimulatedDistortion
 from twin.laboratory.measured_readings import DataFile, SpotReadings
 from twin.laboratory.turntable_run import rms
-from twin.run.quantity import Quantity, Record
 
 JOINT_MODEL = "L = constant + principal_distance tan W - principal_point tan^2 W + radial3 tan^3 W"
 _LINE_UNIT = np.array([1.0 / ARCSEC, MM_PER_M, MM_PER_M, 1.0])

@@ -17,15 +17,15 @@ from analysis.statistics import gain
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera_tests import MeasuredDistortionSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.framework.artefact import FAR, Artefact, Cell, OwnDecimals, SvgFigure, Table, decimals_for
+from twin.framework.data_files import FrameFacts
+from twin.framework.report import Report, Section, answer
+from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.laboratory.distortion_numbers import DISTORTION, ESTIMATE, POINTS
 from twin.laboratory.distortion_run import DistortionRun, SimulatedDistortion
 from twin.laboratory.turntable_numbers import DOUBTFUL
 from twin.laboratory.turntable_report import FIT_NAMES
 from twin.laboratory.turntable_run import rms
-from twin.run.artefact import FAR, Artefact, Cell, OwnDecimals, SvgFigure, Table, decimals_for
-from twin.run.data_files import FrameFacts
-from twin.run.report import Report, Section, answer
-from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -26,6 +26,8 @@ from optics.numerics.backend import Backend
 from scenes.specs.camera_tests import DistortionFiles, DistortionTestSpec, MeasuredDistortionSpec
 from scenes.specs.resolved import DistortionSetup, ExperimentSetup, MeasuredDistortionSetup
 from scenes.yaml.errors import InputError, Issue
+from twin.framework.memory import Lowered, require_memory
+from twin.framework.procedure import Advance, BenchError, silent
 from twin.laboratory.distortion_bench import DistortionBench, DistortionRecord, DistortionTruth
 from twin.laboratory.measured_readings import (
     Comparisons,
@@ -37,8 +39,6 @@ from twin.laboratory.measured_readings import (
 )
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import usable_fits
-from twin.run.memory import Lowered, require_memory
-from twin.run.procedure import Advance, BenchError, silent
 
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
 """Fits of the dividing error that compete for the compensation. The network takes minutes to train; the turntable test

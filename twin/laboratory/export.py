@@ -18,10 +18,10 @@ from scenes.specs import camera_tests
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import dump_yaml
+from twin.framework.data_files import FrameFacts, csv_table, tiff
 from twin.laboratory.distortion_run import SimulatedDistortion
 from twin.laboratory.focus_run import SimulatedFocus, SimulatedState, recorder_of
 from twin.laboratory.turntable_run import TurntableRun
-from twin.run.data_files import FrameFacts, csv_table, tiff
 
 Files: TypeAlias = Mapping[str, str | bytes]
 """Path in the folder -> contents."""

@@ -18,7 +18,7 @@ from optics.geometry.pose import Pose
 from optics.numerics.backend import Backend
 from optics.waves.pupil_stack import PupilFunction
 from scenes.models.camera_model import ROOT, CameraUnderTest, build_camera_under_test
-from twin.run.procedure import Advance, silent
+from twin.framework.procedure import Advance, silent
 from twin.sensors.line_ccd import LineCcd
 from twin.targets.target_images import ALONG, DIRECTIONS, EdgeImager, EdgeOptics, knife_edge
 from twin.targets.target_path import LocalMap, TargetPath

@@ -9,8 +9,8 @@ import numpy as np
 from analysis.arrays import UM_PER_M as UM
 from analysis.focal_plane.through_focus import QUARTIC, FocusVertex
 from analysis.mtf.slanted_edge import measure_edge
+from twin.framework import svg
 from twin.laboratory.focus_run import FocusRun, FocusState, SimulatedFocus, SimulatedState
-from twin.run import svg
 from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
 if TYPE_CHECKING:

@@ -14,12 +14,12 @@ from scipy.stats import chi2
 from analysis.arrays import ARCMIN, UM_PER_M
 from scenes.specs.camera_tests import MeasuredFocusSpec
 from scenes.yaml.units import LENGTH, format_quantity
+from twin.framework.artefact import Artefact, Cell, SvgFigure, Table, fixed
+from twin.framework.report import Report, Section, answer
 from twin.laboratory import focus_plots
 from twin.laboratory.focus_numbers import PLACES, ROW_FAULT, SHIMS, focus_numbers
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus
 from twin.laboratory.turntable_numbers import DOUBTFUL
-from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed
-from twin.run.report import Report, Section, answer
 from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
 MOVED = {"image": "image, along the light", "target": "target, along the light", "focal_plane": "CCD, along the light"}

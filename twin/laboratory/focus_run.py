@@ -32,13 +32,13 @@ from optics.raytrace.trace import BeamMissedError
 from optics.targets.collimator import TooNarrowError
 from scenes.specs.camera_tests import FocusTestSpec, MeasuredFocusSpec
 from scenes.specs.resolved import ExperimentSetup, FocusSetup, MeasuredFocusSetup
+from twin.framework.memory import Lowered, require_memory
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.random_streams import stream
 from twin.laboratory import focus_scan
 from twin.laboratory.focus_bench import BudgetLine, FocusBench
 from twin.laboratory.focus_scan import NyquistMtf, Recorder, SiteScan, Standing
 from twin.laboratory.measured_focus import FocusReadings, read_focus
-from twin.run.memory import Lowered, require_memory
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 from twin.targets.target_images import TRACK
 

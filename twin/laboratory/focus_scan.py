@@ -13,9 +13,9 @@ from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
 from optics.geometry.pose import Pose
 from optics.numerics.backend import cores, one_blas_thread
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.random_streams import stream
 from twin.laboratory.focus_bench import FocusBench, Site
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 from twin.targets.target_images import ALONG, DIRECTIONS
 

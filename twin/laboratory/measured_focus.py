@@ -25,9 +25,9 @@ from scenes.specs.camera_tests import FocusFiles, NoiseSpec
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.units import LENGTH
+from twin.framework.procedure import Advance, silent
 from twin.laboratory.focus_scan import SiteScan
 from twin.laboratory.measured_readings import DataFile
-from twin.run.procedure import Advance, silent
 from twin.targets.target_images import ALONG, DIRECTIONS
 
 MOST_SITES = 3000

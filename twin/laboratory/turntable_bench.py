@@ -20,7 +20,7 @@ from analysis.arrays import Array
 from analysis.turntable.dividing_error import CalibrationSeries
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.turntable import DividingErrorSpec, TurntableTestSpec
-from twin.run.random_streams import stream
+from twin.framework.random_streams import stream
 
 _TABLE, _CALIBRATION, _HELD_OUT, _SPREAD = range(4)
 """Numbers of the seed's random streams."""

@@ -8,9 +8,9 @@ import numpy as np
 
 from analysis.statistics import chance_beyond
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, expected_rejections
+from twin.framework.quantity import Quantity, Record
 from twin.laboratory.measured_readings import Comparisons, DataFile
 from twin.laboratory.turntable_run import TurntableRun, rms
-from twin.run.quantity import Quantity, Record
 
 DOUBTFUL = 1e-3
 """Chance below which a chi-square is told as a warning."""

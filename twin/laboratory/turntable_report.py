@@ -15,12 +15,25 @@ from analysis.arrays import ARCSEC
 from analysis.turntable.dividing_error import covered, gaps
 from scenes.specs.turntable import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
+from twin.framework.artefact import Artefact, SvgFigure, Table, fixed
+from twin.framework.report import Report, Section, answer
+from twin.framework.svg import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    LIGHT,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    look,
+    new_figure,
+    plain_axes,
+    to_svg,
+)
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_numbers import DOUBTFUL, REJECTED, TURNTABLE
 from twin.laboratory.turntable_run import TurntableRun
-from twin.run.artefact import Artefact, SvgFigure, Table, fixed
-from twin.run.report import Report, Section, answer
-from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

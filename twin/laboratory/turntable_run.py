@@ -29,9 +29,9 @@ from analysis.turntable.dividing_error import (
 from optics.numerics.backend import Backend, one_blas_thread
 from scenes.specs.resolved import ExperimentSetup
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
+from twin.framework.procedure import Advance, silent
 from twin.laboratory.measured_readings import Comparisons, read_turntable
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.run.procedure import Advance, silent
 
 TRUTH_READINGS = 4000
 """Readings at which fits are compared with the true curve."""

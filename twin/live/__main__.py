@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from twin.run.cli import BackendName, InputErrorText, Quiet, check_backend, explained
+from twin.framework.cli import BackendName, InputErrorText, Quiet, check_backend, explained
 
 PORT = 8790
 TOKEN = "TWIN_LIVE_TOKEN"

@@ -11,9 +11,9 @@ from scenes.specs.job import TargetsSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from scenes.yaml.errors import InputError
 from twin.camera.camera_view import CameraView, draw_mtf, draw_spot, draw_wavefront, field_text
+from twin.framework.random_streams import stream
+from twin.framework.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, VERMILION, look, to_svg
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.run.random_streams import stream
-from twin.run.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, VERMILION, look, to_svg
 from twin.targets.target_images import DIRECTIONS, TargetCamera
 from twin.targets.target_measurement import EdgeReading, read_edge, target_camera
 

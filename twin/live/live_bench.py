@@ -21,6 +21,7 @@ from scenes.models.clearance import Clearances
 from scenes.models.disturbances import Component, state_of
 from scenes.specs.course import DEFAULT_PIVOT, CourseSpec, moment
 from scenes.specs.job import checked_nodes
+from twin.framework.random_streams import stream
 from twin.live.knobs import Knob, knobs_of, perturbation
 from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState
 from twin.main_job.assumptions import contradiction, doubted
@@ -31,7 +32,6 @@ from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import quality_dicts
 from twin.monitor.observation import StateReader
 from twin.pictures.scene_file import motions
-from twin.run.random_streams import stream
 from twin.scripting.instrument_twin import InstrumentTwin
 from twin.sensors.area_detector import coarse_warnings
 from twin.study.runs.base_job import PHYSICS

@@ -10,10 +10,10 @@ from scenes.specs.course import DEFAULT_PIVOT, FEWEST, MOST, moment
 from scenes.specs.job import JobSpec
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
+from twin.framework.provenance import Provenance, versions
 from twin.live.knobs import AXES, Knob, perturbation
 from twin.live.live_bench import LiveBench
 from twin.live.messages import AskedState, BlindState
-from twin.run.provenance import Provenance, versions
 
 HEAD = "# Recorded with python -m twin.live; repeat it: python -m twin.render THIS_FILE\n"
 

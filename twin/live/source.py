@@ -20,10 +20,10 @@ from scenes.yaml.named import FileKind
 from scenes.yaml.spec import validate
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from scenes.yaml.yaml_file import YamlFile, read_yaml
+from twin.framework.owned_files import digest
+from twin.framework.run_folder import Manifest, read_manifest
 from twin.live.knobs import FactorKnob, base_with, factor_knobs
 from twin.live.messages import MOST_FRAMES
-from twin.run.owned_files import digest
-from twin.run.run_folder import Manifest, read_manifest
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup, resolve_study
 

@@ -10,11 +10,11 @@ from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Split, quantities, split
 from scenes.specs.course import moment
 from scenes.specs.instrument import BASE
+from twin.framework.artefact import plain, significant
 from twin.main_job.monitor_reading import MonitorReading, contradicted
 from twin.main_job.render_results import RenderRun
 from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import SmoothedCourse
-from twin.run.artefact import plain, significant
 
 _NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
 """Without a sentence's end."""

@@ -12,11 +12,23 @@ from markupsafe import Markup
 
 from analysis.monitor import parameters
 from scenes.specs.instrument import BASE
+from twin.framework.artefact import (
+    SAME,
+    SYMBOLS,
+    Artefact,
+    Cell,
+    Marked,
+    Table,
+    Text,
+    fixed,
+    plain,
+    shown_unit,
+    significant,
+)
+from twin.framework.report import Section
 from twin.main_job.render_results import RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.monitor.crosstalk import PRINTED, CameraCrosstalk
-from twin.run.artefact import SAME, SYMBOLS, Artefact, Cell, Marked, Table, Text, fixed, plain, shown_unit, significant
-from twin.run.report import Section
 
 WRONG = 0.1
 """A reading that departs from the truth by more than this part of it is marked ..."""

@@ -14,8 +14,8 @@ from scenes.models.nodal_bodies import HeatedBody, HeatedFace
 from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import FinishTableSpec
 from scenes.specs.resolved import ResolvedJob
+from twin.framework.quantity import Quantity, Record
 from twin.main_job.render_results import JobRun
-from twin.run.quantity import Quantity, Record
 
 
 def table_names(job: JobSpec) -> Mapping[tuple[str, str], str]:

@@ -14,8 +14,8 @@ from optics.geometry.solid import Solid, solid_mesh
 from scenes.models.camera_model import CameraModel
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel, prism_of
+from twin.framework import svg
 from twin.pictures.light_paths import RIM, Beam, LightPaths
-from twin.run import svg
 
 FIELD_COLOURS = {"left edge": svg.SKY, "centre": svg.BLUE, "right edge": svg.PURPLE}
 _CHANNEL_COLOURS = (svg.VERMILION, svg.ORANGE, svg.BROWN, svg.GREY, svg.YELLOW, svg.INK)

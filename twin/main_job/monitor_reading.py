@@ -19,11 +19,11 @@ from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import BEYOND, Recovery
 from analysis.spots.likelihood import FALSE_ALARM as SPOT_ALARM
 from analysis.spots.likelihood import FitStates
+from twin.framework.artefact import significant
+from twin.framework.provenance import SelfCheck
 from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
 from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.monitor.truth import Truth
-from twin.run.artefact import significant
-from twin.run.provenance import SelfCheck
 from twin.uncertainty.monitor_limits import short_text, unseen_texts
 
 CENTROID_NOTES = {

@@ -7,13 +7,24 @@ from typing import Any
 
 import numpy as np
 
+from twin.framework.artefact import (
+    FAR,
+    Artefact,
+    Cell,
+    Marked,
+    Table,
+    fixed,
+    plain,
+    residual,
+    residual_cell,
+    significant,
+)
+from twin.framework.report import Section
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.main_job.verdict import sharpness_lost
 from twin.monitor.image_quality import AT_FIELDS, PLACES, CameraQuality, ImageQuality
 from twin.path_tracing.stray_light import FAMILY
-from twin.run.artefact import FAR, Artefact, Cell, Marked, Table, fixed, plain, residual, residual_cell, significant
-from twin.run.report import Section
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
 

@@ -13,6 +13,11 @@ from rich.table import Table
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
+from twin.framework.cli import print_verdict, print_whole, result_table
+from twin.framework.command import Result, print_warnings
+from twin.framework.procedure import Session
+from twin.framework.reference_frames import described
+from twin.framework.second_process import SecondProcess
 from twin.main_job.assumptions import assumed
 from twin.main_job.render_drawings import begin_drawing, load_drawing
 from twin.main_job.render_folder import write_run
@@ -20,11 +25,6 @@ from twin.main_job.render_job import render_job
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.verdict import judge, recovered_numbers
 from twin.monitor.image_quality import AT_FIELDS, PLACES, QUALITY
-from twin.run.cli import print_verdict, print_whole, result_table
-from twin.run.command import Result, print_warnings
-from twin.run.procedure import Session
-from twin.run.reference_frames import described
-from twin.run.second_process import SecondProcess
 from twin.targets.target_images import DIRECTIONS
 from twin.targets.target_images import PLACES as TARGET_PLACES
 from twin.targets.target_measurement import EdgeReading, TargetRun

@@ -12,10 +12,10 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from scenes.models.instrument_model import Instrument
 from scenes.yaml.named import Named
+from twin.framework.artefact import Undrawn
+from twin.framework.second_process import SecondProcess
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.pictures.light_paths import trace_light_paths
-from twin.run.artefact import Undrawn
-from twin.run.second_process import SecondProcess
 
 if TYPE_CHECKING:
     from twin.uncertainty.monitor_limits import MonitorLimits
@@ -151,9 +151,9 @@ def load_drawing() -> None:
     """Import what all runs draw with, and let it find its fonts."""
     import h5netcdf
 
+    from twin.framework.svg import look, new_figure, to_svg
     from twin.main_job import light_path_plots, spot_plots, summary_plot
     from twin.pictures import scene_file
-    from twin.run.svg import look, new_figure, to_svg
     from twin.uncertainty import uncertainty_report
 
     _ = h5netcdf, light_path_plots, spot_plots, summary_plot, scene_file, uncertainty_report

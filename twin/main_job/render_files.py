@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from scenes.specs.instrument import Channel
+from twin.framework.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, GridData, Gridded, frame_files, netcdf
+from twin.framework.reference_frames import described, frames_text
+from twin.framework.run_folder import RunFolder
 from twin.main_job import job_tables
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.image_quality import QUALITY
 from twin.monitor.time_series import TimeSeries
-from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, GridData, Gridded, frame_files, netcdf
-from twin.run.reference_frames import described, frames_text
-from twin.run.run_folder import RunFolder
 from twin.targets.target_measurement import TargetRun
 from twin.uncertainty.uncertainty_numbers import LIMITS
 

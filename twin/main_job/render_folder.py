@@ -10,6 +10,12 @@ from typing import Any
 import cv2
 from markupsafe import Markup
 
+from twin.framework.artefact import Piece
+from twin.framework.page import report_page, write_artefacts
+from twin.framework.procedure import WRITE, Session
+from twin.framework.report import Report, Section, further_sections
+from twin.framework.run_folder import write_manifest
+from twin.framework.second_process import SecondProcess
 from twin.main_job.crosstalk_sections import crosstalk_section, formula_section, motion_section
 from twin.main_job.job_tables import config_text, faces_of, heated_of
 from twin.main_job.part_sections import finish_section, quality_section, stray_section, target_section
@@ -40,12 +46,6 @@ from twin.main_job.result_sections import (
 from twin.main_job.setup_sections import done_table, facts, setup_section
 from twin.main_job.verdict import judge
 from twin.pictures.scene_file import viewer_markup, viewer_programs, viewer_scripts
-from twin.run.artefact import Piece
-from twin.run.page import report_page, write_artefacts
-from twin.run.procedure import WRITE, Session
-from twin.run.report import Report, Section, further_sections
-from twin.run.run_folder import write_manifest
-from twin.run.second_process import SecondProcess
 
 
 def write_run(run: JobRun, session: Session, picture: bool = False, beside: SecondProcess | None = None) -> str:

@@ -25,6 +25,8 @@ from scenes.specs.perturbation import in_words
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
 from twin.camera.first_order_data import obscuration, unstated_shadows
+from twin.framework.frame_store import mean_of
+from twin.framework.procedure import Advance, silent
 from twin.main_job.job_tables import deformation_warnings
 from twin.main_job.render_results import JobRun, RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
@@ -35,8 +37,6 @@ from twin.monitor.monitor_memory import require_memory
 from twin.monitor.observation import LOST, Observing, light_of, read
 from twin.monitor.time_series import run_series, series_states, too_large
 from twin.path_tracing.stray_light import NominalPathLost, ghost_warnings, stray_light
-from twin.run.frame_store import mean_of
-from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import coarse_warnings
 from twin.targets.target_images import TargetLostError
 from twin.targets.target_measurement import TargetRun, check_targets, render_targets, target_pixels

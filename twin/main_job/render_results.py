@@ -19,6 +19,7 @@ from optics.geometry.tree import State
 from scenes.models.obstruction import Obstruction
 from scenes.models.scenery import MeasuredFinishes
 from scenes.specs.resolved import ResolvedJob
+from twin.framework.provenance import SelfCheck
 from twin.main_job.monitor_reading import MonitorReading, stated_check
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.monitor.image_quality import ImageQuality
@@ -26,7 +27,6 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import TimeSeries
 from twin.monitor.truth import Truth
 from twin.path_tracing.stray_light import StrayLight
-from twin.run.provenance import SelfCheck
 from twin.targets.target_measurement import TargetRun
 from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits
 

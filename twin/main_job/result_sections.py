@@ -8,12 +8,7 @@ import numpy as np
 
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from scenes.specs.course import moment
-from twin.main_job.assumptions import assumed, course_agrees
-from twin.main_job.render_results import JobRun, RenderRun
-from twin.main_job.systematics import joined, systematics
-from twin.monitor.reading_table import Reading, ReadingTable
-from twin.monitor.time_series import TimeSeries
-from twin.run.artefact import (
+from twin.framework.artefact import (
     FAR,
     MINUS,
     Artefact,
@@ -28,7 +23,12 @@ from twin.run.artefact import (
     residual_cell,
     residual_text,
 )
-from twin.run.report import Section
+from twin.framework.report import Section
+from twin.main_job.assumptions import assumed, course_agrees
+from twin.main_job.render_results import JobRun, RenderRun
+from twin.main_job.systematics import joined, systematics
+from twin.monitor.reading_table import Reading, ReadingTable
+from twin.monitor.time_series import TimeSeries
 
 IN_PAGE = ""
 """File of what only the page shows."""

@@ -9,11 +9,11 @@ from analysis.arrays import ARCSEC
 from analysis.monitor import parameters
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from scenes.specs.instrument import BASE
+from twin.framework import svg
+from twin.framework.artefact import MINUS
 from twin.main_job.spot_plots import marks
 from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import TimeSeries
-from twin.run import svg
-from twin.run.artefact import MINUS
 
 COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.SKY, svg.PURPLE, svg.INK, svg.GREY)
 """Colours of the nodes; after the last one they repeat with the next line style."""

@@ -10,11 +10,11 @@ from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
 from scenes.specs.disturbances import JOINT
 from scenes.specs.perturbation import in_words
+from twin.framework.artefact import MINUS, Cell, Table, fixed, plain, shown_unit
+from twin.framework.report import Section
 from twin.main_job.monitor_reading import CENTROID_NOTES
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE
-from twin.run.artefact import MINUS, Cell, Table, fixed, plain, shown_unit
-from twin.run.report import Section
 
 _PAPER = "Wang et al., Acta Photonica Sinica 47(10) 1012001 (2018), doi 10.3788/gxzb20184710.1012001"
 _BUILT = "The nominal state is the instrument as built: frames before, and changes, are those about it."

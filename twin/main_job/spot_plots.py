@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from analysis.monitor.estimators import ESTIMATORS
+from twin.framework import svg
+from twin.framework.artefact import FAR, SAME, residual, shown_unit, significant, tick_text
+from twin.framework.frame_store import mean_of
 from twin.main_job.render_results import RenderRun
 from twin.main_job.result_sections import part_title
 from twin.monitor.crosstalk import CameraCrosstalk
-from twin.run import svg
-from twin.run.artefact import FAR, SAME, residual, shown_unit, significant, tick_text
-from twin.run.frame_store import mean_of
 
 STRETCH = 150.0
 """The asinh stretch is linear up to this fraction (1/STRETCH) of the peak."""

@@ -8,14 +8,14 @@ from textwrap import wrap
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from twin.framework.artefact import FAR, Marked, Table
+from twin.framework.report import sentence
+from twin.framework.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, LIGHT, VERMILION, look, to_png
 from twin.main_job.assumptions import assumed
 from twin.main_job.render_results import RenderRun
 from twin.main_job.result_sections import result_tables
 from twin.main_job.spot_plots import airy_radius, core_window, cross, mean_images, stretch
 from twin.main_job.verdict import limited
-from twin.run.artefact import FAR, Marked, Table
-from twin.run.report import sentence
-from twin.run.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, LIGHT, VERMILION, look, to_png
 
 WIDTH, DPI = 14.0, 100
 """Inches and dots per inch: 1400 px wide."""

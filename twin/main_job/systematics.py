@@ -14,11 +14,11 @@ from analysis.statistics import limit_of
 from optics.geometry.tree import Motion
 from scenes.models.job_state import motions_of
 from scenes.specs.instrument import BASE, CENTRAL_PRISM
+from twin.framework.artefact import plain, shown_unit, significant
 from twin.main_job.render_results import RenderRun
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.monitor.monitor_derivative import LOST, traced_states
 from twin.monitor.motions import ElementaryMotion
-from twin.run.artefact import plain, shown_unit, significant
 from twin.uncertainty.monitor_limits import short_text, unit_text
 
 _FAMILY = 4

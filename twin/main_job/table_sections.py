@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 
 from analysis.arrays import ARCSEC
 from optics.thermal.nodal_deformation import NodalDeformation
+from twin.framework.artefact import Cell, SvgFigure, Table, plain
+from twin.framework.report import Section
+from twin.framework.svg import look, new_figure, signed_map, to_svg
 from twin.main_job.job_tables import BENT, WARMED, faces_of, heated_of
 from twin.main_job.render_results import JobRun
-from twin.run.artefact import Cell, SvgFigure, Table, plain
-from twin.run.report import Section
-from twin.run.svg import look, new_figure, signed_map, to_svg
 
 NAMED = 1e-10
 """Terms smaller than this, metres rms, are left out of the report's table."""

@@ -8,8 +8,8 @@ from matplotlib.colors import AsinhNorm, Normalize
 from matplotlib.patches import Polygon
 
 from optics.targets.target_shapes import TARGETS
+from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.monitor.image_quality import PLACES, ImageQuality, PupilOutline
-from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading
 

@@ -16,6 +16,8 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from optics.geometry.tree import Motion
 from scenes.models.job_state import beyond_statement
 from scenes.specs.course import moment
+from twin.framework.artefact import FAR, SAME, plain, residual_text, significant
+from twin.framework.report import answer
 from twin.main_job.assumptions import NOISE, combination, contradiction, doubted, limits, share_text
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_results import JobRun, RenderRun
@@ -23,8 +25,6 @@ from twin.main_job.systematics import joined, perturbed_unseen, systematics
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import TimeSeries
-from twin.run.artefact import FAR, SAME, plain, residual_text, significant
-from twin.run.report import answer
 
 FALSE_ALARM = 1e-3
 """Chance that noise and disturbances as stated make any warning of a misreading in a run."""

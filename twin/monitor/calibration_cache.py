@@ -37,7 +37,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.llvm import VARIABLE as LLVM_VARIABLE
 from optics.raytrace.reflectors import REFLECTORS
 from scenes.yaml.spec import Spec
-from twin.run import provenance
+from twin.framework import provenance
 from twin.sensors.area_detector import NOISE_TERMS
 
 VARIABLE = "TWIN_CALIBRATIONS"

@@ -19,7 +19,7 @@ from optics.numerics import quadrature
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.trace import BeamMissedError
 from optics.waves.diffraction import Grid, PupilField, at_crossings
-from twin.run.provenance import SelfCheck
+from twin.framework.provenance import SelfCheck
 
 SPOT_RANGES = (0.25, 0.5, 0.8)
 """Shares of the CCD's half size up to which sharp spots may be off its middle, one class of pupil nodes for each: the

@@ -35,6 +35,7 @@ from scenes.specs.instrument import SIDES
 from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
+from twin.framework.random_streams import stream
 from twin.monitor.calibration_cache import CacheEntry
 from twin.monitor.monitor_beams import SpotFocus
 from twin.monitor.monitor_derivative import disturbances_of, motion_models, spot_jacobian
@@ -42,7 +43,6 @@ from twin.monitor.monitor_memory import MonitorSize, require_memory
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import line_family
 from twin.monitor.truth import LineSight, Truth, ground_geometry, truth_jacobian
-from twin.run.random_streams import stream
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
 TEMPLATE_MARGIN = 40

@@ -17,10 +17,10 @@ from scenes.specs.detector import LEAST_SIDE
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.spec import Spec
+from twin.framework import memory
+from twin.framework.frame_store import IN_MEMORY, kept_bytes
+from twin.framework.memory import STARTED, Lowered, amount_text
 from twin.monitor.image_sampling import NodeClasses
-from twin.run import memory
-from twin.run.frame_store import IN_MEMORY, kept_bytes
-from twin.run.memory import STARTED, Lowered, amount_text
 from twin.sensors.area_detector import EmvaDetector
 
 CHUNK = 25

@@ -21,9 +21,9 @@ from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import cores, one_blas_thread, one_kernel_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
+from twin.framework.frame_store import in_file, mean_of
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
-from twin.run.frame_store import in_file, mean_of
 
 LOST = (AimError, BeamMissedError)
 """What says that the light of a state is lost."""

@@ -21,8 +21,8 @@ from analysis.monitor.limits import unmoved
 from analysis.monitor.monitoring import GroundGeometry
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibration, Parameter
 from analysis.monitor.recovery import Estimates, Recovery
+from twin.framework.artefact import FAR, SAME, decimals_for, fixed
 from twin.monitor.truth import Truth
-from twin.run.artefact import FAR, SAME, decimals_for, fixed
 
 
 @dataclass(frozen=True, eq=False)

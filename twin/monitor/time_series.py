@@ -25,12 +25,12 @@ from scenes.specs.course import CourseSpec, moment
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, names_text
+from twin.framework.artefact import significant
+from twin.framework.quantity import Quantity, Record
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import largest_piece
 from twin.monitor.observation import LOST, Observing, observe, one_detector, why_lost
 from twin.monitor.reading_table import ReadingTable, reading_table
-from twin.run.artefact import significant
-from twin.run.quantity import Quantity, Record
 
 LARGEST_SERIES = 200_000_000
 """Pixels of one image per time and channel, which are kept: about 1.2 GB."""

@@ -19,6 +19,8 @@ from rich.console import Console
 
 from scenes.yaml.errors import InputError, nearest
 from scenes.yaml.standard_output import BAD_INPUT, print_error
+from twin.framework import durable
+from twin.framework.cli import INTERRUPTED, AsJson, InputErrorText, Quiet, Strict, end_strictly, print_verdict
 from twin.operate.estimate_commands import (
     alarms,
     exclude,
@@ -43,8 +45,6 @@ from twin.operate.terminal import (
     tell,
     told,
 )
-from twin.run import durable
-from twin.run.cli import INTERRUPTED, AsJson, InputErrorText, Quiet, Strict, end_strictly, print_verdict
 
 if TYPE_CHECKING:
     from twin.operate.record.history import History
@@ -343,8 +343,8 @@ def export(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
+    from twin.framework.data_files import TABLE_FORMATS, MissingPackage
     from twin.operate.record.record_tables import tables as all_tables
-    from twin.run.data_files import TABLE_FORMATS, MissingPackage
 
     if tables not in TABLE_FORMATS:
         near = nearest(tables, TABLE_FORMATS)

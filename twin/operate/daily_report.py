@@ -21,6 +21,9 @@ from analysis.monitor.limits import Quantity
 from analysis.statistics import limit_of
 from scenes.models.disturbances import HEAT
 from scenes.yaml.errors import Problem
+from twin.framework import svg
+from twin.framework.artefact import Artefact, Cell, Marked, OwnDecimals, SvgFigure, Table, Text, decimals_for
+from twin.framework.report import Report, Section, answer
 from twin.operate.estimate.following import name_of, percent, with_sigma
 from twin.operate.overview import (
     CONFIDENCE,
@@ -36,9 +39,6 @@ from twin.operate.overview import (
 )
 from twin.operate.record.entries import MICRO, micros, utc_text
 from twin.operate.record.history import History
-from twin.run import svg
-from twin.run.artefact import Artefact, Cell, Marked, OwnDecimals, SvgFigure, Table, Text, decimals_for
-from twin.run.report import Report, Section, answer
 
 if TYPE_CHECKING:
     pass

@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 
 from scenes.yaml.standard_output import FAILURE, print_error
+from twin.framework import durable
+from twin.framework.cli import InputErrorText, print_verdict
 from twin.operate.terminal import (
     Call,
     NewFolder,
@@ -21,15 +23,13 @@ from twin.operate.terminal import (
     require_new,
     show_table,
 )
-from twin.run import durable
-from twin.run.cli import InputErrorText, print_verdict
 
 if TYPE_CHECKING:
     from analysis.monitor.series_filter import Power
+    from twin.framework.report import Report
     from twin.operate.estimate.following import Course, Following
     from twin.operate.estimate.operation import Operation
     from twin.operate.record.history import History
-    from twin.run.report import Report
 
 STEPS = 4
 """Columns of a forecast after the first, now."""
@@ -252,9 +252,9 @@ def write_report(
     Raises:
         typer.Exit: it cannot be written, which has been told.
     """
+    from twin.framework.page import report_page
     from twin.operate.daily_report import daily_report
     from twin.operate.overview import Overview
-    from twin.run.page import report_page
 
     made = daily_report(history, Overview.of(history, operation), end)
     try:
@@ -336,9 +336,9 @@ def show_power(found: Sequence[Power], console: Console) -> None:
 
 def show_requirements(following: Following, console: Console) -> None:
     """A row for each requirement."""
+    from twin.framework.artefact import plain
     from twin.operate.estimate.following import name_of, percent
     from twin.operate.record.entries import utc_text
-    from twin.run.artefact import plain
 
     if not following.breaks:
         return

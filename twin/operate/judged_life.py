@@ -25,15 +25,15 @@ from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.input_file import read_json
+from twin.framework import svg
+from twin.framework.artefact import Cell, SvgFigure, Table
+from twin.framework.procedure import Advance
+from twin.framework.report import Report, Section, answer
 from twin.operate.estimate.following import Course, Following
 from twin.operate.estimate.operation import Operation
 from twin.operate.record.entries import MICRO, Entry, Given, utc_text
 from twin.operate.record.history import History, initialised
 from twin.operate.record.telemetry import RESULTS, read_table_file, read_telemetry, tables_of
-from twin.run import svg
-from twin.run.artefact import Cell, SvgFigure, Table
-from twin.run.procedure import Advance
-from twin.run.report import Report, Section, answer
 
 FOLLOW = "follow the readings"
 WAYS = {

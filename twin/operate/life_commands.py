@@ -9,11 +9,21 @@ import typer
 
 from scenes.yaml.input_file import read_json
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from twin.framework import durable
+from twin.framework.cli import (
+    LARGEST_SEED,
+    AsJson,
+    BackendName,
+    Force,
+    InputErrorText,
+    Options,
+    Out,
+    Quiet,
+    check_backend,
+)
+from twin.framework.command import Result, finished, progress_shown, run_command
+from twin.framework.procedure import Session
 from twin.operate.terminal import line, tell, told
-from twin.run import durable
-from twin.run.cli import LARGEST_SEED, AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet, check_backend
-from twin.run.command import Result, finished, progress_shown, run_command
-from twin.run.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup

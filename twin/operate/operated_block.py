@@ -25,13 +25,13 @@ from analysis.monitor.limits import Quantity
 from scenes.specs.orbit.adjust import MonitorRecordSpec
 from scenes.specs.orbit.setup import AnyAdjust
 from scenes.yaml.errors import InputError, Problem, unknown
+from twin.framework.procedure import Advance, silent
 from twin.operate.estimate.operation import Operation
 from twin.operate.estimate.operation_model import kept_plan, read_plan
 from twin.operate.record import NotARecord, RecordFailed
 from twin.operate.record.entries import micros, utc_text
 from twin.operate.record.history import History
 from twin.orbit.block.block_run import BlockRun, run_adjustment
-from twin.run.procedure import Advance, silent
 
 if TYPE_CHECKING:
     from analysis.block.point_reduction import Pool

@@ -21,11 +21,11 @@ from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import share_interval
 from optics.numerics.number_tree import FrozenMap
+from twin.framework.artefact import SAME
 from twin.operate.estimate.following import name_of, percent, with_sigma
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.history import History, content_of
 from twin.operate.record.schema import ENTRY, SOURCE
-from twin.run.artefact import SAME
 
 if TYPE_CHECKING:
     from twin.operate.estimate.following import Break, Course, Following, FoundJump

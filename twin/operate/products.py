@@ -32,6 +32,10 @@ from sqlalchemy import select
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.errors import InputError, Problem
+from twin.framework.data_files import WRITER
+from twin.framework.procedure import BenchError
+from twin.framework.quantity import Quantity, Record
+from twin.framework.reference_frames import described
 from twin.operate.estimate.operation_model import plan_digest
 from twin.operate.estimated_motions import EstimatedMotions, LeftOut, Prior, prior_files, state_file
 from twin.operate.record.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
@@ -39,10 +43,6 @@ from twin.operate.record.schema import ENTRY
 from twin.orbit.export.export_report import LINE, export_files
 from twin.orbit.export.export_run import USUAL_HEIGHTS, Export, run_export
 from twin.orbit.export.ground_accuracy import EstimatedChange
-from twin.run.data_files import WRITER
-from twin.run.procedure import BenchError
-from twin.run.quantity import Quantity, Record
-from twin.run.reference_frames import described
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

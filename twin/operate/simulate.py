@@ -25,6 +25,10 @@ from optics.numerics.array_math import covariance_root
 from scenes.models.disturbances import Component, StatedMotions, causes_of, drawn_motions, states_of
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.yaml_file import dump_yaml
+from twin.framework.procedure import Advance
+from twin.framework.random_streams import stream
+from twin.framework.reference_frames import described
+from twin.framework.run_folder import RunFolder
 from twin.main_job.monitor_reading import MonitorReading, stated
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -33,10 +37,6 @@ from twin.monitor.observation import Observation, Observing, observe, one_detect
 from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.telemetry import CONFIG, RESULTS
-from twin.run.procedure import Advance
-from twin.run.random_streams import stream
-from twin.run.reference_frames import described
-from twin.run.run_folder import RunFolder
 
 Moments = NDArray[np.int64]
 

@@ -14,6 +14,12 @@ from scenes.yaml.errors import KeyPath, unknown
 from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, SCALE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
+from twin.framework.cli import InputErrorText
+from twin.framework.durable import write_safely
+from twin.framework.memory import Lowered, require_memory
+from twin.framework.procedure import WRITE, Advance
+from twin.framework.reference_frames import described
+from twin.framework.run_folder import RunFolder, chosen, json_text, write_manifest
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.operation_model import keep_plan, read_plan
 from twin.operate.record.entries import utc_text
@@ -22,12 +28,6 @@ from twin.operate.record.taking import Taken
 from twin.operate.record.telemetry import CONFIG, read_table_file, read_telemetry, tables_of
 from twin.operate.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
 from twin.operate.terminal import moment_said, problems_of
-from twin.run.cli import InputErrorText
-from twin.run.durable import write_safely
-from twin.run.memory import Lowered, require_memory
-from twin.run.procedure import WRITE, Advance
-from twin.run.reference_frames import described
-from twin.run.run_folder import RunFolder, chosen, json_text, write_manifest
 
 PROGRAM = "twin.operate"
 CALIBRATE, TAKE = "calibrate", "take into the record"

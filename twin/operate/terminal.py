@@ -15,9 +15,9 @@ from rich.console import Console
 
 from scenes.yaml.errors import Problem
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
+from twin.framework import durable
+from twin.framework.cli import AsJson, InputErrorText, Quiet, Standing, explained, heartbeat, print_whole, result_table
 from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
-from twin.run import durable
-from twin.run.cli import AsJson, InputErrorText, Quiet, Standing, explained, heartbeat, print_whole, result_table
 
 if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup

@@ -19,9 +19,9 @@ from rich.console import Console
 from scenes.specs.procedures import PROCEDURES, SENSORS
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import ANGLE, DISTANCE, parse_quantity
-from twin.run.cli import AsJson, BackendName, File, Force, InputErrorText, Options, Out, Quiet, Seed, Strict
-from twin.run.command import Result, add_tests, finished, print_warnings, run_command, run_test
-from twin.run.procedure import Advance, Session
+from twin.framework.cli import AsJson, BackendName, File, Force, InputErrorText, Options, Out, Quiet, Seed, Strict
+from twin.framework.command import Result, add_tests, finished, print_warnings, run_command, run_test
+from twin.framework.procedure import Advance, Session
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -208,10 +208,10 @@ def export(
 
     def work(given: tuple[Any, ...], session: Session) -> Result:
         from scenes.yaml.errors import InputError, Issue
+        from twin.framework.procedure import BenchError
         from twin.orbit.export import export_report, quality_run
         from twin.orbit.export.export_run import SceneSource, run_export
         from twin.orbit.export.quality_run import PolynomialSource, run_polynomial_export, with_quality
-        from twin.run.procedure import BenchError
 
         read, heights, uncertainty, points = given
         contents: dict[str, bytes]

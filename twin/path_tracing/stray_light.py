@@ -25,6 +25,7 @@ from scenes.models.scenery import Scenery, build_scenery
 from scenes.models.scenery_parts import Finishes
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import Channel, prism_of
+from twin.framework.quantity import Quantity, Record
 from twin.monitor.monitor_beams import Aimed
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
@@ -33,7 +34,6 @@ from twin.path_tracing.path_result import Balance, Family, PathResult
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource
 from twin.path_tracing.tracer import CHUNK, FAINT, PathTracer, Progress, Sampling
-from twin.run.quantity import Quantity, Record
 
 CONE_ROOM = 1.25
 """Half angle of the source's cone relative to that of the pupil seen from the focal plane."""

@@ -14,9 +14,9 @@ import typer
 
 from scenes.specs.file_kinds import read_for
 from scenes.yaml.named import Named
-from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Strict
-from twin.run.command import Result, finished, run_command
-from twin.run.procedure import Session
+from twin.framework.cli import AsJson, BackendName, Force, Options, Out, Quiet, Strict
+from twin.framework.command import Result, finished, run_command
+from twin.framework.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.monitor_frames import MeasurementSetup

@@ -34,8 +34,8 @@ from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import Examined, examine, lone_pixels, refit, repaired_centroid
 from scenes.specs.monitor_frames import MeasurementSpec
 from scenes.yaml.errors import Issue
+from twin.framework.frame_store import let_go, mean_of
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure
-from twin.run.frame_store import let_go, mean_of
 
 _DEAREST = 4.0
 """Times that sigma may grow by what is missing, before a spot counts as lost."""

@@ -22,8 +22,8 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.monitor_frames import AFTER, BEFORE, MeasurementSetup, MeasurementSpec, per_channel
 from scenes.yaml.errors import InputError, Issue, KeyPath
 from scenes.yaml.spec import Spec
-from twin.run.frame_store import IN_MEMORY, PART, frame_room, let_go
-from twin.run.memory import Lowered, require_memory
+from twin.framework.frame_store import IN_MEMORY, PART, frame_room, let_go
+from twin.framework.memory import Lowered, require_memory
 
 _OTHER_FILES = "frames that were recorded one by one, each named once: the right files of before and after"
 NOMINAL, PERTURBED = "nominal", "perturbed"

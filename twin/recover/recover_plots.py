@@ -11,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from twin.framework import svg
 from twin.main_job.series_plots import time_unit
 from twin.main_job.spot_plots import cross, stretch
 from twin.recover.channel_measurement import SpotResult
 from twin.recover.recover_run import RecoverRun, state_name
-from twin.run import svg
 
 LIMIT = 5.0
 """Limit of the colour scale of residuals, sigmas."""

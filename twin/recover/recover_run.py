@@ -24,6 +24,8 @@ from scenes.specs.course import moment
 from scenes.specs.instrument import SIDES
 from scenes.specs.monitor_frames import MeasurementSetup
 from scenes.yaml.errors import InputError, Issue
+from twin.framework.frame_store import mean_of
+from twin.framework.procedure import Advance, silent
 from twin.main_job.monitor_reading import MonitorReading
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -38,8 +40,6 @@ from twin.recover.measured_frames import (
     read_measurement,
     repeated_frames,
 )
-from twin.run.frame_store import mean_of
-from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import EmvaDetector, told_of_steps
 
 CALIBRATE, READ, MEASURE = "calibrate", "read the frames", "search and measure the spots"

@@ -33,6 +33,7 @@ from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.camera.camera_view import CameraView
+from twin.framework.reference_frames import frames_text
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_job import render_job
 from twin.monitor.crosstalk import estimator_gains
@@ -40,7 +41,6 @@ from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion
 from twin.monitor.truth import truth_jacobian
-from twin.run.reference_frames import frames_text
 from twin.scripting.results import Found, Shot, as_frames, found_table, name_html
 from twin.scripting.results import shot_of as _shot_of
 from twin.sensors.area_detector import coarse_warnings

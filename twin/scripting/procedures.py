@@ -18,11 +18,11 @@ from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from scenes.yaml.spec import Source, annotation_at, validate
 from scenes.yaml.yaml_file import YamlFile
-from twin.run.artefact import cell_text
-from twin.run.page import RunFacts, write_test
-from twin.run.procedure import performed
-from twin.run.report import Report, with_warnings
-from twin.run.run_folder import RunFolder
+from twin.framework.artefact import cell_text
+from twin.framework.page import RunFacts, write_test
+from twin.framework.procedure import performed
+from twin.framework.report import Report, with_warnings
+from twin.framework.run_folder import RunFolder
 
 
 @shows("name", "report.verdict", "report.warnings")

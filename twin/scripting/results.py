@@ -19,14 +19,14 @@ from analysis.monitor.estimators import judged
 from analysis.monitor.monitoring import CameraParameters
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from optics.numerics.backend import Backend
+from twin.framework.procedure import Session, silent
+from twin.framework.reference_frames import frames_text
+from twin.framework.run_folder import RunFolder
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_files import irradiance
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.verdict import judge
 from twin.monitor.image_quality import AT_FIELDS
-from twin.run.procedure import Session, silent
-from twin.run.reference_frames import frames_text
-from twin.run.run_folder import RunFolder
 from twin.targets.target_measurement import PlaceTargets
 
 

@@ -33,8 +33,8 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.yaml.errors import Problem, names_text, nearest
 from scenes.yaml.spec import Spec
-from twin.run.frame_store import frame_room, largest_of, let_go
-from twin.run.random_streams import stream
+from twin.framework.frame_store import frame_room, largest_of, let_go
+from twin.framework.random_streams import stream
 from twin.sensors.exposure_kernel import FEWEST, Reading, exposing_bytes, kernels_there
 from twin.sensors.poisson_numbers import poisson_pieces
 

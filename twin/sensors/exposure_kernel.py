@@ -27,7 +27,7 @@ import numpy as np
 
 from optics.numerics.backend import one_kernel_thread
 from optics.numerics.llvm import ensure_llvm
-from twin.run.frame_store import let_go
+from twin.framework.frame_store import let_go
 from twin.sensors.poisson_numbers import (
     CELLS_PER_UNIT,
     MOST_IN_TABLE,

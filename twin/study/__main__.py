@@ -18,11 +18,11 @@ import typer
 from rich.console import Console
 
 from scenes.specs.file_kinds import read_for
-from twin.run import cli
-from twin.run.command import Result, run_command
+from twin.framework import cli
+from twin.framework.command import Result, run_command
 
 if TYPE_CHECKING:  # help waits for nothing that computes
-    from twin.run.procedure import Session
+    from twin.framework.procedure import Session
     from twin.study.runs.setup import StudySetup
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
@@ -90,8 +90,8 @@ def main(
 
         run_gradient(file, cli.Options(out, None, backend, force, as_json, quiet, strict=strict))
         return
-    from twin.run.cluster import refuse_both
-    from twin.run.run_folder import KeptWork, read_manifest
+    from twin.framework.cluster import refuse_both
+    from twin.framework.run_folder import KeptWork, read_manifest
     from twin.study import study_command
     from twin.study.runs.blocks import BLOCKS
     from twin.study.runs.setup import PROGRAM, resolve_study

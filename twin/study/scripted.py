@@ -25,7 +25,7 @@ from scenes.specs.study import NOISE, TOTAL, StudySpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
-from twin.run.owned_files import scratch
+from twin.framework.owned_files import scratch
 from twin.study.runs.base_job import Tree
 
 Told = Callable[[int, int], None]

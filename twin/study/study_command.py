@@ -9,10 +9,10 @@ from typing import Any
 from rich.console import Console
 
 from scenes.yaml.standard_output import BAD_INPUT, print_error
-from twin.run import cli, cluster, memory, provenance
-from twin.run.command import Result
-from twin.run.procedure import WRITE, Session
-from twin.run.run_folder import write_manifest
+from twin.framework import cli, cluster, memory, provenance
+from twin.framework.command import Result
+from twin.framework.procedure import WRITE, Session
+from twin.framework.run_folder import write_manifest
 from twin.study.runs.blocks import BLOCKS, Engine, journal_of
 from twin.study.runs.plan import Plan, require_study_memory, run_count
 from twin.study.runs.setup import PROGRAM, StudySetup, base_of
@@ -117,7 +117,7 @@ def run_study(
 
 
 def _show(numbers: dict[str, Any], console: Console) -> None:
-    from twin.run.artefact import cell_text
+    from twin.framework.artefact import cell_text
 
     table = cli.result_table(f"{numbers['name']}: {numbers['runs']} runs, {numbers['failed']} failed")
     for head in ("response", "unit", "mean", "std", "95%", "99.7%"):

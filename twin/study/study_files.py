@@ -11,8 +11,8 @@ import numpy as np
 import xarray as xr
 
 from scenes.specs.study import NOISE
-from twin.run import data_files, reference_frames
-from twin.run.run_folder import RunFolder
+from twin.framework import data_files, reference_frames
+from twin.framework.run_folder import RunFolder
 from twin.study.report.study_statistics import Estimate, describe
 from twin.study.runs.base_job import BlockResult, one_line
 from twin.study.runs.plan import Plan

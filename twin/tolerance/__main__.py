@@ -14,9 +14,9 @@ import typer
 
 from scenes.specs.file_kinds import read_for
 from scenes.yaml.named import Named
-from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
-from twin.run.command import Result, finished, run_command
-from twin.run.procedure import Session
+from twin.framework.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
+from twin.framework.command import Result, finished, run_command
+from twin.framework.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.tolerance import ToleranceSetup
@@ -70,7 +70,7 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    from twin.run.run_folder import KeptWork
+    from twin.framework.run_folder import KeptWork
 
     def resolve() -> ToleranceSetup:
         setup: ToleranceSetup = read_for(PROGRAM, file, Named("scenes.specs.tolerance:ToleranceSetup.read"))

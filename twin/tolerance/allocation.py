@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.tolerance import AllocationSpec, ToleranceSetup, amount_si
 from scenes.yaml.units import split_quantity
-from twin.run.procedure import Advance, silent
+from twin.framework.procedure import Advance, silent
 from twin.tolerance.merit_models import MeritModel, ScaledModel, sensitivities
 from twin.tolerance.samples import Samples, adjustment_errors
 from twin.tolerance.tolerance_bench import ToleranceBench

@@ -13,7 +13,7 @@ import numpy as np
 
 from scenes.specs.tolerance import OF_MONITOR
 from twin.camera.varied_beams import AT_ONCE
-from twin.run.procedure import Advance, silent
+from twin.framework.procedure import Advance, silent
 from twin.tolerance.tolerance_bench import ToleranceBench, Tried
 
 MOST_PAIRED = 600

@@ -35,12 +35,12 @@ from scenes.models.shadow import TracedBeams
 from scenes.specs.tolerance import MERIT_UNITS, OF_MONITOR, POSTERIOR, MeritSpec, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from scenes.yaml.units import LENGTH
+from twin.framework.artefact import shown_unit
 from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.information import built_noise, quantity_rows, spot_noise
 from twin.monitor.monitor_derivative import derivative_changes
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import SpotPath
-from twin.run.artefact import shown_unit
 from twin.targets.target_path import TargetPath
 from twin.tolerance.variations import VariedNumber, states_of
 

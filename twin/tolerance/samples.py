@@ -16,9 +16,9 @@ from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.camera.varied_beams import AT_ONCE
-from twin.run import cluster, memory
-from twin.run.procedure import Advance, silent
-from twin.run.run_folder import JOURNAL
+from twin.framework import cluster, memory
+from twin.framework.procedure import Advance, silent
+from twin.framework.run_folder import JOURNAL
 from twin.study.runs.base_job import BlockResult, Failure, Outcome, Run, Tree, one_line, with_values
 from twin.study.runs.blocks import Engine, journal_of
 from twin.study.runs.plan import Plan

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from scenes.yaml.units import split_quantity
-from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, decimals_for, plain, shown_unit
-from twin.run.report import Report, Section, answer
-from twin.run.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, shared_legend, to_svg
+from twin.framework.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, decimals_for, plain, shown_unit
+from twin.framework.report import Report, Section, answer
+from twin.framework.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, shared_legend, to_svg
 from twin.tolerance.merit_models import FARTHEST
 from twin.tolerance.monitor_merit import merit_head, merit_unit, readings_of
 from twin.tolerance.tolerance_run import EXACT, LEVELS, MeritResult, ToleranceRun, Yield

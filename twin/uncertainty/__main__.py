@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed, Strict
-from twin.run.command import Result, finished, run_command
-from twin.run.procedure import Session
+from twin.framework.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed, Strict
+from twin.framework.command import Result, finished, run_command
+from twin.framework.procedure import Session
 
 if TYPE_CHECKING:
     from scenes.specs.resolved import ResolvedJob
@@ -83,7 +83,7 @@ def main(
         return resolved.with_render(resolved.frames, chosen)
 
     def work(resolved: ResolvedJob, session: Session) -> Result:
-        from twin.run.provenance import checks_in
+        from twin.framework.provenance import checks_in
         from twin.uncertainty.coverage import run_uncertainty
         from twin.uncertainty.uncertainty_numbers import uncertainty_numbers
         from twin.uncertainty.uncertainty_report import uncertainty_report

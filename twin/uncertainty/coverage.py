@@ -20,12 +20,12 @@ from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.disturbances import states_of
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue
+from twin.framework.procedure import Advance, silent
+from twin.framework.random_streams import stream
 from twin.monitor.image_sampling import ImageChecks
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe
 from twin.monitor.reading_table import reading_table
-from twin.run.procedure import Advance, silent
-from twin.run.random_streams import stream
 from twin.sensors.area_detector import coarse_warnings
 from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits, unseen_texts
 

@@ -20,12 +20,12 @@ from scenes.models.disturbances import states_of
 from scenes.models.instrument_model import MisplacedError
 from scenes.specs.instrument import BASE
 from scenes.yaml.errors import InputError
+from twin.framework.artefact import shown_unit, significant
 from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.monitor_derivative import disturbances_of
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import LOST, Observing, observe
 from twin.monitor.truth import half_fields
-from twin.run.artefact import shown_unit, significant
 
 BEST = "posterior"
 """The estimator of the least variance: what it leaves only another measurement takes away."""

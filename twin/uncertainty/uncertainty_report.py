@@ -11,9 +11,9 @@ from analysis.arrays import ARCSEC
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Split
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
-from twin.run import svg
-from twin.run.artefact import Cell, SvgFigure, Table, shown_unit, significant
-from twin.run.report import Report, Section, answer, sentence
+from twin.framework import svg
+from twin.framework.artefact import Cell, SvgFigure, Table, shown_unit, significant
+from twin.framework.report import Report, Section, answer, sentence
 from twin.uncertainty.coverage import FALSE, HALF_WIDTHS, LEVELS, Coverage, UncertaintyRun
 from twin.uncertainty.monitor_limits import (
     BEST,

@@ -17,7 +17,7 @@ from analysis.arrays import ARCMIN, ARCSEC
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.spec import Number, Spec, Text
-from twin.run.artefact import plain, significant
+from twin.framework.artefact import plain, significant
 
 FARTHEST = 100.0
 """Factor on an input up to which its limit is looked for."""

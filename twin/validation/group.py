@@ -23,9 +23,9 @@ from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError, Issue, KeyPath, nearest
 from scenes.yaml.spec import Number, Spec, Text, validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
+from twin.framework.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table
+from twin.framework.svg import look, new_figure, plain_axes, to_svg
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.run.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table
-from twin.run.svg import look, new_figure, plain_axes, to_svg
 from twin.validation.check import Check, CheckResult, Chosen, Supposed, sentence
 from twin.validation.row_names import FILE, FOLDER, matches
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from optics.numerics.backend import Backend
+from twin.framework.artefact import Artefact
+from twin.framework.provenance import versions
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.run.artefact import Artefact
-from twin.run.provenance import versions
 from twin.validation.check import VERDICTS, CheckResult, Verdict
 from twin.validation.group import CheckGroup, Context
 from twin.validation.registry import Selection

@@ -9,10 +9,10 @@ from typing import Any
 
 from markupsafe import Markup
 
-from twin.run.artefact import Data, Marked, PngFigure, SvgFigure, Table, decimals_for, fixed, plain, significant
-from twin.run.page import links, report_page, reproduce
-from twin.run.report import Report, Section, answer
-from twin.run.run_folder import RunFolder, write_manifest
+from twin.framework.artefact import Data, Marked, PngFigure, SvgFigure, Table, decimals_for, fixed, plain, significant
+from twin.framework.page import links, report_page, reproduce
+from twin.framework.report import Report, Section, answer
+from twin.framework.run_folder import RunFolder, write_manifest
 from twin.validation.check import AGREED, PAPERS, SIGMAS, VERDICTS, CheckResult, Verdict
 from twin.validation.runner import GroupRun, Validation
 

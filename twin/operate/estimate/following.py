@@ -23,10 +23,10 @@ from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import chance_beyond, limit_of
 from scenes.specs.operation import OperationSpec
+from twin.framework.artefact import decimals_for, fixed, plain
 from twin.operate.estimate.standing import SPANS, Scores
 from twin.operate.record.entries import MICRO, Alarm, utc_text
 from twin.operate.record.history import History
-from twin.run.artefact import decimals_for, fixed, plain
 
 MOST_BAD = 2
 """Readings taken for bad ones, above which it is said: 3 of 200 come by chance once in a thousand times."""

@@ -26,13 +26,13 @@ from analysis.monitor.series_filter import Power, SeriesFilter, detection_power,
 from optics.numerics.backend import load_backend, one_blas_thread
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.errors import Problem
+from twin.framework.provenance import source_digest
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState, beyond, widening
 from twin.operate.estimate.operation_model import OperationModel, plan_digest, traced_model
 from twin.operate.estimate.standing import Standing, Taking, packed, unpacked
 from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
 from twin.operate.record.history import USED, History, content_of
-from twin.run.provenance import source_digest
 
 DAY = 86_400 * MICRO
 EVERY = 1000

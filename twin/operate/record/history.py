@@ -17,6 +17,8 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.input_file import parse_json
+from twin.framework.data_files import WRITER
+from twin.framework.durable import make_folders, sync_folder
 from twin.operate.record import NotARecord, RecordFailed, schema
 from twin.operate.record.entries import (
     DECISION,
@@ -46,8 +48,6 @@ from twin.operate.record.schema import (
     writing,
 )
 from twin.operate.record.taking import Taken, Taking
-from twin.run.data_files import WRITER
-from twin.run.durable import make_folders, sync_folder
 
 USED = ("monitor", "temperature")
 """Kinds of entries that change the estimate; events do by what they step."""

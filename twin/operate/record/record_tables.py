@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from scenes.specs.operation import RUNS
+from twin.framework.data_files import DataTable
+from twin.framework.quantity import Quantity, Record, in_unit
 from twin.operate.record.entries import MICRO
 from twin.operate.record.history import History, content_of
-from twin.run.data_files import DataTable
-from twin.run.quantity import Quantity, Record, in_unit
 
 Row = Mapping[str, Any]
 

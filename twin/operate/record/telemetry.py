@@ -29,6 +29,9 @@ from scenes.yaml.input_file import digest_of, is_file, parse_json, read_json
 from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
+from twin.framework.cli import InputErrorText
+from twin.framework.owned_files import MANIFEST
+from twin.framework.run_folder import Manifest, is_run_folder, read_manifest
 from twin.operate.record.entries import (
     MICRO,
     Entry,
@@ -43,9 +46,6 @@ from twin.operate.record.entries import (
     one_line,
 )
 from twin.operate.record.history import History
-from twin.run.cli import InputErrorText
-from twin.run.owned_files import MANIFEST
-from twin.run.run_folder import Manifest, is_run_folder, read_manifest
 
 RESULTS = {"monitor": "recovered.json", "calibration": "calibration.json", "angle": "angle.json"}
 """Sort of reading -> file of the run folder that holds it."""

@@ -28,6 +28,7 @@ from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.job import JobSpec, PerturbationSpec
 from scenes.specs.perturbation import perturbation_issues
 from scenes.yaml.errors import InputError
+from twin.framework.procedure import BenchError
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight import light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
@@ -36,7 +37,6 @@ from twin.orbit.flight.line_camera import LineAngles, LineCamera, line_cameras, 
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory
-from twin.run.procedure import BenchError
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.angle import OrbitAngleSpec

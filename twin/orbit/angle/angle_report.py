@@ -18,11 +18,11 @@ from analysis.orbit.planes import AXES
 from scenes.specs.orbit.setup import MeasuredAngleSetup
 from scenes.specs.perturbation import in_words
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.framework import svg
+from twin.framework.artefact import FAR, Cell, SvgFigure, Table, fixed
+from twin.framework.report import Report, Section, answer
 from twin.orbit.angle.angle_run import UNLIKELY, AngleRun, PassAngles, Scatter, SimulatedAngleRun, values_of
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, LightEffects
-from twin.run import svg
-from twin.run.artefact import FAR, Cell, SvgFigure, Table, fixed
-from twin.run.report import Report, Section, answer
 
 METHOD_NAMES = {
     "printed": "planes, eq. 5 as printed",

@@ -27,6 +27,7 @@ from scenes.specs.orbit.setup import AnyAngle, MeasuredAngleSetup
 from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.units import MOMENT, format_quantity
 from scenes.yaml.yaml_file import dump_yaml
+from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.angle.angle_flight import LEAST_SIGMA, Measurement, without_effects
 from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, estimated, run_angle
 from twin.orbit.flight.earth import Earth
@@ -36,7 +37,6 @@ from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
-from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

@@ -11,8 +11,8 @@ from analysis.block.block_adjustment import LawTest
 from analysis.block.network import DatumTest, Network, Open
 from analysis.block.reweighting import GroupTest
 from analysis.orbit.forward_intersection import Accuracy
+from twin.framework.quantity import Quantity, Record
 from twin.orbit.block.block_run import BlockRun, CameraChange, Worth
-from twin.run.quantity import Quantity, Record
 
 ACCURACY: Record[Accuracy] = Record(
     "Errors that hold nine points in ten.",

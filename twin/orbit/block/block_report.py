@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from twin.framework.artefact import Cell, Table
+from twin.framework.report import Report, Section, answer
 from twin.orbit.block.block_numbers import ALARM, CHANGE, GROUP
 from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun
 from twin.orbit.measured.pass_measurements import duplicates, listed
-from twin.run.artefact import Cell, Table
-from twin.run.report import Report, Section, answer
 
 _TOLD = 0.1
 """Sigmas beforehand: what is told less well is listed as left to the priors."""

@@ -19,11 +19,11 @@ from analysis.orbit.forward_intersection import Accuracy, level_axes, predicted,
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.setup import AnyAdjust, MeasuredAdjustSetup
+from twin.framework.memory import Lowered, require_memory
+from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
 from twin.orbit.block.measured_block import measured_block
 from twin.orbit.block.pass_knowledge import MonitorSource
-from twin.run.memory import Lowered, require_memory
-from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

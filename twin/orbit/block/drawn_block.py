@@ -23,6 +23,8 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
 from scenes.specs.orbit.flight import AttitudeSpec, OrbitSpec, PassingSpec
 from scenes.specs.orbit.setup import AdjustSetup
+from twin.framework.procedure import BenchError
+from twin.framework.random_streams import stream
 from twin.orbit.block.pass_knowledge import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
 from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.observations import PassData
@@ -33,8 +35,6 @@ from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Platform, Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
 from twin.orbit.measured.pass_measurements import ImagePoints
-from twin.run.procedure import BenchError
-from twin.run.random_streams import stream
 
 Course = Callable[[np.ndarray], np.ndarray]
 Monitored = dict[str, known.CameraKnowledge] | known.CamerasKnowledge

@@ -13,6 +13,7 @@ from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.setup import MeasuredAdjustSetup
+from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.block.pass_knowledge import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
 from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.observations import PassData, light_effects
@@ -23,7 +24,6 @@ from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.measurement_tables import read_measurements
 from twin.orbit.measured.pass_measurements import PassMeasurements
-from twin.run.procedure import Advance, BenchError, silent
 
 _DAY = 86400.0
 

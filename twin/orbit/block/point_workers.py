@@ -9,7 +9,7 @@ from typing import Any
 
 from analysis.arrays import MeasurementError
 from optics.numerics.backend import one_blas_thread
-from twin.run.cluster import ClusterError, Workers, chosen_workers
+from twin.framework.cluster import ClusterError, Workers, chosen_workers
 
 _LOST = "a worker was lost with its share of the points; adjust the block again"
 

@@ -13,6 +13,7 @@ from analysis.calibration.strip_adjustment import Datum
 from analysis.orbit.calibration_parameters import OFFSET, RATE, Combination
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS
+from twin.framework.quantity import Quantity, Record
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
 from twin.orbit.calibration.camera_drift import DriftSize, Monitoring, Treatment
 from twin.orbit.calibration.campaign import Campaign, FieldPass, interior_names
@@ -23,7 +24,6 @@ from twin.orbit.calibration.schemes import FieldErrors, Repeatability, Repeats, 
 from twin.orbit.calibration.screening import ground_sample, meeting_of
 from twin.orbit.calibration.strip import Strips
 from twin.orbit.images.point_judgement import LineJudgement
-from twin.run.quantity import Quantity, Record
 
 # --- errors at check points, by scheme -------------------------------------------------------------------
 

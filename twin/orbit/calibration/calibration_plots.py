@@ -7,11 +7,11 @@ from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
 from analysis.orbit.three_line_model import BIAS, misclosure
+from twin.framework import svg
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.camera_drift import Monitoring
 from twin.orbit.calibration.flown_campaign import true_bias
 from twin.orbit.calibration.schemes import RMS, FieldErrors, values_of
-from twin.run import svg
 
 
 def drift_svg(run: CalibrationRun, found: Monitoring) -> str:

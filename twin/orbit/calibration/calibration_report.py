@@ -9,6 +9,8 @@ import numpy as np
 from analysis.arrays import ARCSEC
 from scenes.specs.orbit.setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.framework.artefact import Cell, Table
+from twin.framework.report import Report, answer
 from twin.orbit.calibration import calibration_sections
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import CalibrationRun, unit
@@ -17,8 +19,6 @@ from twin.orbit.calibration.observations import any_effect, light_effects
 from twin.orbit.calibration.schemes import meets, values_of
 from twin.orbit.calibration.screening import meeting_of
 from twin.orbit.measured.pass_measurements import duplicates, listed
-from twin.run.artefact import Cell, Table
-from twin.run.report import Report, answer
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup

@@ -19,6 +19,8 @@ from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.calibration import LEAST_TIES
 from scenes.specs.orbit.setup import MeasuredCalibrationSetup
+from twin.framework.memory import Lowered, require_memory
+from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.calibration.camera_drift import Monitoring, monitored
 from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, drift_looked_for, gauge_of, simultaneous
@@ -47,8 +49,6 @@ from twin.orbit.calibration.schemes import (
 from twin.orbit.calibration.screening import require_labelled, screened
 from twin.orbit.calibration.strip import Strips, strips_adjusted
 from twin.orbit.measured.measurement_tables import read_measurements
-from twin.run.memory import Lowered, require_memory
-from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

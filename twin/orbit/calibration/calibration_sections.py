@@ -11,6 +11,8 @@ from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.framework.artefact import Artefact, Cell, SvgFigure, Table
+from twin.framework.report import Section
 from twin.orbit.calibration import field_sections
 from twin.orbit.calibration.calibration_plots import drift_svg, figure_svg
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun, unit
@@ -18,8 +20,6 @@ from twin.orbit.calibration.camera_drift import Monitoring, Treatment
 from twin.orbit.calibration.influences import steps_table
 from twin.orbit.calibration.schemes import RMS, FieldErrors, Repeats, SchemeMeans, meets, values_of
 from twin.orbit.calibration.strip import Strips
-from twin.run.artefact import Artefact, Cell, SvgFigure, Table
-from twin.run.report import Section
 
 
 def monitor_gain(found: Monitoring) -> str:

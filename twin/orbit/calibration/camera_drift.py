@@ -18,13 +18,13 @@ from analysis.calibration.adjustment import Adjustment, adjust
 from analysis.orbit.calibration_parameters import Prior, Unknowns, monitor_priors
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from optics.numerics.number_tree import FrozenMap
+from twin.framework.procedure import Advance
+from twin.framework.random_streams import stream
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields, reading_sigma
 from twin.orbit.calibration.observations import EFFECTS
 from twin.orbit.calibration.schemes import FieldErrors, averaged, schemes_tested, tested
-from twin.run.procedure import Advance
-from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup

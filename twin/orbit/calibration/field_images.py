@@ -14,6 +14,8 @@ import numpy as np
 
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import KeyPath
+from twin.framework.procedure import Advance, BenchError
+from twin.framework.random_streams import stream
 from twin.orbit.calibration.observations import FieldPoints, PassData
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.sensor import Sensor
@@ -29,8 +31,6 @@ from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import Patch, PatchError, fly_patch, imaged_lines
 from twin.orbit.images.point_judgement import LineJudgement, judged, true_ground
 from twin.orbit.measured.pass_measurements import ImagePoints
-from twin.run.procedure import Advance, BenchError
-from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.calibration import CalibrationImagesSpec, FieldSpec, PatchPlaceSpec

@@ -14,6 +14,9 @@ from analysis.arrays import ARCSEC
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.framework.artefact import Cell, PngFigure, SvgFigure, Table
+from twin.framework.quantity import Quantity, Record
+from twin.framework.report import Section
 from twin.orbit.calibration.calibration_numbers import IMAGES
 from twin.orbit.calibration.calibration_plots import figure_svg
 from twin.orbit.calibration.calibration_run import CalibrationRun
@@ -24,9 +27,6 @@ from twin.orbit.calibration.screening import ground_sample, meeting_of
 from twin.orbit.images.image_points import BEYOND
 from twin.orbit.images.point_judgement import WRONG
 from twin.orbit.images.point_report import points_png
-from twin.run.artefact import Cell, PngFigure, SvgFigure, Table
-from twin.run.quantity import Quantity, Record
-from twin.run.report import Section
 
 
 def fields_section(run: CalibrationRun) -> Section:

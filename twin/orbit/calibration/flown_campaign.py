@@ -21,6 +21,8 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.random_streams import stream
 from twin.orbit.calibration.campaign import Campaign, PassTruth, campaign_of, line_model
 from twin.orbit.calibration.field_images import FieldImages, Imager
 from twin.orbit.calibration.observations import FieldPoints, PassData, light_effects
@@ -32,8 +34,6 @@ from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import TERMS, Trajectory
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.calibration import FieldSpec, OrbitCalibrationSpec, PointsSpec

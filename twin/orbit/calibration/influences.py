@@ -22,13 +22,13 @@ from analysis.calibration.adjustment import FALSE_ALARM, Adjustment, Rates, Step
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
 from scenes.specs.orbit.measurements import MeasuredCalibrationSpec
+from twin.framework.artefact import Table
+from twin.framework.quantity import in_unit
 from twin.orbit.calibration.campaign import Campaign, FoundDrift
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
 from twin.orbit.calibration.observations import EFFECTS
 from twin.orbit.calibration.schemes import FieldErrors, schemes_tested, tested_before
 from twin.orbit.flight.light_effects import NO_EFFECTS
-from twin.run.artefact import Table
-from twin.run.quantity import in_unit
 
 SURPRISE = 4.0
 """Sigmas of what is expected of an unknown; one of seventy lies beyond by chance in 1 of 200 campaigns."""

@@ -16,11 +16,11 @@ from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.orbit.three_line_model import BIAS, LineModel
 from optics.numerics.number_tree import FrozenMap
+from twin.framework.procedure import Advance
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.observations import EFFECTS
-from twin.run.procedure import Advance
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.calibration import MapLimitsSpec

@@ -20,10 +20,10 @@ from analysis.orbit.forward_intersection import CheckErrors, check_errors, inter
 from analysis.orbit.three_line_model import LineModel, Rays
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
+from twin.framework.procedure import Advance
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import gauge_of
 from twin.orbit.calibration.schemes import averaged
-from twin.run.procedure import Advance
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from twin.framework.quantity import Quantity, Record
 from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
 from twin.orbit.conventions.pass_readings import QUESTIONS, Changes, changed
 from twin.orbit.conventions.reading_fit import Fit
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.run.quantity import Quantity, Record
 
 Ranked = tuple[Check, Tried]
 Placed = tuple[Check, Changes]

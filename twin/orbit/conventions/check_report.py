@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from twin.framework.artefact import Cell, Table
+from twin.framework.report import Report, Section, answer
 from twin.orbit.conventions.check_numbers import changes_text, places_of
 from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
 from twin.orbit.conventions.pass_readings import QUESTIONS
-from twin.run.artefact import Cell, Table
-from twin.run.report import Report, Section, answer
 
 ANOTHER, NONE = 3, 4
 """Exit codes: another reading than the stated one stands; none explains the points."""

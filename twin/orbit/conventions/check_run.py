@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue
+from twin.framework.procedure import Advance, silent
 from twin.orbit.conventions import pass_readings
 from twin.orbit.conventions.pass_readings import QUESTIONS, Changes, PassConventions, PassReadings, changed
 from twin.orbit.conventions.reading_fit import Fit, ImpossibleError, PassBench, line_of, line_times, pixel_of, spread
@@ -21,7 +22,6 @@ from twin.orbit.measured.clock import epoch_before
 from twin.orbit.measured.measurement_tables import campaign_files
 from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_files import platform_table
-from twin.run.procedure import Advance, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

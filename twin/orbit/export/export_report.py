@@ -11,15 +11,15 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
+from twin.framework import svg
+from twin.framework.artefact import Cell, SvgFigure, Table, significant
+from twin.framework.data_files import FrameFacts, tiff
+from twin.framework.quantity import Quantity, Record
+from twin.framework.report import Report, Section, answer
 from twin.orbit.export.export_run import Controlled, Export, ExportedLine, ProductPolynomial, Quality, SceneSource
 from twin.orbit.export.ground_accuracy import TOGETHER, AccuracyMap, GroundSigma
 from twin.orbit.export.line_scanner import ModelError
 from twin.orbit.export.rational_polynomial import RationalPolynomial, residual_sigma
-from twin.run import svg
-from twin.run.artefact import Cell, SvgFigure, Table, significant
-from twin.run.data_files import FrameFacts, tiff
-from twin.run.quantity import Quantity, Record
-from twin.run.report import Report, Section, answer
 
 _UNLIKELY = 1e-3
 """Chance of a chi-square below which covariances of control points cannot be true."""

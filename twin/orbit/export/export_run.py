@@ -30,6 +30,8 @@ from scenes.specs.orbit.measurements import GroundFileSpec
 from scenes.specs.orbit.setup import AngleSetup, SimulateSetup
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.run_folder import read_manifest
 from twin.orbit.angle.angle_flight import angle_camera, fly
 from twin.orbit.export.ground_accuracy import AccuracyMap, EstimatedChange, GroundSigma, ground_sigma
 from twin.orbit.export.line_scanner import LineScanner, line_scanner
@@ -41,8 +43,6 @@ from twin.orbit.images.simulate_run import fly_simulation
 from twin.orbit.measured.dimap_sensor import DimapScene, read_scene
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
 from twin.orbit.measured.xml_file import text_lines
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.run_folder import read_manifest
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

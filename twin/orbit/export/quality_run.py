@@ -16,6 +16,9 @@ from analysis.orbit.image_correction import LEAST_POINTS
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text
 from scenes.yaml.yaml_file import dump_yaml
+from twin.framework.artefact import Table
+from twin.framework.quantity import Quantity, Record
+from twin.framework.report import Report, answer
 from twin.orbit.export.export_report import CONTROL, FOLDER, control_section, quality_answers, quality_warnings
 from twin.orbit.export.export_run import (
     Controlled,
@@ -37,9 +40,6 @@ from twin.orbit.export.rational_polynomial import (
 )
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.dimap_sensor import DimapScene
-from twin.run.artefact import Table
-from twin.run.quantity import Quantity, Record
-from twin.run.report import Report, answer
 
 _COMPARED = (15, 15, 3)
 """Lines, pixels and heights at which polynomials are compared."""

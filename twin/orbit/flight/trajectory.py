@@ -28,9 +28,9 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from optics.geometry.pose import rotation_matrix
+from twin.framework.random_streams import stream
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
 from twin.orbit.flight.orbit import Orbit
-from twin.run.random_streams import stream
 from twin.sensors.charge_transfer import Collection
 
 if TYPE_CHECKING:

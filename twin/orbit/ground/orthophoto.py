@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter, spline_filter
 
+from twin.framework.random_streams import stream
 from twin.orbit.ground.grid import GroundFrame, SplineGrid, Terrain, correlated_field, fractal_field
-from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.scene import ControlSpec, LightSpec, TextureSpec

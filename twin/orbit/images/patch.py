@@ -22,6 +22,8 @@ import numpy as np
 
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.number_tree import FrozenMap
+from twin.framework.memory import Lowered, require_memory
+from twin.framework.random_streams import stream
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.orthophoto import Control, Extent, apparent, around, make_control, reflectance
@@ -30,8 +32,6 @@ from twin.orbit.images.image_points import ImagedGround, LineFrame
 from twin.orbit.images.jitter_exposure import collected
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
 from twin.orbit.images.pushbroom import BORDER, LookMap, PushbroomScene, Window
-from twin.run.memory import Lowered, require_memory
-from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:

@@ -13,13 +13,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 
 from scenes.specs.orbit.scene import ImagePointsSpec
+from twin.framework.artefact import Artefact, Cell, Data, PngFigure, Table
+from twin.framework.data_files import csv_table
+from twin.framework.report import Section
+from twin.framework.svg import SKY, VERMILION, YELLOW, look, new_figure, to_png
 from twin.orbit.images.image_points import CONSENSUS, ImagedGround, LineFrame, MatchedPoints, PatchPoints, status_text
 from twin.orbit.images.patch import Patch
 from twin.orbit.images.point_judgement import WRONG, judged
-from twin.run.artefact import Artefact, Cell, Data, PngFigure, Table
-from twin.run.data_files import csv_table
-from twin.run.report import Section
-from twin.run.svg import SKY, VERMILION, YELLOW, look, new_figure, to_png
 
 
 def pixel_axes(axes: Axes) -> None:

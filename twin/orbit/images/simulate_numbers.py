@@ -16,6 +16,8 @@ from analysis.arrays import Array
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.numerics.array_math import in_span
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
+from twin.framework.quantity import Quantity, Record
+from twin.framework.reference_frames import described
 from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.flight.trajectory import Trajectory, readings
 from twin.orbit.ground.orthophoto import Raster
@@ -23,8 +25,6 @@ from twin.orbit.images import point_judgement
 from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints
 from twin.orbit.images.patch import LineImage, Patch
 from twin.orbit.images.simulate_run import Simulation
-from twin.run.quantity import Quantity, Record
-from twin.run.reference_frames import described
 
 _TRUE_POINTS = 21
 """Along each side of the grid of true ground points."""

@@ -10,16 +10,29 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.framework.artefact import Cell, Data, PngFigure, SvgFigure, Table
+from twin.framework.data_files import FrameFacts, MapPlace
+from twin.framework.reference_frames import described
+from twin.framework.report import Report, Section, answer
+from twin.framework.svg import (
+    BLUE,
+    GREEN,
+    INK,
+    LIGHT,
+    ORANGE,
+    SKY,
+    VERMILION,
+    look,
+    new_figure,
+    plain_axes,
+    to_png,
+    to_svg,
+)
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images import simulate_numbers
 from twin.orbit.images.patch import LineImage
 from twin.orbit.images.point_report import pixel_axes, points_section
 from twin.orbit.images.simulate_run import Simulation
-from twin.run.artefact import Cell, Data, PngFigure, SvgFigure, Table
-from twin.run.data_files import FrameFacts, MapPlace
-from twin.run.reference_frames import described
-from twin.run.report import Report, Section, answer
-from twin.run.svg import BLUE, GREEN, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_png, to_svg
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import SimulateSetup

@@ -12,6 +12,8 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.scene import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.random_streams import stream
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, changed_payload, line_cameras
@@ -21,8 +23,6 @@ from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.images.image_points import POINTS_REMEDY, PatchPoints, PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import ImagedLine, Patch, PatchError, fly_patch, imaged_lines
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

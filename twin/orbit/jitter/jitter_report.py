@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
 from analysis.statistics import robust_sigma
+from twin.framework import svg
+from twin.framework.artefact import Cell, CsvFile, SvgFigure, Table, decimals_for, fixed, significant
+from twin.framework.data_files import csv_table
+from twin.framework.report import Report, Section, answer
 from twin.orbit.jitter.jitter_run import MULTIPLE, JitterRun, Oscillation, PassJitter, blind_multiples, transfers
-from twin.run import svg
-from twin.run.artefact import Cell, CsvFile, SvgFigure, Table, decimals_for, fixed, significant
-from twin.run.data_files import csv_table
-from twin.run.report import Report, Section, answer
 
 _MOST, _SIGMAS = 4000, 5.0
 """Points of a drawn disparity, and robust standard deviations to either side that its axis reaches."""

@@ -17,6 +17,9 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.jitter_search import AXES, OrbitJitterSpec
 from scenes.specs.orbit.setup import AnyJitter, JitterSetup, MeasuredJitterSetup
 from scenes.yaml.yaml_file import dump_yaml
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.quantity import Quantity, Record
+from twin.framework.random_streams import stream
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineTimes, line_cameras
@@ -27,9 +30,6 @@ from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.jitter.sights import Sights, SightsError, sights_of
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.quantity import Quantity, Record
-from twin.run.random_streams import stream
 from twin.sensors.charge_transfer import Collection, Motion
 
 if TYPE_CHECKING:

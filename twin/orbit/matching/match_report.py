@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from twin.framework.artefact import Cell, Table
+from twin.framework.report import Report, Section, answer
 from twin.orbit.images.point_report import point_artefacts
 from twin.orbit.matching.match_run import Match
-from twin.run.artefact import Cell, Table
-from twin.run.report import Report, Section, answer
 
 _FAR = 0.5
 """Share of the reach: matches that lie farther from where they were expected leave the search little room."""

@@ -16,6 +16,9 @@ import numpy as np
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
+from twin.framework.memory import Lowered, require_memory
+from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.quantity import Quantity, Record
 from twin.orbit.conventions.pass_readings import LineClock, PassConventions, read_line_clocks
 from twin.orbit.conventions.reading_fit import ImpossibleError, line_times
 from twin.orbit.flight.earth import Earth
@@ -42,9 +45,6 @@ from twin.orbit.measured.map_part import MapPart, UserMap
 from twin.orbit.measured.measurement_tables import campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_files import platform_table, read_platform
-from twin.run.memory import Lowered, require_memory
-from twin.run.procedure import Advance, BenchError, silent
-from twin.run.quantity import Quantity, Record
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

@@ -24,12 +24,12 @@ from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.units import LENGTH, SPEED, TIME
 from scenes.yaml.yaml_file import dump_yaml
+from twin.framework.procedure import Advance, silent
 from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.measured.map_part import MOST_HEIGHT
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_readings import platform_of
-from twin.run.procedure import Advance, silent
 
 _FAR, _FAST, _LATE, _MANY = 1e9, 1e5, 1e10, 1e9
 """Metres, m/s, seconds and lines beyond which nothing is meant; below them sums of squares do not overflow."""

@@ -37,6 +37,8 @@ from scenes.specs.motion_text import AXES, node_named
 from scenes.specs.orbit.monitor import PARAMETERS, CorrectionSpec, OrbitMonitorSpec
 from scenes.specs.perturbation import not_allowed
 from scenes.yaml.errors import InputError, Problem, unknown
+from twin.framework.procedure import BenchError
+from twin.framework.random_streams import stream
 from twin.monitor.image_quality import ImageQuality, image_quality
 from twin.monitor.monitor_derivative import single_states, spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -45,8 +47,6 @@ from twin.monitor.observation import LOST, Observing, observe
 from twin.monitor.truth import truth_jacobian
 from twin.orbit.monitoring.monitor_series import states_of
 from twin.orbit.monitoring.pair_flight import TOO_FAR, moves_at
-from twin.run.procedure import BenchError
-from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup

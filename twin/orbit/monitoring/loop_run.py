@@ -31,6 +31,8 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS
 from scenes.specs.orbit.scene import ControlSpec, LineImageSpec
 from scenes.specs.resolved import target_band
+from twin.framework.procedure import Advance, BenchError
+from twin.framework.random_streams import stream
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.light_effects import NO_EFFECTS
@@ -53,8 +55,6 @@ from twin.orbit.monitoring.pair_flight import (
     sightings,
     traced_pair,
 )
-from twin.run.procedure import Advance, BenchError
-from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

@@ -24,11 +24,11 @@ from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError
 from scenes.specs.course import moment
 from scenes.specs.instrument import CENTRAL_PRISM
+from twin.framework.procedure import BenchError
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, Record, light_of, read
 from twin.monitor.truth import Truth
 from twin.orbit.monitoring.pair_flight import TOO_FAR, moves_at
-from twin.run.procedure import BenchError
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.monitor import OrbitMonitorSpec

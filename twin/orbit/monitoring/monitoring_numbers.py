@@ -12,6 +12,8 @@ from analysis.arrays import Array
 from analysis.monitor.model_fit import UnseenMode
 from analysis.monitor.monitoring import PER_SI
 from scenes.specs.course import moment
+from twin.framework.artefact import significant
+from twin.framework.quantity import Quantity, Record
 from twin.orbit.monitoring.loop_run import (
     GAIN_MARGIN,
     PHASE_MARGIN_DEG,
@@ -23,8 +25,6 @@ from twin.orbit.monitoring.loop_run import (
 )
 from twin.orbit.monitoring.monitoring_run import Cause, MonitorRun, Smoothing
 from twin.orbit.monitoring.pair_flight import CaseErrors, rms
-from twin.run.artefact import significant
-from twin.run.quantity import Quantity, Record
 
 MOST_MOTIONS = 8
 """Motions that a mode names."""

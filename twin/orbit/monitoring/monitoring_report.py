@@ -22,16 +22,16 @@ from analysis.monitor.monitoring import PER_SI
 from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
 from scenes.yaml.errors import names_text
+from twin.framework import svg
+from twin.framework.artefact import SYMBOLS, CsvFile, SvgFigure, Table, shown_unit, significant
+from twin.framework.data_files import csv_table
+from twin.framework.report import Report, Section, answer
 from twin.monitor.time_series import jump_text
 from twin.orbit.monitoring import monitoring_numbers as numbers
 from twin.orbit.monitoring.loop_run import LoopRun, height_rms
 from twin.orbit.monitoring.monitoring_numbers import positions
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun
 from twin.orbit.monitoring.pair_flight import rms
-from twin.run import svg
-from twin.run.artefact import SYMBOLS, CsvFile, SvgFigure, Table, shown_unit, significant
-from twin.run.data_files import csv_table
-from twin.run.report import Report, Section, answer
 from twin.sensors.area_detector import coarse_warnings
 
 PARTS = {

@@ -25,6 +25,7 @@ from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.specs.instrument import BASE
 from scenes.specs.orbit.monitor import PARAMETERS
+from twin.framework.procedure import Advance, BenchError, silent
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
 from twin.orbit.flight.line_camera import LineCamera, calibrated_line, look_angle
@@ -39,7 +40,6 @@ from twin.orbit.monitoring.pair_flight import (
     point_errors,
     traced_pair,
 )
-from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

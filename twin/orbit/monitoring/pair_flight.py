@@ -18,6 +18,8 @@ from analysis.orbit.forward_intersection import CalibratedLine, Sightings, check
 from optics.geometry.tree import Motion, State
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import moment
+from twin.framework.procedure import Advance, BenchError
+from twin.framework.random_streams import stream
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS
@@ -25,8 +27,6 @@ from twin.orbit.flight.line_camera import LineCamera, calibrated_line, traced_li
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Platform, Sensor
 from twin.orbit.flight.trajectory import Trajectory
-from twin.run.procedure import Advance, BenchError
-from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.monitor import OrbitMonitorSpec

@@ -16,11 +16,11 @@ from rich.console import Console
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.file_kinds import read_for
 from scenes.yaml.errors import key_text
-from twin.run import cli, command, page, procedure, provenance, reference_frames, run_folder, svg
-from twin.run.artefact import Cell, SvgFigure, Table, plain, significant
-from twin.run.quantity import Quantity, Record
-from twin.run.report import Report, Section, answer
-from twin.run.run_folder import RunFolder
+from twin.framework import cli, command, page, procedure, provenance, reference_frames, run_folder, svg
+from twin.framework.artefact import Cell, SvgFigure, Table, plain, significant
+from twin.framework.quantity import Quantity, Record
+from twin.framework.report import Report, Section, answer
+from twin.framework.run_folder import RunFolder
 from twin.sensors.area_detector import coarse_warnings
 from twin.study.gradient.study_gradient import AD, Gradient, study_gradient
 from twin.study.report.study_plots import finish

@@ -24,11 +24,11 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.specs.study import FactorSpec, ResponseSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.units import with_unit
+from twin.framework.cli import InputErrorText
+from twin.framework.procedure import Advance, silent
 from twin.monitor.image_quality import quality_dicts
 from twin.monitor.monitor_derivative import spot_gradient
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.run.cli import InputErrorText
-from twin.run.procedure import Advance, silent
 from twin.study.gradient.gradient_chain import CAP, SHARES, Chain, Slopes, extrapolated, motion_slopes, sight_gradient
 from twin.study.runs.base_job import Failure, Run, leaf
 from twin.study.runs.plan import number_at, number_of, ratios, scaled

@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 
 from scenes.specs.study import GRID, SAMPLERS
-from twin.run.artefact import decimals_for, fixed, significant
-from twin.run.report import answer
+from twin.framework.artefact import decimals_for, fixed, significant
+from twin.framework.report import answer
 from twin.study.report.sensitivity_indices import MANY_FAILED, RESAMPLES, Indices, NoIndices
 from twin.study.report.study_analysis import GOALS, Convergence, Requirement, StudyAnalysis
 from twin.study.report.study_statistics import LEAST, Description, Estimate, Interval, Response, impossible, typeset

@@ -12,7 +12,7 @@ import numpy as np
 
 from analysis.statistics import share_interval
 from scenes.specs.study import ParetoSpec, ThresholdSpec
-from twin.run.quantity import Quantity, Record
+from twin.framework.quantity import Quantity, Record
 from twin.study.report import study_statistics as statistics
 from twin.study.report.linear_model import Effect, LinearModel, MainEffect, linear_model, main_effects
 from twin.study.report.sensitivity_indices import Index, Indices, NoIndices, sensitivity_indices

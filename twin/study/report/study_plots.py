@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
-from twin.run import svg
-from twin.run.artefact import plain
-from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION
+from twin.framework import svg
+from twin.framework.artefact import plain
+from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION
 from twin.study.report.sensitivity_indices import Indices
 from twin.study.report.study_analysis import StudyAnalysis
 from twin.study.report.study_statistics import Description, Factor, Response, Series, mean_interval, typeset

@@ -13,10 +13,10 @@ from matplotlib.text import Text
 
 from scenes.specs.study import FactorSpec, StudySpec
 from scenes.yaml.errors import key_text
-from twin.run import page, run_folder, svg
-from twin.run.artefact import Cell, SvgFigure, Table, Undrawn, fixed, plain
-from twin.run.report import Report, Section
-from twin.run.run_folder import RunFolder
+from twin.framework import page, run_folder, svg
+from twin.framework.artefact import Cell, SvgFigure, Table, Undrawn, fixed, plain
+from twin.framework.report import Report, Section
+from twin.framework.run_folder import RunFolder
 from twin.study.report import conclusions as words
 from twin.study.report import study_analysis
 from twin.study.report import study_plots as plots

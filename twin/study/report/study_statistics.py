@@ -13,7 +13,7 @@ from scipy import stats
 
 from scenes.specs.study import GRID, NOISE, FactorSpec, StudySpec
 from scenes.yaml.errors import InputError, Issue, key_text
-from twin.run.artefact import significant
+from twin.framework.artefact import significant
 from twin.study.runs.plan import axes_of
 
 _SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"}

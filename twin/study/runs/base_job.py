@@ -22,7 +22,7 @@ from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import ZERO_IS_NONE, Spec, annotation_at, metadata_at, validate
 from scenes.yaml.yaml_file import YamlFile
-from twin.run.procedure import silent
+from twin.framework.procedure import silent
 
 
 @dataclass(frozen=True)

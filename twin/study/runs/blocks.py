@@ -18,11 +18,11 @@ from typing import Any
 from optics.numerics.backend import ONE_THREAD, Backend, kernel_threads, load_backend
 from scenes.specs.study import NOISE, TOTAL
 from scenes.yaml.errors import InputError, KeyPath, Problem, key_text
-from twin.run import cluster
-from twin.run.cli import Incomplete, time_text
-from twin.run.journal import Journal
-from twin.run.memory import largest_memory
-from twin.run.provenance import source_digest
+from twin.framework import cluster
+from twin.framework.cli import Incomplete, time_text
+from twin.framework.journal import Journal
+from twin.framework.memory import largest_memory
+from twin.framework.provenance import source_digest
 from twin.study.runs import base_job
 from twin.study.runs.base_job import BlockResult, Failure, Run
 from twin.study.runs.plan import Plan

@@ -14,7 +14,7 @@ from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from scenes.yaml.yaml_file import YamlFile
-from twin.run.memory import Lowered, require_memory
+from twin.framework.memory import Lowered, require_memory
 from twin.study.runs.base_job import Run, Tree, leaf, with_values
 from twin.study.runs.setup import StudySetup
 

@@ -24,7 +24,7 @@ from scenes.yaml.csv_table import lines_of, table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
 from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Source, Spec, validate
-from twin.run.provenance import source_digest, versions
+from twin.framework.provenance import source_digest, versions
 from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, says_nothing, with_place, with_values
 
 PROGRAM = "twin.study"

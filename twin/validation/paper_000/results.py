@@ -20,9 +20,9 @@ from analysis.arrays import ARCSEC, Array
 from analysis.orbit.planes import Method, Sensitivity, Station, Strip, intersection_angles, sensitivity
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.orbit.angle import LINES
+from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, VERMILION
 from twin.orbit.angle.angle_flight import AnglePass, Measurement
 from twin.orbit.angle.angle_run import effect_rows, values_of
-from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, VERMILION
 from twin.validation.check import SIGMAS, Check, CheckResult, Chosen, Supposed, mean_of
 from twin.validation.group import Context, drawing, group_of, load_printed
 from twin.validation.paper_000.method import PAIRS, TEST, Passes, planes_of, repeated, setup_of

@@ -20,10 +20,10 @@ from optics.numerics.backend import cores, one_blas_thread
 from scenes.specs.instrument import BASE
 from scenes.specs.load import load_error_budget
 from scenes.specs.resolved import resolve_budget
+from twin.framework.artefact import Cell
+from twin.framework.svg import BLUE, INK
 from twin.monitor.simulated_budget import BudgetLine, ErrorBudget, Together
 from twin.monitor.truth import line_points
-from twin.run.artefact import Cell
-from twin.run.svg import BLUE, INK
 from twin.validation.check import SIGMAS, CheckResult, Chosen, Supposed
 from twin.validation.group import Context, drawing, group_of, load_printed
 

@@ -26,11 +26,11 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.specs.instrument import BASE
+from twin.framework.artefact import Cell
+from twin.framework.svg import BLUE, GREY, INK, LIGHT
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.truth import Truth
-from twin.run.artefact import Cell
-from twin.run.svg import BLUE, GREY, INK, LIGHT
 from twin.validation.check import CheckResult, rms
 from twin.validation.group import Context, drawing, group_of
 

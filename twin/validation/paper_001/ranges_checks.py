@@ -13,8 +13,8 @@ from analysis.arrays import ARCSEC
 from analysis.monitor.monitoring import MonitorGeometry
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
-from twin.run.artefact import SYMBOLS, Cell
-from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION
+from twin.framework.artefact import SYMBOLS, Cell
+from twin.framework.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION
 from twin.validation.check import CheckResult
 from twin.validation.group import Context, drawing, group_of
 from twin.validation.paper_001 import ranges

@@ -19,14 +19,14 @@ from analysis.orbit.three_line_model import BIAS, INTERIOR
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import CalibrationSetup
+from twin.framework.artefact import Cell
+from twin.framework.random_streams import stream
+from twin.framework.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.orbit.calibration.latitude import LatitudeFit, fitted
 from twin.orbit.calibration.schemes import schemes_tested, tested, tested_before, values_of
-from twin.run.artefact import Cell
-from twin.run.random_streams import stream
-from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION
 from twin.validation.check import SIGMAS, CheckResult, Chosen, Supposed, mean_of, median_of, rms
 from twin.validation.group import Context, drawing, group_of
 from twin.validation.paper_003.model import FIELDS, all_errors, changed, setup_of, without_light

@@ -26,6 +26,8 @@ from scenes.specs.orbit.calibration import CalibrationImagesSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.scene import TerrainSpec
 from scenes.specs.orbit.setup import CalibrationSetup
+from twin.framework.random_streams import stream
+from twin.framework.svg import BLUE, GREY, VERMILION
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass, line_model
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
@@ -37,8 +39,6 @@ from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import window_of
 from twin.orbit.images.pushbroom import MARGIN, PushbroomScene, render_patch
-from twin.run.random_streams import stream
-from twin.run.svg import BLUE, GREY, VERMILION
 from twin.validation.check import CheckResult, Chosen, rms
 from twin.validation.group import Context, drawing, group_of
 

@@ -26,10 +26,10 @@ from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend, one_blas_thread
 from scenes.models.camera_model import ROOT, build_camera_under_test
 from scenes.specs.resolved import DistortionSetup
+from twin.framework.artefact import Cell
+from twin.framework.svg import BLUE, GREY, INK, VERMILION
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import SimulatedDistortion, measure
-from twin.run.artefact import Cell
-from twin.run.svg import BLUE, GREY, INK, VERMILION
 from twin.targets.target_path import TargetPath
 from twin.validation.check import CheckResult, Chosen, mean_of, median_of, rms
 from twin.validation.group import Context, drawing, group_of, load_printed

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from threadpoolctl import threadpool_info
 
 from optics.numerics.backend import LIMIT, cores
-from twin.run.owned_files import digest
+from twin.framework.owned_files import digest
 
 PACKAGES = (
     "space-camera-twin",
@@ -76,7 +76,7 @@ def _version(package: str) -> str | None:
 
 
 ROOT = Path(__file__).resolve().parents[2]
-BEFORE = __name__.removesuffix("twin.run.provenance")
+BEFORE = __name__.removesuffix("twin.framework.provenance")
 """What stands before the names of modules: nothing in a source tree, in a wheel the one package that holds all others
 (docs/wheel).
 """

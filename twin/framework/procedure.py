@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.procedures import Procedure
     from scenes.specs.resolved import ExperimentSetup
-    from twin.run.run_folder import RunFolder
+    from twin.framework.run_folder import RunFolder
 
 Advance = Callable[[str, int, int], None]
 """Told what is being done, and how many of how many parts of it are."""

@@ -46,7 +46,7 @@ PROGRAMS = {
 """First word -> the module that is run, and one line of what it does."""
 COMPLETE = "_CAMTWIN_COMPLETE"
 """Variable by which a shell asks for completions."""
-_BEFORE = __name__.removesuffix("twin.run.console")
+_BEFORE = __name__.removesuffix("twin.framework.console")
 """What stands before the modules' names where the packages were installed within another one; else nothing."""
 
 

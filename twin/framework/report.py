@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from optics.numerics.number_tree import FrozenMap
-from twin.run.artefact import Artefact, Table
-from twin.run.data_files import FrameFacts
+from twin.framework.artefact import Artefact, Table
+from twin.framework.data_files import FrameFacts
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ import numpy as np
 from analysis.arrays import ARCMIN, ARCSEC
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.study import unit_of
-from twin.run.artefact import Cell, Table, shown_unit
-from twin.run.data_files import DataColumn, DataTable
+from twin.framework.artefact import Cell, Table, shown_unit
+from twin.framework.data_files import DataColumn, DataTable
 
 S = TypeVar("S")
 T = TypeVar("T")

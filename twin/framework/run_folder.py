@@ -17,10 +17,10 @@ from typing import Annotated, Any, Protocol
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from scenes.yaml.errors import InputError, Issue
-from twin.run import owned_files
-from twin.run.durable import PARTIAL_NAME, ending_later, make_folders, put_in_place, sync_folder, sync_tree
-from twin.run.owned_files import MANIFEST
-from twin.run.provenance import Checksum, Provenance, versions
+from twin.framework import owned_files
+from twin.framework.durable import PARTIAL_NAME, ending_later, make_folders, put_in_place, sync_folder, sync_tree
+from twin.framework.owned_files import MANIFEST
+from twin.framework.provenance import Checksum, Provenance, versions
 
 _WAITING = f".{MANIFEST}{owned_files.PARTIAL}"
 """Name of the manifest until all that it vouches for is on the disk."""
@@ -194,7 +194,7 @@ class RunFolder:
         if not isinstance(content, memoryview):
             place.write_bytes(content)
             return
-        from twin.run.frame_store import PART, let_go  # with NumPy, and most commands write no frames
+        from twin.framework.frame_store import PART, let_go  # with NumPy, and most commands write no frames
 
         with place.open("wb") as file:
             for start in range(0, len(content), PART):
@@ -251,7 +251,7 @@ class Manifest(BaseModel):
         workers: processes.
         worst_relative: largest relative deviation of derivatives from differences, None where none was compared.
         warnings: what the user was told.
-        checks: what the run checked of itself, as of `twin.run.provenance.SelfCheck`.
+        checks: what the run checked of itself, as of `twin.framework.provenance.SelfCheck`.
         inputs: absolute path of every file that the run read and that is not in its folder -> checksum.
         sha256: checksum of every file of the run but this one, by its path in the folder.
         digest: checksum of all else that stands here, see `seal`.
@@ -437,7 +437,7 @@ def reason(error: OSError) -> str:
 
 
 JOURNAL = ".journal"
-"""Ending of a file with finished pieces of work, `twin.run.journal`."""
+"""Ending of a file with finished pieces of work, `twin.framework.journal`."""
 _KEPT = re.compile(rf"{re.escape(owned_files.KEPT_LOCK)}|[^/]+{re.escape(JOURNAL)}|{PARTIAL_NAME}")
 """Files that commands keep there."""
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from optics.numerics.backend import ONE_THREAD, cores
-from twin.run import cli, durable, owned_files, provenance
+from twin.framework import cli, durable, owned_files, provenance
 
 if TYPE_CHECKING:  # it takes half a second, and a study's file is read before workers are started
     from distributed import Client

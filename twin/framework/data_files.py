@@ -26,7 +26,7 @@ import numpy as np
 import tifffile
 
 from optics.numerics.number_tree import FrozenMap
-from twin.run.frame_store import FileRoom, in_file, mean_of, parts
+from twin.framework.frame_store import FileRoom, in_file, mean_of, parts
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -24,9 +24,9 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
-from twin.run import data_files, provenance, reference_frames, run_folder
-from twin.run.artefact import Artefact
-from twin.run.report import Report, further_sections
+from twin.framework import data_files, provenance, reference_frames, run_folder
+from twin.framework.artefact import Artefact
+from twin.framework.report import Report, further_sections
 
 FIGURES = "*{stroke-linejoin: round; stroke-linecap: butt}"
 """The style sheet that Matplotlib writes into every figure."""

@@ -15,8 +15,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from optics.numerics.number_tree import FrozenMap
-from twin.run import durable, owned_files, provenance
-from twin.run.run_folder import RunFolderError, reason
+from twin.framework import durable, owned_files, provenance
+from twin.framework.run_folder import RunFolderError, reason
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, RecursionError)
 """What a line raises that this program has not written, although its checksum is right."""

@@ -76,10 +76,10 @@ def end_strictly(errors: Console, numbers: Any) -> None:
         numbers: of the result, plain data.
 
     Raises:
-        typer.Exit: a verdict is negative, see `twin.run.provenance.negative_verdicts`.
+        typer.Exit: a verdict is negative, see `twin.framework.provenance.negative_verdicts`.
     """
-    from twin.run.owned_files import first_names
-    from twin.run.provenance import negative_verdicts
+    from twin.framework.owned_files import first_names
+    from twin.framework.provenance import negative_verdicts
 
     if negative := negative_verdicts(numbers):
         print_error(errors, f"--strict: not to be relied on, false in the result: {first_names(negative)}")
@@ -151,7 +151,7 @@ def explained(errors: Console, left: Callable[[], str] = nothing_kept) -> Iterat
         from optics.numerics.array_math import PhysicalError, UnphysicalError
         from optics.numerics.backend import BackendUnavailable
         from optics.numerics.llvm import LibraryMissing
-        from twin.run.run_folder import RunFolderError
+        from twin.framework.run_folder import RunFolderError
 
         # a number that cannot be is a fault of the program; light that a state loses is one of what was asked for
         asked = isinstance(error, RunFolderError | PhysicalError) and not isinstance(error, UnphysicalError)

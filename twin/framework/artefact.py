@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from markupsafe import Markup
 
 from optics.numerics.number_tree import FrozenMap
-from twin.run.data_files import csv_table
+from twin.framework.data_files import csv_table
 
 MINUS = "\N{MINUS SIGN}"
 SAME = 1e-6
@@ -215,7 +215,7 @@ class Artefact:
 
 @dataclass(frozen=True, eq=False)
 class SvgFigure(Artefact):
-    """A drawing; ``svg`` is one <svg> element, as ``twin.run.svg.to_svg`` makes it."""
+    """A drawing; ``svg`` is one <svg> element, as ``twin.framework.svg.to_svg`` makes it."""
 
     kind: ClassVar[str] = "svg"
     svg: str

@@ -19,12 +19,12 @@ from rich.progress import Progress, TaskID
 from scenes.specs.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.run import cli, durable
-from twin.run.procedure import Advance, Session, performed
+from twin.framework import cli, durable
+from twin.framework.procedure import Advance, Session, performed
 
 if TYPE_CHECKING:
-    from twin.run.report import Report
-    from twin.run.run_folder import KeptWork, RunFolder
+    from twin.framework.report import Report
+    from twin.framework.run_folder import KeptWork, RunFolder
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +52,10 @@ def finished(session: Session, kind: str, report: Report, numbers: Mapping[str, 
         kind: of the numbers, which stand in KIND.json.
         report: of the run, with the exit code that it asks for.
         numbers: of the run; the report's verdict is added to them.
-        facts: how it was run, as `twin.run.page.RunFacts` takes them, beside what the session knows.
+        facts: how it was run, as `twin.framework.page.RunFacts` takes them, beside what the session knows.
     """
-    from twin.run import reference_frames
-    from twin.run.page import RunFacts, write_test
+    from twin.framework import reference_frames
+    from twin.framework.page import RunFacts, write_test
 
     told = report.told(numbers)
     known = {"started": session.started, "seconds": session.seconds, "backend": session.backend.name}
@@ -93,7 +93,7 @@ def run_command(
         given = resolve()
         # a bad file is told before these are imported
         from optics.numerics.backend import load_backend
-        from twin.run import provenance, run_folder
+        from twin.framework import provenance, run_folder
 
         folder = run_folder.RunFolder(run_folder.chosen(options.out, stem), options.force)
         started, clock = time.time(), time.monotonic()
@@ -234,8 +234,8 @@ def run_test(
         return setup if changed is None else changed(setup)
 
     def work(setup: Any, session: Session) -> Result:
-        from twin.run.report import numbers_only, with_warnings
-        from twin.run.run_folder import write_manifest
+        from twin.framework.report import numbers_only, with_warnings
+        from twin.framework.run_folder import write_manifest
 
         # a folder that cannot be made is told before the run
         folder = None if options.export is None else _export_folder(setup, options.export, options.force)
@@ -274,7 +274,7 @@ def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
     if "measured" in type(setup.test).model_fields:
         text = "measurements are files already; --export writes those of a simulated bench"
         raise setup.test.error(text, ("measured",), allowed="the file of a simulated test")
-    from twin.run.run_folder import RunFolder, RunFolderError
+    from twin.framework.run_folder import RunFolder, RunFolderError
 
     try:
         return RunFolder(target, force)
@@ -284,7 +284,7 @@ def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
 
 def print_report(report: Report, console: Console) -> None:
     """The verdict, the main table of a report, and what else was found."""
-    from twin.run.artefact import cell_text
+    from twin.framework.artefact import cell_text
 
     cli.print_verdict(console, report.verdict)
     summary = report.summary
