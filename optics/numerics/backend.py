@@ -21,12 +21,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
 from optics.numerics.llvm import ensure_llvm
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 KEPT = 32 << 20
 """Bytes up to which an array comes from the process's own memory; the most that the GNU C library takes."""
@@ -157,6 +159,9 @@ def load_backend(name: str = "llvm") -> Backend:
 
 @cache
 def _controller() -> ThreadpoolController:
+    # a bad file is told before anything computes
+    from threadpoolctl import ThreadpoolController
+
     return ThreadpoolController()
 
 

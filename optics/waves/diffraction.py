@@ -30,9 +30,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
-import cv2
 import numpy as np
-from scipy.special import j1
 
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import cores, one_blas_thread
@@ -376,12 +374,7 @@ def airy(radius: np.ndarray, wavelength: float, f_number: float) -> np.ndarray:
         wavelength: metres.
         f_number: of the beam.
     """
-    # messages about files of designs wait for this module, and scipy takes a tenth of a second
-    from scipy.special import j1
-
-    z = np.pi * np.asarray(radius) / (wavelength * f_number)
-    safe = np.where(z == 0.0, 1.0, z)
-    return np.where(z == 0.0, 1.0, (2.0 * j1(safe) / safe) ** 2)
+    return _jinc(np.pi * np.asarray(radius) / (wavelength * f_number)) ** 2
 
 
 FIT_ERROR = 1e-6
@@ -462,6 +455,9 @@ class PixelResponse:
 
     def apply(self, images: np.ndarray) -> np.ndarray:
         """Filter images (B, R, C); returns (B, R - 2 reach, C - 2 reach)."""
+        # messages about files of designs wait for this module
+        import cv2
+
         r = self.reach
         out = np.empty((len(images), images.shape[1] - 2 * r, images.shape[2] - 2 * r))
 
@@ -490,5 +486,8 @@ def _symmetric_kernel(fx: np.ndarray, fy: np.ndarray, wanted: np.ndarray, reach:
 
 
 def _jinc(z: np.ndarray) -> np.ndarray:
+    # messages about files of designs wait for this module, and scipy takes a tenth of a second
+    from scipy.special import j1
+
     safe = np.where(z == 0.0, 1.0, z)
     return np.where(z == 0.0, 1.0, 2.0 * j1(safe) / safe)

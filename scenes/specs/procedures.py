@@ -36,7 +36,7 @@ class Procedure:
         judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
         seeded: whether anything is drawn at random; config.yaml then states the seed.
         about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
-        frames: quantity of KIND.json -> what it refers to, where `twin.framework.reference_frames.FRAMES` does not say it.
+        frames: quantity of KIND.json -> what it refers to, where `twin.framework.reference_frames` does not say it.
     """
 
     kind: str
@@ -156,7 +156,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.orbit.setup:AdjustSetup",
         measured="scenes.specs.orbit.setup:MeasuredAdjustSetup",
         run="twin.operate.operated_block:run_operated_block",
-        numbers="twin.orbit.block.block_report:BLOCK",
+        numbers="twin.orbit.block.block_numbers:BLOCK",
         report="twin.orbit.block.block_report:block_report",
         varied=True,
         about="""
@@ -202,7 +202,7 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.orbit.calibration.calibration_run:run_calibration",
         numbers="twin.orbit.calibration.calibration_numbers:CALIBRATION",
         report="twin.orbit.calibration.calibration_report:calibration_report",
-        export="twin.orbit.calibration.calibration_run:exported",
+        export="twin.orbit.calibration.calibration_export:exported",
         varied=True,
         about="""
     Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
@@ -221,7 +221,7 @@ PROCEDURES: dict[str, Procedure] = {
         "check",
         setup="scenes.specs.orbit.setup:CheckSetup",
         run="twin.orbit.conventions.check_run:run_check",
-        numbers="twin.orbit.conventions.check_report:CHECK",
+        numbers="twin.orbit.conventions.check_numbers:CHECK",
         report="twin.orbit.conventions.check_report:check_report",
         export="twin.orbit.conventions.check_run:exported",
         judged=False,
@@ -304,9 +304,9 @@ PROCEDURES: dict[str, Procedure] = {
         "simulate",
         setup="scenes.specs.orbit.setup:SimulateSetup",
         run="twin.orbit.images.simulate_run:run_simulation",
-        numbers="twin.orbit.images.simulate_run:SIMULATE",
+        numbers="twin.orbit.images.simulate_numbers:SIMULATE",
         report="twin.orbit.images.simulate_report:simulation_report",
-        export="twin.orbit.images.simulate_run:simulation_exported",
+        export="twin.orbit.calibration.calibration_export:simulation_exported",
         about="""
     Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ def _content(told: Any) -> bytes:
     if "config" in told:
         module, _, name = told["config"].partition(":")
         place = (SCENES if "/" in told["of"] else JOBS) / told["of"]
-        return bytes(getattr(importlib.import_module(module), name)(place).to_yaml().encode())
+        return bytes(attrgetter(name)(importlib.import_module(module))(place).to_yaml().encode())
     return file_of(told["of"], *told.get("edits", {}).items()) + told.get("more", "").encode()
 
 

@@ -62,13 +62,13 @@ def verdicts(identifiers):
     return {name: found[name] for name in identifiers}
 
 
-def solved(change, method="corrected"):
+def solved(change, form="corrected"):
     """(3), (5): slopes otherwise found; change: (matrix, right side) -> slopes."""
 
     def broken(right):
         def wrong(measured, which, lines=LINES):
             fits = right(measured, which, lines)
-            return [_with_slopes(fit, change) if which == method else fit for fit in fits]
+            return [_with_slopes(fit, change) if which == form else fit for fit in fits]
 
         return wrong
 

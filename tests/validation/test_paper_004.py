@@ -103,7 +103,7 @@ def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, 
             }
             return setup.model_copy(update={"test": setup.test.model_copy(update=update)})
 
-        monkeypatch.setattr(turntable_checks, "TurntableSetup", changed)
+        monkeypatch.setattr(turntable_checks.TurntableSetup, "read", changed)
         (found,) = run_checks(select([turntable_checks.GROUP], identifier), load_backend("llvm"), 1, fast=True).results
         return found.verdict
 

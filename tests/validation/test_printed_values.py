@@ -12,7 +12,8 @@ from scenes.yaml.yaml_file import parse_yaml
 from tests.twin.study_bench import REFUSED
 from twin.validation.check import Supposed, sentence
 from twin.validation.group import Printed, load_printed
-from twin.validation.registry import FILE, GROUPS
+from twin.validation.registry import GROUPS
+from twin.validation.row_names import FILE
 
 FOLDERS = sorted((Path(__file__).parents[2] / "twin/validation").glob("paper_*"))
 

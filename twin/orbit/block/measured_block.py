@@ -21,8 +21,6 @@ from scenes.specs.orbit.adjust import CameraChangeSpec, LawSpec
 from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec
 from scenes.specs.orbit.setup import MeasuredAdjustSetup
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.orbit.block.measured_block import MonitorSource, camera_sigmas, change_covariance, monitored_camera
-from twin.orbit.block.pass_knowledge import law_of
 from twin.orbit.calibration.campaign import light_effects, line_model, pass_data
 from twin.orbit.flight.earth import Earth, tai_of
 from twin.orbit.flight.light_effects import NO_EFFECTS

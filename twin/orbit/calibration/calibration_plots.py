@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
+from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS, misclosure
 from twin.framework import svg
 from twin.orbit.calibration.calibration_run import CalibrationRun

@@ -14,6 +14,7 @@ import numpy as np
 from analysis.arrays import ARCSEC
 from analysis.calibration.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET, RATE
+from analysis.orbit.three_line_model import BIAS
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.framework.artefact import Cell, OwnDecimals, PngFigure, SvgFigure, Table
 from twin.framework.report import Section

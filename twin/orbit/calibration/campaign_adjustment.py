@@ -21,8 +21,8 @@ from typing import Literal
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2
 
+from analysis import statistics
 from analysis.block.reweighting import Robust
 from analysis.calibration.adjustment import FALSE_ALARM, Adjustment, adjust
 from analysis.orbit.calibration_parameters import OFFSET, RATE, Gauge, Prior, Unknowns, index
@@ -209,7 +209,7 @@ class LatitudeFit:
     @property
     def p_value(self) -> float:
         """Chance of such a chi-square if latitude is all that matters."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+        return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     def curve(self, latitude: np.ndarray) -> np.ndarray:
         """Fitted bias, radians."""

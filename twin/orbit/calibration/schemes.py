@@ -31,7 +31,7 @@ from analysis.calibration.adjustment import Adjustment, adjust
 from analysis.calibration.strip_adjustment import Datum, StripAdjustment, adjust_strip
 from analysis.orbit.calibration_parameters import CalibrationField, Prior, Unknowns, monitor_priors
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
-from analysis.orbit.three_line_model import BIAS, LineModel
+from analysis.orbit.three_line_model import BIAS, LineModel, Rays
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.procedure import Advance

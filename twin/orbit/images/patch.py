@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import chi2
 
+from analysis import statistics
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.memory import Lowered, require_memory
@@ -338,7 +338,7 @@ class LineJudgement:
     @property
     def p_value(self) -> float:
         """Chance of a chi-square as large or larger."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+        return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
 
 def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:

@@ -43,7 +43,7 @@ from twin.orbit.images.simulate_run import (
 )
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.calibration import InteriorChangeSpec
+    from scenes.specs.orbit.scene import InteriorChangeSpec
     from scenes.specs.orbit.setup import SimulateSetup
 
 

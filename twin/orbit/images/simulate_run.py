@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from analysis.arrays import Array
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.numerics.array_math import in_span

@@ -1,0 +1,1 @@
+"""The Jacobian of a study's responses by its factors."""
