@@ -156,7 +156,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.orbit.setup:AdjustSetup",
         measured="scenes.specs.orbit.setup:MeasuredAdjustSetup",
         run="twin.operate.operated_block:run_operated_block",
-        numbers="twin.orbit.block.block_numbers:BLOCK",
+        numbers="twin.orbit.block.block_report:BLOCK",
         report="twin.orbit.block.block_report:block_report",
         varied=True,
         about="""
@@ -202,7 +202,7 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.orbit.calibration.calibration_run:run_calibration",
         numbers="twin.orbit.calibration.calibration_numbers:CALIBRATION",
         report="twin.orbit.calibration.calibration_report:calibration_report",
-        export="twin.orbit.calibration.calibration_export:exported",
+        export="twin.orbit.calibration.calibration_run:exported",
         varied=True,
         about="""
     Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
@@ -221,7 +221,7 @@ PROCEDURES: dict[str, Procedure] = {
         "check",
         setup="scenes.specs.orbit.setup:CheckSetup",
         run="twin.orbit.conventions.check_run:run_check",
-        numbers="twin.orbit.conventions.check_numbers:CHECK",
+        numbers="twin.orbit.conventions.check_report:CHECK",
         report="twin.orbit.conventions.check_report:check_report",
         export="twin.orbit.conventions.check_run:exported",
         judged=False,
@@ -304,9 +304,9 @@ PROCEDURES: dict[str, Procedure] = {
         "simulate",
         setup="scenes.specs.orbit.setup:SimulateSetup",
         run="twin.orbit.images.simulate_run:run_simulation",
-        numbers="twin.orbit.images.simulate_numbers:SIMULATE",
+        numbers="twin.orbit.images.simulate_run:SIMULATE",
         report="twin.orbit.images.simulate_report:simulation_report",
-        export="twin.orbit.calibration.calibration_export:simulation_exported",
+        export="twin.orbit.images.simulate_run:simulation_exported",
         about="""
     Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
