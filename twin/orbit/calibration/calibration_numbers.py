@@ -175,12 +175,13 @@ def _rms(parts: Sequence[LineJudgement]) -> Array:
 MATCHING: Record[Sequence[LineJudgement]] = Record(
     "Points of one sort in the images of one line, over the patches of a field.",
     *_sums(MATCH_COUNTS),
-    Quantity("rms_lines_px", lambda parts: _rms(parts)[0], "RMS error along the track of places that are not wrong"),
-    Quantity("rms_pixels_px", lambda parts: _rms(parts)[1], "RMS error along the line of places that are not wrong"),
+    Quantity("rms_lines_px", lambda parts: _rms(parts)[0], "RMS error along track of right places", "RMS track"),
+    Quantity("rms_pixels_px", lambda parts: _rms(parts)[1], "RMS error along line of right places", "RMS line"),
     Quantity(
         "chi_square_ratio",
         lambda parts: sum(j.chi_square for j in parts) / max(_degrees(parts).sum(), 1.0),
         "chi-square of the errors of these places over its degrees of freedom",
+        "χ²/dof",
     ),
 )
 
