@@ -59,7 +59,7 @@ def require_kernels() -> None:
 def test_neither_kernel_nor_threads_change_frames_and_readings(tmp_path) -> None:
     """The main job: more threads change no byte of any file, another kernel none of frames and readings.
 
-    By chance, see docs/architecture.md, this fails once in some thousand changes of the last digits.
+    By chance, see docs/promises.md, this fails once in some thousand changes of the last digits.
     """
     write_study(tmp_path)
     job = tmp_path / "job.yaml"
