@@ -109,6 +109,7 @@ def test_the_console_command_knows_every_program(tmp_path):
     assert started(tmp_path, script, "--version").stdout.endswith(f" from {ROOT}\n")
 
 
+@pytest.mark.second
 def test_the_console_command_lists_without_importing_what_it_lists(tmp_path):
     done = started(tmp_path, "-X", "importtime", console(tmp_path), "--help")
     found = set(re.findall(r"\| +([\w.]+)$", done.stderr, re.M))
@@ -116,6 +117,7 @@ def test_the_console_command_lists_without_importing_what_it_lists(tmp_path):
     assert not {"numpy", "pydantic", "rich", "optics", "scenes", *(module for module, _ in PROGRAMS.values())} & found
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("typed", "offered"), quick(1, [("or", {"orbit"}), ("lab f", {"focus"}), ("mtf --pitc", {"--pitch"})])
 )

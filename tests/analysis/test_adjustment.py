@@ -176,6 +176,7 @@ def test_variance_components_find_wrong_sigmas():
         assert found.sigma[name] == pytest.approx(right.sigma[name], rel=0.15)
 
 
+@pytest.mark.second
 def test_variance_factors_are_bounded():
     """Exact data: no noise at all is found, and the factors end where they must."""
     found = adjust([measured(VIEW)], LABORATORY, NOISE, gauge=HOLD_XY, variance_components=True)
@@ -183,6 +184,7 @@ def test_variance_factors_are_bounded():
     assert found.values == pytest.approx(truth(found.names), rel=1e-6)
 
 
+@pytest.mark.second
 def test_priors_pull_as_their_weight_says():
     """A monitor that knows the difference of two principal points to a nanometre fixes it, and its sigma."""
     prior = Prior({"forward y": 1.0, "nadir y": -1.0}, -23e-6, 1e-9, "monitor")

@@ -40,6 +40,7 @@ def good(fit, clean):
     return fit(clean)
 
 
+@pytest.mark.second
 def test_calibrated_spots_fit_and_keep_their_sigma(good) -> None:
     states = fit_states(good)
     assert states.fits.all()

@@ -146,6 +146,7 @@ def test_second_peaks_count_from_four_pixels_on():
     assert _second(corner, 0, 1) == 0.0
 
 
+@pytest.mark.second
 def test_thresholds_are_options(texture, frame, points):
     patches = texture.patches(points[:30])
     strict = match(frame, patches, points[:30], reach=5, options=MatchOptions(largest_sigma=0.005))

@@ -63,6 +63,7 @@ def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) 
     assert compared > 3 * len(EVERY)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", quick(1, ["gf7", "gf7_conic"]))
 def test_errors_and_envelope_are_those_of_the_camera(backend, camera, name: str) -> None:
     """Against wavefronts of the camera as told to users, and heights of all that its clear apertures hold."""
@@ -143,6 +144,7 @@ def test_starts(backend, gf7, beams) -> None:
     assert search(backend, nominal, CONICS, beams, Operands(650e-9), starts=1).local
 
 
+@pytest.mark.second
 def test_constraints_that_cannot_be_held(backend, gf7, beams) -> None:
     """An envelope of half the length with nothing to vary but the image plane."""
     nominal = prescription_of(gf7.spec)

@@ -56,6 +56,7 @@ def test_kinds_of_aberration() -> None:
     assert {term: kind_of(term) for term in kinds} == kinds
 
 
+@pytest.mark.second
 def test_refocusing_finds_a_focal_plane_that_was_moved(backend) -> None:
     """Of a sharp camera 1 mm out of focus, and 5 mrad out of level: back to where its own best focus is."""
     camera = load_camera("gf7")

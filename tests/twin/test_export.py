@@ -150,6 +150,7 @@ def test_gdal_finds_what_the_rigorous_sensor_finds(flight, name: str) -> None:
     assert max(rpc.error_px) < 1e-4
 
 
+@pytest.mark.second
 def test_polynomials_say_how_far_jitter_is_from_them(flight) -> None:
     sensor = _sensor(flight, "nadir", LightEffects(), measured=True)
     rpc = RationalPolynomial.fit(sensor, 0, sensor.camera.pixels, (0.0, 2000.0))

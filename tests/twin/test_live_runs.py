@@ -232,6 +232,7 @@ def test_a_measurement_without_an_instrument(tmp_path):
     assert "geometry of the cameras alone" in said
 
 
+@pytest.mark.second
 def test_a_run_of_uncertainty_opens_its_job(tmp_path):
     resolved = resolve(written(tmp_path, JOB))
     folder = run_folder(tmp_path / "run", "twin.uncertainty", resolved.to_yaml(), "uncertainty")
@@ -372,6 +373,7 @@ def test_folders_that_are_none_of_a_run(tmp_path):
         assert (code, words in said) == (2, True), said
 
 
+@pytest.mark.second
 def test_a_manifest_of_somebody_else_changes_nothing(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()

@@ -240,6 +240,7 @@ def clean(following: Following) -> Following:
     return replace(following, breaks=(), jumps=(), sensors=(), innovations=())
 
 
+@pytest.mark.second
 def test_what_contradicts_the_plan_is_in_the_numbers(following: Following) -> None:
     calm = replace(clean(following), widened=1.0, too_many_jumps=False, bad_readings=((1, "x"), (2, "y")))
     good = calm.to_dict()

@@ -143,6 +143,7 @@ def test_the_newest_plan_counts_and_reads_back(record: Path, tmp_path: Path) -> 
             assert connection.exec_driver_sql("SELECT count(*) FROM plan").scalar() == 2
 
 
+@pytest.mark.second
 def test_an_estimate_rests_on_a_part_of_the_plan(tmp_path: Path) -> None:
     text = "instrument: gf7_pair\ndisturbances: in_service\n"
 

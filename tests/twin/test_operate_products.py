@@ -499,6 +499,7 @@ def test_products_are_the_same_whenever_and_by_whichever_plan_they_are_asked_for
     }
 
 
+@pytest.mark.second
 def test_the_files_of_a_record_are_its_estimate(followed: Followed, tmp_path: Path) -> None:
     """Motions of the job make the changes of the estimate, and the prior their covariance."""
     later = utc_text(followed.time + 3600 * MICRO)

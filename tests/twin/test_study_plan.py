@@ -56,6 +56,7 @@ def test_drawn_designs_follow_their_distributions(tmp_path, kind) -> None:
     assert not np.any(column(other, "m2z") == z)
 
 
+@pytest.mark.second
 def test_a_grid_is_every_combination(tmp_path) -> None:
     plan = plan_of(
         tmp_path,
