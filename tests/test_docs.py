@@ -128,6 +128,7 @@ def models_of(text: str) -> list[type[Any]]:
     return found
 
 
+@pytest.mark.second
 def test_yaml_is_a_file_that_can_be_read(instrument, backend) -> None:
     for block in blocks("yaml"):
         models = models_of(block.text)

@@ -51,6 +51,7 @@ def hits(place: Path) -> str:
     return (place / "hit").read_text("utf-8") if (place / "hit").exists() else ""
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("module", quick(1, ["twin.render", "scenes.lens", "analysis.mtf"]))
 def test_a_module_runs_nothing_of_the_folder_where_it_is_started(tmp_path, module):
     """One of the program's own name cannot be helped: Python looks for that there before this program is found."""

@@ -116,6 +116,7 @@ def test_stepwise_ends_where_the_simultaneous_one_does_and_as_slowly_as_predicte
     assert steps.rounds > 100
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("robust", quick(1, ["huber", "igg"]))
 def test_wrong_matches_lose_their_weight(robust):
     """3 per cent of the image points are off by 10 to 60 px."""

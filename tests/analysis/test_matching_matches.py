@@ -76,6 +76,7 @@ def test_repeated_pattern_is_ambiguous_and_an_edge_is_uncertain():
     assert not found.accepted[0]
 
 
+@pytest.mark.second
 def test_search_is_good_to_tenths(texture, frame, points):
     places = points[:100] + 0.3
     peaks = search(frame, texture.patches(places), places + np.array([30.0, -30.0]), 40)

@@ -81,6 +81,7 @@ def test_a_moved_target_is_a_moved_detector(bench, gf7) -> None:
     assert np.all(moved > 0.0)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("place", [MIDDLE, EDGE])
 @pytest.mark.parametrize("term", quick(3, [2, 5, 8, 6, 7, 11]))
 def test_the_wavefront_appears_in_the_pupil(bench, term: int, place: np.ndarray) -> None:

@@ -38,6 +38,7 @@ def beams(gf7):
     return beams_of(gf7.spec)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("measure", quick(1, ["wavefront", "spot"]))
 def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) -> None:
     operands = Operands(650e-9, principal_distance=5.5, measure=measure, distortion=1.0)
@@ -90,6 +91,7 @@ def test_axes_of_a_beam() -> None:
     np.testing.assert_allclose(np.linalg.det(frames), 1.0, rtol=1e-14)
 
 
+@pytest.mark.second
 def test_a_detuned_camera_comes_back(backend, gf7, beams) -> None:
     """From its own conics and from conics that are wrong by a percent gf7 gets to one optimum, no worse than itself."""
     nominal = prescription_of(gf7.spec)

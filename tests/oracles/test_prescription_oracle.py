@@ -115,6 +115,7 @@ LSST/Rubin_v3.14_y.yaml
 """.split()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", quick(4, BATOID))
 def test_as_batoid_traces_its_telescopes(backend, name: str) -> None:
     """Places, directions and paths of rays over the whole pupil at the detector; a wavefront is their paths."""

@@ -131,6 +131,7 @@ OVERLAPS = {
 MOVE = re.compile(r"move it by ([+-])([xyz]) ([0-9.e+]+) mm of the base")
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", OVERLAPS)
 def test_bodies_in_each_other(name, bare) -> None:
     """A message names both bodies and how deep they reach into each other, and says how far and along which axis the

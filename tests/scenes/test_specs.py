@@ -112,6 +112,7 @@ def test_lines_of_a_camera_of_ones_own(tmp_path: Path) -> None:
     assert dict(orbit_setup.AngleSetup.read(write(tmp_path, small)).angles) == {"alpha": ("backward", "nadir")}
 
 
+@pytest.mark.second
 def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
     """By name or path; a configuration without its camera is refused."""
     setup = orbit_setup.AngleSetup.read(SCENES / ORBIT / "angle_gf7.yaml")

@@ -82,6 +82,7 @@ def test_a_blurred_camera(backend, tmp_path, z: str, waves: float, left: float, 
     ) == pytest.approx(beams.errors(FocalPlane.of(moved)), rel=1e-6)
 
 
+@pytest.mark.second
 def test_a_camera_without_a_focus(backend, tmp_path) -> None:
     """M2 0.7 m too far: the light diverges after M3, and no place of the image helps."""
     (text,) = blur_warnings(with_camera(load_camera(gf7_with(tmp_path, "-2.70 m", focal_length="21.4 m"))), backend)

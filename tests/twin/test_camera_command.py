@@ -131,6 +131,7 @@ def test_what_it_refuses(tmp_path) -> None:
         assert not (tmp_path / "out").exists(), words
 
 
+@pytest.mark.second
 def test_a_camera_without_a_focus_cannot_be_refocused(tmp_path, backend) -> None:
     file = gf7_with(tmp_path, "-2.70 m", focal_length="21.4 m")
     result = invoke(app, file, "--refocus", "--out", tmp_path / "out")

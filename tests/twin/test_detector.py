@@ -267,6 +267,7 @@ def test_impossible_exposures_are_explained() -> None:
             call()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("part", "key", "value", "message"), REFUSED["detectors_in_files"])
 def test_detectors_that_cannot_work_are_told_by_file_and_line(tmp_path, part, key, value, message):
     """They were tracebacks, some of them after minutes."""

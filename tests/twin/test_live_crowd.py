@@ -109,6 +109,7 @@ def test_who_says_nothing_locks_nobody_out(capfd):
     assert (said.out, said.err) == ("", "")
 
 
+@pytest.mark.second
 def test_one_address_does_not_take_the_places_of_others():
     with serving(StandIn()) as (port, _), ExitStack() as stack:
         quiet = lines(stack, port, 5, source="127.0.0.9")
@@ -137,6 +138,7 @@ def test_what_is_never_said_whole_has_its_time(said, monkeypatch):
         assert len(server.connections) == 0
 
 
+@pytest.mark.second
 def test_the_next_request_of_a_connection_has_its_time_too(monkeypatch):
     monkeypatch.setattr(guard, "HEAD", 0.4)
     with serving(StandIn()) as (port, _), ExitStack() as stack:
@@ -147,6 +149,7 @@ def test_the_next_request_of_a_connection_has_its_time_too(monkeypatch):
         assert ended(line, 1.5)
 
 
+@pytest.mark.second
 def test_an_answer_that_is_not_taken_is_given_up(monkeypatch):
     monkeypatch.setattr(guard, "ANSWER", 0.5)
     with serving(StandIn()) as (port, server), ExitStack() as stack:

@@ -341,6 +341,7 @@ DATA = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("program", "test", "words"), REFUSED["shown_runs"])
 def test_run_folders_without_a_monitors_state(tmp_path, program, test, words):
     folder = run_folder(tmp_path / "run", program, DATA[program]() if program in DATA else None, test)

@@ -431,6 +431,7 @@ def test_a_computer_that_ends_while_nobody_asks_is_told_and_started_again():
         assert told(ws) == [RUNS]
 
 
+@pytest.mark.second
 def test_a_stopped_computer_is_told_and_started_again_if_it_stays(monkeypatch):
     monkeypatch.setattr("twin.live.clients.STOPPED", 1.0)
     computer = StandIn()
@@ -488,6 +489,7 @@ def test_an_instrument_that_cannot_be_built_is_told_by_the_command(monkeypatch):
         _serve("job.yaml", None, "127.0.0.1", 0, True, "llvm", (), None)
 
 
+@pytest.mark.second
 def test_the_server_ends_when_the_last_page_is_closed(monkeypatch):
     monkeypatch.setattr("twin.live.server.LINGER", 0.3)
     with serving(StandIn(), stay=False) as (port, server):

@@ -173,6 +173,7 @@ def rewritten(folder: Path, data: object) -> Path:
     return folder
 
 
+@pytest.mark.second
 def test_results_that_are_none_are_refused(record: Path, tmp_path: Path) -> None:
     apart, bare = "times and states that do not belong together", "a state without cameras or without a time"
     cases = [([], "no results"), ({"times_s": [0, 1], "series": [{"cameras": {}}]}, apart), ({"series": {}}, bare)]
@@ -511,6 +512,7 @@ def test_readings_of_another_instrument(record: Path, tmp_path: Path) -> None:
     assert "not of gf7_pair_two" in run("init", record, "gf7_pair_two").stderr
 
 
+@pytest.mark.second
 def test_a_reading_against_other_reference_images(record: Path, tmp_path: Path) -> None:
     """Those of the earliest reading count, in a file and after it; the same images with a pixel less are the same."""
 

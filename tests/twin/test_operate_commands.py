@@ -150,6 +150,7 @@ def test_a_forecast_begins_now_and_its_sigma_grows(record: Path, life: Path) -> 
     assert "forecast from 2026-06-25T00:00:00Z to 2026-07-25T00:00:00Z" in done.stdout
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("until", "text"), REFUSED["past_forecasts"])
 def test_a_forecast_of_what_is_past(until: str, text: str, record: Path, life: Path) -> None:
     done = run("forecast", record, life / "plan.yaml", "--until", until)

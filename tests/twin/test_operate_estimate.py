@@ -274,6 +274,7 @@ def test_a_requirement_that_is_going_to_break(known, tmp_path) -> None:
     assert found.breaks_us == int(life.times[-1])
 
 
+@pytest.mark.second
 def test_times_that_nobody_knows_anything_of(known, tmp_path) -> None:
     stated = known[2]
     estimate = followed(known, tmp_path, entries_of(known, life_of(stated, 12.0, 3.0, 1, {}), 1))
@@ -447,6 +448,7 @@ def test_a_person_decides(known, tmp_path) -> None:
     assert len(list(history.entries("decision"))) == 3
 
 
+@pytest.mark.second
 def test_a_contradicted_start_stays_in_sigma(known, tmp_path) -> None:
     """All motions are twelve times as large as stated: the first readings say so, and sigma still does at the end."""
     entries, life = readings(known, 24, 0.0, scale=12.0)

@@ -172,6 +172,7 @@ def test_lines_without_points_cannot_be_searched() -> None:
         sights_of(measured, {"blue": line_cameras(one.camera)["blue"]}, None, one.test.search, LightEffects())
 
 
+@pytest.mark.second
 def test_lines_of_which_one_looks_elsewhere_cannot_be_searched() -> None:
     """A thousand pixels across, which no height explains: half of them in each line, where 200 may be."""
     one = setup()

@@ -153,6 +153,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable:
     return partial(invoke, program(monkeypatch, run=lambda *given: LEVEL.run(*given)))
 
 
+@pytest.mark.second
 def test_progress_is_told_where_there_is_no_terminal(run: Callable, tmp_path: Path, monkeypatch) -> None:
     """Also while one part of the work takes long."""
     monkeypatch.setattr(cli, "TICK_SECONDS", 0.05)

@@ -210,6 +210,7 @@ def test_steep_terrain_is_refused() -> None:
             looked()
 
 
+@pytest.mark.second
 def test_looks_that_cannot_be_followed_are_refused() -> None:
     """A window at the image's end, looks past the Earth, an attitude that no node follows."""
     flat, inside = Terrain.flat(600.0), Window(40, 6000, 10, 10)
@@ -222,6 +223,7 @@ def test_looks_that_cannot_be_followed_are_refused() -> None:
             look_map(sensor, FRAME, flat, window)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("limit", "value", "words"),
     [

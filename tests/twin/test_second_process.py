@@ -148,6 +148,7 @@ def test_no_second_process_on_one_core_or_beside_other_threads(monkeypatch) -> N
     assert found == [os.getpid()] * 2
 
 
+@pytest.mark.second
 def test_nothing_is_left_behind() -> None:
     before = open_files()
     for stop in (False, True):

@@ -86,6 +86,7 @@ def test_paths_whose_first_surface_is_searched_are_those_of_a_search(backend, gf
     same(*runs)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("metal", "steps"),
     [

@@ -109,6 +109,7 @@ def test_a_table_of_other_than_text_is_told_with_its_line(tmp_path) -> None:
 M2 = "base/forward/M2"
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("key", TEXTS["neutral"])
 @pytest.mark.parametrize("order", quick(1, [-1, 1]))
 def test_a_place_without_a_value_starts_where_nothing_happens(tmp_path, key, order) -> None:
