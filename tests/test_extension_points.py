@@ -246,6 +246,7 @@ def as_npy(frames: np.ndarray, facts: FrameFacts) -> bytes:
     return out.getvalue()
 
 
+@pytest.mark.second
 @extends(ESTIMATORS)
 def test_an_estimator(experiment: Callable[[str], MonitorExperiment], monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of what ``derived`` reads, with half of its noise, for every camera and for the angle between them."""
@@ -326,6 +327,7 @@ def bar_size(image: np.ndarray) -> tuple[float, float]:
     return float(columns.sum() / columns.max()), float(rows.sum() / inside)
 
 
+@pytest.mark.second
 @extends(TARGETS)
 def test_a_target(monkeypatch: pytest.MonkeyPatch) -> None:
     """A job may name it, and a camera's image of it is as wide and long as it is."""

@@ -80,6 +80,7 @@ def test_a_value_in_one_line_of_yaml_reads_back() -> None:
         assert parse_yaml(f"x: {flow(value)}\n").data == {"x": value}
 
 
+@pytest.mark.second
 def test_every_sort_of_file_says_what_reads_it_and_ships_an_example(pages: dict[str, str]) -> None:
     assert set(READ_BY) == set(MODELS)
     assert all(shipped().values())

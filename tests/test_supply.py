@@ -39,6 +39,7 @@ def installed(layers: tuple[str, ...], python: str) -> dict[str, str]:
     return out
 
 
+@pytest.mark.second
 def test_every_requirement_is_locked_at_the_version_where_its_range_begins() -> None:
     for layer, python in itertools.product(EXTRAS, PYTHONS):
         have = installed(LAYERS[: LAYERS.index(layer) + 1], python)
@@ -155,6 +156,7 @@ def test_setup_names_the_packages_that_an_administrator_installs(tmp_path: Path)
     assert "apt-get install python3-venv" in done.stderr
 
 
+@pytest.mark.second
 def test_every_locked_package_has_its_licence() -> None:
     rows = read_table()
     assert len(rows) == len({(row.package, row.version) for row in rows})
@@ -174,6 +176,7 @@ def test_every_locked_package_has_its_licence() -> None:
         assert spdx().parse(named, validate=True, strict=True) is not None
 
 
+@pytest.mark.second
 def test_the_bill_of_materials_lists_every_locked_package() -> None:
     layers = ("install", "live")
     pytest.importorskip("cyclonedx")

@@ -32,6 +32,7 @@ def judged(pair: Pair, options: MatchOptions | None = None):
     return used, error, 0.5 * square, found
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("changes", quick(1, SMALL), ids=str)
 def test_errors_keep_in_their_covariances(changes) -> None:
     """64 points: three standard deviations of the mean half of chi-square of those accepted, 1 of a point, beyond what

@@ -27,6 +27,7 @@ def differences(function, at, step):
     return np.array([(function(at + move) - function(at - move)) / (2.0 * move.max()) for move in moves])
 
 
+@pytest.mark.second
 def test_the_curvature_is_that_of_the_square_sum():
     """At a least squares solution in noise, against second differences of half the square sum."""
     rng = np.random.default_rng(1)
@@ -64,6 +65,7 @@ def test_the_curvature_is_that_of_the_square_sum():
     assert not found.covariance(np.ones(1, bool)).any()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("smoothing", "factors"), [(0.0, [1.0]), (0.7, [1.0, -0.3, -0.2]), (1.1, [0.8, 0.5, -0.9])])
 def test_energy_of_white_noise(smoothing, factors):
     """Against noise that is smoothed and interpolated: 400 templates of 19^2 places, all phases; five sigmas."""

@@ -50,6 +50,7 @@ def test_lamberts_total_is_its_albedo(angle) -> None:
     assert lambert(0.3).total(np.radians(angle)) == pytest.approx(0.3, rel=2e-3)
 
 
+@pytest.mark.second
 def test_the_total_is_the_integral_of_the_interpolated_table() -> None:
     rng = np.random.default_rng(1)
     table = ScatterTable(

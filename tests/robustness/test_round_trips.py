@@ -34,6 +34,7 @@ def test_yaml(data) -> None:
     assert repr(found) == repr(data)  # tells 1 from 1.0 and true, and -0.0 from 0.0
 
 
+@pytest.mark.second
 @settings(max_examples=100)
 @given(st.sampled_from((ANGLE, LENGTH, SCALE, PER_LENGTH3)), st.floats(allow_nan=False, allow_infinity=False))
 def test_quantities(kind, value) -> None:
@@ -78,6 +79,7 @@ CAMERAS = line_cameras(load_three_line_camera("th1"))
 SHARE = st.floats(0.0, 1.0)
 
 
+@pytest.mark.second
 @given(
     name=st.sampled_from(sorted(CAMERAS)),
     effects=st.tuples(st.booleans(), st.booleans(), st.booleans()),

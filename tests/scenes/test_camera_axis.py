@@ -64,6 +64,7 @@ def own_radius(model: CameraModel, pupil: float) -> float:
     return float(np.hypot(*ray.stop[0]))
 
 
+@pytest.mark.second
 def test_the_stop_is_as_large_as_the_marginal_ray_makes_it(backend) -> None:
     """Behind power that is not where a paraxial ray goes: the beam before the first surface has the stated width."""
     model = camera(backend, PETZVAL, "STOP", 0.055, "26 mm", 0.0797)
@@ -102,6 +103,7 @@ AFOCAL = {
 }  # fmt: skip
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("name", AFOCAL)
 def test_afocal_systems_are_no_cameras(backend, name: str, stated: bool) -> None:
@@ -114,6 +116,7 @@ def test_afocal_systems_are_no_cameras(backend, name: str, stated: bool) -> None
     assert told == pytest.approx(magnification, rel=1e-4)
 
 
+@pytest.mark.second
 def test_the_data_are_those_of_one_state(backend) -> None:
     """Two mirrors by hand, M2 a millimetre nearer to M1 and the image plane 5 mm farther out."""
     f1, f2, apart, place = 1.5, -0.5, 1.1, 0.63

@@ -187,6 +187,7 @@ def stated_of_job(folder, instrument: str, disturbances: str, backend) -> Stated
     return stated_motions(resolved, build_instrument(resolved.instrument, resolved.cameras, backend))
 
 
+@pytest.mark.second
 def test_what_another_instrument_does_not_have_is_told_once_for_each_pattern(backend, tmp_path) -> None:
     """Cameras of other names: the file is of another instrument, while those of the library are of any camera."""
     instrument = (load.LIBRARY / load.INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8").replace("backward", "nadir")
@@ -285,6 +286,7 @@ def covariance_of(sigma: np.ndarray, rng: np.random.Generator, rank: int) -> np.
     return size[:, None] * covariance * size
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("count", "rank"), [(6, 6), (6, 2), (60, 60), (60, 5)])
 def test_a_covariance_is_written_and_read_back(pair, tmp_path, count, rank) -> None:
     """In one file, and with many components in two; also one that leaves combinations without any spread."""
@@ -342,6 +344,7 @@ def table_of(folder, rows) -> DisturbancesSpec:
     return load.load_disturbances(folder / "own.yaml")
 
 
+@pytest.mark.second
 def test_a_table_may_have_its_columns_in_any_order(pair, tmp_path) -> None:
     found = motions_of_spec(table_of(tmp_path, ["# a remark", *TABLE]), pair)
     np.testing.assert_array_equal(found.correlation, [[1.0, 0.8, 0.0], [0.8, 1.0, -0.3], [0.0, -0.3, 1.0]])

@@ -22,6 +22,7 @@ FOLDERS = dict(line.split() for line in Path(__file__).with_name("file_kinds.txt
 FILES = sorted(path.relative_to(SCENES).as_posix() for path in SCENES.rglob("*.yaml"))
 
 
+@pytest.mark.second
 def test_every_shipped_file_is_recognised() -> None:
     assert {kind.name for kind in FILE_KINDS} == set(FOLDERS.values())
     for file in FILES:

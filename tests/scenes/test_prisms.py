@@ -72,6 +72,7 @@ def turned(vector, pivot: str = "apex") -> dict[str, Motion]:
     return {"glass": Motion(rotate=tuple(ARCSEC * np.array(vector)), pivot=pivot)}
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("hand", [1.0, -1.0])
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), *TURNS])
 @pytest.mark.parametrize("slant", [(0.0, 0.0), (0.004, -0.007)])
@@ -119,6 +120,7 @@ def frames(parts) -> dict[str, np.ndarray]:
     return {body.path.rpartition("/")[2]: body.pose.rotation for body in parts.bodies}
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("prism", "face"), [(prism, face) for prism, faces in FACES.items() for face in faces])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_angle_errors(backend, prism, face, axis) -> None:
@@ -267,6 +269,7 @@ def by_hand(parts, state, position, direction):
     return np.array(places), way, length
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", ["hollow_transfer", "periscope"])
 @pytest.mark.parametrize("turn", ATTITUDES)
 @pytest.mark.parametrize("slant", [(0.0, 0.0), (0.004, -0.007)])
@@ -307,6 +310,7 @@ def test_angle_errors_are_tilts_of_the_mirrors(kind) -> None:
         made(kind, errors={"window": (0.0, 0.0)})
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", ["hollow_transfer", "periscope"])
 @pytest.mark.parametrize("width", [0.02, 0.06, 0.15])
 @pytest.mark.parametrize("factor", [1.0, 1.3, 10.0])

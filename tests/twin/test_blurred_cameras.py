@@ -82,12 +82,14 @@ def test_a_blurred_camera(backend, tmp_path, z: str, waves: float, left: float, 
     ) == pytest.approx(beams.errors(FocalPlane.of(moved)), rel=1e-6)
 
 
+@pytest.mark.second
 def test_a_camera_without_a_focus(backend, tmp_path) -> None:
     """M2 0.7 m too far: the light diverges after M3, and no place of the image helps."""
     (text,) = blur_warnings(with_camera(load_camera(gf7_with(tmp_path, "-2.70 m", focal_length="21.4 m"))), backend)
     assert re.search(r"blurred as designed: 513 waves rms .* refocusing cannot help: its light has no focus", text)
 
 
+@pytest.mark.second
 def test_just_beyond_the_limit(backend, tmp_path) -> None:
     limits = [sharpness(load_camera(gf7_with(tmp_path, z)), backend).worst for z in ("-2.0158 m", "-2.01578 m")]
     assert limits[0] < BLURRED < limits[1]
@@ -97,6 +99,7 @@ def test_just_beyond_the_limit(backend, tmp_path) -> None:
     assert [len(text) for text in texts] == [0, 1]
 
 
+@pytest.mark.second
 def test_every_test_that_has_a_camera_warns(backend, tmp_path) -> None:
     """All but the design, whose start is there to be improved, and tests without a camera's prescription."""
     blurred = load_camera(gf7_with(tmp_path, "-2.02 m"))

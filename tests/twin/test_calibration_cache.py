@@ -84,6 +84,7 @@ def entry() -> CacheEntry:
     return CacheEntry.of(load_backend(), (), "some input")
 
 
+@pytest.mark.second
 def test_a_calibration_read_back_is_the_computed_one_bit_for_bit(folder: Path) -> None:
     os.environ[VARIABLE] = OFF
     computed = numbers(MonitorExperiment(job(), load_backend()))
@@ -144,6 +145,7 @@ def changed(value: Any) -> Iterator[Any]:
         yield 0.0
 
 
+@pytest.mark.second
 def test_every_value_of_every_input_is_part_of_the_key() -> None:
     resolved = job()
     given = resolved.instrument, dict(resolved.cameras), resolved.detector, resolved.disturbances
@@ -174,6 +176,7 @@ def test_an_experiment_names_each_of_its_inputs() -> None:
     assert len({*stated, one._entry.key}) == 3
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("owner", "name", "value"),
     [

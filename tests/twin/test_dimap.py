@@ -54,6 +54,7 @@ def places(scene: Scene, count: int = 30) -> tuple[np.ndarray, np.ndarray, np.nd
     return row, column, random.uniform(-100.0, 4000.0, count)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", SCENES)
 def test_the_rigorous_model_is_that_of_the_format(tmp_path: Path, name: str) -> None:
     scene = SCENES[name]

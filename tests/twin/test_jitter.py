@@ -100,6 +100,7 @@ def test_gauss_rules_of_a_collection_mean_polynomials() -> None:
 # --- attitude ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_jitter_has_the_stated_amplitude_phase_and_level() -> None:
     one = stated({"lines": [{"frequency": "0.65 Hz", "amplitude": "2 1 0 arcsec", "phase": "30 90 0 deg"}]})
     t = np.linspace(-3.0, 5.0, 97)

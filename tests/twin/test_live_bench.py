@@ -205,6 +205,7 @@ def test_hidden_motions_are_drawn_from_what_is_stated(bench, first):
     assert low < white @ white < high
 
 
+@pytest.mark.second
 def test_every_knob_moves_what_it_names(bench):
     """One knob of every kind at every body gives a perturbation of this body alone, with the number as typed."""
     first, nodes = bench.twin.resolved.job.plain()["perturb"], bench.twin.experiment.instrument.nodes

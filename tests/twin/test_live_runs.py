@@ -232,6 +232,7 @@ def test_a_measurement_without_an_instrument(tmp_path):
     assert "geometry of the cameras alone" in said
 
 
+@pytest.mark.second
 def test_a_run_of_uncertainty_opens_its_job(tmp_path):
     resolved = resolve(written(tmp_path, JOB))
     folder = run_folder(tmp_path / "run", "twin.uncertainty", resolved.to_yaml(), "uncertainty")
@@ -340,6 +341,7 @@ DATA = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("program", "test", "words"), REFUSED["shown_runs"])
 def test_run_folders_without_a_monitors_state(tmp_path, program, test, words):
     folder = run_folder(tmp_path / "run", program, DATA[program]() if program in DATA else None, test)
@@ -372,6 +374,7 @@ def test_folders_that_are_none_of_a_run(tmp_path):
         assert (code, words in said) == (2, True), said
 
 
+@pytest.mark.second
 def test_a_manifest_of_somebody_else_changes_nothing(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()

@@ -28,6 +28,7 @@ def kernels(path, motions):
         return {kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel}
 
 
+@pytest.mark.second
 def test_derivatives_by_any_motions_take_the_same_kernels(path):
     """With figures or without: to compile another set of kernels takes seconds."""
     plain, figured = line_family("backward"), (ElementaryMotion(f"{BASE}/backward/M2", "figure", 8),)

@@ -153,6 +153,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable:
     return partial(invoke, program(monkeypatch, run=lambda *given: LEVEL.run(*given)))
 
 
+@pytest.mark.second
 def test_progress_is_told_where_there_is_no_terminal(run: Callable, tmp_path: Path, monkeypatch) -> None:
     """Also while one part of the work takes long."""
     monkeypatch.setattr(cli, "TICK_SECONDS", 0.05)
@@ -194,6 +195,7 @@ def test_work_that_takes_long_says_so_once_by_its_first_pieces(silent: bool, mon
     assert said.getvalue() == ("" if silent else "note: passes: about 7 min left\n")
 
 
+@pytest.mark.second
 def test_a_terminal_shows_progress_itself() -> None:
     shown = io.StringIO()
     with heartbeat(Console(file=shown, force_terminal=True), lambda: "far", False, 0.02):
@@ -204,6 +206,7 @@ def test_a_terminal_shows_progress_itself() -> None:
     assert set(shown.getvalue().splitlines()) == {"progress: far"}
 
 
+@pytest.mark.second
 def test_command(run: Callable, tmp_path: Path) -> None:
     """What a test of one's own gives: --json, files, and the same again from its config.yaml."""
     path = tmp_path / "level.yaml"

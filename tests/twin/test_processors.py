@@ -59,7 +59,7 @@ def require_kernels() -> None:
 def test_neither_kernel_nor_threads_change_frames_and_readings(tmp_path) -> None:
     """The main job: more threads change no byte of any file, another kernel none of frames and readings.
 
-    By chance, see docs/architecture.md, this fails once in some thousand changes of the last digits.
+    By chance, see docs/promises.md, this fails once in some thousand changes of the last digits.
     """
     write_study(tmp_path)
     job = tmp_path / "job.yaml"
@@ -139,6 +139,7 @@ def test_a_reading_whose_sigma_says_nothing_is_stated_whole(sigma) -> None:
     assert stated({"x": 1.0 / 3.0})["x"] == 1.0 / 3.0
 
 
+@pytest.mark.second
 def test_last_digits_are_not_stated() -> None:
     """What another kernel makes of readings, 1e-11 sigma, is gone from files but for one in 10^5."""
     rng = np.random.default_rng(3)

@@ -53,6 +53,7 @@ def polynomials(root: ET.Element) -> RationalPolynomial:
     return RationalPolynomial(offset - [1.0, 1.0, 0.0, 0.0, 0.0], scale, *row, *column)
 
 
+@pytest.mark.second
 @needed
 def test_a_pleiades_scene_meets_its_own_polynomials(tmp_path: Path) -> None:
     """The ground segment's numbers in the elements of DIMAP 2: velocities are against the stars, and polynomials hold

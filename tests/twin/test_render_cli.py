@@ -193,6 +193,7 @@ def complains(result, *words: object) -> str:
     return result.stderr
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("case", BAD_FILES)
 def test_bad_files(case, tmp_path):
     content, words = BAD_FILES[case]

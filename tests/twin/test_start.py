@@ -90,6 +90,7 @@ for name, module, words in json.loads(sys.argv[1]):
 """
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("command", quick(1, ["status", "ingest", "products"]))
 def test_a_record_that_is_not_there_waits_for_no_database(command: str, tmp_path: Path) -> None:
     words = [command, str(tmp_path / "none"), *(["a.yaml"] if command == "ingest" else [])]

@@ -63,6 +63,7 @@ def test_ranks_by_the_binomial_distribution() -> None:
         assert high == 1.0 if met == count else stats.binom.cdf(met, count, high) == pytest.approx(0.025, rel=1e-9)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("ways", list(itertools.product(("min", "max"), repeat=2)))
 def test_fronts_by_brute_force(ways) -> None:
     rng = np.random.default_rng(4)
@@ -295,6 +296,7 @@ def test_few_failed_runs_widen_the_intervals() -> None:
                 assert high - low > 0.02
 
 
+@pytest.mark.second
 def test_a_total_index_is_no_less_than_the_first_order() -> None:
     """A step with noise, of which 40 runs show little: without care half of the totals were less."""
     for seed in range(8):
@@ -336,6 +338,7 @@ def test_a_grid_is_taken_apart_exactly() -> None:
     np.testing.assert_allclose(found["main_effects"][0]["means"], [-3.0, 0.0, 3.0], atol=1e-12)
 
 
+@pytest.mark.second
 def test_enough_runs() -> None:
     few, many = ({c.name: c for c in convergences(draws(n))} for n in (100, 20_000))
     assert not few["mean"].enough

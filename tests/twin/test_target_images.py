@@ -115,6 +115,7 @@ def detector_mtf(fx: np.ndarray, fy: np.ndarray, diffusion: float) -> np.ndarray
     return np.sinc(PITCH * fx) * np.sinc(PITCH * fy) * smear * spread
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_perfect_pupil(perfect, direction):
     worst = []
@@ -346,6 +347,7 @@ def test_sense_of_the_axes(path) -> None:
     assert place[:, 0] @ axes[:, 0] > 0.99
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("number", range(len(PLACES)))
 def test_local_map_between_its_points(path, number: int) -> None:
     """Chief rays of 40 random directions inside the map's reach, in a bent camera."""

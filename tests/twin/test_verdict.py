@@ -61,6 +61,7 @@ def all_of(told: Judgement) -> str:
     return " ".join((told.verdict, *told.more))
 
 
+@pytest.mark.second
 def test_nothing_perturbed(job) -> None:
     told = judge(job("{}"))
     assert told.verdict.startswith("Nothing was perturbed, and all 12 readings of the model are within 3 σ of zero")
@@ -92,6 +93,7 @@ def moved(run: RenderRun, parameter: int, sigmas: float) -> RenderRun:
     return replace(run, recovery=replace(run.recovery, parameters=parameters))
 
 
+@pytest.mark.second
 def test_beneath_the_noise(job) -> None:
     run = job("{base/forward/focal_plane: {shift: [0.003 um, 0 um, 0 um]}}")
     told = judge(run)
@@ -104,6 +106,7 @@ def test_beneath_the_noise(job) -> None:
     assert clearest.sigma * np.sqrt(run.frames / int(found[1])) == pytest.approx(abs(clearest.true) / FAR, rel=0.1)
 
 
+@pytest.mark.second
 def test_recovered(job) -> None:
     run = job("{base/forward/focal_plane: {shift: [3 um, -2 um, 0 um], rotate: [0 arcsec, 0 arcsec, 5 arcsec]}}")
     told = judge(run)
@@ -116,6 +119,7 @@ def test_recovered(job) -> None:
     assert [w for w in told.warnings if w.startswith("Δγ of forward [arcsec] is misread by more than the change")]
 
 
+@pytest.mark.second
 def test_another_motion_is_named_with_its_share(job) -> None:
     run = job("{base/forward/M2: {shift: [0 um, 0 um, 3 um]}}", frames=9)
     told = judge(run)
@@ -129,6 +133,7 @@ def test_another_motion_is_named_with_its_share(job) -> None:
     assert f"{100.0 * abs(worst.error / worst.true):.0f} % of the change" in told.verdict
 
 
+@pytest.mark.second
 def test_readings_larger_than_the_change(job) -> None:
     run = job("{base/forward/focal_plane: {rotate: [20 arcsec, 0 arcsec, 0 arcsec]}}")
     told = judge(run)

@@ -213,6 +213,7 @@ def test_every_number_has_the_unit_that_its_key_says() -> None:
     assert by_hand == CONVERTED_BY_HAND
 
 
+@pytest.mark.second
 def test_no_key_of_a_result_hides_its_unit() -> None:
     """In the results of all commands a key with the word of a unit is known to be in that unit."""
     for file in GOLDEN.glob("*.json"):
