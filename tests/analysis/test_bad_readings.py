@@ -16,6 +16,8 @@ from tests.analysis.followed_series import follow, of_shifts
 from tests.analysis.stated_motions import SpotNoise, disturbances
 from tests.analysis.test_series_smoother import conditioned
 
+pytestmark = pytest.mark.second
+
 NOISE, COUNT, EVERY, DAYS = 0.001, 6, 900.0, 30
 DRIFT = 60.0
 """Days in which mounts forget where they were; a reading comes every day."""
@@ -85,7 +87,6 @@ def read_of(one: Series) -> tuple[Observed, ...]:
     return of_shifts(one.times, one.shifts, NOISE**2 * np.eye(COUNT))
 
 
-@pytest.mark.second
 def test_the_state_is_that_of_the_good_readings() -> None:
     """Nothing is stated to jump: errors above what motions explain are left out, and all is as if they had not come.
     The filter and the joint normal differ by rounding alone.
@@ -108,7 +109,6 @@ def test_the_state_is_that_of_the_good_readings() -> None:
     assert left >= 30  # of 36; an error of 0.05 px is within what both bodies' motions make of a coordinate
 
 
-@pytest.mark.second
 def test_a_jump_that_looks_bad_counts_with_both_until_the_next_reading() -> None:
     """A slip in a direction in which a body hardly moves spots: set aside, and taken with the next reading; a bad
     reading of the same size is not.
@@ -131,7 +131,6 @@ def test_a_jump_that_looks_bad_counts_with_both_until_the_next_reading() -> None
                 assert found.bad is None
 
 
-@pytest.mark.second
 def test_two_jumps_in_one_gap_leave_a_rest() -> None:
     """The body that is named explains its own jump and not the other: the rest tells, and is none of one jump alone."""
     told = toy(True)
@@ -148,7 +147,6 @@ def test_two_jumps_in_one_gap_leave_a_rest() -> None:
         assert (square < limit_of(1e-3, degrees)) == alone
 
 
-@pytest.mark.second
 def test_the_power_is_that_of_the_filter() -> None:
     """Jumps of the size that half are found of within three readings, given to the filter itself: a binomial count."""
     told, count = toy(True), 60

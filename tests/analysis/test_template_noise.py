@@ -8,6 +8,8 @@ from analysis.matching.least_squares import noise_energy, template_noise
 from analysis.matching.spline import SplineStack, low_passed
 from tests.analysis.stereo_pairs import Pair
 
+pytestmark = pytest.mark.second
+
 HALF, REACH = 15, 12
 SHIFT = np.array([0.37, -0.21])
 ROW, COLUMN = (grid.ravel().astype(float) for grid in np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1])
@@ -27,7 +29,6 @@ def differences(function, at, step):
     return np.array([(function(at + move) - function(at - move)) / (2.0 * move.max()) for move in moves])
 
 
-@pytest.mark.second
 def test_the_curvature_is_that_of_the_square_sum():
     """At a least squares solution in noise, against second differences of half the square sum."""
     rng = np.random.default_rng(1)
@@ -65,7 +66,6 @@ def test_the_curvature_is_that_of_the_square_sum():
     assert not found.covariance(np.ones(1, bool)).any()
 
 
-@pytest.mark.second
 @pytest.mark.parametrize(("smoothing", "factors"), [(0.0, [1.0]), (0.7, [1.0, -0.3, -0.2]), (1.1, [0.8, 0.5, -0.9])])
 def test_energy_of_white_noise(smoothing, factors):
     """Against noise that is smoothed and interpolated: 400 templates of 19^2 places, all phases; five sigmas."""
@@ -100,7 +100,6 @@ def edges(count, *, noise, faint, seed):
     return Pair(np.hstack(images[0]), np.hstack(images[1]), places, places + SHIFT)
 
 
-@pytest.mark.second
 def test_places_on_edges_keep_in_their_covariances():
     """Edges whose faint texture tells the place along them: half of chi-square is 1 within the limits of so many
     windows (one false alarm in 1000), and the long axis lies along the edge. Without texture, however strong the edge,

@@ -19,6 +19,8 @@ from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.sensor import Sensor
 
+pytestmark = pytest.mark.second
+
 TEXT = st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), max_size=20)
 SCALARS = st.none() | st.booleans() | st.integers(-(10**29), 10**29) | st.floats(allow_nan=False) | TEXT
 TREES = st.recursive(
@@ -26,7 +28,6 @@ TREES = st.recursive(
 )
 
 
-@pytest.mark.second
 @settings(max_examples=30)
 @given(st.dictionaries(TEXT, TREES, min_size=1, max_size=4))
 def test_yaml(data) -> None:
@@ -34,7 +35,6 @@ def test_yaml(data) -> None:
     assert repr(found) == repr(data)  # tells 1 from 1.0 and true, and -0.0 from 0.0
 
 
-@pytest.mark.second
 @settings(max_examples=100)
 @given(st.sampled_from((ANGLE, LENGTH, SCALE, PER_LENGTH3)), st.floats(allow_nan=False, allow_infinity=False))
 def test_quantities(kind, value) -> None:
@@ -55,7 +55,6 @@ RESOLVERS = {
 }
 
 
-@pytest.mark.second
 def test_configurations_of_spoilt_files_that_are_good(tmp_path) -> None:
     """The config.yaml of whatever can be read is read back to the same text, wherever it lies."""
     table, good = cases(), 0
@@ -79,7 +78,6 @@ CAMERAS = line_cameras(load_three_line_camera("th1"))
 SHARE = st.floats(0.0, 1.0)
 
 
-@pytest.mark.second
 @given(
     name=st.sampled_from(sorted(CAMERAS)),
     effects=st.tuples(st.booleans(), st.booleans(), st.booleans()),

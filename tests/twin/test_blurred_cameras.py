@@ -16,6 +16,8 @@ from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import resolve_job
 from tests.oracles.test_reference_cameras import bundle, wavefront_error
 
+pytestmark = pytest.mark.second
+
 GF7 = (LIBRARY / "cameras" / "gf7.yaml").read_text("utf-8")
 M2 = "z: -2.01593047747168 m"
 STOP = "stop_diameter: 0.23980194283070688 m\n"
@@ -38,7 +40,6 @@ def with_camera(camera: CameraSpec):
     return job.model_copy(update={"cameras": FrozenMap({"gf7": camera})})
 
 
-@pytest.mark.second
 @pytest.mark.parametrize("name", library_names("cameras"))
 def test_the_librarys_cameras_are_sharp(backend, camera, name: str) -> None:
     """And as blurred as a full trace of their own fields says."""
@@ -54,7 +55,6 @@ def test_the_librarys_cameras_are_sharp(backend, camera, name: str) -> None:
     assert blur_warnings(with_camera(load_camera(name)), backend) == ()
 
 
-@pytest.mark.second
 @pytest.mark.parametrize(
     ("z", "waves", "left", "words"),
     [
@@ -82,14 +82,12 @@ def test_a_blurred_camera(backend, tmp_path, z: str, waves: float, left: float, 
     ) == pytest.approx(beams.errors(FocalPlane.of(moved)), rel=1e-6)
 
 
-@pytest.mark.second
 def test_a_camera_without_a_focus(backend, tmp_path) -> None:
     """M2 0.7 m too far: the light diverges after M3, and no place of the image helps."""
     (text,) = blur_warnings(with_camera(load_camera(gf7_with(tmp_path, "-2.70 m", focal_length="21.4 m"))), backend)
     assert re.search(r"blurred as designed: 513 waves rms .* refocusing cannot help: its light has no focus", text)
 
 
-@pytest.mark.second
 def test_just_beyond_the_limit(backend, tmp_path) -> None:
     limits = [sharpness(load_camera(gf7_with(tmp_path, z)), backend).worst for z in ("-2.0158 m", "-2.01578 m")]
     assert limits[0] < BLURRED < limits[1]
@@ -99,7 +97,6 @@ def test_just_beyond_the_limit(backend, tmp_path) -> None:
     assert [len(text) for text in texts] == [0, 1]
 
 
-@pytest.mark.second
 def test_every_test_that_has_a_camera_warns(backend, tmp_path) -> None:
     """All but the design, whose start is there to be improved, and tests without a camera's prescription."""
     blurred = load_camera(gf7_with(tmp_path, "-2.02 m"))
