@@ -169,7 +169,7 @@ def taken(schema: Mapping[str, Any]) -> Takes:
         return _mapping(schema)
     if schema["type"] == "array":
         return _list(schema)
-    limits = " and ".join(f"{words} {_bound(schema[name])}" for name, words in _BOUNDS.items() if name in schema)
+    limits = " and ".join(f"{words} {bound_text(schema[name])}" for name, words in _BOUNDS.items() if name in schema)
     if schema.get("pattern", "").startswith("^[A-Za-z]"):
         return Takes("name")
     return Takes("name or path" if schema.get("minLength") else _WORDS[schema["type"]], limits=limits)
@@ -208,7 +208,8 @@ def _mapping(schema: Mapping[str, Any]) -> Takes:
     return taken(item).within(f"mapping by {'Zernike term' if terms else 'node'}", NODE)
 
 
-def _bound(value: float) -> str:
+def bound_text(value: float) -> str:
+    """A limit as the reference writes it."""
     if value == 2**63 - 1:
         return "2⁶³ − 1"
     return f"{value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if isinstance(value, int) else f"{value:g}"
