@@ -60,13 +60,13 @@ def json_schema(name: str) -> dict[str, Any]:
     Raises:
         KeyError: another name.
     """
-    schema = _models()[name].model_json_schema(schema_generator=_Generator)
+    schema = _models()[name].model_json_schema(schema_generator=WithUnits)
     for model in (schema, *schema.get("$defs", {}).values()):
         _describe(model)
     return {"$schema": DIALECT, **schema}
 
 
-class _Generator(GenerateJsonSchema):
+class WithUnits(GenerateJsonSchema):
     """Writes the defaults of quantities as text with a unit, as they stand in files."""
 
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> JsonSchemaValue:

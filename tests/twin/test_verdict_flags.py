@@ -15,7 +15,7 @@ import pytest
 import typer
 
 import twin
-from docs.site.golden_fields import kept_fields
+from docs.site.run_pages import kept_fields
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.resolved import resolve
 from scenes.specs.study import UNITS, unit_of
