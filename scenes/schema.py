@@ -70,6 +70,7 @@ class WithUnits(GenerateJsonSchema):
     """Writes the defaults of quantities as text with a unit, as they stand in files."""
 
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> JsonSchemaValue:
+        """Return the schema of a key, its default as files write it."""
         result = super().default_schema(schema)
         if isinstance(schema.get("default"), float | tuple) and schema["default"] != ():
             result["default"] = SchemaSerializer(schema["schema"]).to_python(schema["default"], mode="json")
