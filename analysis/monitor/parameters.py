@@ -20,6 +20,7 @@ from analysis.arrays import ARCSEC, UM_PER_M, Array, shows
 from analysis.monitor.monitoring import GroundGeometry, MonitorGeometry
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_template import SpotTemplate
+from optics.numerics.extension_table import ExtensionTable
 
 PAIR = ("left", "right")
 """Names of the channels at the +Y and at the -Y end of a line, which paper 001 numbers 1 and 2."""
@@ -135,7 +136,7 @@ class _Alone:
         return tuple(float(k == self.number) for k in range(4))
 
 
-CAMERA_PARAMETERS = (
+ESTIMATED = (
     Parameter(
         "d_alpha_arcsec", "Δα", "turn of the camera about its Y, right-handed, perturbed minus nominal", 4,
         _Alone(0),
@@ -153,9 +154,11 @@ CAMERA_PARAMETERS = (
         _Alone(3),
     ),
 )  # fmt: skip
-"""What is read of every camera. The first four are what estimators estimate; a further one is a combination of them."""
-ESTIMATED = CAMERA_PARAMETERS[:4]
 """Those that estimators estimate, in the order of a camera's vector of changes."""
+CAMERA_PARAMETERS = ExtensionTable("camera_parameters", {one.key: one for one in ESTIMATED}, Parameter)
+"""What is read of every camera, by its key. The first four are what estimators estimate; a further one is a combination
+of them, and its name here is its key.
+"""
 ANGLE = Parameter("change_arcsec", "Δθ", "change of the angle between the cameras' lines of sight, opening positive", 4)
 """What is read of the angle between two cameras."""
 GROUND = (
@@ -172,4 +175,4 @@ def rows_of(camera: CameraCalibration) -> Array:
     Args:
         camera: its calibration.
     """
-    return np.array([one.per_si * np.array(one.of(camera)) for one in CAMERA_PARAMETERS if one.of is not None])
+    return np.array([one.per_si * np.array(one.of(camera)) for one in CAMERA_PARAMETERS.values() if one.of is not None])

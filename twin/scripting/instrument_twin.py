@@ -18,7 +18,7 @@ import xarray as xr
 
 from analysis.monitor import parameters
 from analysis.monitor.recovery import recover
-from analysis.spots.centroid import CENTROIDS
+from analysis.spots import CENTROIDS
 from optics.geometry.tree import ORIGIN, State
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.camera_sharpness import blur_warnings
@@ -267,7 +267,7 @@ class InstrumentTwin:
             before: frames of the unperturbed instrument, grey values, (channel, frame, row, column) in the order of
                 ``shot.before.channel``; a DataArray or an array.
             after: of the perturbed one.
-            centroid: ``ml`` (the calibrated shape of the spot), ``gaussian`` or ``energy``; the job's if not given.
+            centroid: name of a method of `analysis.spots.CENTROIDS`; the job's if not given.
 
         Raises:
             ValueError: frames of another shape, or no such centroid.
@@ -339,7 +339,7 @@ class InstrumentTwin:
                 "channel": keys,
                 "axis": ["row", "column"],
                 "camera": names,
-                "parameter": [one.key for one in parameters.CAMERA_PARAMETERS],
+                "parameter": [one.key for one in parameters.CAMERA_PARAMETERS.values()],
                 "estimator": list(gains),
             },
             attrs={"reference_frames": frames_text("crosstalk")},

@@ -29,6 +29,7 @@ from pydantic import ValidationError
 from analysis.spots.noise import COARSE, FEW, WHOLE, FurtherNoise, NoiseModel
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import cores
+from optics.numerics.extension_table import ExtensionTable
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.yaml.errors import Problem, names_text, nearest
@@ -117,7 +118,7 @@ class FixedOffsets:
         return
 
 
-NOISE_TERMS: dict[str, Callable[[float], NoiseTerm]] = {"read": ReadNoise, "offset": FixedOffsets}
+NOISE_TERMS = ExtensionTable[Callable[[float], NoiseTerm]]("noise_terms", {"read": ReadNoise, "offset": FixedOffsets})
 """Name that a data sheet may write under ``noise`` -> the term of the number that stands there, electrons rms where the
 term does not say otherwise. A new one is added here.
 """
