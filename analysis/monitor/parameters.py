@@ -95,15 +95,15 @@ class Parameter:
         symbol: its name in tables, figures and sentences.
         meaning: what it is, with its sign.
         decimals: that the terminal shows.
-        of: of a camera: what it is made of, (4,) SI units per rad and m of d_alpha, d_beta, d_gamma and d_f, given the
-            camera's calibration; None for a reading of two cameras together.
+        of: of a camera: what it is made of, (4,) SI units per rad and m of d_alpha, d_beta, d_gamma and d_f, or those
+            given the camera's calibration; None for a reading of two cameras together.
     """
 
     key: str
     symbol: str
     meaning: str
     decimals: int
-    of: Callable[[CameraCalibration], ArrayLike] | None = None
+    of: Callable[[CameraCalibration], ArrayLike] | tuple[float, ...] | None = None
 
     @property
     def file_unit(self) -> str:
@@ -126,32 +126,22 @@ class Parameter:
         return _PER_SI[self.file_unit]
 
 
-@dataclass(frozen=True)
-class _Alone:
-    """One of the four that are estimated, by itself; what is sent to another process is no lambda."""
-
-    number: int
-
-    def __call__(self, camera: CameraCalibration) -> ArrayLike:
-        return tuple(float(k == self.number) for k in range(4))
-
-
 ESTIMATED = (
     Parameter(
         "d_alpha_arcsec", "Δα", "turn of the camera about its Y, right-handed, perturbed minus nominal", 4,
-        _Alone(0),
+        (1.0, 0.0, 0.0, 0.0),
     ),
     Parameter(
         "d_beta_arcsec", "Δβ", "turn of the camera about its X, right-handed, perturbed minus nominal", 4,
-        _Alone(1),
+        (0.0, 1.0, 0.0, 0.0),
     ),
     Parameter(
         "d_gamma_arcsec", "Δγ", "turn of the camera about its Z, the line of sight, perturbed minus nominal", 3,
-        _Alone(2),
+        (0.0, 0.0, 1.0, 0.0),
     ),
     Parameter(
         "d_f_um", "Δf", "change of the principal distance, in pixels of the line CCD, longer positive", 2,
-        _Alone(3),
+        (0.0, 0.0, 0.0, 1.0),
     ),
 )  # fmt: skip
 """Those that estimators estimate, in the order of a camera's vector of changes."""
@@ -175,4 +165,5 @@ def rows_of(camera: CameraCalibration) -> Array:
     Args:
         camera: its calibration.
     """
-    return np.array([one.per_si * np.array(one.of(camera)) for one in CAMERA_PARAMETERS.values() if one.of is not None])
+    made_of = ((one.per_si, one.of) for one in CAMERA_PARAMETERS.values() if one.of is not None)
+    return np.array([unit * np.array(of(camera) if callable(of) else of) for unit, of in made_of])

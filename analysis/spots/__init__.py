@@ -32,9 +32,7 @@ class Centroid:
     measure: Callable[[Array, int, NoiseModel, SpotTemplate, int], SpotPositions]
 
 
-def _maximum_likelihood(
-    mean: Array, frames: int, noise: NoiseModel, template: SpotTemplate, threads: int
-) -> SpotPositions:
+def _likelihood(mean: Array, frames: int, noise: NoiseModel, template: SpotTemplate, threads: int) -> SpotPositions:
     from analysis.spots.likelihood import maximum_likelihood_fit
 
     return maximum_likelihood_fit(mean, frames, noise, template, threads=threads)
@@ -53,7 +51,7 @@ def _energy(mean: Array, frames: int, noise: NoiseModel, template: SpotTemplate,
 
 
 _CENTROIDS = {
-    "ml": Centroid("maximum-likelihood fit of the calibrated spot shape", _maximum_likelihood),
+    "ml": Centroid("maximum-likelihood fit of the calibrated spot shape", _likelihood),
     "gaussian": Centroid("fit of a Gaussian", _gaussian),
     "energy": Centroid("windowed energy centroid, as in the paper", _energy),
 }

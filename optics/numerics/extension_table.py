@@ -41,13 +41,9 @@ def entries() -> tuple[Entry, ...]:
     installed. Of a distribution that is installed twice the first one on the path counts.
     """
     names = {found.name for found in distributions() if PREFIX in (found.read_text("entry_points.txt") or "")}
-    return tuple(
-        Entry(name, found.version, point.group, point.name, point.value)
-        for name in sorted(names)
-        for found in (distribution(name),)
-        for point in found.entry_points
-        if point.group.startswith(PREFIX)
-    )
+    points = [(found, point) for found in map(distribution, sorted(names)) for point in found.entry_points]
+    every = (Entry(found.name, found.version, point.group, point.name, point.value) for found, point in points)
+    return tuple(entry for entry in every if entry.group.startswith(PREFIX))
 
 
 class ExtensionTable(UserDict[str, Value]):

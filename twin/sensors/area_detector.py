@@ -32,7 +32,7 @@ from optics.numerics.backend import cores
 from optics.numerics.extension_table import ExtensionTable
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec
-from scenes.yaml.errors import Problem, names_text, nearest
+from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.spec import Spec
 from twin.framework.frame_store import frame_room, largest_of, let_go
 from twin.framework.random_streams import stream
@@ -222,10 +222,7 @@ class EmvaDetector:
         sheet.check_exposure(exposure)
         for name in sheet.noise or {}:
             if name not in NOISE_TERMS:
-                key, known = ("noise", name), names_text(NOISE_TERMS)
-                raise sheet.error(
-                    "no such noise", key, found=name, allowed=known, suggestion=nearest(name, NOISE_TERMS)
-                )
+                raise sheet.error(unknown("no such noise", name, NOISE_TERMS, ("noise", name)))
         terms = tuple(NOISE_TERMS[name](value) for name, value in (sheet.noise or {}).items())
         return cls(**{name: getattr(sheet, name) for name in cls._sheet_names()}, noise=terms)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from optics.numerics.extension_table import PREFIX, ExtensionTable, entries
+from optics.numerics.extension_table import ExtensionTable, entries
 from scenes.yaml.errors import nearest
 from scenes.yaml.named import Named
 from twin.validation.row_names import matches, names_in_files
@@ -36,8 +36,6 @@ _GROUPS = (
     Named("twin.validation.paper_017.bundle:GROUP"),
 )
 """Where each group is. A new one is added here."""
-_FURTHER = "check_groups"
-"""Entry points of other distributions' groups, each the only one of its name."""
 
 GROUPS: tuple[CheckGroup, ...]
 """Every group, in the order in which they run; imported when it is asked for."""
@@ -48,7 +46,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from twin.validation.group import CheckGroup
 
-    others = ExtensionTable[CheckGroup](_FURTHER, {}, CheckGroup)
+    others = ExtensionTable[CheckGroup]("check_groups", {}, CheckGroup)
     found = globals()[name] = (*(named.get() for named in _GROUPS), *others.values())
     return found
 
@@ -107,8 +105,8 @@ def require_known(only: str | None) -> None:
     Raises:
         UnknownCheck: there is nothing under one of the prefixes.
     """
-    further = any(entry.group == PREFIX + _FURTHER for entry in entries())
-    if only is not None and not further and "GROUPS" not in globals():
+    # other distributions' groups are in no file of ours
+    if only is not None and not entries() and "GROUPS" not in globals():
         _known(only, names_in_files())
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, cast
@@ -31,7 +32,7 @@ from twin.operate.record.entries import MICRO
 
 _FILTER = (Aside, BadReading, Belief, Disturbances, HeatInputs, Innovation, Jump, Observed, Quantity)
 _CLASSES = (*_FILTER, SeriesFilter, TimeLaw, Track)
-_OTHERS = {one.key: one for one in (ANGLE, *GROUND)}
+_PARAMETERS = ChainMap(CAMERA_PARAMETERS, {one.key: one for one in (ANGLE, *GROUND)})
 
 
 def packed(value: Any) -> bytes:
@@ -74,9 +75,7 @@ def unpacked(content: bytes, *classes: type) -> Any:
             return known[one["class"]](**{name: value(each) for name, each in one["of"].items()})
         if "mapping" in one:
             return {value(key): value(each) for key, each in one["mapping"]}
-        if "array" in one:
-            return arrays[one["array"]]
-        return (CAMERA_PARAMETERS if one["parameter"] in CAMERA_PARAMETERS else _OTHERS)[one["parameter"]]
+        return arrays[one["array"]] if "array" in one else _PARAMETERS[one["parameter"]]
 
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
