@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.named import FileKind, Named
 
@@ -96,7 +97,7 @@ def studied() -> tuple[str, ...]:
 SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
 """What the adjustment of a block can be asked to do without; the command's help names them."""
 
-PROCEDURES: dict[str, Procedure] = {
+_PROCEDURES: dict[str, Procedure] = {
     "lab focus": Procedure(
         "focus",
         setup="scenes.specs.resolved:FocusSetup",
@@ -382,4 +383,5 @@ PROCEDURES: dict[str, Procedure] = {
     """,
     ),
 }
+PROCEDURES = ExtensionTable("procedures", _PROCEDURES, Procedure)
 """Name of the command after ``twin.`` -> the test. A test is its own modules and one entry here."""

@@ -4,7 +4,7 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
 from enum import Enum
 from pathlib import Path
@@ -196,7 +196,7 @@ def test_an_experiment_names_each_of_its_inputs() -> None:
 )
 def test_program_packages_and_machine_are_part_of_the_key(owner, name, value, entry, monkeypatch) -> None:
     backend = load_backend()
-    (monkeypatch.setitem if isinstance(owner, dict | os._Environ) else monkeypatch.setattr)(owner, name, value)
+    (monkeypatch.setitem if isinstance(owner, MutableMapping) else monkeypatch.setattr)(owner, name, value)
     calibration_cache._machine.cache_clear()
     other = CacheEntry.of(backend, (), "some input").key
     monkeypatch.undo()

@@ -58,7 +58,7 @@ def test_crosstalk_explains_the_systematic_residuals(run):
     for name in run.crosstalk:
         for estimator in ("model", "posterior"):  # which takes the spots of both cameras together
             bias = systematics(run, name).bias[estimator]
-            for k, p in enumerate(PARAMETERS):
+            for k, p in enumerate(PARAMETERS.values()):
                 own = run.recovered_dict()["cameras"][name][estimator]
                 error = own[p.key] - run.truth_dict()["cameras"][name][p.key]
                 largest = max(largest, abs(error) / own[f"{p.key}_sigma_noise"])

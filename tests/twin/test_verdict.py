@@ -12,8 +12,7 @@ from rich.console import Console
 
 import twin.main_job.render_job as render_job_module
 from analysis.monitor.limits import Split
-from analysis.monitor.parameters import ANGLE, GROUND
-from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
+from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, GROUND
 from scenes.specs.resolved import resolve
 from twin.framework.artefact import FAR
 from twin.main_job.assumptions import assumed
@@ -50,7 +49,9 @@ def good(run: RenderRun) -> tuple[int, int]:
     contents.
     """
     recovered, truth, own = run.recovered_dict(), run.truth_dict(), run.judged
-    pairs = [(recovered["cameras"][c][own], truth["cameras"][c], p.key) for c in truth["cameras"] for p in PARAMETERS]
+    pairs = [
+        (recovered["cameras"][c][own], truth["cameras"][c], p) for c in truth["cameras"] for p in CAMERA_PARAMETERS
+    ]
     pairs.append((recovered["intersection_angle"][own], truth["intersection_angle"], ANGLE.key))
     pairs += [(recovered["ground"][own], truth["ground"], p.key) for p in GROUND]
     return sum(abs(r[key] - t[key]) <= FAR * r[f"{key}_sigma"] for r, t, key in pairs), len(pairs)

@@ -150,12 +150,13 @@ def explained(errors: Console, left: Callable[[], str] = nothing_kept) -> Iterat
         # the work that failed has imported these; help and a bad file do not wait for them
         from optics.numerics.array_math import PhysicalError, UnphysicalError
         from optics.numerics.backend import BackendUnavailable
+        from optics.numerics.extension_table import EntryPointError
         from optics.numerics.llvm import LibraryMissing
         from twin.framework.run_folder import RunFolderError
 
         # a number that cannot be is a fault of the program; light that a state loses is one of what was asked for
         asked = isinstance(error, RunFolderError | PhysicalError) and not isinstance(error, UnphysicalError)
-        if not asked and not isinstance(error, BackendUnavailable | LibraryMissing):
+        if not asked and not isinstance(error, BackendUnavailable | EntryPointError | LibraryMissing):
             raise
         print_error(errors, str(error))
         raise typer.Exit(code_of(error.__cause__) if asked else FAILURE) from None

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
+from optics.numerics.extension_table import EntryPointError
 from scenes.specs.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
@@ -167,10 +168,22 @@ def add_tests(app: typer.Typer, program: str, apart: Collection[str] = ()) -> No
         program: first word of the tests' names.
         apart: commands that have options of their own and are added by the program itself.
     """
-    for name, procedure in PROCEDURES.items():
+    for name in PROCEDURES:
         of, command = name.split()
         if of == program and command not in apart:
-            add_test(app, f"twin.{program}", command, procedure)
+            try:
+                add_test(app, f"twin.{program}", command, PROCEDURES[name])
+            except EntryPointError as error:
+                _add_unusable(app, command, error)
+
+
+def _add_unusable(app: typer.Typer, command: str, error: EntryPointError) -> None:
+    """Add a test of another distribution that cannot be used: its help says why, and the others work."""
+
+    @app.command(command, help=str(error), context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+    def unusable() -> None:
+        with cli.explained(Console(stderr=True)):
+            raise error
 
 
 def add_test(app: typer.Typer, program: str, command: str, procedure: Procedure) -> None:

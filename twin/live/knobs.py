@@ -14,7 +14,7 @@ from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.job import JobSpec
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.study import DesignSpec, FactorSpec
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, unknown
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from twin.study.runs.base_job import Tree, with_values
 from twin.study.runs.plan import Plan, number_at
@@ -170,8 +170,7 @@ def perturbation(
     for name, value in values.items():
         knob = knobs.get(name)
         if knob is None:
-            known = names_text(knobs)
-            raise InputError(Issue("no such knob", found=repr(name), allowed=known, suggestion=nearest(name, knobs)))
+            raise InputError(unknown("no such knob", name, knobs).at())
         if not abs(value) <= knob.limit:
             raise InputError(
                 Issue(

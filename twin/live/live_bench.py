@@ -170,7 +170,7 @@ class LiveBench:
 
     @property
     def _parameters(self) -> Sequence[parameters.Parameter]:
-        return parameters.CAMERA_PARAMETERS if self.monitored else parameters.ESTIMATED
+        return tuple(parameters.CAMERA_PARAMETERS.values()) if self.monitored else parameters.ESTIMATED
 
     @cached_property
     def _designed(self) -> dict[str, Any]:

@@ -26,13 +26,6 @@ from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.monitor.truth import Truth
 from twin.uncertainty.monitor_limits import short_text, unseen_texts
 
-CENTROID_NOTES = {
-    "ml": "maximum-likelihood fit of the calibrated spot shape",
-    "gaussian": "fit of a Gaussian",
-    "energy": "windowed energy centroid, as in the paper",
-}
-"""Method of finding spots -> its name for readers."""
-
 
 @shows("cameras", "frames", "centroid", "recovery")
 @dataclass(frozen=True, eq=False)

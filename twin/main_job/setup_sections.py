@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from analysis.arrays import ARCSEC
+from analysis.spots import CENTROIDS
 from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
@@ -12,7 +13,6 @@ from scenes.specs.disturbances import JOINT
 from scenes.specs.perturbation import in_words
 from twin.framework.artefact import MINUS, Cell, Table, fixed, plain, shown_unit
 from twin.framework.report import Section
-from twin.main_job.monitor_reading import CENTROID_NOTES
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE
 
@@ -72,7 +72,7 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
             "the CCD",
         ),
         ("Frames", f"{run.frames} before and {run.frames} after, seed {run.seed}"),
-        ("Spot centres", CENTROID_NOTES[resolved.job.analysis.centroid]),
+        ("Spot centres", CENTROIDS[resolved.job.analysis.centroid].title),
     )
 
 

@@ -135,7 +135,7 @@ def _moves(motion: Motion) -> bool:
 def _hidden(run: RenderRun, found: tuple[Reading, ...]) -> str:
     """The least changes that can be told from none, of the parameters of the cameras."""
     parts = []
-    for p in parameters.CAMERA_PARAMETERS:
+    for p in parameters.CAMERA_PARAMETERS.values():
         sigmas = [r.sigma for r in found if r.parameter == p]
         parts += [f"{p.symbol} {significant(FAR * max(sigmas), 2, floor=0.0)} {p.unit}"] if sigmas else []
     who = (

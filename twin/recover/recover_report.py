@@ -9,11 +9,12 @@ import numpy as np
 from analysis.monitor import parameters
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
+from analysis.spots import CENTROIDS
 from scenes.specs.course import moment
 from twin.framework.artefact import FAR, Cell, SvgFigure, Table, decimals_for, fixed, plain, significant
 from twin.framework.report import Report, Section, answer
 from twin.main_job.assumptions import NOISE, assumed, course_agrees, limits, share_text
-from twin.main_job.monitor_reading import CENTROID_NOTES, contradicted, stated
+from twin.main_job.monitor_reading import contradicted, stated
 from twin.recover.channel_measurement import ChannelResult, SpotResult
 from twin.recover.recover_plots import Line, changes_svg, residuals_svg, spots_svg
 from twin.recover.recover_run import RecoverRun, state_name
@@ -92,7 +93,7 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
         second = f"the clearest change is {clearest.name}, {clearest.read}"
     else:
         parts = []
-        for p in parameters.CAMERA_PARAMETERS:
+        for p in parameters.CAMERA_PARAMETERS.values():
             sigmas = [one.sigma for one in found if one.parameter == p]
             parts += [f"{p.symbol} {significant(FAR * max(sigmas), 2, floor=0.0)} {p.unit}"] if sigmas else []
         first = (
@@ -127,7 +128,7 @@ def recover_report(run: RecoverRun) -> Report:
     facts = [
         ("instrument", _name(run) if run.setup.model is not None else f"geometry of {_name(run)}"),
         ("spot's shape", "from the model" if run.setup.test.template == "twin" else "learnt from the frames before"),
-        ("centroid", CENTROID_NOTES[reading.centroid]),
+        ("centroid", CENTROIDS[reading.centroid].title),
         ("area CCD", f"{run.setup.detector.name}, pixels of {plain(1e6 * run.pitch)} µm"),
         ("frames", _frames_text(run)),
     ]

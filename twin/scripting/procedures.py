@@ -15,7 +15,7 @@ from analysis.arrays import shows
 from optics.numerics.backend import load_backend
 from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import ExperimentSetup
-from scenes.yaml.errors import InputError, Issue, names_text, nearest
+from scenes.yaml.errors import InputError, unknown
 from scenes.yaml.spec import Source, annotation_at, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.framework.artefact import cell_text
@@ -91,8 +91,7 @@ def perform(
         InputError: no such test, file or key; or the test failed on its bench, with the key to be changed.
     """
     if name not in PROCEDURES:
-        meant = nearest(name, PROCEDURES)
-        raise InputError(Issue("no such test", found=repr(name), allowed=names_text(PROCEDURES), suggestion=meant))
+        raise InputError(unknown("no such test", name, PROCEDURES).at())
     procedure = PROCEDURES[name]
     setup = procedure.resolve(file)
     if changes:
