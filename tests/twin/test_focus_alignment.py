@@ -24,11 +24,10 @@ from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import FocusSetup
 from twin.framework.procedure import BenchError
 from twin.laboratory import focus_run
-from twin.laboratory.focus_bench import FocusBench
+from twin.laboratory.focus_bench import VERTEX_ERROR, FocusBench, Recorder, in_focus, scan
 from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_report import focus_report as report
 from twin.laboratory.focus_run import FocusRun, SimulatedFocus, align, align_files, line_turn, mount_of, plan_shims
-from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, in_focus, scan
 from twin.targets.target_images import DIRECTIONS, TRACK
 
 FILE = SCENES / LAB / "focus.yaml"

@@ -10,7 +10,7 @@ from analysis.arrays import ARCSEC, MM_PER_M, Array
 from analysis.orientation.interior import LINE_TERMS, InteriorOrientation, LineOrientation
 from analysis.turntable.dividing_error import DividingCompensation, expected_rejections
 from twin.framework.quantity import Quantity, Record
-from twin.laboratory import turntable_numbers
+from twin.laboratory import turntable_run
 from twin.laboratory.distortion_run import DistortionRun, Estimate, SimulatedDistortion
 from twin.laboratory.measured_readings import DataFile, SpotReadings
 from twin.laboratory.turntable_run import rms
@@ -80,7 +80,7 @@ COMPENSATION: Record[DividingCompensation] = Record(
     "The turntable's dividing error, as it is compensated.",
     Quantity("fit", lambda table: table.fit.name, "fit that cross-validation chooses"),
     Quantity("repeatability_arcsec", lambda table: table.repeatability, "standard deviation of one comparison"),
-    *turntable_numbers.COMPENSATION,
+    *turntable_run.COMPENSATION,
 )
 _Pair: TypeAlias = tuple[Estimate, Estimate]
 TRUE_ESTIMATE: Record[_Pair] = Record(
@@ -187,10 +187,10 @@ DISTORTION: Record[DistortionRun] = Record(
     Quantity("rejected_readings", lambda r: r.readings and REJECTED.rows(r), "of spots", where_known=True),
     Quantity(
         "rejected_comparisons",
-        lambda r: r.readings and turntable_numbers.rejected_rows(r.tables),
+        lambda r: r.readings and turntable_run.rejected_rows(r.tables),
         "in files",
         where_known=True,
     ),
-    Quantity("files", _files, "that were read", record=turntable_numbers.DATA_FILE, where_known=True),
+    Quantity("files", _files, "that were read", record=turntable_run.DATA_FILE, where_known=True),
     Quantity("truth", lambda r: r if isinstance(r, SimulatedDistortion) else None, record=TRUTH, where_known=True),
 )

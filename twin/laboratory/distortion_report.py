@@ -23,9 +23,8 @@ from twin.framework.report import Report, Section, answer
 from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.laboratory.distortion_numbers import DISTORTION, ESTIMATE, POINTS
 from twin.laboratory.distortion_run import DistortionRun, SimulatedDistortion
-from twin.laboratory.turntable_numbers import DOUBTFUL
 from twin.laboratory.turntable_report import FIT_NAMES
-from twin.laboratory.turntable_run import rms
+from twin.laboratory.turntable_run import DOUBTFUL, rms
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -37,8 +37,7 @@ from twin.laboratory.measured_readings import (
     read_turntable,
     unwrapped,
 )
-from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_run import usable_fits
+from twin.laboratory.turntable_run import TurntableModel, usable_fits
 
 CLOSED_FORMS = tuple(name for name in FITS if name != "network")
 """Fits of the dividing error that compete for the compensation. The network takes minutes to train; the turntable test

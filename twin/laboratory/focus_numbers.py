@@ -11,11 +11,10 @@ from analysis.arrays import UM_PER_M as UM
 from analysis.focal_plane.through_focus import FocusVertex
 from optics.geometry.pose import rotation_vector
 from twin.framework.quantity import Quantity, Record
-from twin.laboratory.focus_bench import BudgetLine
+from twin.laboratory.focus_bench import VERTEX_ERROR, BudgetLine
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus, SimulatedState
-from twin.laboratory.focus_scan import VERTEX_ERROR
 from twin.laboratory.measured_focus import RowFault
-from twin.laboratory.turntable_numbers import DATA_FILE, likely
+from twin.laboratory.turntable_run import DATA_FILE, likely
 from twin.targets.target_images import ALONG, TRACK
 
 

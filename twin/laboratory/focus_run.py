@@ -35,9 +35,8 @@ from scenes.specs.resolved import ExperimentSetup, FocusSetup, MeasuredFocusSetu
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.random_streams import stream
-from twin.laboratory import focus_scan
-from twin.laboratory.focus_bench import BudgetLine, FocusBench
-from twin.laboratory.focus_scan import NyquistMtf, Recorder, SiteScan, Standing
+from twin.laboratory import focus_bench
+from twin.laboratory.focus_bench import BudgetLine, FocusBench, NyquistMtf, Recorder, SiteScan, Standing
 from twin.laboratory.measured_focus import FocusReadings, read_focus
 from twin.sensors.area_detector import FixedPattern
 from twin.targets.target_images import TRACK
@@ -151,8 +150,8 @@ class Shimming:
 
     plane: FocalPlaneFit
     plan: ShimPlan
-    vertex_error: float = focus_scan.VERTEX_ERROR
-    vertex_trend: float = focus_scan.VERTEX_TREND
+    vertex_error: float = focus_bench.VERTEX_ERROR
+    vertex_trend: float = focus_bench.VERTEX_TREND
 
     @property
     def systematic(self) -> np.ndarray:
@@ -370,7 +369,7 @@ def decide(
     state: FocusState,
     mount: Mount,
     present: np.ndarray,
-    vertex: tuple[float, float] = (focus_scan.VERTEX_ERROR, focus_scan.VERTEX_TREND),
+    vertex: tuple[float, float] = (focus_bench.VERTEX_ERROR, focus_bench.VERTEX_TREND),
 ) -> Shimming:
     """The plane through best focus and the shims that bring the assembly there.
 
@@ -472,7 +471,7 @@ def _look(
     """Measure one standing of the assembly. Only the first one needs to be searched for focus."""
     recorder = recorder_of(bench, standing, seed, number, patterns)
     name = "through focus, before" if number == 0 else f"through focus, round {number}"
-    scans = focus_scan.scan(recorder, lambda _, done, total: advance(name, done, total), search=number == 0)
+    scans = focus_bench.scan(recorder, lambda _, done, total: advance(name, done, total), search=number == 0)
     sigma = bench.setup.test.level
     true = line_turn(standing.pose)
     read = true + float(np.random.default_rng(stream(seed, _LEVEL, number)).normal(0.0, sigma))
@@ -481,7 +480,7 @@ def _look(
         LineLevel(read, sigma),
         bench,
         standing,
-        focus_scan.in_focus(recorder) if number > 0 else (),
+        focus_bench.in_focus(recorder) if number > 0 else (),
         np.array([site.defocus(standing.pose, standing.heights[site.band]) for site in bench.sites]),
         true,
         shims,

@@ -31,9 +31,7 @@ from twin.framework.svg import (
     plain_axes,
     to_svg,
 )
-from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_numbers import DOUBTFUL, REJECTED, TURNTABLE
-from twin.laboratory.turntable_run import TurntableRun
+from twin.laboratory.turntable_run import DOUBTFUL, REJECTED, TURNTABLE, TurntableModel, TurntableRun
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,7 +16,7 @@ import numpy as np
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.images.line_optics import LineOptics
-from twin.sensors.charge_transfer import Collection
+from twin.sensors.line_ccd import Collection
 
 TOLERANCE = 1e-3
 """Pixels: of place and smear by the moments that are taken."""
