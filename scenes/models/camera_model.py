@@ -866,6 +866,7 @@ def _apertures(
         half, middle = 0.5 * (high - low), 0.5 * (high + low)
         box = Rectangle(float(half[0]), float(half[1]), (float(middle[0]), float(middle[1])))
         hits = np.where(valid[0, :, None], traced.hit(i)[0, :, :2], np.nan).reshape(len(fields), _RIM_POINTS, 2)
+        hits = hits[~np.isnan(hits).all(axis=(1, 2))]  # fields whose light is lost say nothing of an outline
         out[name] = box if spec.mirrors[name].light == "passes" else _made(box, hits, spec, name)
     return out
 

@@ -324,18 +324,20 @@ def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodi
     if over > 0.0:
         what = f"the clear aperture of {element.name} reaches {1e3 * over:.3g} mm over the edge of its face"
         camera, side = element.name.split("/")[:2]
-        key, choice = _way_to_edge(solid.path, across, over)
+        key, choice = _way_to_edge(solid.path, across, over, 2.0 * element.aperture.inscribed)
         raise MisplacedError(f"{solid.path}: {what}, beyond {across}", key, choice, (camera, side))
 
 
-def _way_to_edge(path: str, across: str, over: float) -> tuple[KeyPath, str]:
-    """What to change when a clear aperture reaches over a face's edge to the face named ``across``, by so many metres,
-    and what to choose there.
+def _way_to_edge(path: str, across: str, over: float, wide: float) -> tuple[KeyPath, str]:
+    """What to change when a clear aperture of a width reaches over a face's edge to the face named ``across``, by so
+    many metres, and what to choose there.
     """
     if path != CENTRAL_PRISM:
         return key_of(path), "a width, shift and angle_errors with faces that hold their clear apertures"
     if across == "bottom":
         return (CENTRAL_KEY, "height"), f"a height that is at least {1e3 * over:.3g} mm larger"
+    if 2.0 * over >= wide:
+        return (CENTRAL_KEY, "spread"), f"a spread that is at least {2e3 * over:.3g} mm larger"
     smaller = f"an aperture that is at least {2e3 * over:.3g} mm smaller, or a spread that is as much larger"
     return ("monitor", "return_face", "aperture"), smaller
 

@@ -425,22 +425,25 @@ def _scan_site(recorder: Recorder, number: int, search: bool) -> SiteScan:
                 raise _lost(site, problem) from problem
             # the first scan may have met a side lobe or a flank: go to the highest point, then look everywhere again
             best = int(np.argmax(sum(mtf.values())))
-            centre = _search(recorder, number, zero) if attempt == 1 or not search else float(target[best])
+            again = 1000 * (_ATTEMPTS + 1) if attempt == 1 else 0  # images of their own for a second search
+            centre = _search(recorder, number, zero, again) if attempt == 1 or not search else float(target[best])
             continue
         frames = {edge: taken[edge][int(np.argmax(mtf[edge]))][2][0] for edge in DIRECTIONS}
         return SiteScan(shift, mtf, sigma, vertex, frames, target, 1000 * (attempt + 1))
     raise AssertionError("unreachable")
 
 
-def _search(recorder: Recorder, number: int, zero: float) -> float:
-    """Rough place of the peak, as a move of the target: where the whole reach shows most contrast along the line."""
+def _search(recorder: Recorder, number: int, zero: float, first: int = 0) -> float:
+    """Rough place of the peak, as a move of the target: where the whole reach shows most contrast along the line.
+    ``first``: number of the first image.
+    """
     plan = recorder.bench.setup.test.scan
     site = recorder.bench.sites[number]
     # wide peaks need no more positions than that some of them meet the peak
     step = max(plan.step, 2.0 * zero / _COARSE)
     reach = plan.reach / site.nominal_per_shift[ALONG]
     shift = np.linspace(-reach, reach, 2 * int(np.ceil(plan.reach / step)) + 1)
-    taken = [recorder.attempt(number, ALONG, float(s), k) for k, s in enumerate(shift)]
+    taken = [recorder.attempt(number, ALONG, float(s), k) for k, s in enumerate(shift, first)]
     if all(np.isinf(one[1]) for one in taken):
         raise BenchError(
             f"the edge cannot be measured anywhere through focus in {site.band} at field {site.field:g}: {taken[0][3]}",

@@ -21,8 +21,9 @@ from scenes.specs.camera_tests import MeasuredFocusSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.framework import svg
 from twin.framework.artefact import Artefact, Cell, SvgFigure, Table, fixed
+from twin.framework.quantity import Record
 from twin.framework.report import Report, Section, answer
-from twin.laboratory.focus_numbers import PLACES, ROW_FAULT, SHIMS, focus_numbers
+from twin.laboratory import focus_run
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus, SimulatedState
 from twin.laboratory.turntable_run import DOUBTFUL
 from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
@@ -187,7 +188,7 @@ MOVED = {"image": "image, along the light", "target": "target, along the light",
 
 def focus_report(run: FocusRun) -> Report:
     """Report of an alignment."""
-    data = focus_numbers(run)
+    data = focus_run.focus_numbers(run)
     sections = (_shims(run), _plane(run), _curve_section(run))
     if isinstance(run, SimulatedFocus):
         return Report(
@@ -368,10 +369,7 @@ def _summary(data: Mapping[str, Any]) -> Table:
     plane = data["plane"]
     rows: list[tuple[Cell, ...]] = [
         ("largest distance from best focus [µm]", data["confocal_um_max"], data["confocal_um_sigma"]),
-        ("piston of the plane [µm]", plane["piston_um"], plane["piston_um_sigma"]),
-        ("slope along X′ [arcsec]", plane["slope_x_arcsec"], plane["slope_x_arcsec_sigma"]),
-        ("slope along Y′ [arcsec]", plane["slope_y_arcsec"], plane["slope_y_arcsec_sigma"]),
-        ("CCDs off one plane [µm rms]", plane["chips_um_rms"], None),
+        *focus_run.PLANE.lines(plane, ("piston_um", "slope_x_arcsec", "slope_y_arcsec", "chips_um_rms")),
     ]
     rows += [
         (f"change of shim {name.removeprefix('hole_')} [µm]", one["change_um"], one["change_um_sigma"])
@@ -385,26 +383,18 @@ def _shims(run: FocusRun) -> Section:
     """The shims of every round."""
     tables = []
     for number, done in enumerate(run.shimmings, 1):
-        rows = [
-            (
-                f"{hole}",
-                f"{fixed(one['change_um'], 1)} ± {one['change_um_sigma']:.1f}",
-                *(fixed(one[key], 1) for key in ("ground_um", "shim_um")),
-                fixed(float(np.linalg.norm(one["slide_mm"])), 3),
-            )
-            for hole, one in enumerate(SHIMS.rows(done), 1)
-        ]
+        rows = {
+            f"{hole}": {**one, "slide_mm": float(np.linalg.norm(one["slide_mm"]))}
+            for hole, one in enumerate(focus_run.SHIMS.rows(done), 1)
+        }
         title = "Shims" if len(run.shimmings) == 1 else f"Shims of round {number}"
         caption = (
-            "Changes of thickness under each hole; their sigma holds noise, the error that all vertices share, and "
-            f"that the CCDs do not stand in one plane ({UM_PER_M * done.plane.extra_sigma:.1f} µm rms: chips, "
-            "curvature of field). The turn in the mounting surface of "
+            "Changes of thickness under each hole. The turn in the mounting surface of "
             f"{fixed(done.plan.turn / ARCMIN, 2)} arcmin is set by hand; without it the line would be off its wanted "
             f"level by {fixed(done.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting surface is not parallel "
             "to the focal plane."
         )
-        heads = ("hole", "change [µm]", "ground [µm]", "new shim [µm]", "slide [mm]")
-        tables.append(Table(f"shims-{number}", title, caption, heads, rows))
+        tables.append(focus_run.SHIMS.table(f"shims-{number}", title, caption, rows, label="hole"))
     return Section("Shims", (), tuple(tables))
 
 
@@ -421,8 +411,7 @@ def _plane(run: FocusRun) -> Section:
     text = (
         f"Chi-square of the plane is {plane.chi_square:.1f} for {plane.degrees_of_freedom} degrees of freedom "
         "with the places' own sigmas. What the places scatter beyond them, "
-        f"{UM_PER_M * plane.extra_sigma:.1f} µm rms, is in the weights and in all sigmas of plane and shims: CCDs that "
-        "are not in one plane, curvature of the field, sigmas that are too small.",
+        f"{UM_PER_M * plane.extra_sigma:.1f} µm rms, is in the weights and in all sigmas of plane and shims.",
         f"All vertices share an error of {UM_PER_M * done.vertex_error:.2g} µm by the form of the curve; "
         f"{UM_PER_M * done.vertex_trend:.2g} µm of it change from the middle to the ends; both are in the sigmas.",
     )
@@ -432,56 +421,35 @@ def _plane(run: FocusRun) -> Section:
         caption += " Dashes: truth from the traced pupils."
     artefacts: tuple[Artefact, ...] = (
         SvgFigure("defocus", "Where the CCDs stand", caption, defocus_svg(run)),
-        PLACES.table("places", "Places", "Before the last shims.", PLACES.rows(last), keys),
+        focus_run.PLACES.table("places", "Places", "Before the last shims.", focus_run.PLACES.rows(last), keys),
     )
     return Section("Plane", text, artefacts, folded=1)
 
 
 def _curve_section(run: FocusRun) -> Section:
     """Curves through focus, of the last standing of which a plane was made as a table."""
-    rows: list[tuple[Cell, ...]] = [
-        (
-            one["band"],
-            one["x_mm"],
-            one["y_mm"],
-            DIRECTION_NAMES[edge],
-            curve["vertex_um"],
-            curve["vertex_um_sigma"],
-            f"{curve['peak_mtf']:.4f} ± {curve['peak_mtf_sigma']:.4f}",
-            curve["chi_square"],
-            curve["degrees_of_freedom"],
-            f"{curve['positions_used']} of {curve['positions']}",
-        )
-        for one in PLACES.rows(_last(run))
+    rows = [
+        {**one, "direction": DIRECTION_NAMES[edge], **curve}
+        for one in focus_run.PLACES.rows(_last(run))
         for edge, curve in one["curves"].items()
     ]
-    heads = ("band", "x [mm]", "y [mm]", "direction", "vertex [µm]", "sigma [µm]", "peak", "χ²", "ν", "positions")
-    caption, digits = "Vertices as moves of the image.", (None, 3, 3, None, 2, 2)
+    where = [focus_run.PLACES[key] for key in ("band", "x_mm", "y_mm")]
+    record = Record("A curve.", *where, focus_run.BUDGET["direction"], *focus_run.CURVE)
     drawn = "MTF with one sigma and the fitted curve, by band; black: the CCD."
     artefacts: list[Artefact] = [
         SvgFigure("through-focus", "Through focus", drawn, through_focus_svg(run)),
-        Table("curves", "Curves through focus", caption, heads, rows, digits),
+        record.table("curves", "Curves through focus", "Vertices as moves of the image.", rows),
     ]
     if run.readings and run.readings.no_edge:
-        gone = [{**ROW_FAULT(one), "file": Path(one.file).name} for one in run.readings.no_edge]
+        gone = [{**focus_run.ROW_FAULT(one), "file": Path(one.file).name} for one in run.readings.no_edge]
         note = "They have no weight."
-        artefacts.insert(1, ROW_FAULT.table("no-edge", "Images without a measurable edge", note, gone))
-    text = [
-        "The main peak of every curve is fitted by v = p (1 − u + 0.3 u²), u = a (z − z₀)², over the positions where "
-        "it is above half of its peak; best focus of a place is midway between its directions, which astigmatism moves "
-        "apart."
-    ]
+        artefacts.insert(1, focus_run.ROW_FAULT.table("no-edge", "Images without a measurable edge", note, gone))
+    text: tuple[str, ...] = ()
     if isinstance(run, SimulatedFocus):
         ratio = run.bench.sites[0].nominal_per_shift
-        text.insert(
-            0,
-            "The target is moved through the collimator's focus; a slanted edge is recorded at every position in both "
-            "directions, and its MTF at the band's Nyquist frequency is fitted. The image moves along the line's "
-            "direction with f² of that direction over the collimator's f², which differ by "
-            f"{100 * abs(ratio[TRACK] / ratio[ALONG] - 1.0):.1f}% in this camera; each direction is reduced with its "
-            "own.",
-        )
-    return Section("Through focus", tuple(text), tuple(artefacts), folded=1)
+        apart = 100 * abs(ratio[TRACK] / ratio[ALONG] - 1.0)
+        text = (f"Per move of the target the image moves by {apart:.1f}% more in one direction than in the other.",)
+    return Section("Through focus", text, tuple(artefacts), folded=1)
 
 
 def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
@@ -505,15 +473,9 @@ def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
         )
         for line in data["mtf_budget"]
     ]
-    text = (
-        "The MTF along the track has everything in it: optics, pixel, charge diffusion and the motion of the image "
-        "over the stages.",
-        "The camera as designed would have the product of diffraction, design and pixel. The others are the "
-        "degradations that camera and test declare.",
-    )
     return Section(
         "MTF at the Nyquist frequency",
-        text,
+        (),
         (
             Table(
                 "mtf",

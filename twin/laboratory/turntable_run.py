@@ -403,22 +403,22 @@ REJECTED: Record[Comparisons] = Record(
 )
 FIT: Record[tuple[TurntableRun, str]] = Record(
     "One fit of the dividing error; the source is the run and the fit's name.",
-    Quantity("heldout_rms_arcsec", lambda s: s[0].held_out_rms(s[1]), "RMS residual at the held-out readings"),
-    Quantity("train_rms_arcsec", lambda s: rms(s[0].residual(s[1])), "RMS residual at the calibrated readings"),
-    Quantity("cross_validation_rms_arcsec", lambda s: s[0].choice[s[1]].validation.rms, "RMS at readings left out"),
-    Quantity("effective_parameters", lambda s: s[0].fits[s[1]].effective_parameters, "trace of the smoothing matrix"),
+    Quantity("heldout_rms_arcsec", lambda s: s[0].held_out_rms(s[1]), "RMS residual", "held out", 4),
+    Quantity("train_rms_arcsec", lambda s: rms(s[0].residual(s[1])), "RMS residual", "training points", 4),
+    Quantity("cross_validation_rms_arcsec", lambda s: s[0].choice[s[1]].validation.rms, "RMS", "cross-validation", 4),
+    Quantity("effective_parameters", lambda s: s[0].fits[s[1]].effective_parameters, "trace of smoothing", decimals=1),
     Quantity("settings", lambda s: s[0].fits[s[1]].settings, "what was selected: order, period, smoothing, trainings"),
 )
 COMPENSATION: Record[DividingCompensation] = Record(
     "What a compensated angle is wrong by beside the calibration's noise: one sigma of each part.",
-    Quantity("common_arcsec", lambda c: c.common, "a constant, the same at all readings"),
-    Quantity("smooth_arcsec", lambda c: c.smooth, "misfit along the curve, correlated over one step"),
-    Quantity("white_arcsec", lambda c: c.white, "misfit of each reading by itself"),
+    Quantity("common_arcsec", lambda c: c.common, "a constant, the same at all readings", decimals=4),
+    Quantity("smooth_arcsec", lambda c: c.smooth, "misfit along the curve, correlated over one step", decimals=4),
+    Quantity("white_arcsec", lambda c: c.white, "misfit of each reading by itself", decimals=4),
 )
 TRUE_FIT: Record[Any] = Record(
     "A fit minus the true curve.",
-    Quantity("true_rms_arcsec", rms, "RMS difference"),
-    Quantity("true_spread_arcsec", np.std, "RMS difference without a constant, which differences of angles do not see"),
+    Quantity("true_rms_arcsec", rms, "RMS difference", "truth", 4),
+    Quantity("true_spread_arcsec", np.std, "the same without a constant, which no angle sees", "truth, no constant", 4),
 )
 TRUTH: Record[TurntableRun] = Record(
     "What no test in a laboratory has.",
@@ -464,13 +464,20 @@ TURNTABLE: Record[TurntableRun] = Record(
     "turntable.json.",
     Quantity("name", lambda r: r.spec.name, "name of the test"),
     Quantity("seed", lambda r: r.seed, "seed of all that was drawn"),
-    Quantity("repeat_rms_arcsec", lambda r: np.max(r.series.rms_before), "largest RMS of the repeats at a reading"),
-    Quantity("chauvenet_rms_arcsec", lambda r: np.max(r.series.rms_after), "the largest of those that are kept"),
-    Quantity("averaging_alone_rms_arcsec", lambda r: r.series.averaging_alone, "largest RMS of a mean of all"),
-    Quantity("mean_rms_arcsec", lambda r: r.series.mean_rms, "largest RMS of a mean of what is kept"),
     Quantity(
-        "repeatability_arcsec", lambda r: r.series.repeatability, "sigma of one comparison, all readings together"
+        "repeat_rms_arcsec",
+        lambda r: np.max(r.series.rms_before),
+        "largest RMS of the repeats at a reading",
+        decimals=3,
     ),
+    Quantity(
+        "chauvenet_rms_arcsec", lambda r: np.max(r.series.rms_after), "the largest of those that are kept", decimals=3
+    ),
+    Quantity(
+        "averaging_alone_rms_arcsec", lambda r: r.series.averaging_alone, "largest RMS of a mean of all", decimals=3
+    ),
+    Quantity("mean_rms_arcsec", lambda r: r.series.mean_rms, "largest RMS of a mean of what is kept", decimals=3),
+    Quantity("repeatability_arcsec", lambda r: r.series.repeatability, "one comparison, σ of all together", decimals=3),
     Quantity("rejected", lambda r: r.series.rejected, "comparisons that Chauvenet's criterion takes out"),
     Quantity("rejected_expected_of_good", lambda r: expected_rejections(r.series.counts), "average if all were good"),
     Quantity("suspect_angles", lambda r: np.sum(r.series.suspect), "readings that still scatter after the criterion"),
@@ -482,9 +489,14 @@ TURNTABLE: Record[TurntableRun] = Record(
     Quantity("compensation", lambda r: r.compensation, "of the chosen fit", record=COMPENSATION),
     Quantity("points", lambda r: POINTS.rows((r, r.series)), "calibrated readings"),
     Quantity("heldout_points", lambda r: POINTS.rows((r, r.held_out)) if r.held_out else [], "held-out readings"),
-    Quantity("fit_chi_square", lambda r: r.chi_square[0], "of the chosen fit against the sigmas of the means"),
-    Quantity("fit_degrees_of_freedom", lambda r: r.chi_square[1], "means minus effective parameters"),
-    Quantity("heldout_chi_square", lambda r: r.held_out_chi_square[0], "against all that the compensation states"),
+    Quantity("fit_chi_square", lambda r: r.chi_square[0], "chi-square against the sigmas of the means", decimals=1),
+    Quantity("fit_degrees_of_freedom", lambda r: r.chi_square[1], "means minus effective parameters", decimals=1),
+    Quantity(
+        "heldout_chi_square",
+        lambda r: r.held_out_chi_square[0],
+        "of held-out readings against the compensation",
+        decimals=1,
+    ),
     Quantity("heldout_degrees_of_freedom", lambda r: r.held_out_chi_square[1], "number of held-out readings"),
     Quantity("heldout_agrees", lambda r: r.held_out and likely(*r.held_out_chi_square), "whether that is likely"),
     Quantity(
