@@ -11,7 +11,7 @@ import twin
 from docs.site.markdown import anchor, code, prose, sentence, table
 from docs.site.spec_keys import Key, Spec, Takes, example, flow, keys, sections, shipped, summary
 from scenes.schema import MODELS
-from scenes.specs.file_kinds import FILE_KINDS
+from scenes.specs.file_kinds import file_kinds
 from scenes.specs.load import INSTRUMENTS, SCENES, library_names
 from scenes.specs.perturbation import NodeInfo
 
@@ -32,7 +32,7 @@ def title(kind: str) -> str:
 
 def read_by(kind: str) -> str:
     """Which command reads a sort of file, and where its name stands in others."""
-    (known,) = (one for one in FILE_KINDS if one.name == kind)
+    (known,) = (one for one in file_kinds() if one.name == kind)
     command = f"by {code(f'python -m {known.command}')}" if known.command else ""
     return ", or ".join(filter(None, (command, known.place and f"in {known.place}")))
 

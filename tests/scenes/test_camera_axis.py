@@ -10,9 +10,7 @@ from typer import Exit
 from optics.geometry.tree import Motion
 from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.aim import AimError
-from scenes.models.camera_axis import AfocalError
-from scenes.models.camera_model import CameraModel, derive_camera
-from scenes.models.stated_focal_length import check_entrance_pupil
+from scenes.models.camera_model import AfocalError, CameraModel, check_entrance_pupil, derive_camera
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate

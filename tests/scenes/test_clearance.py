@@ -10,17 +10,18 @@ from scipy.spatial import ConvexHull, Delaunay
 
 from optics.geometry.pose import rotation_matrix
 from scenes.models import instrument_builder, obstruction
-from scenes.models.clearance import (
+from scenes.models.instrument_model import MisplacedError
+from scenes.models.obstruction import (
     LEAST_GAP,
+    RAYS,
     check_clearance,
     check_solids,
     convex_bodies,
+    find_obstructions,
     find_overlaps,
     remedy,
     separation,
 )
-from scenes.models.instrument_model import MisplacedError
-from scenes.models.obstruction import RAYS, find_obstructions
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_cameras, load_instrument
 from scenes.yaml.errors import InputError
 from tests.tiers import quick

@@ -7,9 +7,16 @@ import pytest
 
 from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
-from scenes.models.disturbances import Component, StatedMotions, motions_of_spec, state_of, stated_motions
+from scenes.models.disturbances import (
+    Component,
+    StatedMotions,
+    joint_disturbances,
+    joint_files,
+    motions_of_spec,
+    state_of,
+    stated_motions,
+)
 from scenes.models.instrument_builder import build_instrument
-from scenes.models.joint_disturbances import joint_disturbances, joint_files
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs import load
 from scenes.specs.disturbances import DisturbancesSpec

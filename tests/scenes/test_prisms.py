@@ -23,8 +23,7 @@ from optics.raytrace import reflectors
 from optics.raytrace.assembly import Assembly
 from optics.thermal.heat import Temperature
 from optics.thermal.thermo_elastic import free_linear_field
-from scenes.models.clearance import LEAST_GAP, find_overlaps, separation
-from scenes.models.obstruction import find_obstructions, rays_taken
+from scenes.models.obstruction import LEAST_GAP, find_obstructions, find_overlaps, rays_taken, separation
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.load import load_instrument
 from tests.optics.bench import run

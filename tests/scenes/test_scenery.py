@@ -12,8 +12,16 @@ from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import Body, Motion, RigidTree
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.meshes import sheet_mesh
-from scenes.models.scenery import Scenery, build_scenery
-from scenes.models.scenery_parts import Detector, Finishes, SceneSurface, mirror_surface, plate_surfaces, solid_surfaces
+from scenes.models.scenery import (
+    Detector,
+    Finishes,
+    Scenery,
+    SceneSurface,
+    build_scenery,
+    mirror_surface,
+    plate_surfaces,
+    solid_surfaces,
+)
 from scenes.specs.baffle import box, ring, tube
 
 STATE = {

@@ -11,8 +11,7 @@ import pytest
 
 from optics.thermal.nodal_deformation import nodal_deformation
 from scenes.models.instrument_builder import build_instrument
-from scenes.models.job_state import job_state
-from scenes.models.nodal_bodies import FINE_CELLS, HeatedBody, deformed_face, heated_bodies
+from scenes.models.job_state import FINE_CELLS, HeatedBody, deformed_face, heated_bodies, job_state
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, compose
-from scenes.models.clearance import convex_bodies
 from scenes.models.instrument_builder import build_instrument, squared_facets
+from scenes.models.obstruction import convex_bodies
 from scenes.specs.instrument import as_built_file
 from scenes.specs.load import load_cameras, load_instrument
 from scenes.specs.resolved import resolve, resolve_camera

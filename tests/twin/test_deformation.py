@@ -13,7 +13,7 @@ from optics.geometry.tree import Motion, compose
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import nodal_deformation
 from optics.thermal.nodal_temperature import Coverage
-from scenes.models.nodal_bodies import HeatedBody, HeatedFace
+from scenes.models.job_state import HeatedBody, HeatedFace
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve, resolve_job

@@ -42,9 +42,8 @@ from twin.sensors.area_detector import (
     coarse_warnings,
     told_of_steps,
 )
-from twin.sensors.charge_transfer import Collection, Motion
 from twin.sensors.exposure_kernel import FEWEST
-from twin.sensors.line_ccd import LineCcd
+from twin.sensors.line_ccd import Collection, LineCcd, Motion
 from twin.sensors.poisson_numbers import SERIES_END, TABLE_END, poisson_numbers, poisson_quantile
 
 FALSE_ALARM = 1e-6

@@ -14,7 +14,7 @@ from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.images.line_optics import collected, exposures
 from twin.orbit.images.patch import window_of
 from twin.orbit.images.pushbroom import PushbroomScene, render_patch
-from twin.sensors.charge_transfer import Collection, Motion
+from twin.sensors.line_ccd import Collection, Motion
 
 ARCSEC = np.pi / 648000.0
 NU = np.array([0.1, 0.25, 0.5, 1.0])

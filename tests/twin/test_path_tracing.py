@@ -18,8 +18,7 @@ from optics.geometry.tree import AT_REST, Body, Motion, RigidTree, State
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.scenery import Scenery, build_scenery
-from scenes.models.scenery_parts import Detector, detector_surface, mirror_surface
+from scenes.models.scenery import Detector, Scenery, build_scenery, detector_surface, mirror_surface
 from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, facing, flat_mirror, glass_scene, screen, slab
 from twin.monitor.monitor_path import MonitorPath

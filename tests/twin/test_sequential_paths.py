@@ -17,8 +17,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree
 from optics.materials.scatter import CoatingTable, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from scenes.models.scenery import Scenery, build_scenery
-from scenes.models.scenery_parts import Finishes, mirror_surface
+from scenes.models.scenery import Finishes, Scenery, build_scenery, mirror_surface
 from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, facing, scene_beam, screen, ways_and_search
 from twin.path_tracing.clear_ways import ClearWays

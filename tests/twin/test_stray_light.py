@@ -14,8 +14,7 @@ from scipy.stats import chi2, norm, t
 from optics.geometry.tree import Motion
 from optics.materials.scatter import MIRROR, Finish
 from scenes.models.instrument_builder import build_instrument
-from scenes.models.scenery import build_scenery
-from scenes.models.scenery_parts import Finishes
+from scenes.models.scenery import Finishes, build_scenery
 from scenes.specs.baffle import BaffleSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY

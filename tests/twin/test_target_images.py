@@ -21,8 +21,7 @@ from optics.waves.diffraction import Grid, image
 from optics.waves.imaging import imaging_rays, pupil_field
 from optics.waves.pupil_stack import circular_pupil
 from optics.waves.transfer import polychromatic_transfer
-from scenes.models.camera_axis import LAUNCH_DISTANCE
-from scenes.models.camera_model import ROOT, build_camera_under_test, camera_alone
+from scenes.models.camera_model import LAUNCH_DISTANCE, ROOT, build_camera_under_test, camera_alone
 from scenes.specs.camera import BandSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec, CollimatorSpec
 from scenes.specs.load import load_camera, load_detector

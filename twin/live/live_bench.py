@@ -17,8 +17,8 @@ from analysis.monitor import parameters
 from analysis.monitor.parameters import Parameter
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
-from scenes.models.clearance import Clearances
 from scenes.models.disturbances import Component, state_of
+from scenes.models.obstruction import Clearances
 from scenes.specs.course import DEFAULT_PIVOT, CourseSpec, moment
 from scenes.specs.job import checked_nodes
 from twin.framework.random_streams import stream

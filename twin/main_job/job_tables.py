@@ -10,7 +10,7 @@ from typing import Any
 
 from optics.numerics.number_tree import FrozenMap
 from optics.thermal.nodal_deformation import PRINTED, SEEN, NodalDeformation
-from scenes.models.nodal_bodies import HeatedBody, HeatedFace
+from scenes.models.job_state import HeatedBody, HeatedFace
 from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import FinishTableSpec
 from scenes.specs.resolved import ResolvedJob

@@ -27,8 +27,15 @@ from optics.waves.diffraction import UnsampledImageError
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
-from scenes.models.job_state import job_state, motions_of, on_deformed
-from scenes.models.nodal_bodies import HeatedBody, deformed_face, heated_body, with_heat
+from scenes.models.job_state import (
+    HeatedBody,
+    deformed_face,
+    heated_body,
+    job_state,
+    motions_of,
+    on_deformed,
+    with_heat,
+)
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.course import NO_MOTION
 from scenes.specs.instrument import SIDES

@@ -21,8 +21,7 @@ from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
 from optics.waves.diffraction import Grid, image
 from scenes.models.instrument_model import Instrument
-from scenes.models.scenery import Scenery, build_scenery
-from scenes.models.scenery_parts import Finishes
+from scenes.models.scenery import Finishes, Scenery, build_scenery
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import Channel, prism_of
 from twin.framework.quantity import Quantity, Record

@@ -37,8 +37,7 @@ from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.spectrum import SpectrumSpec, black_body_photons
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Jitter, Trajectory
-from twin.sensors.charge_transfer import Collection
-from twin.sensors.line_ccd import LineCcd, band_wavelengths
+from twin.sensors.line_ccd import Collection, LineCcd, band_wavelengths
 
 if TYPE_CHECKING:
     from scenes.specs.detector import DetectorSpec

@@ -14,9 +14,17 @@ from analysis.statistics import share_interval
 from scenes.specs.study import ParetoSpec, ThresholdSpec
 from twin.framework.quantity import Quantity, Record
 from twin.study.report import study_statistics as statistics
-from twin.study.report.linear_model import Effect, LinearModel, MainEffect, linear_model, main_effects
 from twin.study.report.sensitivity_indices import Index, Indices, NoIndices, sensitivity_indices
-from twin.study.report.study_statistics import Estimate, Response, StudyRuns
+from twin.study.report.study_statistics import (
+    Effect,
+    Estimate,
+    LinearModel,
+    MainEffect,
+    Response,
+    StudyRuns,
+    linear_model,
+    main_effects,
+)
 
 
 @dataclass(frozen=True, eq=False)
