@@ -98,8 +98,12 @@ def unnamed(meant: Callable[[Sequence[str]], str]) -> type[TyperGroup]:
 
     class Group(TyperGroup):
         def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+            return list(super().parse_args(ctx, self.whole(args)))
+
+        def whole(self, args: list[str]) -> list[str]:
+            """Return the arguments with the subcommand before them."""
             named = not args or args[0] in self.commands or args[0] == "--help"
-            return list(super().parse_args(ctx, args if named else [meant(args), *args]))
+            return args if named else [meant(args), *args]
 
     return Group
 
