@@ -26,7 +26,7 @@ class Procedure:
 
     Attributes:
         kind: for example ``focus``; KIND.json has the numbers.
-        setup: class of the simulated test with all it refers to, an `ExperimentSetup`.
+        setup: class of the simulated test with all it refers to, an `ExperimentSetup`; or what reads its file.
         run: set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
         report: run -> `twin.framework.report.Report`.
@@ -65,11 +65,12 @@ class Procedure:
         """Class of the simulated test's set-up."""
         return Named(self.setup).get() if isinstance(self.setup, str) else self.setup
 
-    def resolve(self, path: Path | str) -> Any:
+    def resolve(self, path: Path | str, *named: str | None) -> Any:
         """Read a test with all it refers to.
 
         Args:
             path: of its file or of a run's config.yaml, or the name of a test in the library.
+            named: what else is named of a set-up that is read by a function.
 
         Raises:
             InputError: a file cannot be read or is not valid, or they do not fit together.
@@ -78,7 +79,7 @@ class Procedure:
             measured = Named(self.measured).get()
             if measured.measured_by(Named("scenes.specs.resolved:test_keys")(path)):
                 return measured.read(path)
-        return self.model.read(path)
+        return getattr(self.model, "read", self.model)(path, *named)
 
 
 BASES: dict[str, Named] = {
@@ -381,6 +382,38 @@ _PROCEDURES: dict[str, Procedure] = {
 
     Example: `python -m twin.asbuilt check scenes/examples/asbuilt_gf7.yaml`
     """,
+    ),
+    "camera": Procedure(
+        "optics",
+        setup="scenes.specs.resolved:resolve_camera",
+        run="twin.camera.camera_run:run_camera",
+        numbers="twin.camera.camera_run:CAMERA",
+        report="twin.camera.camera_report:camera_report",
+    ),
+    "recover": Procedure(
+        "recovered",
+        setup="scenes.specs.monitor_frames:MeasurementSetup",
+        run="twin.recover.recover_run:run_recover",
+        numbers="twin.recover.recover_run:recover_numbers",
+        report="twin.recover.recover_report:recover_report",
+        judged=False,
+    ),
+    "tolerance": Procedure(
+        "tolerance",
+        setup="scenes.specs.tolerance:ToleranceSetup",
+        run="twin.tolerance.tolerance_run:run_tolerance",
+        numbers="twin.tolerance.tolerance_run:TOLERANCE",
+        report="twin.tolerance.tolerance_report:tolerance_report",
+        judged=False,
+    ),
+    "uncertainty": Procedure(
+        "uncertainty",
+        setup="scenes.specs.resolved:resolve_with",
+        run="twin.uncertainty.coverage:run_uncertainty",
+        numbers="twin.uncertainty.uncertainty_numbers:uncertainty_numbers",
+        report="twin.uncertainty.uncertainty_report:uncertainty_report",
+        judged=False,
+        seeded=False,
     ),
 }
 PROCEDURES = ExtensionTable("procedures", _PROCEDURES, Procedure)

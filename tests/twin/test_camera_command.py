@@ -146,7 +146,7 @@ def test_tilt_is_an_option(tmp_path, monkeypatch) -> None:
     """The word of earlier versions is read, and told how it is written."""
     asked = []
 
-    def run(setup, backend, refocus, tilt, advance):
+    def run(setup, backend, seed, advance, refocus, tilt):
         asked.append((refocus, tilt))
         raise InputError(Issue("enough"))
 

@@ -21,7 +21,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera
-from scenes.specs.procedures import Procedure
+from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
 from tests.twin.commands import files, invoke
@@ -29,7 +29,7 @@ from tests.twin.test_blurred_cameras import gf7_with
 from twin.framework import cli, reference_frames
 from twin.framework.artefact import PngFigure, SvgFigure, Table
 from twin.framework.cli import heartbeat
-from twin.framework.command import add_test, progress_shown
+from twin.framework.command import add_tests, progress_shown
 from twin.framework.procedure import Advance, BenchError
 from twin.framework.quantity import plain_data
 from twin.framework.report import Report, Section, answer
@@ -142,9 +142,10 @@ def program(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> typer.Typer:
     """Return a program with the test as its command, but for what is changed."""
     frames = {**reference_frames.FRAMES, "level": {"readings_arcsec": "about the level's own axis"}}
     monkeypatch.setattr(reference_frames, "FRAMES", FrozenMap(frames))
+    monkeypatch.setitem(PROCEDURES, "bench level", replace(LEVEL, **changes))
     app = typer.Typer()
     app.callback()(lambda: None)
-    add_test(app, "own.bench", "level", replace(LEVEL, **changes))
+    add_tests(app, "bench")
     return app
 
 

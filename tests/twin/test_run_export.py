@@ -33,8 +33,7 @@ from twin.framework.run_folder import RunFolder, write_manifest
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_files import write_data
 from twin.main_job.render_job import render_job
-from twin.recover.recover_report import recover_numbers
-from twin.recover.recover_run import run_recover
+from twin.recover.recover_run import recover_numbers, run_recover
 
 JOB = ROOT / "tests/golden/jobs/perturb.yaml"
 SEED, FRAMES = 5, 3

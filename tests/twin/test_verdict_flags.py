@@ -12,18 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 
 import twin
 from docs.site.run_pages import kept_fields
-from optics.numerics.number_tree import FrozenMap
 from scenes.specs.resolved import resolve
 from scenes.specs.study import UNITS, unit_of
 from tests.golden.digest import expanded
 from tests.twin.commands import invoke
-from tests.twin.test_procedure import FILE, LEVEL
-from twin.framework import reference_frames
-from twin.framework.command import add_test
+from tests.twin.test_procedure import FILE, LEVEL, program
 from twin.framework.provenance import VERDICT, negative_verdicts
 from twin.framework.quantity import Quantity, Record
 from twin.main_job.render_job import render_job
@@ -139,11 +135,7 @@ def test_strict_ends_with_a_code_of_its_own(
     good: bool, options: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also with --quiet, where the warnings stand in JSON; the run folder is complete."""
-    monkeypatch.setattr(reference_frames, "FRAMES", FrozenMap({**reference_frames.FRAMES, "level": {}}))
-    app = typer.Typer()
-    app.callback()(lambda: None)
-    judged = replace(LEVEL, numbers=lambda run: {**LEVEL.numbers(run), "fit": {"agrees": good}})
-    add_test(app, "own.bench", "level", judged)
+    app = program(monkeypatch, numbers=lambda run: {**LEVEL.numbers(run), "fit": {"agrees": good}})
     (tmp_path / "level.yaml").write_text(FILE, "utf-8")
     done = invoke(app, "level", tmp_path / "level.yaml", "--out", tmp_path / "run", "--quiet", *options)
     assert done.exit_code == code, done.stderr

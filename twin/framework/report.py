@@ -13,6 +13,7 @@ from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.artefact import Artefact, Table
 from twin.framework.data_files import FrameFacts
+from twin.framework.provenance import SelfCheck
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +75,8 @@ class Report:
         image_facts: name of images -> what is known of these frames; of some or all.
         code: exit code of the command, of a test whose answer it is.
         conclusions: what follows from the numbers, sentence by sentence, before all tables.
+        files: path in the run folder -> content, of files that no page shows.
+        checks: what the run checked of itself; none for what its numbers say.
     """
 
     title: str
@@ -87,6 +90,8 @@ class Report:
     image_facts: Mapping[str, FrameFacts] = field(default_factory=FrozenMap)
     code: int = 0
     conclusions: tuple[str, ...] = ()
+    files: Mapping[str, bytes] = field(default_factory=FrozenMap)
+    checks: tuple[SelfCheck, ...] = ()
 
     @property
     def artefacts(self) -> tuple[Artefact, ...]:

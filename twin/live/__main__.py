@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from twin.framework.cli import BackendName, InputErrorText, Quiet, check_backend, explained
+from twin.framework.cli import BackendName, InputErrorText, Quiet, check_backend, explained, program
 
 PORT = 8790
 TOKEN = "TWIN_LIVE_TOKEN"
@@ -23,7 +23,7 @@ EXTRA = (
     "`bash setup.sh --live`"
 )
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = program()
 
 
 @app.command()
