@@ -19,16 +19,8 @@ from twin.framework import svg
 from twin.framework.artefact import Artefact, OwnDecimals, SvgFigure, Table
 from twin.framework.quantity import Record
 from twin.framework.report import Report, Section, answer
-from twin.laboratory.turntable_run import (
-    COMPENSATION,
-    DOUBTFUL,
-    FIT,
-    REJECTED,
-    TRUE_FIT,
-    TURNTABLE,
-    TurntableModel,
-    TurntableRun,
-)
+from twin.laboratory import turntable_run
+from twin.laboratory.turntable_run import DOUBTFUL, TURNTABLE, TurntableModel, TurntableRun
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -241,7 +233,7 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     artefacts += [_ranking(result), _left(run, result), _chi_square(result)]
     gone = result.get("rejected_readings")
     if gone:
-        artefacts.append(rejected_table(REJECTED, "turntable-rejected", "Comparisons", gone))
+        artefacts.append(rejected_table(turntable_run.REJECTED, "turntable-rejected", "Comparisons", gone))
     return Section("Fits of the dividing error", tuple(text), tuple(artefacts), folded=1 if gone else 0)
 
 
@@ -262,9 +254,11 @@ def _ranking(result: Mapping[str, Any]) -> Table:
             "all phases of the signal, and the same without a constant, which differences of angles do not see."
         )
         fits = {name: {**fit, **truth["fits"][name]} for name, fit in fits.items()}
-        keys += [one.key for one in TRUE_FIT]
+        keys += [one.key for one in turntable_run.TRUE_FIT]
     rows = {FIT_NAMES[name]: fits[name] for name in result["ranking"]}
-    return Record("A fit.", *FIT, *TRUE_FIT).table("turntable-fits", "The fits", note, rows, keys, "fit")
+    return Record("A fit.", *turntable_run.FIT, *turntable_run.TRUE_FIT).table(
+        "turntable-fits", "The fits", note, rows, keys, "fit"
+    )
 
 
 def _noise(run: TurntableRun) -> float:
@@ -274,7 +268,7 @@ def _noise(run: TurntableRun) -> float:
 
 def _left(run: TurntableRun, result: Mapping[str, Any]) -> Table:
     noise = "noise of the calibration, mean over its readings [arcsec]", OwnDecimals(_noise(run), 4)
-    lines = [noise, *COMPENSATION.lines(result["compensation"])]
+    lines = [noise, *turntable_run.COMPENSATION.lines(result["compensation"])]
     title = "What is left of a compensated angle"
     return Table("turntable-sigma", title, "Without the repeatability of one comparison.", ("part", "σ"), lines)
 
