@@ -16,10 +16,10 @@ from analysis.monitor.parameters import ANGLE, GROUND
 from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
 from scenes.specs.resolved import resolve
 from twin.framework.artefact import FAR
-from twin.main_job.assumptions import assumed
 from twin.main_job.render_command import _table
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
+from twin.main_job.systematics import assumed
 from twin.main_job.verdict import FALSE_ALARM, Judgement, alarm_limit, judge, readings, recovered_numbers
 
 OUTSIDE = "a motion outside the family of the model"

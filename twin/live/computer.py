@@ -25,9 +25,8 @@ from optics.numerics.backend import BackendUnavailable, cores, kernel_threads, o
 from optics.numerics.llvm import LibraryMissing
 from scenes.yaml.errors import InputError
 from twin.live.camera_pictures import CameraPictures
-from twin.live.live_bench import LOST, LiveBench
+from twin.live.live_bench import LOST, LiveBench, course_text, job_text
 from twin.live.messages import AskedState, AskedView, BlindState, Opened, packed
-from twin.live.recording import course_text, job_text
 from twin.live.source import read_source
 from twin.pictures.scene_file import write_scene
 from twin.scripting.instrument_twin import InstrumentTwin

@@ -16,6 +16,8 @@ from analysis.monitor.estimators import Estimator
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, Parameter
 from analysis.monitor.recovery import Recovery
 from optics.geometry.tree import State
+from optics.thermal.nodal_deformation import NodalDeformation
+from scenes.models.nodal_bodies import HeatedBody
 from scenes.models.obstruction import Obstruction
 from scenes.models.scenery import MeasuredFinishes
 from scenes.specs.resolved import ResolvedJob
@@ -104,6 +106,16 @@ class JobRun:
         if ANGLE_GROUP in out:
             out[ANGLE_GROUP] = {"nominal_deg": float(np.degrees(self.truth.angle))} | out[ANGLE_GROUP]
         return out
+
+    @property
+    def deformed(self) -> Mapping[str, NodalDeformation]:
+        """Body -> what the table of displaced nodes is that deforms it."""
+        return self.experiment.deformed(self.resolved.job)
+
+    @property
+    def heated(self) -> Mapping[str, HeatedBody]:
+        """Body -> what the table of temperatures is that warms it."""
+        return self.experiment.heated(self.resolved.job)
 
     @property
     def checks(self) -> tuple[SelfCheck, ...]:

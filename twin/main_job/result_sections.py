@@ -24,9 +24,8 @@ from twin.framework.artefact import (
     residual_text,
 )
 from twin.framework.report import Section
-from twin.main_job.assumptions import assumed, course_agrees
 from twin.main_job.render_results import JobRun, RenderRun
-from twin.main_job.systematics import joined, systematics
+from twin.main_job.systematics import assumed, course_agrees, joined, systematics
 from twin.monitor.reading_table import Reading, ReadingTable
 from twin.monitor.time_series import TimeSeries
 
