@@ -297,7 +297,7 @@ def test_motions_far_from_what_is_stated_are_found_out(job) -> None:
         run = job(f"{{{body}: {motion}}}", more)
         told = judge(run)
         (warning,) = [text for text in told.warnings if "contradict" in text]
-        assert run.consistency is not None
+        assert run.reading.consistency is not None
         assert "contradict the prior launch: chi-square" in warning
         assert f"where {run.consistency.limit:.1f} is exceeded with a chance of 0.001" in warning
         assert f"motions of {run.consistency.suspects[0].body} would explain them best" in warning

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
@@ -145,7 +146,7 @@ class LiveBench:
             "instrument": twin.name,
             "cameras": list(twin.cameras),
             "nodes": nodes,
-            "knobs": [knob.plain() for knob in self.knobs.values()],
+            "knobs": [asdict(knob) for knob in self.knobs.values()],
             "frames": twin.resolved.frames,
             "seed": self.at_rest.seed,
             "parameters": [_label(p) for p in self._parameters],

@@ -38,13 +38,15 @@ from twin.main_job.render_results import PROGRAM, JobRun, RenderRun
 from twin.main_job.result_sections import (
     IN_PAGE,
     course_sections,
+    done_table,
+    facts,
     figure,
     residual_section,
     result_tables,
+    setup_section,
     shown_time,
     spot_section,
 )
-from twin.main_job.setup_sections import done_table, facts, setup_section
 from twin.main_job.verdict import judge
 from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.scene_file import viewer_markup, viewer_programs, viewer_scripts

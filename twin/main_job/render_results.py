@@ -185,11 +185,6 @@ class RenderRun(JobRun):
         return self.reading.gains
 
     @property
-    def consistency(self) -> Consistency | None:
-        """Agreement of the reading's shifts with the prior; None without a prior."""
-        return self.reading.consistency
-
-    @property
     def sigma_holds(self) -> bool:
         """Whether nothing that was measured contradicts the sigmas; of a course at none of its times."""
         return self.reading.sigma_holds if self.series is None else bool(np.all(self.series.sigma_holds))
