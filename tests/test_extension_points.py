@@ -78,7 +78,7 @@ from twin.monitor import calibration_cache
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.orbit import Orbit, acceleration, propagate
-from twin.path_tracing.sinks import NOMINAL
+from twin.path_tracing.path_result import NOMINAL
 from twin.path_tracing.source import RaySource
 from twin.path_tracing.stray_light import monitor_families
 from twin.path_tracing.tracer import PathTracer

@@ -16,8 +16,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import Frame, Opcode
 
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
-from twin.serving import guard
-from twin.serving.guard import COOKIE, MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS, Guard, names_of_this_machine
+from twin.live import guard
+from twin.live.guard import COOKIE, MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS, Guard, names_of_this_machine
 
 WRONG = [
     b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(256)),  # TLS

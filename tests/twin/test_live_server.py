@@ -22,10 +22,9 @@ from twin.framework.cli import InputErrorText
 from twin.live.__main__ import TOKEN, _serve
 from twin.live.clients import BAD_MESSAGES, Client, Goodbye
 from twin.live.computer import CannotStart, ComputerLost
+from twin.live.guard import BadToken, Guard, new_token
 from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, read_message
-from twin.live.server import LiveServer
-from twin.serving.guard import BadToken, Guard, new_token
-from twin.serving.server import listen
+from twin.live.server import LiveServer, listen
 
 
 @contextmanager

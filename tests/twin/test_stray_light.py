@@ -22,7 +22,7 @@ from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.path_tracing.sinks import GHOST, NOMINAL, STRAY
+from twin.path_tracing.path_result import GHOST, NOMINAL, STRAY
 from twin.path_tracing.stray_light import (
     REACH,
     NominalPathLost,

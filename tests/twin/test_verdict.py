@@ -15,10 +15,10 @@ from analysis.monitor.limits import Split
 from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, GROUND
 from scenes.specs.resolved import resolve
 from twin.framework.artefact import FAR
-from twin.main_job.assumptions import assumed
 from twin.main_job.render_command import _table
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
+from twin.main_job.systematics import assumed
 from twin.main_job.verdict import FALSE_ALARM, Judgement, alarm_limit, judge, readings, recovered_numbers
 
 OUTSIDE = "a motion outside the family of the model"
@@ -298,7 +298,7 @@ def test_motions_far_from_what_is_stated_are_found_out(job) -> None:
         run = job(f"{{{body}: {motion}}}", more)
         told = judge(run)
         (warning,) = [text for text in told.warnings if "contradict" in text]
-        assert run.consistency is not None
+        assert run.reading.consistency is not None
         assert "contradict the prior launch: chi-square" in warning
         assert f"where {run.consistency.limit:.1f} is exceeded with a chance of 0.001" in warning
         assert f"motions of {run.consistency.suspects[0].body} would explain them best" in warning

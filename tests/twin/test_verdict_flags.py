@@ -32,7 +32,7 @@ WARNED_ELSEWHERE = {
     ("Sensitivity to a factor", "rbd_fast_agrees"): "twin.study.report.study_analysis",
     ("block.json", "agrees"): "twin.orbit.block.block_report",
     ("The loop closed and open", "stable"): "that of margins_hold",
-    ("course.json", "sigma_holds"): "twin.monitor.time_series, and twin.main_job.assumptions for single times",
+    ("course.json", "sigma_holds"): "twin.monitor.time_series, and twin.main_job.systematics for single times",
     ("What random states gave", "sigma_holds"): "twin.uncertainty.uncertainty_report",
     ("focus.json of a measured series", "curves_agree"): "twin.laboratory.focus_report",
     ("turntable.json", "heldout_agrees"): "twin.laboratory.turntable_report",

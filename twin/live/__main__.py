@@ -105,9 +105,8 @@ def _serve(
         InputErrorText: the extra is missing, the address is taken, or the instrument cannot be built.
     """
     try:
-        from twin.live.server import LiveServer
-        from twin.serving.guard import BadToken, Guard, new_token
-        from twin.serving.server import addresses, listen
+        from twin.live.guard import BadToken, Guard, new_token
+        from twin.live.server import LiveServer, addresses, listen
     except ImportError as error:
         raise InputErrorText(f"{EXTRA} ({error.name})") from None
     from twin.live.computer import CannotStart, Computer

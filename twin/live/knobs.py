@@ -7,7 +7,7 @@ the knob's unit, and what it does is what a job's file does that writes this num
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from scenes.specs.course import DEFAULT_PIVOT
@@ -78,10 +78,6 @@ class Knob:
     reach: float
     limit: float
 
-    def plain(self) -> dict[str, Any]:
-        """Plain data for the page."""
-        return asdict(self)
-
 
 def axes_of(kind: str) -> tuple[str, ...]:
     """What knobs of a kind are called after it."""
@@ -111,7 +107,7 @@ def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
             given = _given(plain.get(node, {}), kind)
             unit = _unit(given.values(), what.unit)
             for axis in dict.fromkeys((*axes_of(kind), *given)):
-                value = _in_unit(given.get(axis), unit)
+                value = _number(given.get(axis), unit, 0.0)
                 size = 1.0 if what.unit == unit else unit_ratio(what.unit, unit)
                 reach = max(what.reach * size, 2.0 * abs(value))
                 name = knob_name(node, kind, axis)
@@ -140,15 +136,6 @@ def _unit(quantities: Iterable[Any], usual: str) -> str:
     parts = [split_quantity(q) for q in quantities]
     units = {part[1] for part in parts if part is not None and part[0] != 0}
     return units.pop() if len(units) == 1 else usual
-
-
-def _in_unit(quantity: Any, unit: str) -> float:
-    part = None if quantity is None else split_quantity(quantity)
-    if part is None:
-        return 0.0
-    number, own = part
-    # dividing keeps decimal fractions where a product would not
-    return float(number) if own == unit else float(number) / unit_ratio(unit, own)
 
 
 def perturbation(
@@ -238,10 +225,6 @@ class FactorKnob:
     whole: bool
     knobs: Mapping[str, float]
 
-    def plain(self) -> dict[str, Any]:
-        """Plain data for the page."""
-        return asdict(self)
-
     def scalar(self, value: float) -> Any:
         """A value as a study's file writes it."""
         number = int(value) if self.whole and value == int(value) else value
@@ -301,13 +284,14 @@ def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | No
 
 
 def _number(value: Any, unit: str, otherwise: float) -> float:
-    """A value of the base in the factor's unit."""
+    """A quantity in a unit."""
     if isinstance(value, int | float):
         return float(value)
     part = split_quantity(value)
     if part is None:
         return otherwise
     number, own = part
+    # dividing keeps decimal fractions where a product would not
     return float(number) if own == unit else float(number) / unit_ratio(unit, own)
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import center_of_mass
 
 from analysis.arrays import shows
 from analysis.monitor.disturbances import Disturbances
@@ -372,10 +373,8 @@ class MonitorExperiment:
 
     def _template(self, image: np.ndarray) -> SpotTemplate:
         """Calibrated shape of one spot; its centre is the energy centroid of the core (above 5% of the peak)."""
-        core = np.where(image > 0.05 * image.max(), image, 0.0)
-        row = float(core.sum(axis=1) @ np.arange(image.shape[0]) / core.sum())
-        column = float(core.sum(axis=0) @ np.arange(image.shape[1]) / core.sum())
-        return SpotTemplate.from_image(image, row, column, self.path.shape)
+        row, column = center_of_mass(np.where(image > 0.05 * image.max(), image, 0.0))
+        return SpotTemplate.from_image(image, float(row), float(column), self.path.shape)
 
     def pattern(self, seed: int | Sequence[int]) -> FixedPattern:
         """PRNU and DSNU of all area CCDs, (C, rows, columns); the same before and after. Those of several seeds one

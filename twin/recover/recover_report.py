@@ -10,8 +10,8 @@ from analysis.spots import CENTROIDS
 from scenes.specs.course import moment
 from twin.framework.artefact import FAR, Cell, SvgFigure, Table, decimals_for, fixed, plain, significant
 from twin.framework.report import Report, Section, answer
-from twin.main_job.assumptions import NOISE, assumed, course_agrees, limits, share_text
 from twin.main_job.monitor_reading import worst_checks
+from twin.main_job.systematics import NOISE, assumed, course_agrees, limits, share_text
 from twin.recover.channel_measurement import ChannelResult, SpotResult
 from twin.recover.recover_plots import Line, changes_svg, residuals_svg, spots_svg
 from twin.recover.recover_run import RecoverRun, state_name
