@@ -13,7 +13,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
-from analysis.spots.static_defects import repaired_centroid
+from analysis.spots.static_defects import _off, repaired_centroid
 from tests.analysis.refusals import refuses
 from tests.analysis.test_spot_centroids import airy
 
@@ -122,3 +122,12 @@ def test_the_influence_of_every_pixel_is_the_change_it_makes(template, measure, 
         scale = np.sqrt(np.einsum("ahw,ahw->a", found.gain_maps[0], found.gain_maps[0]))
         np.testing.assert_array_less(np.abs(change - expected), 0.01 * scale)
     assert np.all(found.gain_maps[0][:, ~dirty.good] == 0.0)
+
+
+@pytest.mark.parametrize("level", [0.1, 30.0])
+def test_pixels_are_off_by_sigmas_whatever_the_noise(level):
+    """Of 4096 pixels one is beyond six sigmas with a chance of 1e-5; a pixel of twelve is."""
+    residual = np.random.default_rng(2).standard_normal((64, 64))
+    residual[20, 30] += 12.0
+    found = _off(level * residual, np.full((64, 64), level**2), np.ones((64, 64), bool), 6.0)
+    assert np.argwhere(found).tolist() == [[20, 30]]
