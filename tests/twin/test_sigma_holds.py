@@ -142,7 +142,7 @@ def test_a_reading_whose_state_cannot_be_traced_says_so(pair, blurred) -> None:
 
 
 def test_what_no_spot_sees_is_a_warning(orbit, monkeypatch) -> None:
-    """The line CCD alone, 20 um: d_alpha is -0.73 arcsec and read as 0; spots move by a tenth of their noise of 1e-3 px.
+    """The line CCD alone, 20 um: d_alpha is -0.73 arcsec and read as 0; spots move by a tenth of their noise, 1e-3 px.
     And coma of M2 at five times its sigma, which moves spots as likelier motions do.
     """
     traced = systematics.traced_states
