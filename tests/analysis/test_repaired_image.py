@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import ScreenedFrames
@@ -131,3 +132,12 @@ def test_pixels_are_off_by_sigmas_whatever_the_noise(level):
     residual[20, 30] += 12.0
     found = _off(level * residual, np.full((64, 64), level**2), np.ones((64, 64), bool), 6.0)
     assert np.argwhere(found).tolist() == [[20, 30]]
+
+
+@pytest.mark.parametrize(("width", "fits"), [(4.0, True), (7.0, False)])
+def test_a_spot_that_is_smeared_beyond_its_shape_is_another(template, width, fits):
+    """No vibration moves a spot by more than 5 px rms: what is wider is no smeared one, and does not fit."""
+    one = bench(template, "clean")
+    one.terms = FitTerms(smear=True)
+    found = one.fit(120.0 + gaussian_filter(one.image - 120.0, width))
+    assert (found.core[0] < 1.0) == fits
