@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, multivariate_normal
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.filter_state import Observed
+from analysis.monitor.filter_state import Observed, _with_errors
 from analysis.monitor.series_filter import SeriesFilter, detection_power
 from analysis.statistics import limit_of
 from tests.analysis.followed_series import follow, of_shifts
@@ -107,6 +107,22 @@ def test_the_state_is_that_of_the_good_readings() -> None:
             assert np.all(np.abs(course.values[0] - mean) < 1e-6 * sigma)
             assert np.allclose(course.total[0], covariance, rtol=1e-6, atol=1e-9 * sigma.min() ** 2)
     assert left >= 30  # of 36; an error of 0.05 px is within what both bodies' motions make of a coordinate
+
+
+def test_errors_are_weighed_by_normal_densities() -> None:
+    """With errors at the coordinate that explains most, and at all of them."""
+    rng = np.random.default_rng(6)
+    root, reading, errors = rng.normal(size=(3, 3)), 3.0 * rng.normal(size=3), np.array([0.5, 2.0, 9.0])
+    good = root @ root.T + 0.1 * np.eye(3)
+    precision = np.linalg.inv(good)
+    found = _with_errors(precision, precision @ reading, errors)
+
+    def log_ratio(size: np.ndarray) -> float:
+        bad, without = (multivariate_normal(cov=good + np.diag(s)) for s in (size, 0.0 * size))
+        return float(bad.logpdf(reading) - without.logpdf(reading))
+
+    alone = [log_ratio(row) for row in np.diag(errors)]
+    np.testing.assert_allclose(found[[0, 2]], [max(alone), log_ratio(errors)], rtol=1e-9)
 
 
 def test_a_jump_that_looks_bad_counts_with_both_until_the_next_reading() -> None:

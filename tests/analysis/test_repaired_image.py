@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import ScreenedFrames
@@ -13,7 +14,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
-from analysis.spots.static_defects import repaired_centroid
+from analysis.spots.static_defects import _off, repaired_centroid
 from tests.analysis.refusals import refuses
 from tests.analysis.test_spot_centroids import airy
 
@@ -123,3 +124,21 @@ def test_the_influence_of_every_pixel_is_the_change_it_makes(template, measure, 
         scale = np.sqrt(np.einsum("ahw,ahw->a", found.gain_maps[0], found.gain_maps[0]))
         np.testing.assert_array_less(np.abs(change - expected), 0.01 * scale)
     assert np.all(found.gain_maps[0][:, ~dirty.good] == 0.0)
+
+
+@pytest.mark.parametrize("level", [0.1, 30.0])
+def test_pixels_are_off_by_sigmas_whatever_the_noise(level):
+    """Of 4096 pixels one is beyond six sigmas with a chance of 1e-5; a pixel of twelve is."""
+    residual = np.random.default_rng(2).standard_normal((64, 64))
+    residual[20, 30] += 12.0
+    found = _off(level * residual, np.full((64, 64), level**2), np.ones((64, 64), bool), 6.0)
+    assert np.argwhere(found).tolist() == [[20, 30]]
+
+
+@pytest.mark.parametrize(("width", "fits"), [(4.0, True), (7.0, False)])
+def test_a_spot_that_is_smeared_beyond_its_shape_is_another(template, width, fits):
+    """No vibration moves a spot by more than 5 px rms: what is wider is no smeared one, and does not fit."""
+    one = bench(template, "clean")
+    one.terms = FitTerms(smear=True)
+    found = one.fit(120.0 + gaussian_filter(one.image - 120.0, width))
+    assert (found.core[0] < 1.0) == fits

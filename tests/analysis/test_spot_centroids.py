@@ -179,6 +179,17 @@ def test_shape_that_does_not_fit_shows_in_chi_square(template, light, before, pl
     assert np.all(maximum_likelihood_fit(ghost, FRAMES, NOISE, template).reduced_chi_square > 2)
 
 
+@pytest.mark.second
+def test_chi_square_of_a_gaussian_fit_is_per_degree_of_freedom():
+    """Draws that are orthogonal to each other have the mean of all draws, but for what is not linear (1e-5)."""
+    row, column = np.indices((24, 24))
+    level = GAIN * (PEAK_E * np.exp(-((row - 11.2) ** 2 + (column - 11.7) ** 2) / 3.0) + SKY_E) + OFFSET
+    noise = NoiseModel(GAIN, DARK_NOISE_E, 0.0, OFFSET, 0.0, 0.0, 4095.0)
+    drawn = 24.0 * np.linalg.qr(np.random.default_rng(3).standard_normal((576, 576)))[0].reshape(576, 24, 24)
+    found = gaussian_fit(level + np.sqrt(noise.temporal_variance_dn2(level, 1)) * drawn, 1, noise)
+    assert np.mean(found.reduced_chi_square) == pytest.approx(1.0, abs=1e-4)
+
+
 def test_influence_maps_predict_small_changes(template, light):
     """Position change from a small random disturbance against the maps; the rest is of second order."""
     clean = (GAIN * light + OFFSET)[:3]

@@ -66,7 +66,7 @@ def test_scale_grows_distances_but_not_a_rigid_inside(tree: RigidTree) -> None:
 def test_bad_trees_and_states_are_refused(tree: RigidTree) -> None:
     with pytest.raises(KeyError, match="nobody"):
         tree.place([{"nobody": Motion()}])
-    with pytest.raises(KeyError, match="nowhere"):
+    with pytest.raises(KeyError, match="a: pivot 'nowhere'"):
         tree.place([{"a": Motion(pivot="nowhere")}])
     with pytest.raises(ValueError, match="bend"):
         tree.place([{}], [("a", "bend", 0)])

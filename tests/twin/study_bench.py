@@ -37,7 +37,7 @@ def budget(folder: Path, name: str = "gf7", **changes: Any) -> ToleranceSetup:
 def write_study(folder: Path, *changes: tuple[str, str], text: str = STUDY) -> Path:
     """The study and its base in a folder, with changes of its text."""
     instrument = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
-    small = replaced(instrument, ("name: gf7_pair", "name: small"), ("rows: 96, columns: 96", "rows: 48, columns: 48"))
+    small = replaced(instrument, ("name: gf7_pair", "name: small"), ("rows: 96, columns: 96", "rows: 44, columns: 48"))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "small.yaml").write_text(small, "utf-8")
     (folder / "job.yaml").write_text("instrument: small.yaml\nrender: {frames: 1, seed: 1}\n", "utf-8")

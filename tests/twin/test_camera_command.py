@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scenes.models.camera_design import file_with_plane
-from scenes.models.camera_sharpness import FocalPlane, sharpness
+from scenes.models.camera_sharpness import FIELDS, FocalPlane, sharpness
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import LIBRARY, load_camera
 from scenes.specs.resolved import resolve_camera
@@ -68,6 +68,8 @@ def test_refocusing_finds_a_focal_plane_that_was_moved(backend) -> None:
     assert found.after.z == pytest.approx(own.after.z, abs=1e-6)
     assert found.after.tilt == pytest.approx(own.after.tilt, abs=1e-6)
     assert found.errors_before.max() > 0.3 > found.errors_after.max()
+    assert {(-x, y) for x, y in FIELDS} == set(FIELDS)  # both sides count alike
+    assert len(set(FIELDS)) == len(found.errors_after)
     assert abs(find_focus(camera, backend, tilt=False).after.z - camera.image.z) < 3e-6  # it was designed so
 
 

@@ -63,6 +63,10 @@ def test_a_child_that_fails_is_told(words: tuple[str, ...], told: str) -> None:
         doctor.run_probe(list(words), timeout_s=1.0 if "sleep" in words[1] else 60.0)
 
 
+def test_the_answer_of_a_child_is_its_last_line() -> None:
+    assert doctor.run_probe(["-c", """print('a note'); print('{"result": {"cores": 2}}')"""]) == {"cores": 2}
+
+
 def test_every_dependency_is_asked_for_in_a_range_that_is_here() -> None:
     asked = {one.name: one.specifier for one in doctor.requirements()}
     assert len(asked) > 10

@@ -1,5 +1,7 @@
 """Paper 001's error budget: mechanisms against the exact trace, scaling, and the printed tables."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from scenes.specs.disturbances import JobDisturbancesSpec
 from scenes.specs.load import load_disturbances, load_error_budget
 from scenes.specs.resolved import resolve_budget
 from scenes.yaml.errors import InputError
+from twin.monitor import simulated_budget
 from twin.monitor.simulated_budget import ErrorBudget, _shifts
 
 TRIALS = 40
@@ -74,6 +77,14 @@ def test_the_growth_of_a_focal_plane_is_a_true_change_and_no_error(backend, budg
     together = make(backend, causes=small | warm, photons_per_frame=4e6, all_together=20).together()
     assert together.spot[0] / ARCSEC == pytest.approx(0.18, rel=0.5)
     assert together.parameters["paper_single"]["d_f_m"][0] < 3e-6
+
+
+def test_the_scatter_of_a_few_frames_is_that_of_many(budget, monkeypatch):
+    """Two frames at +1 and -1 have the unbiased variance 2."""
+    seen = SimpleNamespace(position=np.repeat([1.0, -1.0], 2 * len(budget.experiment.path.channels)))
+    monkeypatch.setattr(budget, "spec", budget.spec.model_copy(update={"trials": 2}))
+    monkeypatch.setattr(simulated_budget, "measure_spots", lambda *_: seen)
+    np.testing.assert_allclose(budget._centroid_scatter(1.0) ** 2, 2.0)
 
 
 @pytest.mark.second

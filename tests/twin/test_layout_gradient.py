@@ -308,3 +308,9 @@ def test_a_search_without_a_layout_that_stands_is_refused(setup: MonitorDesignSe
     monkeypatch.setattr(monitor_design, "_ghosts", lambda *_: True)
     with pytest.raises(BenchError, match="every layout on the front throws ghosts"):
         monitor_design.run_monitor_design(setup, None)
+
+
+def test_of_many_layouts_the_best_the_lightest_and_some_between_are_shown(monkeypatch) -> None:
+    monkeypatch.setattr(monitor_design, "merit", lambda sigmas, bench: sigmas)
+    many = tuple(SimpleNamespace(sigmas=k, pupil_share=0.0, mass=-k) for k in range(101))
+    assert [one.mass for one in monitor_design._front(many, SimpleNamespace())] == [0, -20, -40, -60, -80, -100]

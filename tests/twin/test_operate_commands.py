@@ -286,6 +286,7 @@ def test_a_reading_that_contradicts_what_is_stated(following: Following) -> None
     (found,) = alarms_of(PLAN, replace(own, innovations=seen))
     assert (found.kind, found.time) == ("contradiction", times[2])
     assert "chi-square 50 of 8 coordinates, at most 45.7" in found.text
+    assert found.content["degrees_of_freedom"] == 8
     assert list(alarms_of(PLAN, replace(own, innovations=tuple((t, 45.0, 8) for t in times)))) == []
     jump = FoundJump("base/forward/M1", times[1], times[2], times[3], (), 30.0, 1e-9, {})
     kinds = [kind for kind, _ in told_of(replace(own, innovations=seen[1:], jumps=(jump,)))]

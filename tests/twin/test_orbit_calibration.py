@@ -1,22 +1,24 @@
 """In-orbit calibration over fields, end to end: recovery, statistics, schemes, and as a user runs it."""
 
 from dataclasses import astuple, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from analysis.orbit.calibration_parameters import CalibrationError
+from analysis.orbit.calibration_parameters import CalibrationError, Noise
 from analysis.orbit.three_line_model import misclosure
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES, EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup
+from twin.orbit.calibration import campaign_adjustment
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import run_calibration, true_values
-from twin.orbit.calibration.campaign import PassData, image_sigma, interior_names
+from twin.orbit.calibration.campaign import Campaign, PassData, image_sigma, interior_names
 from twin.orbit.calibration.campaign_adjustment import GAUGE, fitted, rate_priors, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import surprises
@@ -295,3 +297,15 @@ def test_short_fields_have_honest_sigmas() -> None:
 
 
 # The command
+
+
+def test_rates_that_residuals_show_are_assumed_with_their_uncertainty(monkeypatch) -> None:
+    """Of two passes the larger of each axis; of a rate that nothing settles nothing is known."""
+    estimate, sigma = 1e-6 * np.array([[3.0, 0.0, 1.0, 1.0, 0.0, 9.0], [4.0, 2.0, 0.0, 1.0, 1.0, np.inf]])
+    rates = SimpleNamespace(p_value=0.0, estimate=estimate, sigma=sigma)
+    found = SimpleNamespace(rates=rates, courses=SimpleNamespace(p_value=0.5), factors={"attitude walk": 4.0})
+    monkeypatch.setattr(campaign_adjustment, "simultaneous", lambda *_, **__: found)
+    campaign = Campaign(SETUP.test, {"nadir": SimpleNamespace(interior=(0.5,))}, Noise(1e-6), ())
+    drifts = campaign_adjustment.drift_looked_for(campaign).drifts
+    assert drifts.rate == pytest.approx((5e-6, 2e-6, 1e-6))
+    assert drifts.walk == pytest.approx(4e-6)

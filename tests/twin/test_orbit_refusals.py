@@ -505,3 +505,7 @@ def test_line_images_with_too_few_points_are_told(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(BenchError, match=r"^line images: only 7 of 20 points were matched$") as caught:
         loop_run.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))
     assert caught.value.key == ("mechanisms", "images")
+    monkeypatch.setattr(loop_run, "tie_points", lambda *_, **__: Ns(in_all=np.arange(20) < 8))
+    monkeypatch.setattr(loop_run, "fly_patch", lambda *_: Ns(true_point=lambda *_: 1 // 0))
+    with pytest.raises(AttributeError):  # eight are taken, which have no lines here
+        loop_run.imaged_pair(PAIR, flight, 0, known, known, known, flown, np.random.SeedSequence(1))

@@ -221,6 +221,11 @@ def test_every_body_is_a_node_where_it_stands(gf7_pair, loaded):
         assert np.abs(matrix[:3, 3] - pose.translation).max() < 1e-6
         assert np.abs(matrix[:3, :3] - pose.rotation).max() < 1e-6
     assert scene.graph.transforms.parents["base/forward/M1"] == "base/forward"
+    # only the glass of prisms is seen through
+    modes = {name: part.visual.material.alphaMode for name, part in scene.geometry.items()}
+    assert {name for name, mode in modes.items() if mode == "BLEND"} == {
+        n for n in modes if "monitor/" in n and "base/" in n
+    }
 
 
 def drawn(told: dict, factor: float) -> np.ndarray:

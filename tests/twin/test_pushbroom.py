@@ -16,7 +16,7 @@ from tests.twin.pushbroom_bench import LINE_TIME, LINES, PLACE, Ground, lines, l
 from twin.orbit.flight.line_camera import LineCamera
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.images import pushbroom
-from twin.orbit.images.line_optics import ImageMotion, LineOptics
+from twin.orbit.images.line_optics import ImageMotion, LineOptics, optics_of
 from twin.orbit.images.patch import PatchError, fly_patch, window_of
 from twin.orbit.images.pushbroom import (
     MARGIN,
@@ -167,6 +167,11 @@ def test_what_stands_before_the_lens_takes_light_and_contrast() -> None:
     sheet = load_detector("th1_line")
     free = optics()["nadir"]
     cut = LineOptics.from_specs(image, 12000, 6.5e-6, LINE_TIME, sheet)
+    # pixels of a line of twice the pitch get four times the light
+    wide = payload.lines["forward"].model_copy(update={"pitch": 13e-6})
+    two = payload.model_copy(update={"lines": payload.lines | {"forward": wide}})
+    both = optics_of(two, ("nadir", "forward"), LINE_TIME, {"th1_line": sheet})
+    assert both["forward"].photons_per_reflectance == pytest.approx(4.0 * both["nadir"].photons_per_reflectance)
     # a strip of half width a of the unit disk: 2 (a sqrt(1 - a^2) + asin a)
     share = 2.0 * (0.1 * np.sqrt(0.99) + np.arcsin(0.1)) / np.pi
     assert cut.photons_per_reflectance / free.photons_per_reflectance == pytest.approx(1.0 - share, rel=2e-5)

@@ -322,6 +322,7 @@ def test_the_nodes_of_an_instrument_are_listed(tmp_path) -> None:
     refused = run(path, "--out", tmp_path / "run")
     assert refused.exit_code == 2
     assert all(name in refused.stderr for name in data["nodes"])
+    assert run("--list-nodes", path, "--backend", "gpu").exit_code == 2
     table = run("--list-nodes", path)
     assert table.exit_code == 0
     assert all(name in table.stdout for name in data["nodes"])

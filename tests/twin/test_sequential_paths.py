@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from optics.geometry.aperture import Circle
 from optics.geometry.pose import Pose, rotation_matrix
@@ -238,6 +239,11 @@ def test_light_out_and_back_has_clear_ways_everywhere(gf7_pair) -> None:
     ends = [way.after for way in found.ways]
     assert ends.count(-1) == len(families)  # each is one chain
     assert all(after in (-1, number + 1) for number, after in enumerate(ends))
+    for way in found.ways:
+        surface = scenery.surfaces[way.end.surface]
+        if not surface.surface.is_plane:  # the box about the curved surface of a camera's mirror holds all of it
+            sides = ConvexHull(way.end.corners).equations
+            assert np.max(surface.pose.apply(surface.vertices) @ sides[:, :3].T + sides[:, 3]) < 0.0
 
 
 def two_mirrors(*more: tuple[float, float]) -> Scenery:

@@ -15,6 +15,7 @@ from analysis.spots.centroid import mean_frames
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import difference_covariance
 from scenes.models.disturbances import state_of
+from twin.main_job import systematics
 from twin.main_job.systematics import BLIND
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.image_sampling import WRONG
@@ -141,12 +142,20 @@ def test_a_reading_whose_state_cannot_be_traced_says_so(pair, blurred) -> None:
     assert told.recovered_dict()["retraced"]["model"]["off_in_sigma"] is None
 
 
-def test_what_no_spot_sees_is_a_warning(orbit) -> None:
-    """The line CCD alone, 20 um: d_alpha is -0.73 arcsec and read as 0. And coma of M2 at five times its sigma, which
-    moves spots as likelier motions do.
+def test_what_no_spot_sees_is_a_warning(orbit, monkeypatch) -> None:
+    """The line CCD alone, 20 um: d_alpha is -0.73 arcsec and read as 0; spots move by a tenth of their noise, 1e-3 px.
+    And coma of M2 at five times its sigma, which moves spots as likelier motions do.
     """
-    shot = orbit.perturbed({"base/forward/focal_plane/line": {"shift": "20 0 0 um"}}).render(frames=2, seed=1)
-    (told,) = [text for text in shot.warnings if text.startswith("base/forward/focal_plane/line")]
+    traced = systematics.traced_states
+
+    def shaken(*args):
+        found = traced(*args)
+        return replace(found, spots=found.spots + 1e-4)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(systematics, "traced_states", shaken)
+        shot = orbit.perturbed({"base/forward/focal_plane/line": {"shift": "20 0 0 um"}}).render(frames=2, seed=1)
+        (told,) = [text for text in shot.warnings if text.startswith("base/forward/focal_plane/line")]
     assert "moves no spot beyond its noise" in told
     assert "forward Δα changes by −0.727 arcsec" in told
     shot = orbit.perturbed({"base/forward/M2": {"figure": {"Z7": "10 nm"}}}).render(frames=2, seed=1)

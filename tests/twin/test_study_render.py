@@ -72,7 +72,7 @@ def test_the_same_block_gives_the_same_bits(study, backend, monkeypatch) -> None
     one = study.setup.job.evaluate(study.setup.tree, runs, backend)
     two = study.setup.job.evaluate(study.setup.tree, runs, backend)
     assert one == two
-    monkeypatch.setattr(monitor_memory, "LARGEST_FRAMES", 3 * 9 * 4 * 48 * 48)  # a frame and a fixed pattern each
+    monkeypatch.setattr(monitor_memory, "LARGEST_FRAMES", 3 * 9 * 4 * 44 * 48)  # a frame and a fixed pattern each
     assert study.setup.job.evaluate(study.setup.tree, runs, backend) == one
 
 

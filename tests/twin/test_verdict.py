@@ -15,6 +15,7 @@ from analysis.monitor.limits import Split
 from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, GROUND
 from scenes.specs.resolved import resolve
 from twin.framework.artefact import FAR
+from twin.main_job import verdict
 from twin.main_job.render_command import _table
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
@@ -95,7 +96,7 @@ def moved(run: RenderRun, parameter: int, sigmas: float) -> RenderRun:
 
 
 @pytest.mark.second
-def test_beneath_the_noise(job) -> None:
+def test_beneath_the_noise(job, monkeypatch) -> None:
     run = job("{base/forward/focal_plane: {shift: [0.003 um, 0 um, 0 um]}}")
     told = judge(run)
     assert told.verdict.startswith("The perturbation is below the noise: no true change reaches 3 σ")
@@ -105,6 +106,9 @@ def test_beneath_the_noise(job) -> None:
     assert found is not None
     clearest = max(readings(run, "model"), key=lambda r: abs(r.true / r.sigma))
     assert clearest.sigma * np.sqrt(run.frames / int(found[1])) == pytest.approx(abs(clearest.true) / FAR, rel=0.1)
+    for most, said in ((int(found[1]), True), (int(found[1]) - 1, False)):
+        monkeypatch.setattr(verdict, "MOST_FRAMES", most)
+        assert ("frames would reveal" in all_of(judge(run))) == said
 
 
 @pytest.mark.second

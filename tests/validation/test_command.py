@@ -195,6 +195,7 @@ def test_a_verdict_follows_from_the_numbers(measured, sigma, verdict):
     assert ("another one" in result.how) == (measured == 3.05)
     assert ("cause is not known" in result.how) == (verdict == REFUTED and measured != 3.05)
     assert "a reason" in result.how.splitlines()[-1]
+    assert check(tolerance=0.0).evaluate(1.0, None, "A count.").verdict == CONFIRMED
 
 
 @pytest.mark.parametrize(

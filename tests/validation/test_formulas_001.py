@@ -1,12 +1,13 @@
 """Paper 001's formulas on rendered images, single and joint: their factors and verdicts."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 
-from twin.validation.paper_001.formulas import GROUP, JOINT, mirror_turns
+from twin.validation.paper_001.formulas import GROUP, JOINT, JointMotions, mirror_turns
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -42,3 +43,19 @@ def test_a_mirror_turns_the_ray_by_twice_its_turn(backend):
     turned, moved = mirror_turns(backend, turns)
     assert turned == pytest.approx(2 * turns, rel=1e-9)
     assert moved == pytest.approx(np.tan(2 * turns), rel=1e-9)
+
+
+def test_the_slope_of_angles_scatters_as_its_sigma_says() -> None:
+    """Of 2000 campaigns the scatter is known to 1.6 %."""
+    rng = np.random.default_rng(5)
+    true, sigma = 1e-5 * rng.normal(size=12), np.full(12, 1e-6)
+
+    def fitted() -> tuple[float, float]:
+        angle = SimpleNamespace(change_rad=0.9 * true + sigma * rng.normal(size=12), sigma_rad=sigma)
+        run = SimpleNamespace(mixtures=slice(None), truth=SimpleNamespace(angle_change=true))
+        run.estimates = lambda: SimpleNamespace(angle={"model": angle})
+        return JointMotions.angle(run, "model")[:2]
+
+    slope, stated = np.array([fitted() for _ in range(2000)]).T
+    assert np.std(slope) == pytest.approx(stated[0], rel=0.08)
+    assert np.mean(slope) == pytest.approx(0.9, abs=4.0 * stated[0] / np.sqrt(2000))

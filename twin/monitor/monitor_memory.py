@@ -111,11 +111,6 @@ class MonitorSize:
         return cls(spots, ccd.rows, ccd.columns, phase, frames, times, pictures)
 
     @property
-    def pixels(self) -> int:
-        """Of all area CCDs."""
-        return self.spots * self.rows * self.columns
-
-    @property
     def rays(self) -> int:
         """Number of rays of sharp spots of all channels, wherever they are on their CCDs."""
         return self.spots * NodeClasses(self.phase, (0.5 * self.rows, 0.5 * self.columns)).sharp_count

@@ -380,6 +380,9 @@ def test_fields_are_those_of_the_file(tmp_path: Path, backend) -> None:
     assert "one axis alone, to 2 deg" in notes[0]
     assert "corners are 2.828 deg out" in notes[0]
     assert "--field '2 deg'" in notes[0]
+    # a single direction gets a small field about it
+    made = camera_of(replace(lens, fields=((0.0, 0.0),)), "singlet", backend)
+    assert made.camera.field.x == made.camera.field.y == pytest.approx(math.radians(0.05))
     # a round field is asked for in words, and has the square in it
     made = camera_of(replace(lens, round_field=True), "singlet", backend)
     assert made.camera.field.x == pytest.approx(math.radians(2) / math.sqrt(2.0), rel=1e-14)

@@ -112,15 +112,13 @@ class EarthRotation:
         """
         t = np.asarray(seconds, dtype=np.float64)
         after, before = (self.celestial(t + step) for step in (_DIFFERENCE_STEP, -_DIFFERENCE_STEP))
-        # C' C^T = -[q x] with q the angular velocity of the CIRS in its own axes
+        # C' C^T = -[q x] with q the angular velocity of the CIRS in its own axes, without a part about the pole: its
+        # origin does not rotate
         turn = (after - before) @ np.swapaxes(self.celestial(t), -1, -2) / (2.0 * _DIFFERENCE_STEP)
-        q = 0.5 * np.stack(
-            [turn[..., 1, 2] - turn[..., 2, 1], turn[..., 2, 0] - turn[..., 0, 2], turn[..., 0, 1] - turn[..., 1, 0]],
-            axis=-1,
-        )
+        x, y = 0.5 * (turn[..., 1, 2] - turn[..., 2, 1]), 0.5 * (turn[..., 2, 0] - turn[..., 0, 2])
         angle = self.angle + RATE * t
         c, s = np.cos(angle), np.sin(angle)
-        tirs = np.stack([c * q[..., 0] + s * q[..., 1], c * q[..., 1] - s * q[..., 0], q[..., 2] + RATE], axis=-1)
+        tirs = np.stack([c * x + s * y, c * y - s * x, np.full_like(x, RATE)], axis=-1)
         return tirs @ self.polar.T
 
 
