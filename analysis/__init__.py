@@ -1,7 +1,7 @@
 """Images and measurements in, parameters and uncertainties out.
 
 Stands on numpy, scipy, opencv and `optics.numerics`, and never sees the truth of a simulation, so that it can be used
-on real images. Sub-modules: `noise`, `spot_template`, `centroid`, `monitoring`, `model_fit`.
+on real images. Sub-modules: `noise`, `spot_template`, `centroid`, `monitor_formulas`, `model_fit`.
 """
 
 import os

@@ -51,7 +51,7 @@ def run_probe(arguments: list[str], timeout_s: float = PROBE_TIMEOUT_S) -> dict[
     """Run Python with these arguments in a child process and return the JSON object on its last line of stdout.
 
     Args:
-        arguments: what follows the interpreter, for instance ["-m", "twin.framework.probe", "kernel"].
+        arguments: what follows the interpreter, for instance ["-m", "twin.framework.doctor_probe", "kernel"].
         timeout_s: the child is killed after this many seconds.
 
     Raises:

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array, Indices
 from analysis.block.block import Block, CameraKnowledge, CamerasKnowledge, Term
+from analysis.block.error_processes import BlockError, Corrections, Part, Support
 from analysis.block.point_reduction import FixedPoints, Heights, LineImage, Packets, Pointings, PriorGroup, Reduction
-from analysis.block.processes import BlockError, Corrections, Part, Support
 from analysis.orbit.three_line_model import BIAS, DRIFT
 
 OFFSET = ("along", "across", "down")

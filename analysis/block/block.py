@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.arrays import Array, Indices
-from analysis.block.processes import BlockError, Law
+from analysis.block.error_processes import BlockError, Law
 from analysis.orbit.three_line_model import LineModel, Rays
 
 Scope = Literal["pass", "tracker", "block"]

@@ -33,8 +33,8 @@ from analysis import statistics
 from analysis.arrays import Array, Indices
 from analysis.block.assembly import Assembly, Process, assembled, group_ranks
 from analysis.block.block import Block
+from analysis.block.error_processes import BlockError
 from analysis.block.point_reduction import Checked, Pool, Reduced, Reduction, SharedReduction, State
-from analysis.block.processes import BlockError
 from analysis.block.reweighting import SETTLED, GroupTest, Rule, UnsettledError, settled
 
 FAR = 0.02

@@ -17,8 +17,8 @@ from analysis.arrays import Array
 from analysis.block.assembly import assembled
 from analysis.block.block import Block, Term
 from analysis.block.block_adjustment import BlockAdjustment
+from analysis.block.error_processes import Law
 from analysis.block.point_reduction import State
-from analysis.block.processes import Law
 from analysis.orbit.calibration_parameters import echelon, shown
 from analysis.orbit.forward_intersection import level_axes
 

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from analysis.arrays import Array, Indices
-from analysis.block.processes import Corrections, by_rotation_vector, cross, turned, turned_back
+from analysis.block.error_processes import Corrections, by_rotation_vector, cross, turned, turned_back
 from analysis.block.reweighting import standardised_packets
 from analysis.orbit.three_line_model import LineModel, Rays
 

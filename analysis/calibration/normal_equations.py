@@ -8,8 +8,9 @@ eliminated in the same way, and what is left are the equations of the unknowns x
 
 Noise of measured attitude and station that image points of a pass share, by the laws of its readings.
 
-Points exposed within a few readings have errors in common. The unknowns of the laws (`analysis.block.processes`) are
-unknowns of an adjustment with a sparse prior, and the correlation of any two image points is exact.
+Points exposed within a few readings have errors in common. The unknowns of the laws
+(`analysis.block.error_processes`) are unknowns of an adjustment with a sparse prior, and the correlation of any two
+image points is exact.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array
-from analysis.block.processes import Corrections, Law, Part, Support
+from analysis.block.error_processes import Corrections, Law, Part, Support
 from analysis.block.reweighting import GroupTest
 from analysis.orbit.calibration_parameters import (
     CalibrationError,

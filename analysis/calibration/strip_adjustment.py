@@ -37,7 +37,7 @@ from scipy.sparse.linalg import splu
 
 from analysis import statistics
 from analysis.arrays import Array
-from analysis.block.processes import Corrections
+from analysis.block.error_processes import Corrections
 from analysis.calibration.normal_equations import Equations, SharedNoise, State, Weights, assemble
 from analysis.orbit.calibration_parameters import (
     CalibrationError,

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from analysis.arrays import Array
-from analysis.monitor import model_fit, monitoring
+from analysis.monitor import model_fit, monitor_formulas
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
+from analysis.monitor.monitor_formulas import CameraParameters, MonitorGeometry
 from analysis.monitor.parameters import CameraCalibration
 from optics.numerics.extension_table import ExtensionTable
 
@@ -129,7 +129,7 @@ Exact = Callable[[ArrayLike, ArrayLike, ArrayLike, MonitorGeometry], CameraParam
 
 @dataclass(frozen=True)
 class Formula(OfEachCamera):
-    """A set of formulas of `analysis.monitor.monitoring`.
+    """A set of formulas of `analysis.monitor.monitor_formulas`.
 
     Attributes:
         name: there and in files.
@@ -158,7 +158,7 @@ class Formula(OfEachCamera):
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
         """The formulas' coefficients; further spots have no say."""
         out = np.zeros((PARAMETERS_EACH, 2 * len(camera.channels)))
-        out[:, [2 * k + axis for k in _pair(camera) for axis in (0, 1)]] = monitoring.coefficients(
+        out[:, [2 * k + axis for k in _pair(camera) for axis in (0, 1)]] = monitor_formulas.coefficients(
             self.name, camera.geometry
         )
         return out
@@ -223,7 +223,7 @@ _ESTIMATORS: dict[str, Estimator] = {
     "paper_single": Formula(
         "paper_single",
         "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed, one change at a time",
-        monitoring.paper_single,
+        monitor_formulas.paper_single,
     ),
     "paper_joint": Formula("paper_joint", "joint changes as Wang et al. (2018) print them"),
     "derived": Formula(

@@ -31,7 +31,7 @@ from scipy.special import gammaln, ndtr
 from analysis.arrays import Array
 from analysis.monitor import parameters
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.monitoring import GroundGeometry
+from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibration, Parameter
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from analysis.arrays import ARCSEC, UM_PER_M, Array, shows
-from analysis.monitor.monitoring import GroundGeometry, MonitorGeometry
+from analysis.monitor.monitor_formulas import GroundGeometry, MonitorGeometry
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_template import SpotTemplate
 from optics.numerics.extension_table import ExtensionTable

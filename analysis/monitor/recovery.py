@@ -32,7 +32,13 @@ from analysis.arrays import Array, OfStates, shows
 from analysis.monitor.disturbances import Consistency, Disturbances, consistency
 from analysis.monitor.estimators import PARAMETERS_EACH, Shifts, applicable
 from analysis.monitor.limits import quantities
-from analysis.monitor.monitoring import CameraParameters, GroundError, GroundGeometry, IntersectionAngleChange, exact
+from analysis.monitor.monitor_formulas import (
+    CameraParameters,
+    GroundError,
+    GroundGeometry,
+    IntersectionAngleChange,
+    exact,
+)
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.spots import CENTROIDS
 from analysis.spots.centroid import mean_frames

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("twin", "analysis", "scenes", "optics")
 FIRST = ("twin.render", "twin.recover", "twin.lab", "twin.orbit", "twin.study", "twin.design")
 """Programs that stand first; the others follow by name."""
-NOT_FOR_USERS = {"twin.framework.probe": "the doctor's own helper"}
+NOT_FOR_USERS = {"twin.framework.doctor_probe": "the doctor's own helper"}
 """Modules that can be run and are no commands, with the reason."""
 
 

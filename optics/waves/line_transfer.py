@@ -11,7 +11,7 @@ two pupils cross, which is at another place for every shift, the integrand has a
 square of the number of lines. A third of the lines is a rule of its own; with other nodes on the cells it tells the
 error, and lines are added until it is small.
 
-``optics.waves.transfer`` serves any frequencies and defocus.
+``optics.waves.optical_transfer`` serves any frequencies and defocus.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import cores, one_blas_thread
 from optics.numerics.quadrature import PupilNodes, gauss, nodes_for
 from optics.waves.edge_shadow import StopOutlines
+from optics.waves.optical_transfer import WORST_TRANSFER
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import EVENLY, PupilFunction
 from optics.waves.pupil_terms import polynomials, products, smooth_terms
-from optics.waves.transfer import WORST_TRANSFER
 
 RIM_SIDES = 2048
 """Of the polygon with the area of the pupil that stands for its edge: within 4e-7 of it, to both sides alike."""

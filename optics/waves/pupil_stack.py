@@ -8,7 +8,7 @@ the eikonal in metres does not depend on the wavelength, so one fit serves a who
 
 There is one fit. The integrals are worked out in two ways: here at once for thousands of perturbed states, each at two
 frequencies and one focus, where code for one pupil spends its time on calls and not on numbers; in
-``optics.waves.transfer`` for one pupil at any number of frequencies and focuses, with nodes for each.
+``optics.waves.optical_transfer`` for one pupil at any number of frequencies and focuses, with nodes for each.
 """
 
 from __future__ import annotations

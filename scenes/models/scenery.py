@@ -21,7 +21,17 @@ from optics.geometry.pose import Pose
 from optics.geometry.solid import Coating, Face, Solid, solid_mesh
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Motion, PlacedBodies, State
-from optics.materials.scatter import ABSORBER, BARE, BLACK, COATED, GROUND, MIRROR, SILICON, CoatingTable, Finish
+from optics.materials.fresnel_scatter import (
+    ABSORBER,
+    BARE,
+    BLACK,
+    COATED,
+    GROUND,
+    MIRROR,
+    SILICON,
+    CoatingTable,
+    Finish,
+)
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument

@@ -15,7 +15,6 @@ from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, resolve_on
 from scenes.specs.tolerance import Amount, CompensatorSpec, FieldShare, MeritSpec
 from scenes.yaml.errors import Problem, names_text, unknown
-from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import (
     Flag,
     Name,
@@ -30,6 +29,7 @@ from scenes.yaml.spec import (
     Whole,
     one_given,
 )
+from scenes.yaml.unit_fields import Quantity, Vector
 from scenes.yaml.units import ANGLE, LENGTH, TEMPERATURE_DIFFERENCE
 
 Fields = Annotated[tuple[tuple[FieldShare, FieldShare], ...], Field(min_length=1, max_length=200)]

@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import AreaCcdSpec, Frames, GlassName, ReticleSpec
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import AngleSigma, Length, PositiveLength, Quantity, Wavelength
 from scenes.yaml.spec import Number, Spec, TitledSpec, Whole
+from scenes.yaml.unit_fields import AngleSigma, Length, PositiveLength, Quantity, Wavelength
 from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity
 
 HalfAngle = Annotated[float, Quantity(ANGLE, above_zero=True, largest="44 deg")]

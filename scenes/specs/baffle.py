@@ -13,11 +13,11 @@ from pydantic import Field, model_validator
 
 from optics.geometry.aperture import Circle, Edge, EdgeShape, Ellipse, Polygon, Ray, Rectangle
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
-from optics.materials.scatter import BLACK, Finish
+from optics.materials.fresnel_scatter import BLACK, Finish
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.yaml.spec import Spec, one_given
+from scenes.yaml.unit_fields import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.yaml.units import ANGLE, LENGTH
 
 TUBE_SIDES = 24

@@ -17,7 +17,8 @@ from scenes.specs.detector import PixelPitch
 from scenes.specs.glass import LensGlass, Medium
 from scenes.specs.spectrum import Spectrum, SpectrumSpec
 from scenes.yaml.errors import Problem, unknown
-from scenes.yaml.quantity import (
+from scenes.yaml.spec import Name, Named, Number, Ref, Seed, Spec, Text, TitledSpec, Whole
+from scenes.yaml.unit_fields import (
     AsphereTerms,
     Length,
     PositiveLength,
@@ -28,7 +29,6 @@ from scenes.yaml.quantity import (
     Vector2,
     Wavelength,
 )
-from scenes.yaml.spec import Name, Named, Number, Ref, Seed, Spec, Text, TitledSpec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, MASS, SCALE
 
 Diffusion = Annotated[float, Quantity(LENGTH, smallest="0 um", largest="1 mm")]

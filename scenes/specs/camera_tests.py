@@ -13,8 +13,17 @@ from scenes.specs.instrument import Frames
 from scenes.specs.perturbation import FigureTerm, PlainPerturbationSpec
 from scenes.specs.turntable import TableAngle, TurntableFiles
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import Angle, AngleSigma, AngleSigmas, LengthSigma, PositiveLength, Quantity, Vector, Vector3
 from scenes.yaml.spec import Name, Number, Paths, Ref, Reference, Seed, Spec, Text, TitledSpec, Whole, one_given
+from scenes.yaml.unit_fields import (
+    Angle,
+    AngleSigma,
+    AngleSigmas,
+    LengthSigma,
+    PositiveLength,
+    Quantity,
+    Vector,
+    Vector3,
+)
 from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity
 
 

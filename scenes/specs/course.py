@@ -16,8 +16,8 @@ from optics.thermal.heat import Temperature
 from scenes.yaml import units
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
-from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import ZERO_IS_NONE, Name, Paths, Reference, Spec, validate
+from scenes.yaml.unit_fields import Quantity, Vector
 from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile
 
 TemperatureChange = Annotated[float, Quantity(units.TEMPERATURE_DIFFERENCE, largest="1000 K", unsigned="100 K")]

@@ -8,8 +8,8 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from scenes.yaml.errors import KeyPath, Problem, names_text
-from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Named, Number, Spec, TitledSpec, Whole
+from scenes.yaml.unit_fields import Quantity
 from scenes.yaml.units import LENGTH, TIME, format_quantity
 
 LEAST_SIDE = 24

@@ -20,7 +20,6 @@ from scenes.specs.motion_text import motion_of
 from scenes.yaml import units
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
-from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import (
     Name,
     Named,
@@ -34,6 +33,7 @@ from scenes.yaml.spec import (
     Whole,
     short_for,
 )
+from scenes.yaml.unit_fields import Quantity, Vector
 
 NONE = "none"
 """`disturbances: none`: nothing is stated, and sigmas are those of the noise alone."""

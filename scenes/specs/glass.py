@@ -21,8 +21,8 @@ from optics.materials.material import MATERIALS, TemperatureRange
 from optics.numerics.array_math import UnphysicalError
 from scenes.specs.spectrum import WavelengthRange
 from scenes.yaml.errors import Problem, unknown
-from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Number, Spec, Text, Whole, short_for
+from scenes.yaml.unit_fields import Quantity
 from scenes.yaml.units import EXPANSION, LENGTH, format_quantity
 
 Medium = Literal["vacuum", "air"]

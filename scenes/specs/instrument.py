@@ -20,7 +20,6 @@ from scenes.specs.baffle import BaffleSpec
 from scenes.specs.detector import AreaSide, PixelPitch
 from scenes.specs.perturbation import AsBuilt, PlainPerturbationSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, unknown
-from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
 from scenes.yaml.spec import (
     Catalogued,
     Name,
@@ -35,6 +34,7 @@ from scenes.yaml.spec import (
     name_in,
     one_given,
 )
+from scenes.yaml.unit_fields import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, TEMPERATURE, TIME
 
 BASE = "base"

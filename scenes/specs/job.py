@@ -25,8 +25,8 @@ from scenes.specs.perturbation import (
 )
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.named import Named
-from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Flag, NothingIsEmpty, OneOf, Paths, Ref, Seed, Spec, Whole
+from scenes.yaml.unit_fields import Quantity
 from scenes.yaml.units import ANGLE, SCALE
 
 

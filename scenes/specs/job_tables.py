@@ -17,8 +17,8 @@ from scenes.yaml import node_table
 from scenes.yaml.errors import KeyPath, Problem, names_text, nearest, shown
 from scenes.yaml.finish_files import ENDING, read_bsdf, read_coating
 from scenes.yaml.input_file import digest_of
-from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import ZERO_IS_NONE, Reference, Spec, Text, Whole, short_for
+from scenes.yaml.unit_fields import Quantity
 from scenes.yaml.units import SCALE
 
 Checksum = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]

@@ -21,8 +21,8 @@ from scenes.specs.resolved import ExperimentSetup, ResolvedJob, resolve_job
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import file_beside, is_file, unusable
-from scenes.yaml.quantity import PositiveLength
 from scenes.yaml.spec import Named, NothingIsEmpty, Paths, Ref, Reference, Spec, Whole, one_given, short_for
+from scenes.yaml.unit_fields import PositiveLength
 from scenes.yaml.units import MOMENT, parse_quantity
 from scenes.yaml.yaml_file import LARGEST_BYTES
 

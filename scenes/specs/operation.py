@@ -19,8 +19,8 @@ from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.load import DISTURBANCES, INSTRUMENTS, placed
 from scenes.specs.resolved import ResolvedJob, resolve_on
 from scenes.yaml.errors import Problem, names_text, nearest, shown, unknown
-from scenes.yaml.quantity import ClockReading, Quantity, TimeScale
 from scenes.yaml.spec import Name, Number, Paths, Ref, Reference, Spec, Text, Whole, not_empty, short_for, validate
+from scenes.yaml.unit_fields import ClockReading, Quantity, TimeScale
 from scenes.yaml.units import ANGLE, LENGTH, MOMENT, SCALE, TEMPERATURE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
 

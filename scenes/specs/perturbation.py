@@ -24,8 +24,8 @@ from scenes.specs.course import (
 )
 from scenes.specs.motion_text import meant, node_named, perturbation_in_words
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
-from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import ZERO_IS_NONE, Name, Paths, Spec
+from scenes.yaml.unit_fields import Quantity
 from scenes.yaml.units import LENGTH
 
 FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um"), ZERO_IS_NONE]

@@ -16,8 +16,8 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 from optics.numerics.quadrature import gauss, gauss_of
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import KeyPath, Problem
-from scenes.yaml.quantity import Quantity, Vector, Wavelength
 from scenes.yaml.spec import Number, Reference, Spec, one_given, short_for
+from scenes.yaml.unit_fields import Quantity, Vector, Wavelength
 from scenes.yaml.units import LENGTH, TEMPERATURE, format_quantity
 
 

@@ -11,8 +11,8 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import AngleSigma, Quantity
 from scenes.yaml.spec import Number, Reference, Seed, Spec, TitledSpec, Whole
+from scenes.yaml.unit_fields import AngleSigma, Quantity
 from scenes.yaml.units import ANGLE, format_quantity
 
 TableAngle = Annotated[float, Quantity(ANGLE, largest="360 deg")]

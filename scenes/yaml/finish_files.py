@@ -18,7 +18,7 @@ Source  Measured
     1.2E-01  ...        one row for each azimuth, one number for each radial angle
     DataEnd
 
-Angles are in degrees, azimuth and radial angle about the specular direction (``optics.materials.scatter``); lines
+Angles are in degrees, azimuth and radial angle about the specular direction (`fresnel_scatter`); lines
 that are empty or begin with # are left out. Numbers of one list may go on in the next line.
 
 wavelength [nm],angle [deg],R [percent],T [percent]
@@ -39,7 +39,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.materials.scatter import CoatingTable, ScatterTable
+from optics.materials.fresnel_scatter import CoatingTable, ScatterTable
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, nearest, shown

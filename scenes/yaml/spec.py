@@ -34,7 +34,7 @@ from pydantic_core import CoreSchema, ErrorDetails, PydanticUndefined, core_sche
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import file_beside, is_file, unusable
-from scenes.yaml.quantity import Terms, allowed_at, written
+from scenes.yaml.unit_fields import Terms, allowed_at, written
 from scenes.yaml.units import decimal_comma
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
 

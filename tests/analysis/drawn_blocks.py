@@ -14,7 +14,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from analysis.block.block import Block, CameraKnowledge, Footprints, Pass, Points, Scene, Term, Terrain, TrackerAngle
-from analysis.block.processes import Law
+from analysis.block.error_processes import Law
 from analysis.orbit.three_line_model import LineModel, Rays
 
 ARCSEC = np.pi / 648000.0

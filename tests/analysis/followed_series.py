@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.filter_state import Belief, Innovation, Observed
 from analysis.monitor.jump_detection import Jump, Step, Steps, steps
-from analysis.monitor.series_filter import SeriesFilter, hinted, smoothed
+from analysis.monitor.kalman_filter import SeriesFilter, hinted, smoothed
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import StateSpace
 

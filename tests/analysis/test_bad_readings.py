@@ -10,7 +10,7 @@ from scipy.stats import binom, multivariate_normal
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.filter_state import Observed, _with_errors
-from analysis.monitor.series_filter import SeriesFilter, detection_power
+from analysis.monitor.kalman_filter import SeriesFilter, detection_power
 from analysis.statistics import limit_of
 from tests.analysis.followed_series import follow, of_shifts
 from tests.analysis.stated_motions import SpotNoise, disturbances

@@ -5,7 +5,7 @@ import pytest
 
 from analysis.block.block import Term
 from analysis.block.block_adjustment import adjust_block
-from analysis.block.processes import Law
+from analysis.block.error_processes import Law
 from tests.analysis.dense_block import DenseBlock
 from tests.analysis.drawn_blocks import ARCSEC, Plan, draw
 from tests.tiers import quick

@@ -7,7 +7,7 @@ import pytest
 
 from analysis.block.block import Term
 from analysis.block.block_adjustment import adjust_block
-from analysis.block.processes import Law
+from analysis.block.error_processes import Law
 from tests.analysis.drawn_blocks import ARCSEC, PITCH, Plan, draw, without_errors_in_images
 from tests.analysis.refusals import refuses
 from twin.framework.cluster import ClusterError

@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 from analysis.block.block import Term
 from analysis.block.block_adjustment import adjust_block, law_tests
+from analysis.block.error_processes import BlockError, Law, Support
 from analysis.block.network import datum_test, network_of, open_combinations
-from analysis.block.processes import BlockError, Law, Support
 from tests.analysis.drawn_blocks import ARCSEC, EAST, PITCH, Plan, draw, without_errors_in_images
 from tests.analysis.refusals import refuses
 from tests.tiers import quick

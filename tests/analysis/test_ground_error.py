@@ -8,7 +8,7 @@ from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
 from analysis.arrays import ARCSEC
-from analysis.monitor.monitoring import EARTH_RADIUS_M, GroundGeometry
+from analysis.monitor.monitor_formulas import EARTH_RADIUS_M, GroundGeometry
 from analysis.orbit.forward_intersection import CalibratedLine, Sightings, intersect_pair
 
 ALTITUDE, LOOKS, FIELD, FOCAL = 505e3, (math.radians(26.0), math.radians(-5.0)), (0.018, 0.019), (5.5, 5.4)

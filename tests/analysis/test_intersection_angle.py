@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.arrays import ARCSEC
-from analysis.monitor.monitoring import CameraParameters, exact
+from analysis.monitor.monitor_formulas import CameraParameters, exact
 from tests.analysis.refusals import refuses
 
 FORWARD, BACKWARD = np.deg2rad(26.0), np.deg2rad(-5.0)

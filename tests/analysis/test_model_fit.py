@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor.model_fit import RankError, gain, observability
-from analysis.monitor.monitoring import CameraParameters
+from analysis.monitor.monitor_formulas import CameraParameters
 from tests.analysis.refusals import refuses
 
 NAMES = ["shift x", "shift y", "turn z", "scale"]

@@ -9,7 +9,7 @@ from scipy.stats import binom, chi2, ncx2
 from analysis.monitor import limits
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, TimeLaw, consistency
 from analysis.monitor.estimators import Shifts, applicable
-from analysis.monitor.monitoring import MonitorGeometry
+from analysis.monitor.monitor_formulas import MonitorGeometry
 from analysis.monitor.parameters import CameraCalibration
 from tests.analysis.stated_motions import correlation_of, disturbances
 from tests.tiers import quick

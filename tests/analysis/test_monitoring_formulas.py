@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from analysis.arrays import ARCSEC
-from analysis.monitor.monitoring import (
+from analysis.monitor.monitor_formulas import (
     CameraParameters,
     MonitorGeometry,
     coefficients,

@@ -16,7 +16,7 @@ from analysis.arrays import UndeterminedError
 from analysis.block import block_adjustment, reweighting
 from analysis.block.block import CamerasKnowledge, Term
 from analysis.block.block_adjustment import adjust_block, pruned
-from analysis.block.processes import BlockError, Law
+from analysis.block.error_processes import BlockError, Law
 from analysis.calibration import normal_equations, strip_adjustment
 from analysis.calibration.adjustment import adjust
 from analysis.calibration.strip_adjustment import adjust_strip
@@ -26,10 +26,10 @@ from analysis.matching.spline import resampled
 from analysis.monitor import limits
 from analysis.monitor.estimators import ESTIMATORS, Posterior, Shifts
 from analysis.monitor.filter_state import Observed
+from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.model_fit import gain, observability
-from analysis.monitor.monitoring import CameraParameters, GroundGeometry, MonitorGeometry
+from analysis.monitor.monitor_formulas import CameraParameters, GroundGeometry, MonitorGeometry
 from analysis.monitor.recovery import measure_spots, recover
-from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import StateSpace
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import measure_pages

@@ -7,7 +7,7 @@ import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.filter_state import Observed
-from analysis.monitor.series_filter import SeriesFilter, jointly
+from analysis.monitor.kalman_filter import SeriesFilter, jointly
 from analysis.monitor.series_smoother import smooth
 from analysis.monitor.state_space import HeatInputs, StateSpace
 from tests.analysis.followed_series import follow, of_shifts, whole_steps
@@ -90,7 +90,7 @@ def test_pieces_do_not_matter(monkeypatch) -> None:
     told, (times, shifts) = stated(LAWS[:6]), series(30, 1.0)
     how, read = SeriesFilter(told, window=0), of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS))
     whole = follow(how, read, times)
-    monkeypatch.setattr("analysis.monitor.series_filter._PIECE", 7)
+    monkeypatch.setattr("analysis.monitor.kalman_filter._PIECE", 7)
     pieces = follow(how, read, times)
     sigma = np.sqrt(np.diagonal(whole.smoothed.total, 0, 1, 2))
     assert np.all(np.abs(whole.smoothed.values - pieces.smoothed.values) < 1e-9 * sigma)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.series_filter import SeriesFilter, hinted, smoothed
+from analysis.monitor.kalman_filter import SeriesFilter, hinted, smoothed
 from tests.analysis.followed_series import follow, of_shifts, whole_steps
 from tests.analysis.stated_motions import disturbances
 from tests.tiers import quick

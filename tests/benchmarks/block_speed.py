@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from analysis.block.block import Block, CameraKnowledge, Pass, Points, Scene, Term
 from analysis.block.block_adjustment import adjust_block
-from analysis.block.processes import Law
+from analysis.block.error_processes import Law
 from analysis.orbit.three_line_model import LineModel, Rays
 from optics.numerics.backend import one_blas_thread
 from tests.analysis.drawn_blocks import (

@@ -15,7 +15,7 @@ from scenes.specs.operation import read_operation
 from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.twin.record_bench import A_DAY, START, given, made
-from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.operation_filter import Operation
 from twin.operate.record import FILE
 from twin.operate.record.entries import Entry
 from twin.operate.record.history import History

@@ -223,7 +223,7 @@ def test_golden_files_are_small_and_one_for_each_job() -> None:
     assert sum(path.stat().st_size for path in FOLDER.glob("*.json")) < 3e6
 
 
-NO_RESULT = {"twin.doctor": "it tells what this machine has", "twin.framework.probe": "the doctor's own"}
+NO_RESULT = {"twin.doctor": "it tells what this machine has", "twin.framework.doctor_probe": "the doctor's own"}
 """Programs without a golden run, and why."""
 
 

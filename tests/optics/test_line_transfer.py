@@ -7,9 +7,9 @@ from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError
 from optics.waves.edge_shadow import StopOutlines
 from optics.waves.line_transfer import CutPupil, cut_pupils, line_transfers, lit_at
+from optics.waves.optical_transfer import transfer
 from optics.waves.pupil_shadow import PupilShadow, separate
 from optics.waves.pupil_stack import PupilFunction, circular_pupil
-from optics.waves.transfer import transfer
 
 WAVELENGTH, F_NUMBER = 650e-9, 10.0
 CUTOFF = 1.0 / (F_NUMBER * WAVELENGTH)
@@ -77,7 +77,7 @@ def test_a_clear_edge_is_a_smaller_pupil() -> None:
 @pytest.mark.second
 @pytest.mark.parametrize("turn", [0.0, 0.4, 0.5 * np.pi])
 def test_disk_and_vanes_as_by_pieces_of_shadows(turn: float) -> None:
-    """The shadows in ``optics.waves.transfer`` are cut from the same outlines."""
+    """The shadows in ``optics.waves.optical_transfer`` are cut from the same outlines."""
     pupil = aberrated(0.4)
     dark = [disk(0.35, 0.02 + 0.01j, 64), *(vane(0.3 + k * np.pi / 2.0) for k in range(4))]
     pieces, _ = separate([np.stack([p.real, p.imag], axis=-1)[None] for p in dark], fewest=True)

@@ -13,20 +13,20 @@ from scipy.spatial import QhullError
 
 from optics.geometry.aperture import Edge, Polygon
 from optics.geometry.polygon import quadrature as polygon_quadrature
-from optics.materials import scatter
+from optics.materials import fresnel_scatter
+from optics.materials.fresnel_scatter import ScatterTable
 from optics.materials.glass import CatalogueGlass
-from optics.materials.scatter import ScatterTable
 from optics.numerics import quadrature
 from optics.raytrace.trace import _redirect
 from optics.thermal import elastic_mesh
 from optics.thermal.elastic_mesh import polyhedron_mesh
 from optics.thermal.nodal_temperature import NodalTemperature
-from optics.waves import pupil_shadow, transfer
+from optics.waves import optical_transfer, pupil_shadow
 from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import outlines_on_stop
+from optics.waves.optical_transfer import TransferTable, with_nodes_enough
 from optics.waves.pupil_shadow import PupilShadow
 from optics.waves.pupil_stack import PupilFunction, circular_pupil, fit_pupils
-from optics.waves.transfer import TransferTable, with_nodes_enough
 
 NODES = quadrature.disk(12, 48)
 CROSSED = Polygon(((0.0, 0.0), (0.5, 0.5), (0.0, 0.5), (0.5, 0.0), (0.3, 0.8), (0.2, -0.3)))
@@ -98,23 +98,23 @@ def test_numerics_that_do_not_come_out_are_refused(monkeypatch) -> None:
         raise QhullError("QH6154 initial simplex is flat")
 
     for module, name, value, call, words in (
-        (scatter, "MOST_CELLS", 1, lambda: replace(TABLE), "cells are more than 1"),
+        (fresnel_scatter, "MOST_CELLS", 1, lambda: replace(TABLE), "cells are more than 1"),
         (elastic_mesh, "ConvexHull", failing, lambda: polyhedron_mesh(BOX, 0.5), "degenerate: QH6154"),
         (elastic_mesh, "_volumes", lambda nodes, t: np.zeros(len(t)), lambda: polyhedron_mesh(BOX, 0.5), "watertight"),
         (pupil_shadow, "_ROOM", -1.0, within, "came out larger than the whole"),
         (pupil_shadow, "quadrature", doubled, cut, "came out of another size than it has"),
-        (transfer, "WORST_TRANSFER", -1.0, cut, "still changes by"),
-        (transfer, "_MOST_NODES", 1, table, "too many waves for a table"),
+        (optical_transfer, "WORST_TRANSFER", -1.0, cut, "still changes by"),
+        (optical_transfer, "_MOST_NODES", 1, table, "too many waves for a table"),
     ):
         call()
         with monkeypatch.context() as patch:
             patch.setattr(module, name, value)
-            if module is transfer and name == "_MOST_NODES":
+            if module is optical_transfer and name == "_MOST_NODES":
                 patch.setattr(module, "TABLE_TAIL", 0.0)
             with pytest.raises(ValueError, match=words):
                 call()
     with pytest.raises(ValueError, match="has no part 'dark'"):
-        transfer._correlate(pupil, np.zeros(1), np.full(1, 650e-9), np.zeros(1), "dark")
+        optical_transfer._correlate(pupil, np.zeros(1), np.full(1, 650e-9), np.zeros(1), "dark")
 
 
 def test_an_interaction_that_the_trace_does_not_know_is_refused(backend) -> None:

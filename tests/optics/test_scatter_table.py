@@ -13,8 +13,16 @@ import pytest
 from scipy.integrate import dblquad, quad
 from scipy.stats import chi2
 
-from optics.materials import scatter as finishes
-from optics.materials.scatter import STEPS, ABg, HarveyShack, ScatterTable, acceptance, sample_distance, total_scatter
+from optics.materials import fresnel_scatter as finishes
+from optics.materials.fresnel_scatter import (
+    STEPS,
+    ABg,
+    HarveyShack,
+    ScatterTable,
+    acceptance,
+    sample_distance,
+    total_scatter,
+)
 from scenes.models.scenery import Finishes, MeasuredFinishes
 
 INCIDENCE = np.radians([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0])

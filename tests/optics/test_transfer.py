@@ -14,12 +14,12 @@ from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
-from optics.waves import transfer
+from optics.waves import optical_transfer as transfer
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.imaging import aim_collimated, imaging_rays, pupil_field
+from optics.waves.optical_transfer import TransferTable, polychromatic_transfer
 from optics.waves.pupil_stack import PupilFunction, circular_pupil, fit_pupils
 from optics.waves.pupil_terms import PupilEdge
-from optics.waves.transfer import TransferTable, polychromatic_transfer
 from scenes.models.camera_model import IMAGE, field_direction
 from tests.tiers import quick
 

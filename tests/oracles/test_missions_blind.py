@@ -54,7 +54,7 @@ from scipy.stats import betabinom, binom
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.jump_detection import Jump
-from analysis.monitor.series_filter import SeriesFilter
+from analysis.monitor.kalman_filter import SeriesFilter
 from optics.numerics.backend import one_blas_thread
 from tests.analysis.followed_series import Followed, follow, of_shifts
 

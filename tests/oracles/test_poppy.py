@@ -7,7 +7,7 @@ import pytest
 
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
-from optics.waves import transfer
+from optics.waves import optical_transfer
 from optics.waves.diffraction import Grid, image
 from tests.oracles.pupil_grid import WAVELENGTH, FarPoint, fitted, pupil_grid
 from tests.tiers import quick
@@ -80,7 +80,7 @@ def test_transfer_function(point) -> None:
     assert np.max(f) < 0.5 / step  # the pixels sample the image finely enough
     waves = [np.exp(-2j * np.pi * np.outer(f[:, i], axis.points())) for i in (0, 1)]
     got = np.einsum("mr,rc,mc->m", waves[1], light, waves[0])
-    want = transfer.transfer(pupil, f, WAVELENGTH, np.array([0.0]))[0]
+    want = optical_transfer.transfer(pupil, f, WAVELENGTH, np.array([0.0]))[0]
     assert len(want) == 15
     np.testing.assert_allclose(got, want, rtol=0, atol=2e-3)
     assert np.max(np.abs(want)) > 0.8

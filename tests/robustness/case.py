@@ -20,7 +20,7 @@ CUTS = Path(__file__).with_name("cuts.txt").read_text("utf-8").split()
 SOONER = (
     "twin.design.monitor_design.LayoutBench",
     "scenes.models.thermal_model.ThermalModel._bent",
-    "optics.waves.transfer._correlate",
+    "optics.waves.optical_transfer._correlate",
 )
 """Parts of building that take seconds, finite elements and transfer functions: most mutants stop before them."""
 

@@ -12,8 +12,8 @@ import pytest
 import scenes.specs
 from scenes.yaml import units
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import EXAMPLES, Quantity, Vector, example_of
 from scenes.yaml.spec import Spec
+from scenes.yaml.unit_fields import EXAMPLES, Quantity, Vector, example_of
 
 EXACT = {
     units.LENGTH: {"20 um": 20e-6, "20um": 20e-6, " 20  µm ": 20e-6, "650 nm": 650e-9, "-11851.78535 mm": -11.85178535,

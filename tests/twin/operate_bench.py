@@ -17,9 +17,9 @@ from tests.twin.operation_records import life_of, plan_of, record_of
 from tests.twin.operation_records import monitor_entry as own_entry
 from tests.twin.record_bench import START, given, made, pair
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState
+from twin.operate.estimate.estimate_snapshot import Scores
 from twin.operate.estimate.operation_model import keep_plan
-from twin.operate.estimate.standing import Scores
+from twin.operate.estimate.reported_estimate import Break, Course, Following, FoundJump, Motions, SensorState
 from twin.operate.record.entries import MICRO, Alarm, Entry
 from twin.operate.record.history import History
 
@@ -88,7 +88,7 @@ def plan(events: bool = True) -> Any:
 
 @dataclass
 class StandIn:
-    """In place of `twin.operate.estimate.operation.Operation`: quantities grow evenly, one jump, one stuck sensor."""
+    """In place of an `Operation`: quantities grow evenly, one jump, one stuck sensor."""
 
     history: History
     plan: Any = field(default_factory=plan)

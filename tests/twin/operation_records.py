@@ -9,7 +9,7 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 from scenes.specs.operation import OperationSetup, read_operation
 from scenes.specs.resolved import resolve_with
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.operation_filter import Operation
 from twin.operate.record.entries import MICRO, Entry, Given, digest_of_data, micros
 from twin.operate.record.history import History, initialised
 

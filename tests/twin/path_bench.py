@@ -12,7 +12,7 @@ from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, RigidTree
-from optics.materials.scatter import ABSORBER, BARE, Finish
+from optics.materials.fresnel_scatter import ABSORBER, BARE, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from scenes.models.camera_model import LINE_AXIS, collimated, field_direction

@@ -20,7 +20,7 @@ from twin.operate.record.entries import MICRO
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """As `twin.operate.estimate.operation.Course`."""
+    """As `twin.operate.estimate.operation_filter.Course`."""
 
     times: np.ndarray
     quantities: tuple

@@ -7,7 +7,7 @@ import pytest
 
 from optics.geometry.tree import Motion
 from optics.numerics.array_math import UnphysicalError
-from optics.waves.transfer import polychromatic_transfer
+from optics.waves.optical_transfer import polychromatic_transfer
 from scenes.specs.spectrum import SpectrumSpec
 from tests.scenes.lens.colour_cameras import colour_camera
 from twin.camera.camera_optics import CameraOptics

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from analysis.monitor import monitoring
-from analysis.monitor.monitoring import MonitorGeometry
+from analysis.monitor import monitor_formulas
+from analysis.monitor.monitor_formulas import MonitorGeometry
 from optics.geometry import zernike
 from optics.geometry.tree import Motion
 from optics.raytrace.assembly import points_to_world
@@ -242,7 +242,7 @@ PRINTED = [
 @pytest.mark.parametrize(("name", "motion", "which", "factor"), PRINTED)
 def test_printed_formulas_have_the_right_sign(spots, truth, geometry, name, motion, which, factor):
     """Positive factors, of the expected size but for the camera's anamorphism (3%), with columns along -X."""
-    reading = monitoring.coefficients(name, geometry)[which] @ spots[motion].ravel()
+    reading = monitor_formulas.coefficients(name, geometry)[which] @ spots[motion].ravel()
     assert reading / truth[motion][which] == pytest.approx(factor, rel=0.035)
 
 

@@ -19,7 +19,7 @@ from optics.numerics.backend import load_backend
 from optics.targets.target_image import target_image
 from optics.targets.target_shapes import pinhole
 from optics.waves.diffraction import Grid
-from optics.waves.transfer import TransferTable
+from optics.waves.optical_transfer import TransferTable
 from scenes.specs.load import EXAMPLES, LAB, load_named
 from scenes.specs.resolved import DistortionSetup
 from scenes.specs.turntable import TurntableTestSpec

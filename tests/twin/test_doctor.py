@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 
 from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
 from twin import doctor
-from twin.framework import lock_file, probe
+from twin.framework import doctor_probe, lock_file
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,7 +55,7 @@ ABORTS = "import os, sys; sys.stderr.write('LLVM ERROR: Cannot select: fmaximum\
         (("-c", ABORTS), "needs LLVM 17 or newer.*Cannot select"),
         (("-c", "import time; time.sleep(60)"), "no answer after 1 s"),
         (("-c", "raise SystemExit(3)"), "exit code 3 and no answer"),
-        (("-m", "twin.framework.probe", "render", "no_such_variant"), "no_such_variant"),
+        (("-m", "twin.framework.doctor_probe", "render", "no_such_variant"), "no_such_variant"),
     ],
 )
 def test_a_child_that_fails_is_told(words: tuple[str, ...], told: str) -> None:
@@ -127,13 +127,13 @@ def test_every_check_says_what_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (doctor._libatomic().status, doctor._llvm().status) == ("failed", "failed")
     with pytest.raises(LibraryMissing, match="apt install libatomic1"):
         ensure_llvm()
-    monkeypatch.setattr(probe, "ULPS", -1.0)
+    monkeypatch.setattr(doctor_probe, "ULPS", -1.0)
     with pytest.raises(RuntimeError, match="the kernel's results differ from numpy's by"):
-        probe.kernel()
+        doctor_probe.kernel()
     dark = SimpleNamespace(set_variant=str, load_dict=dict, render=lambda *words, **how: np.zeros((16, 16, 1)))
     monkeypatch.setitem(sys.modules, "mitsuba", dark)
     with pytest.raises(RuntimeError, match=r"radiance 1 was rendered as 0 \.\. 0"):
-        probe.render()
+        doctor_probe.render()
     monkeypatch.setattr(doctor, "run_probe", fail)
     assert (doctor._probe("kernel", [], str).status, doctor._gpu().status) == ("failed", "note")
     for found, status in (({"available": False}, "note"), ({"version": "12", "compute_capability": "9.0"}, "ok")):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from twin.path_tracing.families import MARKS, Touch, family_name
+from twin.path_tracing.path_families import MARKS, Touch, family_name
 
 HERE = "base/forward/monitor/left"
 OUT = (

@@ -10,8 +10,8 @@ import pytest
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.tree import Motion
 from optics.numerics.number_tree import FrozenMap
+from optics.waves.optical_transfer import polychromatic_transfer
 from optics.waves.pupil_stack import PupilFunction
-from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import ROOT
 from scenes.specs.load import LAB, SCENES
 from scenes.specs.resolved import FocusSetup

@@ -8,8 +8,8 @@ import pytest
 from scipy import stats
 
 from analysis.arrays import ARCSEC
-from analysis.monitor import model_fit, monitoring
-from analysis.monitor.monitoring import PER_SI
+from analysis.monitor import model_fit, monitor_formulas
+from analysis.monitor.monitor_formulas import PER_SI
 from analysis.monitor.recovery import measure_spots, recover
 from optics.geometry.tree import Motion
 from scenes.specs.instrument import BASE
@@ -81,7 +81,7 @@ def test_derived_formulas_are_good_to_one_percent(measured):
     signs, cameras = measured
     checked = 0
     for true, shift, calibration in cameras.values():
-        reading = shift @ monitoring.coefficients("derived", calibration.geometry).T * PER_SI
+        reading = shift @ monitor_formulas.coefficients("derived", calibration.geometry).T * PER_SI
         moved = signs != 0  # alone: the parameter that is moved; together: all four
         error = np.abs(reading / np.where(moved, true, 1.0) - 1.0)[moved]
         assert np.max(error) < DERIVED_LIMIT, np.max(error)

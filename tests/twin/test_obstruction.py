@@ -12,7 +12,7 @@ from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import imaging_rays
-from optics.waves.transfer import polychromatic_transfer
+from optics.waves.optical_transfer import polychromatic_transfer
 from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams
 from scenes.specs.baffle import Plate
 from scenes.specs.load import load_band_detectors

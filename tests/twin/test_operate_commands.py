@@ -18,9 +18,17 @@ from tests.twin.study_bench import REFUSED
 from twin.framework.provenance import negative_verdicts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
-from twin.operate.estimate.following import AGAIN, Break, Following, FoundJump, SensorState, alarms_of, raise_alarms
-from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.operation_filter import Operation
 from twin.operate.estimate.operation_model import keep_plan
+from twin.operate.estimate.reported_estimate import (
+    AGAIN,
+    Break,
+    Following,
+    FoundJump,
+    SensorState,
+    alarms_of,
+    raise_alarms,
+)
 from twin.operate.record.entries import MICRO, Entry, utc_text
 from twin.operate.record.history import History
 

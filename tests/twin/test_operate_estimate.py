@@ -25,10 +25,10 @@ from tests.twin.operation_records import (
 )
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
-from twin.operate.estimate import operation as operation_module
-from twin.operate.estimate.following import Course, alarms_of, beyond, widening
-from twin.operate.estimate.operation import Operation
-from twin.operate.estimate.standing import Scores, Sensor, Standing
+from twin.operate.estimate import operation_filter as operation_module
+from twin.operate.estimate.estimate_snapshot import Scores, Sensor, Standing
+from twin.operate.estimate.operation_filter import Operation
+from twin.operate.estimate.reported_estimate import Course, alarms_of, beyond, widening
 from twin.operate.operated_block import posterior
 from twin.operate.record.entries import MICRO, Entry
 

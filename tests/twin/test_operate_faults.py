@@ -29,7 +29,7 @@ from tests.twin.test_durability import mounted
 from twin.framework.data_files import TABLE_FORMATS
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
-from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.operation_filter import Operation
 from twin.operate.record import FILE, RecordFailed
 from twin.operate.record.entries import Alarm
 from twin.operate.record.history import History, initialised
@@ -180,7 +180,7 @@ def test_the_same_record_on_a_postgresql_server(server: str, tmp_path: Path) -> 
 @pytest.mark.second
 def test_the_same_estimate_on_a_postgresql_server(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is known now, of the past and ahead: the same bytes, also where it goes on from what was kept."""
-    monkeypatch.setattr("twin.operate.estimate.operation.HEAD", 1)
+    monkeypatch.setattr("twin.operate.estimate.operation_filter.HEAD", 1)
     plan = plan_of(tmp_path)
     experiment = MonitorExperiment(plan.model, load_backend())
     stated = experiment.disturbances

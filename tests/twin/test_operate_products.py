@@ -29,7 +29,7 @@ from tests.twin.products_bench import StandIn
 from tests.twin.record_bench import START, given, made, pair
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app as operate
-from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.operation_filter import Operation
 from twin.operate.estimate.operation_model import keep_plan
 from twin.operate.estimated_motions import EstimatedMotions, perturbation, prior_files, state_file
 from twin.operate.products import Mark, Products, _warnings, product_files, validity

@@ -21,9 +21,9 @@ from twin.framework.page import report_page
 from twin.operate import daily_report as daily
 from twin.operate.__main__ import app
 from twin.operate.daily_report import _warnings, daily_report, end_of_day, state_table
-from twin.operate.estimate.following import percent
-from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.operation_filter import Operation
 from twin.operate.estimate.operation_model import kept_plan
+from twin.operate.estimate.reported_estimate import percent
 from twin.operate.overview import Overview, coverage, points_of, readings, span_of, spread, trend
 from twin.operate.record.entries import Alarm, Entry, micros
 from twin.operate.record.history import History, content_of, initialised

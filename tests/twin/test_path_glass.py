@@ -13,12 +13,12 @@ from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, RigidTree
-from optics.materials.scatter import ABSORBER, BARE, Finish, reflectance
+from optics.materials.fresnel_scatter import ABSORBER, BARE, Finish, reflectance
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.scenery import Finishes, Scenery, solid_surfaces
 from tests.optics.bench import unit
 from tests.twin.path_bench import facing, frame, glass_scene, screen, slab
-from twin.path_tracing.families import Event, decode
+from twin.path_tracing.path_families import Event, decode
 from twin.path_tracing.path_result import Family, PathResult
 from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.tracer import PathTracer, Sampling

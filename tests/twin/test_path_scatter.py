@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from optics.geometry.pose import Pose
 from optics.geometry.solid import Coating
-from optics.materials.scatter import (
+from optics.materials.fresnel_scatter import (
     ABg,
     CoatingTable,
     Finish,
@@ -27,8 +27,8 @@ from tests.optics.bench import unit
 from tests.optics.test_scatter_table import lambert, of_lobe
 from tests.tiers import quick
 from tests.twin.path_bench import flat_mirror, glass_scene, screen, slab
-from twin.path_tracing.families import Event
 from twin.path_tracing.importance_sampling import Leaving, TableDraw, spread
+from twin.path_tracing.path_families import Event
 from twin.path_tracing.source import DiskSource, random_streams
 from twin.path_tracing.tables import upload_finishes
 from twin.path_tracing.tracer import PathTracer, Sampling

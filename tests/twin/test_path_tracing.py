@@ -22,7 +22,7 @@ from scenes.models.scenery import Detector, Scenery, build_scenery, detector_sur
 from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, facing, flat_mirror, glass_scene, screen, slab
 from twin.monitor.monitor_path import MonitorPath
-from twin.path_tracing.families import nominal_codes
+from twin.path_tracing.path_families import nominal_codes
 from twin.path_tracing.path_result import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.stray_light import monitor_families, trace_stray

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from optics.numerics.number_tree import FrozenMap
-from twin.framework.quantity import plain_data
+from twin.framework.record import plain_data
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from twin.framework.artefact import PngFigure, SvgFigure, Table
 from twin.framework.cli import heartbeat
 from twin.framework.command import add_tests, progress_shown
 from twin.framework.procedure import Advance, BenchError
-from twin.framework.quantity import plain_data
+from twin.framework.record import plain_data
 from twin.framework.report import Report, Section, answer
 from twin.study.runs.base_job import Failure, ProcedureBase, Run
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from twin.framework.quantity import Quantity, Record, in_unit
+from twin.framework.record import Quantity, Record, in_unit
 
 
 @dataclass

@@ -13,7 +13,7 @@ import pytest
 
 import twin
 from analysis.monitor.estimators import ESTIMATORS
-from analysis.monitor.monitoring import PARAMETERS
+from analysis.monitor.monitor_formulas import PARAMETERS
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from tests.twin.commands import files

@@ -16,14 +16,14 @@ from optics.geometry.aperture import Circle
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree
-from optics.materials.scatter import CoatingTable, Finish
+from optics.materials.fresnel_scatter import CoatingTable, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.scenery import Finishes, Scenery, build_scenery, mirror_surface
 from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, facing, scene_beam, screen, ways_and_search
 from twin.path_tracing.clear_ways import ClearWays
-from twin.path_tracing.families import Event, code, nominal_codes
 from twin.path_tracing.importance_sampling import LEAST_KEPT, Followed, Thinning, learn
+from twin.path_tracing.path_families import Event, code, nominal_codes
 from twin.path_tracing.path_result import PathResult
 from twin.path_tracing.source import DiskSource
 from twin.path_tracing.stray_light import monitor_families, pinhole

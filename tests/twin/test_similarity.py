@@ -14,7 +14,7 @@ import pytest
 from optics.geometry.tree import Motion, State
 from optics.materials.material import MATERIALS, Material, material
 from optics.thermal.heat import Temperature
-from optics.waves.transfer import polychromatic_transfer
+from optics.waves.optical_transfer import polychromatic_transfer
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument

@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chi2, norm, t
 
 from optics.geometry.tree import Motion
-from optics.materials.scatter import MIRROR, Finish
+from optics.materials.fresnel_scatter import MIRROR, Finish
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.scenery import Finishes, build_scenery
 from scenes.specs.baffle import BaffleSpec

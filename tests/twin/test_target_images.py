@@ -19,8 +19,8 @@ from optics.raytrace.system import assemble
 from optics.targets.target_shapes import pinhole_target, star_target
 from optics.waves.diffraction import Grid, image
 from optics.waves.imaging import imaging_rays, pupil_field
+from optics.waves.optical_transfer import polychromatic_transfer
 from optics.waves.pupil_stack import circular_pupil
-from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import LAUNCH_DISTANCE, ROOT, build_camera_under_test, camera_alone
 from scenes.specs.camera import BandSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec, CollimatorSpec

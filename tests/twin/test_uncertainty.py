@@ -11,7 +11,7 @@ from scipy.stats import binom, chi2, norm, t
 
 from analysis.arrays import ARCSEC
 from analysis.monitor import limits as theory
-from analysis.monitor.monitoring import GroundGeometry
+from analysis.monitor.monitor_formulas import GroundGeometry
 from optics.geometry.tree import Motion
 from optics.numerics.backend import load_backend
 from scenes.specs.job import JobSpec

@@ -21,7 +21,7 @@ from tests.golden.digest import expanded
 from tests.twin.commands import invoke
 from tests.twin.test_procedure import FILE, LEVEL, program
 from twin.framework.provenance import VERDICT, negative_verdicts
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
 from twin.main_job.verdict import judge, recovered_numbers

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from optics.materials.scatter import Finish
+from optics.materials.fresnel_scatter import Finish
 from optics.numerics.backend import Backend, BackendUnavailable, load_backend
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace

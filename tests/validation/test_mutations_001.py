@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.monitor import autocollimator, monitoring, recovery
+from analysis.monitor import autocollimator, monitor_formulas, recovery
 from scenes.specs.load import load_autocollimator_test
 from tests.validation.mutated import break_it, times
 from twin.laboratory.autocollimator_bench import Reader, run_autocollimator_test
@@ -94,7 +94,7 @@ def factors(estimator: str, row: int, change: Callable[[np.ndarray], np.ndarray]
 
         return wrong
 
-    return monitoring, "coefficients", broken
+    return monitor_formulas, "coefficients", broken
 
 
 def relation(axis: str, unit: int, change: Callable[[float, float], float]):

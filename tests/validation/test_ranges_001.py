@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.monitor import monitoring
+from analysis.monitor import monitor_formulas
 from analysis.spots.spot_positions import SpotError
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
@@ -164,8 +164,8 @@ def test_the_range_of_a_formula_turns_with_a_wrong_factor(bench, wide, backend, 
         return show._range(context, row, both, bench.geometry("forward")).verdict
 
     assert judged() == verdict
-    right = monitoring.coefficients
-    monkeypatch.setattr(monitoring, "coefficients", lambda name, geometry: 0.5 * right(name, geometry))
+    right = monitor_formulas.coefficients
+    monkeypatch.setattr(monitor_formulas, "coefficients", lambda name, geometry: 0.5 * right(name, geometry))
     assert judged() == REFUTED
 
 

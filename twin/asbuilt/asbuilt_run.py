@@ -17,8 +17,8 @@ from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
 from twin.asbuilt.next_step import Advice, advice
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, silent
-from twin.framework.quantity import Quantity, Record
 from twin.framework.random_streams import stream
+from twin.framework.record import Quantity, Record
 from twin.tolerance.monitor_merit import Merit, merit_unit, shown_merit
 
 LEVELS = (0.025, 0.16, 0.5, 0.84, 0.975)

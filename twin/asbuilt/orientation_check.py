@@ -18,7 +18,7 @@ from twin.asbuilt.measured_kinds import UNKNOWN_FOCUS, MeasuredKind, WavefrontRe
 from twin.asbuilt.wavefront_files import read_coefficients, stated_orientation
 from twin.framework.artefact import Cell, Table
 from twin.framework.procedure import Advance, silent
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 
 FREE_FOCUS = 100.0 * UNKNOWN_FOCUS

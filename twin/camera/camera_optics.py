@@ -29,9 +29,9 @@ from optics.raytrace.assembly import Assembly
 from optics.raytrace.first_order import equal_area_radius
 from optics.waves.imaging import path_to_sphere
 from optics.waves.line_transfer import line_transfers
+from optics.waves.optical_transfer import polychromatic_transfer
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
-from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import ROOT, CameraModel, camera_alone, derive_camera, field_direction, lenses
 from scenes.models.camera_sharpness import FIELDS, Cut, FieldBeams, FocalPlane, stop_nodes
 from scenes.models.instrument_model import Instrument

@@ -33,7 +33,7 @@ from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
 from twin.camera.colour import COLOURS, Colours, colour_data, judge_colours
 from twin.camera.first_order_data import FIRST_ORDER, FirstOrderData, first_order_data
 from twin.framework.procedure import Advance, silent
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.framework.reference_frames import frames_text
 from twin.monitor.image_quality import CameraQuality, image_quality
 from twin.monitor.truth import trace_truth

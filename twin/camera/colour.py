@@ -20,14 +20,14 @@ import numpy as np
 
 from optics.numerics.quadrature import gauss, nodes_for
 from optics.waves.diffraction import Grid, PupilField, image
+from optics.waves.optical_transfer import LEAST_ACROSS
 from optics.waves.pupil_stack import SHADOW_NODES, PupilFunction
-from optics.waves.transfer import LEAST_ACROSS
 from scenes.models.camera_model import lenses
 from scenes.models.camera_sharpness import FocalPlane
 from scenes.specs.spectrum import SpectrumSpec
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field, Mtf
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.targets.target_images import wavelengths_enough
 
 FIRST_RULE = 5

@@ -9,7 +9,7 @@ import numpy as np
 from analysis.arrays import shows
 from analysis.orientation.interior import principal_distance, principal_distance_and_point
 from optics.raytrace.first_order import enclosed_area
-from optics.waves.transfer import polychromatic_transfer
+from optics.waves.optical_transfer import polychromatic_transfer
 from scenes.models.camera_sharpness import FocalPlane
 from twin.camera.camera_optics import CameraOptics, rim
 from twin.camera.camera_results import Field

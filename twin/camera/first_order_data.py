@@ -34,7 +34,7 @@ from scenes.models.camera_model import (
 )
 from scenes.specs.camera import BandSpec, CameraSpec, LineSpec
 from twin.camera.camera_optics import CameraOptics, rim
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 
 EARLIER = 6.0
 """How far before its launch point light is looked at for what stands in it, metres."""

@@ -29,7 +29,7 @@ from scenes.models import camera_design
 from scenes.models.camera_model import derive_camera
 from scenes.models.camera_sharpness import BLURRED
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 
 REMARK = """Prescription frame: z along the parent axis, light enters toward +z, y in the plane of symmetry, x along the
 line CCD. Made by python -m twin.design from {start}: least squares of the wavefront error over the field."""

@@ -18,7 +18,7 @@ from scenes.specs.resolved import ResolvedJob
 from twin.design.layout_bench import LayoutBench, LayoutFacts
 from twin.design.layout_search import Found, Search, merit, optima
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.stray_light import GHOSTS, Ghost, ghosts, stray_light
 

@@ -25,8 +25,8 @@ from optics.numerics.backend import Backend, one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.targets.target_shapes import Target, pinhole
+from optics.waves.optical_transfer import TransferTable, transfer
 from optics.waves.pupil_stack import PupilFunction
-from optics.waves.transfer import TransferTable, transfer
 from scenes.models.camera_model import ROOT, build_camera_under_test
 from scenes.specs.resolved import DistortionSetup
 from twin.framework.procedure import Advance, BenchError, silent

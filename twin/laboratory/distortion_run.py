@@ -36,7 +36,7 @@ from scenes.specs.resolved import DistortionSetup, ExperimentSetup, MeasuredDist
 from scenes.yaml.errors import InputError, Issue
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.laboratory import turntable_run
 from twin.laboratory.distortion_bench import DistortionBench, DistortionRecord, DistortionTruth
 from twin.laboratory.measured_readings import (

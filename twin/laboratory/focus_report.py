@@ -21,7 +21,7 @@ from scenes.specs.camera_tests import MeasuredFocusSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.framework import svg
 from twin.framework.artefact import Artefact, Cell, SvgFigure, Table, fixed
-from twin.framework.quantity import Record
+from twin.framework.record import Record
 from twin.framework.report import Report, Section, answer
 from twin.laboratory import focus_run
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus, SimulatedState

@@ -17,7 +17,7 @@ from scenes.specs.turntable import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
 from twin.framework import svg
 from twin.framework.artefact import Artefact, OwnDecimals, SvgFigure, Table
-from twin.framework.quantity import Record
+from twin.framework.record import Record
 from twin.framework.report import Report, Section, answer
 from twin.laboratory import turntable_run
 from twin.laboratory.turntable_run import DOUBTFUL, TURNTABLE, TurntableModel, TurntableRun

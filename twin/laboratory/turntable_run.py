@@ -44,8 +44,8 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.resolved import ExperimentSetup
 from scenes.specs.turntable import DividingErrorSpec, MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from twin.framework.procedure import Advance, silent
-from twin.framework.quantity import Quantity, Record
 from twin.framework.random_streams import stream
+from twin.framework.record import Quantity, Record
 from twin.laboratory.measured_readings import Comparisons, DataFile, read_turntable
 
 _TABLE, _CALIBRATION, _HELD_OUT, _SPREAD = range(4)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from optics.geometry.tree import State
-from optics.waves.transfer import polychromatic_transfer
+from optics.waves.optical_transfer import polychromatic_transfer
 from scenes.specs.job import TargetsSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from scenes.yaml.errors import InputError

@@ -14,7 +14,7 @@ from analysis.arrays import shows
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares, consistency
 from analysis.monitor.estimators import Estimator, applicable, judged
 from analysis.monitor.limits import Quantity, posterior_sigma, quantities, unmoved
-from analysis.monitor.monitoring import GroundGeometry
+from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import BEYOND, Recovery
 from analysis.spots.likelihood import FALSE_ALARM as SPOT_ALARM

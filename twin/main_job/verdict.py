@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from analysis.monitor import parameters
-from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.monitor_formulas import PER_SI
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from optics.geometry.tree import Motion
 from scenes.models.job_state import beyond_statement

@@ -12,7 +12,7 @@ from analysis.monitor import model_fit, parameters
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.model_fit import ObservabilityReport
-from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.monitor_formulas import PER_SI
 from analysis.monitor.parameters import CameraCalibration
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment

@@ -50,7 +50,7 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import target_band
 from scenes.specs.spectrum import SpectrumSpec
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.sensors.line_ccd import band_factors
 
 CUT_MEAN_DEGREE = 14

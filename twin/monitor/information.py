@@ -16,7 +16,7 @@ import numpy as np
 
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.limits import Split, split
-from analysis.monitor.monitoring import GroundGeometry
+from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.recovery import joint
 from analysis.spots.likelihood import image_bound
 from optics.geometry.tree import State

@@ -15,7 +15,7 @@ from scipy.ndimage import center_of_mass
 
 from analysis.arrays import shows
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.monitoring import GroundGeometry, MonitorGeometry
+from analysis.monitor.monitor_formulas import GroundGeometry, MonitorGeometry
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.monitor.recovery import MotionModel
 from analysis.spots.spot_template import SpotTemplate

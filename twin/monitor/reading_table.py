@@ -18,7 +18,7 @@ from analysis.monitor import parameters
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.limits import unmoved
-from analysis.monitor.monitoring import GroundGeometry
+from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibration, Parameter
 from analysis.monitor.recovery import Estimates, Recovery
 from twin.framework.artefact import FAR, SAME, decimals_for, fixed

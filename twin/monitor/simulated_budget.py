@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from analysis.arrays import ARCSEC
-from analysis.monitor.monitoring import coefficients
+from analysis.monitor.monitor_formulas import coefficients
 from analysis.monitor.recovery import Recovery, measure_spots
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend, cores, one_blas_thread

@@ -10,7 +10,7 @@ import numpy as np
 
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares
 from analysis.monitor.jump_detection import Jump
-from analysis.monitor.monitoring import GroundGeometry
+from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import Curvature, Recovery, SpotEvidence, estimates_of
 from analysis.monitor.series_smoother import smooth, window_of
@@ -26,7 +26,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, names_text
 from twin.framework.artefact import significant
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import largest_piece
 from twin.monitor.observation import LOST, Observing, observe, one_detector, why_lost

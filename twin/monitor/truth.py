@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from analysis.arrays import shows
-from analysis.monitor.monitoring import GroundGeometry
+from analysis.monitor.monitor_formulas import GroundGeometry
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import points_to_world

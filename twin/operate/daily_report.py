@@ -24,7 +24,7 @@ from scenes.yaml.errors import Problem
 from twin.framework import svg
 from twin.framework.artefact import Artefact, Cell, Marked, OwnDecimals, SvgFigure, Table, Text, decimals_for
 from twin.framework.report import Report, Section, answer
-from twin.operate.estimate.following import name_of, percent, with_sigma
+from twin.operate.estimate.reported_estimate import name_of, percent, with_sigma
 from twin.operate.overview import (
     CONFIDENCE,
     DAY,

@@ -25,10 +25,10 @@ from twin.operate.terminal import (
 )
 
 if TYPE_CHECKING:
-    from analysis.monitor.series_filter import Power
+    from analysis.monitor.kalman_filter import Power
     from twin.framework.report import Report
-    from twin.operate.estimate.following import Course, Following
-    from twin.operate.estimate.operation import Operation
+    from twin.operate.estimate.operation_filter import Operation
+    from twin.operate.estimate.reported_estimate import Course, Following
     from twin.operate.record.history import History
 
 STEPS = 4
@@ -316,7 +316,7 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
 
 def _show_course(course: Course, console: Console) -> None:
     """A row for each quantity, a column for each time."""
-    from twin.operate.estimate.following import name_of, with_sigma
+    from twin.operate.estimate.reported_estimate import name_of, with_sigma
 
     utc = course.utc
     rows = []
@@ -337,7 +337,7 @@ def show_power(found: Sequence[Power], console: Console) -> None:
 def show_requirements(following: Following, console: Console) -> None:
     """A row for each requirement."""
     from twin.framework.artefact import plain
-    from twin.operate.estimate.following import name_of, percent
+    from twin.operate.estimate.reported_estimate import name_of, percent
     from twin.operate.record.entries import utc_text
 
     if not following.breaks:

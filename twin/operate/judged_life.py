@@ -29,8 +29,8 @@ from twin.framework import svg
 from twin.framework.artefact import Cell, SvgFigure, Table
 from twin.framework.procedure import Advance
 from twin.framework.report import Report, Section, answer
-from twin.operate.estimate.following import Course, Following
-from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.operation_filter import Operation
+from twin.operate.estimate.reported_estimate import Course, Following
 from twin.operate.record.entries import MICRO, Entry, Given, utc_text
 from twin.operate.record.history import History, initialised
 from twin.operate.record.telemetry import RESULTS, read_table_file, read_telemetry, tables_of

@@ -26,7 +26,7 @@ from scenes.specs.orbit.adjust import MonitorRecordSpec
 from scenes.specs.orbit.setup import AnyAdjust
 from scenes.yaml.errors import InputError, Problem, unknown
 from twin.framework.procedure import Advance, silent
-from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.operation_filter import Operation
 from twin.operate.estimate.operation_model import kept_plan, read_plan
 from twin.operate.record import NotARecord, RecordFailed
 from twin.operate.record.entries import micros, utc_text

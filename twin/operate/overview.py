@@ -1,7 +1,7 @@
 """What readers are told of an instrument in operation, for the daily report.
 
-An overview takes the estimate as `twin.operate.estimate.operation` gives it, with the alarms of the record, and says
-in words and rows what holds, what changed and whether predictions came true. Nothing is estimated here.
+An overview takes the estimate as `twin.operate.estimate.operation_filter` gives it, with the alarms of the record, and
+says in words and rows what holds, what changed and whether predictions came true. Nothing is estimated here.
 
 Return single readings of the monitor as the report shows them: the first and last times, and evenly chosen ones.
 """
@@ -22,14 +22,14 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import share_interval
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.artefact import SAME
-from twin.operate.estimate.following import name_of, percent, with_sigma
+from twin.operate.estimate.reported_estimate import name_of, percent, with_sigma
 from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.record.history import History, content_of
 from twin.operate.record.schema import ENTRY, SOURCE
 
 if TYPE_CHECKING:
-    from twin.operate.estimate.following import Break, Course, Following, FoundJump
-    from twin.operate.estimate.operation import Operation
+    from twin.operate.estimate.operation_filter import Operation
+    from twin.operate.estimate.reported_estimate import Break, Course, Following, FoundJump
     from twin.operate.record.history import History
 
 KIND = "monitor"

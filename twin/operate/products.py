@@ -34,7 +34,7 @@ from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.errors import InputError, Problem
 from twin.framework.data_files import WRITER
 from twin.framework.procedure import BenchError
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.framework.reference_frames import described
 from twin.operate.estimate.operation_model import plan_digest
 from twin.operate.estimated_motions import EstimatedMotions, LeftOut, Prior, prior_files, state_file
@@ -47,8 +47,8 @@ from twin.orbit.export.ground_accuracy import EstimatedChange
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.models.disturbances import Component
-    from twin.operate.estimate.following import Course, Following
-    from twin.operate.estimate.operation import Operation
+    from twin.operate.estimate.operation_filter import Operation
+    from twin.operate.estimate.reported_estimate import Course, Following
     from twin.operate.record.history import History
     from twin.orbit.export.export_run import ExportSource
 

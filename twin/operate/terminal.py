@@ -21,8 +21,8 @@ from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
 
 if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup
-    from twin.operate.estimate.following import Following
-    from twin.operate.estimate.operation import Operation
+    from twin.operate.estimate.operation_filter import Operation
+    from twin.operate.estimate.reported_estimate import Following
     from twin.operate.record.entries import Alarm
     from twin.operate.record.history import History
 
@@ -154,7 +154,7 @@ class Call:
         Raises:
             InputErrorText: there is no reading of the monitor.
         """
-        from twin.operate.estimate.operation import Operation
+        from twin.operate.estimate.operation_filter import Operation
 
         standing, history = cli.Standing("follow the record"), history or self.history
         with problems_of(history.url), cli.heartbeat(self.errors, standing.__str__, self.options.silent):
@@ -169,7 +169,7 @@ class Call:
 
     def estimate(self, plan: Path | None = None) -> tuple[Operation, Following, list[Alarm]]:
         """Return the estimate under a plan, what it says, and the alarms that are new, which are then in the record."""
-        from twin.operate.estimate.following import raise_alarms
+        from twin.operate.estimate.reported_estimate import raise_alarms
 
         operation = self.followed(self.planned(plan))
         following = operation.follow()

@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull
 from optics.geometry.aperture import Aperture, Rectangle
 from optics.geometry.pose import Pose
 from scenes.models.scenery import LEAST_CLEARANCE, Scenery, SceneSurface
-from twin.path_tracing.families import decode
+from twin.path_tracing.path_families import decode
 
 FACING = 0.05
 """Least cosine of a way with the normals of a curved aperture that sees all of another one: three degrees from grazing,

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from optics.materials import scatter
+from optics.materials import fresnel_scatter
 from optics.numerics.backend import Backend
-from twin.path_tracing.families import Event
+from twin.path_tracing.path_families import Event
 
 NEAREST = 1e-6
 """Smallest distance of ``near_distance``, in direction cosines."""
@@ -31,14 +31,14 @@ def near_distance(u: Any) -> Any:
     """Distance between ``NEAREST`` and ``scatter.WIDEST``, even in its logarithm, from u in [0, 1)."""
     import drjit as dr
 
-    return NEAREST * dr.exp(u * log(scatter.WIDEST / NEAREST))
+    return NEAREST * dr.exp(u * log(fresnel_scatter.WIDEST / NEAREST))
 
 
 def near_density(distance: Any) -> Any:
     """Density of the square of ``near_distance``."""
     import drjit as dr
 
-    return dr.select(distance >= NEAREST, 0.5 / (log(scatter.WIDEST / NEAREST) * distance * distance), 0.0)
+    return dr.select(distance >= NEAREST, 0.5 / (log(fresnel_scatter.WIDEST / NEAREST) * distance * distance), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ def spread(
         n = leaving.normal
         up = dr.copysign(1.0, dr.select(leaving.diffusing, -leaving.toward, dr.dot(direction, n)))
         side = n * up
-        distance = scatter.sample_distance(u, scale, exponent)
+        distance = fresnel_scatter.sample_distance(u, scale, exponent)
         if near is not None:
             by_distance = rng.next_float64() < near
             distance = dr.select(by_distance, near_distance(u), distance)
@@ -151,7 +151,7 @@ def spread(
             ours = (1.0 - near) * plain + near * near_density(distance)
             lobed = scattering if drawn is None else scattering & (drawn.marks[1] < 0.5)
             weight = dr.select(lobed, weight * plain / ours, weight)
-        kept = keep < scatter.acceptance(distance, scale, exponent, kind)
+        kept = keep < fresnel_scatter.acceptance(distance, scale, exponent, kind)
         distance = dr.select(leaving.diffusing, dr.sqrt(u), distance)
         index = dr.select(leaving.diffusing, 1.0, leaving.index)
         sine, cosine = dr.sincos(2.0 * dr.pi * v)

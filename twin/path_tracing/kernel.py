@@ -1,6 +1,6 @@
 """The loop over a path's surfaces, recorded once as one Dr.Jit kernel; all numbers of the scene enter as arrays.
 
-In each step a path flies to the next surface (``meeting``), the surface shares its light out, and the path goes one of
+In each step a path flies to the next surface (``surface_intersection``), the surface shares its light out, and the path goes one of
 the ways that there are. Neighbouring paths are worked on together, in packets of the machine's vectors. A packet takes
 as long as its longest path, and all that any of its paths needs: what only some surfaces need (Newton's method,
 Fresnel's formulas, a lobe, a detector) is computed by packets that need it. Sources let neighbours start alike, and
@@ -14,14 +14,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from optics.materials import scatter
+from optics.materials import fresnel_scatter
 from optics.numerics.backend import Backend
 from twin.path_tracing import clear_ways
 from twin.path_tracing import tables as layout
-from twin.path_tracing.families import BITS, FACTOR, OUTSIDE, START, Event
 from twin.path_tracing.importance_sampling import Leaving, TableDraw, spread
-from twin.path_tracing.meeting import Flight, Place, locate, next_surface
+from twin.path_tracing.path_families import BITS, FACTOR, OUTSIDE, START, Event
 from twin.path_tracing.path_result import Arrival, Sinks, record
+from twin.path_tracing.surface_intersection import Flight, Place, locate, next_surface
 
 STEP_BACK = 1e-5
 """How far behind a triangle that is passed over the search goes on, metres."""
@@ -361,7 +361,7 @@ def shares(
     if glass:
         after = dr.select(inside, 1.0, place.row[layout.INDEX])
         ratio = dr.select(inside, place.row[layout.INDEX], place.row[layout.INVERSE])
-        bent = scatter.cosine_after(incidence, ratio, 1.0)
+        bent = fresnel_scatter.cosine_after(incidence, ratio, 1.0)
     marks: list[Any] = []
     if features.measured:
         assert tables.measured is not None
@@ -385,7 +385,7 @@ def shares(
             some = met & bare & ~total
 
             def fresnel(reflected: Any, transmitted: Any) -> tuple[Any, Any]:
-                plain = scatter.reflectance(incidence, before, after)
+                plain = fresnel_scatter.reflectance(incidence, before, after)
                 return dr.select(some, plain, reflected), dr.select(some, 1.0 - plain, transmitted)
 
             reflected, transmitted = dr.if_stmt(

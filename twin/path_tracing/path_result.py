@@ -12,7 +12,7 @@ import numpy as np
 
 from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
-from twin.path_tracing.families import Touch
+from twin.path_tracing.path_families import Touch
 from twin.path_tracing.tables import NOMINAL_SUMS, ROWS_PER_SURFACE, Kind, SceneTables
 
 NOMINAL, GHOST, STRAY = range(3)

@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 
 from optics.geometry.surface import SurfaceNumbers
-from optics.materials.scatter import Finish
+from optics.materials.fresnel_scatter import Finish
 from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
 from twin.path_tracing import tables as layout
 from twin.path_tracing.clear_ways import Patch
-from twin.path_tracing.families import Event, code, decode, signature
 from twin.path_tracing.importance_sampling import Thinning, divide
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, choose, shares
-from twin.path_tracing.meeting import Flight, Place, locate
+from twin.path_tracing.path_families import Event, code, decode, signature
 from twin.path_tracing.path_result import Arrival, Sinks, record
+from twin.path_tracing.surface_intersection import Flight, Place, locate
 
 GROUP = 4
 """Surfaces in a row that a packet passes without asking whether any of its paths is still there."""

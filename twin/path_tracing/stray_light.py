@@ -24,11 +24,11 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.scenery import Finishes, Scenery, build_scenery
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import Channel, prism_of
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.monitor.monitor_beams import Aimed
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
-from twin.path_tracing.families import Event, Touch, family_name, nominal_codes
+from twin.path_tracing.path_families import Event, Touch, family_name, nominal_codes
 from twin.path_tracing.path_result import NOMINAL, Balance, Family, PathResult
 from twin.path_tracing.source import DiskSource
 from twin.path_tracing.tracer import CHUNK, FAINT, PathTracer, Progress, Sampling

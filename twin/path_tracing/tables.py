@@ -13,8 +13,8 @@ from optics.geometry.aperture import Aperture, DiskNumbers, EllipseNumbers, Rect
 from optics.geometry.sag_terms import SagTerm, kinds_of, of_kinds
 from optics.geometry.surface import FigureNumbers, GridNumbers, SurfaceNumbers
 from optics.geometry.zernike import triangle_size
-from optics.materials import scatter
-from optics.materials.scatter import DrawnScatter, Finish
+from optics.materials import fresnel_scatter
+from optics.materials.fresnel_scatter import DrawnScatter, Finish
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import leaves
 from scenes.models.scenery import Scenery, SceneSurface
@@ -53,15 +53,15 @@ class FinishTables:
 
     def shares(self, marks: Sequence[Any], cosine: Any, active: Any) -> tuple[Any, Any]:
         """Reflectance and transmittance of the coatings of paths that have one, by the cosine on the side of air."""
-        number, k, w = self._place(marks[0], cosine, scatter.COATING_STEPS)
-        first = 2 * ((scatter.COATING_STEPS + 1) * number + k)
+        number, k, w = self._place(marks[0], cosine, fresnel_scatter.COATING_STEPS)
+        first = 2 * ((fresnel_scatter.COATING_STEPS + 1) * number + k)
         has = active & (marks[0] > 0.5)
         low, high = ([self._get(self.coatings, first + n + step, has) for n in (0, 1)] for step in (0, 2))
         return (1.0 - w) * low[0] + w * high[0], (1.0 - w) * low[1] + w * high[1]
 
     def total(self, marks: Sequence[Any], cosine: Any, active: Any) -> Any:
         """Total integrated scatter of the tables of paths that have one."""
-        number, k, w = self._place(marks[1], cosine, scatter.STEPS)
+        number, k, w = self._place(marks[1], cosine, fresnel_scatter.STEPS)
         has = active & (marks[1] > 0.5)
         first = self._uint(self._get(self.headers, _HEADER * number + 2, has)) + k
         return (1.0 - w) * self._get(self.numbers, first, has) + w * self._get(self.numbers, first + 1, has)
@@ -79,7 +79,7 @@ class FinishTables:
         """
         import drjit as dr
 
-        number, k, w = self._place(marks[1], cosine, scatter.STEPS)
+        number, k, w = self._place(marks[1], cosine, fresnel_scatter.STEPS)
         has = active & (marks[1] > 0.5)
         header = [self._get(self.headers, _HEADER * number + n, has) for n in range(_HEADER)]
         rings, sectors, share, ring_sums, sector_sums, cosines, azimuths = (self._uint(v) for v in header[:7])
@@ -474,7 +474,7 @@ def _curves(s: SceneSurface) -> np.ndarray:
 
 def _finish(finish: Finish) -> list[float]:
     reflectance, transmission, bare, diffuse, share, scale, exponent, kind = finish.numbers
-    area = 1.0 if finish.scatter is None else scatter.lobe_area(scale, exponent)
+    area = 1.0 if finish.scatter is None else fresnel_scatter.lobe_area(scale, exponent)
     return [-1.0 if bare else reflectance, transmission, diffuse, share, scale, exponent, kind, area]
 
 

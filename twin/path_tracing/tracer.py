@@ -11,9 +11,9 @@ import numpy as np
 from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
 from twin.path_tracing.clear_ways import ClearWays
-from twin.path_tracing.families import Touch, signature, touches
 from twin.path_tracing.importance_sampling import Followed, Thinning, learn
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, follow
+from twin.path_tracing.path_families import Touch, signature, touches
 from twin.path_tracing.path_result import NOMINAL, Collector, Key, PathResult, Sinks, make_sinks
 from twin.path_tracing.sequential import Left, Step, go_on, pass_along, steps_of
 from twin.path_tracing.source import DiskSource, Source, pieces, start

@@ -12,7 +12,7 @@ import numpy as np
 
 from analysis.arrays import shows
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
-from analysis.monitor.monitoring import MonitorGeometry, coefficients
+from analysis.monitor.monitor_formulas import MonitorGeometry, coefficients
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.monitor.recovery import MotionModel, Recovery, judged_spots, recover, recovery_of
 from analysis.spots.noise import NoiseModel

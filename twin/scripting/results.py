@@ -16,7 +16,7 @@ import xarray as xr
 from analysis.arrays import shows
 from analysis.monitor import parameters
 from analysis.monitor.estimators import judged
-from analysis.monitor.monitoring import CameraParameters
+from analysis.monitor.monitor_formulas import CameraParameters
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from optics.numerics.backend import Backend
 from twin.framework.procedure import Session, silent

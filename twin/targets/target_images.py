@@ -30,8 +30,8 @@ from optics.raytrace.trace import BeamMissedError
 from optics.targets.target_image import EdgeProfile, target_image
 from optics.targets.target_shapes import Target, bar_group, slanted_edge
 from optics.waves.diffraction import Grid
+from optics.waves.optical_transfer import TransferTable, polychromatic_transfer
 from optics.waves.pupil_stack import PupilFunction
-from optics.waves.transfer import TransferTable, polychromatic_transfer
 from scenes.models.camera_model import lenses
 from scenes.specs.camera import BandSpec
 from scenes.specs.spectrum import SpectrumSpec

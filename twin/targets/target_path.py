@@ -30,9 +30,9 @@ from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import StopOutlines, settled_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
 from optics.waves.line_transfer import LINE_SIDES, CutPupil, cut_pupils, lit_at
+from optics.waves.optical_transfer import with_nodes_enough
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import CUT_RESIDUAL, CUT_RINGS, DEGREE, PupilFunction, fit_pupils
-from optics.waves.transfer import with_nodes_enough
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
 from scenes.models.shadow import ImagingShadows, SeenEdges, TracedBeams
 

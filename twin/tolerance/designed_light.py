@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.numerics.array_math import UnphysicalError
+from optics.waves.optical_transfer import VariedTransfer, polychromatic_transfer
 from optics.waves.pupil_terms import products
-from optics.waves.transfer import VariedTransfer, polychromatic_transfer
 from scenes.models.camera_model import lenses
 from scenes.specs.camera import CameraSpec
 from scenes.specs.spectrum import SpectrumSpec

@@ -20,7 +20,7 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, silent
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
 from twin.tolerance.given_warnings import beam_warnings, given_warnings, missed_warnings
 from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities

@@ -11,7 +11,7 @@ import numpy as np
 
 from analysis.monitor import limits
 from analysis.monitor.limits import Elasticity
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.uncertainty.coverage import FALSE, Coverage, UncertaintyRun
 from twin.uncertainty.monitor_limits import BEST, LINES, MonitorLimits, Remedy
 

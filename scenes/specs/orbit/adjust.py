@@ -28,8 +28,8 @@ from scenes.specs.orbit.measurements import MeasuredTestSpec
 from scenes.specs.orbit.scene import LineTime
 from scenes.specs.procedures import SENSORS
 from scenes.yaml.errors import Problem, unknown
-from scenes.yaml.quantity import AngleSigmas, Quantity, Vector
 from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Seed, Spec, Whole, not_empty
+from scenes.yaml.unit_fields import AngleSigmas, Quantity, Vector
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 
 Sensor = Literal["ties", "control", "monitor", "laser", "terrain", "tracker_angles"]

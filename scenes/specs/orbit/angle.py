@@ -8,8 +8,8 @@ from pydantic import AfterValidator, Field, model_validator
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec, PayloadTestSpec
 from scenes.specs.perturbation import PlainPerturbationSpec
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import Quantity, Vector, Wavelength
 from scenes.yaml.spec import Flag, Name, Named, Number, Paths, Seed, Spec, Whole, short_for
+from scenes.yaml.unit_fields import Quantity, Vector, Wavelength
 from scenes.yaml.units import DISTANCE, LENGTH, MOMENT
 
 LINES = ("forward", "nadir", "backward")

@@ -9,8 +9,8 @@ from scenes.specs.orbit.angle import LINES, DatumShift, EffectsSpec, GroundSigma
 from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec, InteriorChangeSpec, LineTime, Side
 from scenes.yaml.errors import Problem, names_text, unknown
-from scenes.yaml.quantity import AngleSigmas, LengthSigma, Quantity, Vector
 from scenes.yaml.spec import Flag, Name, Named, Number, Ref, Seed, Spec, TitledSpec, Whole, not_empty, one_given
+from scenes.yaml.unit_fields import AngleSigmas, LengthSigma, Quantity, Vector
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 
 LEAST_TIES = 20

@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from scenes.yaml.errors import Problem, shown
-from scenes.yaml.quantity import AngleSigmas, Quantity, Vector
 from scenes.yaml.spec import Number, Ref, Spec, TitledSpec, one_given
+from scenes.yaml.unit_fields import AngleSigmas, Quantity, Vector
 from scenes.yaml.units import ANGLE, ANGLE_SPECTRUM, DISTANCE, FREQUENCY, LENGTH, MOMENT, SPEED, TIME, format_quantity
 
 Frequency = Annotated[float, Quantity(FREQUENCY, above_zero=True, largest="10 kHz")]

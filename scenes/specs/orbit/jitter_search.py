@@ -11,8 +11,8 @@ from scenes.specs.orbit.angle import LightEffectsSpec, Moment, TerrainHeight
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, Frequency, OrbitSpec, PayloadTestSpec
 from scenes.specs.orbit.scene import LineTime
 from scenes.yaml.errors import Problem, names_text
-from scenes.yaml.quantity import AngleSigma, Quantity
 from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
+from scenes.yaml.unit_fields import AngleSigma, Quantity
 from scenes.yaml.units import FREQUENCY, LENGTH, TIME, format_quantity
 
 HeightSigma = Annotated[float, Quantity(LENGTH, smallest="0.001 m", largest="10 km")]

@@ -20,8 +20,8 @@ from scenes.specs.orbit.flight import EarthSpec, Interval, LengthSigmas, Payload
 from scenes.specs.orbit.jitter_search import JitterSearchSpec, SomeLines
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.yaml.errors import KeyPath, Problem, names_text
-from scenes.yaml.quantity import AngleSigmas, ClockReading, Quantity, TimeScale
 from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Spec, SpecType, Text, Whole, not_empty
+from scenes.yaml.unit_fields import AngleSigmas, ClockReading, Quantity, TimeScale
 from scenes.yaml.units import ANGLE, LENGTH, TIME
 
 Toward = Literal["forward", "back", "right", "left", "up", "down"]

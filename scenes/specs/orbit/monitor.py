@@ -22,8 +22,8 @@ from scenes.specs.orbit.scene import GroundSpec as SceneGroundSpec
 from scenes.specs.orbit.scene import ImagePointsSpec, LineTime, Side
 from scenes.specs.perturbation import NodeInfo, PlainPerturbationSpec, perturbation_issues
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
-from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Flag, Name, Named, NothingIsEmpty, Number, Paths, Ref, Seed, Spec, Text, TitledSpec, Whole
+from scenes.yaml.unit_fields import Quantity
 from scenes.yaml.units import ANGLE, LENGTH, MOMENT, Kind, parse_quantity
 
 _EVEN = 1e-6

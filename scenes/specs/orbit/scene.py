@@ -16,8 +16,8 @@ from scenes.specs.orbit.angle import GroundSigma, LightEffectsSpec, Moment, Terr
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, PayloadTestSpec
 from scenes.specs.spectrum import WavelengthRange
 from scenes.yaml.errors import Problem, names_text
-from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Name, Named, Number, Ref, Seed, Spec, Whole
+from scenes.yaml.unit_fields import Quantity, Vector
 from scenes.yaml.units import ANGLE, LENGTH, TIME, format_quantity
 
 _EVEN_TERMS = ("Z4", "Z5", "Z6", "Z11", "Z12", "Z13", "Z14", "Z15", "Z22")

@@ -14,8 +14,8 @@ from scenes.specs.detector import PixelPitch
 from scenes.specs.instrument import LookAngle
 from scenes.specs.orbit.scene import LineImageSpec
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.yaml.spec import Named, Spec, TitledSpec, Whole, not_empty
+from scenes.yaml.unit_fields import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.yaml.units import ANGLE, LENGTH, Kind
 
 _PER_LENGTH2 = Kind("an inverse length squared", "1/m^2", ("1/m^2", "1/mm^2"), "0.02 1/m^2")

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from analysis.arrays import Array
+from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.limits import Quantity, quantities
 from analysis.monitor.parameters import ANGLE, ANGLE_GROUP, CAMERA_PARAMETERS, GROUND, GROUND_GROUP
-from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import HeatInputs
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import HEAT, StatedMotions

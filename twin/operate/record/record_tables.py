@@ -7,7 +7,7 @@ from typing import Any
 
 from scenes.specs.operation import RUNS
 from twin.framework.data_files import DataTable
-from twin.framework.quantity import Quantity, Record, in_unit
+from twin.framework.record import Quantity, Record, in_unit
 from twin.operate.record.entries import MICRO
 from twin.operate.record.history import History, content_of
 

@@ -40,7 +40,7 @@ from analysis.orbit.planes import (
 from analysis.orbit.resection import ObservedLine, Resection, ResectionError, resect
 from optics.numerics.backend import one_blas_thread
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.orbit.angle.angle_flight import AnglePass, Measurement, angle_camera, fly
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineAngles

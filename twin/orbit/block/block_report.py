@@ -15,7 +15,7 @@ from analysis.block.network import DatumTest, Network, Open
 from analysis.block.reweighting import GroupTest
 from analysis.orbit.forward_intersection import Accuracy
 from twin.framework.artefact import Cell, Table
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun, CameraChange, Worth
 from twin.orbit.measured.pass_measurements import duplicates, listed

@@ -16,9 +16,9 @@ from scipy.stats import chi2
 from analysis.arrays import MeasurementError
 from analysis.block.block import Block
 from analysis.block.block_adjustment import BlockAdjustment, LawTest, adjust_block, kept_block, law_tests
+from analysis.block.error_processes import BlockError
 from analysis.block.network import DatumTest, Network, Open, datum_test, network_of, open_combinations
 from analysis.block.point_reduction import Pool
-from analysis.block.processes import BlockError
 from analysis.orbit.forward_intersection import Accuracy, level_axes, predicted, realised
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap

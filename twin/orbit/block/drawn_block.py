@@ -15,7 +15,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from analysis.block import block as known
-from analysis.block.processes import STEPPED, Law
+from analysis.block.error_processes import STEPPED, Law
 from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
 from optics.numerics.array_math import covariance_root

@@ -12,7 +12,7 @@ import numpy as np
 
 from analysis.block import block as known
 from analysis.block.block import CameraKnowledge, CamerasKnowledge, Term
-from analysis.block.processes import Law
+from analysis.block.error_processes import Law
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays

@@ -13,7 +13,7 @@ from analysis.calibration.strip_adjustment import Datum
 from analysis.orbit.calibration_parameters import OFFSET, RATE, Combination
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
 from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Screening, interior_names
 from twin.orbit.calibration.campaign_adjustment import LatitudeFit

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from twin.framework.artefact import Cell, Table
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
 from twin.orbit.conventions.pass_readings import QUESTIONS, Changes, Fit, changed

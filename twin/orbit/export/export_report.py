@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from twin.framework import svg
 from twin.framework.artefact import Cell, SvgFigure, Table, significant
 from twin.framework.data_files import FrameFacts, tiff
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 from twin.orbit.export.export_run import Controlled, Export, ExportedLine, ProductPolynomial, Quality, SceneSource
 from twin.orbit.export.ground_accuracy import TOGETHER, AccuracyMap, GroundSigma

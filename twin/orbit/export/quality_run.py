@@ -17,7 +17,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.artefact import Table
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, answer
 from twin.orbit.export.export_report import CONTROL, FOLDER, control_section, quality_answers, quality_warnings
 from twin.orbit.export.export_run import (

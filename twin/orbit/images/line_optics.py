@@ -29,9 +29,9 @@ from scipy import constants, fft
 
 from optics.geometry.polygon import area
 from optics.geometry.zernike import cartesian_terms
+from optics.waves.optical_transfer import TransferTable
 from optics.waves.pupil_shadow import PupilShadow, separate
 from optics.waves.pupil_stack import PupilFunction, circular_pupil
-from optics.waves.transfer import TransferTable
 from scenes.specs.camera import BandSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.spectrum import SpectrumSpec, black_body_photons

@@ -28,8 +28,8 @@ from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.quantity import Quantity, Record, plain_data
 from twin.framework.random_streams import stream
+from twin.framework.record import Quantity, Record, plain_data
 from twin.framework.reference_frames import described
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects

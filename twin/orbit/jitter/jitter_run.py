@@ -18,8 +18,8 @@ from scenes.specs.orbit.jitter_search import AXES, OrbitJitterSpec
 from scenes.specs.orbit.setup import AnyJitter, JitterSetup, MeasuredJitterSetup
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.quantity import Quantity, Record
 from twin.framework.random_streams import stream
+from twin.framework.record import Quantity, Record
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineTimes, line_cameras

@@ -18,7 +18,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.orbit.conventions.pass_readings import (
     ImpossibleError,
     LineClock,

@@ -22,8 +22,8 @@ from analysis.arrays import ARCSEC
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.jump_detection import Jump
+from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.recovery import MeasuredSpots, Recovery, SpotEvidence, judged_spots
-from analysis.monitor.series_filter import SeriesFilter
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
 from analysis.statistics import chance_beyond, limit_of

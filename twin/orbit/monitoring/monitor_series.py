@@ -12,7 +12,7 @@ import numpy as np
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import LeastSquares, Posterior, Shifts
 from analysis.monitor.jump_detection import Jump
-from analysis.monitor.monitoring import CameraParameters
+from analysis.monitor.monitor_formulas import CameraParameters
 from analysis.monitor.recovery import MeasuredSpots, Recovery, SpotEvidence, judged_spots
 from analysis.monitor.series_smoother import smooth, window_of
 from analysis.spots.centroid import mean_frames

@@ -10,10 +10,10 @@ import numpy as np
 
 from analysis.arrays import Array
 from analysis.monitor.model_fit import UnseenMode
-from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.monitor_formulas import PER_SI
 from scenes.specs.course import moment
 from twin.framework.artefact import significant
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.orbit.monitoring.loop_run import (
     GAIN_MARGIN,
     PHASE_MARGIN_DEG,

@@ -18,7 +18,7 @@ from analysis.arrays import ARCSEC
 from analysis.monitor import disturbances
 from analysis.monitor.control_loop import open_loop, rejection
 from analysis.monitor.model_fit import UnseenMode
-from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.monitor_formulas import PER_SI
 from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
 from scenes.yaml.errors import names_text

@@ -17,7 +17,7 @@ from scipy.stats import chi2, norm
 
 from analysis.arrays import ARCSEC
 from analysis.monitor.disturbances import Consistency
-from analysis.monitor.monitoring import IntersectionAngleChange, exact
+from analysis.monitor.monitor_formulas import IntersectionAngleChange, exact
 from analysis.orbit.forward_intersection import IntersectionError, between
 from optics.geometry.tree import Motion, State, compose
 from optics.numerics.number_tree import FrozenMap

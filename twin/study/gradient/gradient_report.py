@@ -18,7 +18,7 @@ from scenes.specs.file_kinds import read_for
 from scenes.yaml.errors import key_text
 from twin.framework import cli, command, page, procedure, provenance, reference_frames, run_folder, svg
 from twin.framework.artefact import Cell, SvgFigure, Table, plain, significant
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 from twin.framework.run_folder import RunFolder
 from twin.sensors.area_detector import coarse_warnings

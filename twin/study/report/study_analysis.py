@@ -12,7 +12,7 @@ import numpy as np
 
 from analysis.statistics import share_interval
 from scenes.specs.study import ParetoSpec, ThresholdSpec
-from twin.framework.quantity import Quantity, Record
+from twin.framework.record import Quantity, Record
 from twin.study.report import study_statistics as statistics
 from twin.study.report.sensitivity_indices import Index, Indices, NoIndices, sensitivity_indices
 from twin.study.report.study_statistics import Estimate, Response, StudyRuns

@@ -19,8 +19,8 @@ from optics.numerics.backend import Backend
 from scenes.specs.procedures import Procedure
 from scenes.specs.study import ResponseSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, shown
-from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import ZERO_IS_NONE, Spec, annotation_at, metadata_at, validate
+from scenes.yaml.unit_fields import Quantity
 from scenes.yaml.yaml_file import YamlFile
 from twin.framework.procedure import silent
 

@@ -12,8 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
-from analysis.monitor import monitoring
-from analysis.monitor.monitoring import MonitorGeometry
+from analysis.monitor import monitor_formulas
+from analysis.monitor.monitor_formulas import MonitorGeometry
 from analysis.monitor.recovery import measure_spots
 from optics.geometry.tree import Motion
 from optics.numerics.backend import cores, one_blas_thread
@@ -99,7 +99,7 @@ def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_s
         d_alpha, d_beta, d_gamma in radians and d_f in metres.
     """
     pixels = spot * geometry.principal_distance_m / geometry.pitch_m
-    factors = np.sqrt(np.sum(monitoring.coefficients(estimator, geometry) ** 2, axis=1))
+    factors = np.sqrt(np.sum(monitor_formulas.coefficients(estimator, geometry) ** 2, axis=1))
     return dict(zip(("d_alpha", "d_beta", "d_gamma", "d_f"), (float(v) for v in factors * pixels), strict=True))
 
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
 from analysis.monitor import autocollimator, recovery
-from analysis.monitor.monitoring import MonitorGeometry
+from analysis.monitor.monitor_formulas import MonitorGeometry
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree, State
 from optics.numerics.backend import Backend

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from analysis.arrays import ARCSEC
-from analysis.monitor import monitoring
-from analysis.monitor.monitoring import PER_SI, MonitorGeometry
+from analysis.monitor import monitor_formulas
+from analysis.monitor.monitor_formulas import PER_SI, MonitorGeometry
 from analysis.monitor.recovery import measure_spots
 from optics.geometry import zernike
 from optics.geometry.pose import Pose, about_axis
@@ -120,10 +120,10 @@ class Bench:
             # without the calibrated gradients over the field
             bare = replace(geometry, d_f_per_alpha_m=0.0, d_gamma_per_beta=0.0)
             found = {
-                PRINTED: monitoring.paper_single(before, after, nothing, geometry),
-                JOINT: monitoring.paper_joint(before, after, nothing, geometry),
-                CORRECTED: monitoring.derived(before, after, nothing, bare),
-                CALIBRATED: monitoring.derived(before, after, nothing, geometry),
+                PRINTED: monitor_formulas.paper_single(before, after, nothing, geometry),
+                JOINT: monitor_formulas.paper_joint(before, after, nothing, geometry),
+                CORRECTED: monitor_formulas.derived(before, after, nothing, bare),
+                CALIBRATED: monitor_formulas.derived(before, after, nothing, geometry),
             }
             out[name] = {form: parameters.vector * PER_SI for form, parameters in found.items()}
         return out

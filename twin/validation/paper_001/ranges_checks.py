@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
-from analysis.monitor.monitoring import MonitorGeometry
+from analysis.monitor.monitor_formulas import MonitorGeometry
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from twin.framework.artefact import SYMBOLS, Cell

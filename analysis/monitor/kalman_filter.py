@@ -34,7 +34,7 @@ the second takes these for steps of their chances and sizes.
 How large a jump has to be to be found: of each body, by simulation of the test that finds it.
 
 After many readings at even intervals, what a step does to the next ones no longer depends on when it comes. With the
-information J of n readings on a step of the outputs (`series_filter`), the score of n readings after a step a is
+information J of n readings on a step of the outputs (`kalman_filter`), the score of n readings after a step a is
 
     b(n) = b(n-1) + N((J(n) - J(n-1)) a, J(n) - J(n-1)),
 

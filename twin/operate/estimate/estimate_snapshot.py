@@ -22,9 +22,9 @@ from analysis.arrays import Array
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances, TimeLaw
 from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track
 from analysis.monitor.jump_detection import Jump
+from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, GROUND, Parameter
-from analysis.monitor.series_filter import SeriesFilter
 from analysis.monitor.state_space import HeatInputs
 from analysis.statistics import limit_of
 from twin.operate.estimate.operation_model import OperationModel

@@ -21,16 +21,25 @@ from analysis.arrays import Array
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.filter_state import Belief, Observed
 from analysis.monitor.jump_detection import Jump, Step
+from analysis.monitor.kalman_filter import Power, SeriesFilter, detection_power, hinted, jointly, smoothed
 from analysis.monitor.limits import Quantity
-from analysis.monitor.series_filter import Power, SeriesFilter, detection_power, hinted, jointly, smoothed
 from optics.numerics.backend import load_backend, one_blas_thread
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.errors import Problem
 from twin.framework.provenance import source_digest
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState, beyond, widening
+from twin.operate.estimate.estimate_snapshot import Standing, Taking, packed, unpacked
 from twin.operate.estimate.operation_model import OperationModel, plan_digest, traced_model
-from twin.operate.estimate.standing import Standing, Taking, packed, unpacked
+from twin.operate.estimate.reported_estimate import (
+    Break,
+    Course,
+    Following,
+    FoundJump,
+    Motions,
+    SensorState,
+    beyond,
+    widening,
+)
 from twin.operate.record.entries import DECISION, MICRO, digest_of_data, utc_text
 from twin.operate.record.history import USED, History, content_of
 

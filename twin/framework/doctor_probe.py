@@ -1,4 +1,6 @@
-"""Small jobs that `twin.doctor` runs in a child process: `python -m twin.framework.probe kernel|render|gpu [VARIANT]`.
+"""Small jobs that `twin.doctor` runs in a child process.
+
+`python -m twin.framework.doctor_probe kernel|render|gpu [VARIANT]` is one of them.
 
 A bad LLVM does not raise, it aborts the process; that is why these run apart. Each job writes one line of JSON on
 stdout.

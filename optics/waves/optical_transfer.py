@@ -13,9 +13,9 @@ itself.
 
 MTF of a pupil whose wavefront varies a little about that of a known one, for thousands of wavefronts at once.
 
-The nodes of the overlap's quadrature (``optics.waves.transfer``) and what the known pupil has there are worked out
-once; a varied wavefront then costs a matrix product and a sum of phasors. The edge and the amplitude are the known
-pupil's: small motions change them in the second order of what they do to the wavefront.
+The nodes of the overlap's quadrature (``optics.waves.optical_transfer``) and what the known pupil has there are
+worked out once; a varied wavefront then costs a matrix product and a sum of phasors. The edge and the amplitude are
+the known pupil's: small motions change them in the second order of what they do to the wavefront.
 """
 
 from __future__ import annotations

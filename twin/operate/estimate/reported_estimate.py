@@ -24,7 +24,7 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.statistics import chance_beyond, limit_of
 from scenes.specs.operation import OperationSpec
 from twin.framework.artefact import decimals_for, fixed, plain
-from twin.operate.estimate.standing import SPANS, Scores
+from twin.operate.estimate.estimate_snapshot import SPANS, Scores
 from twin.operate.record.entries import MICRO, Alarm, utc_text
 from twin.operate.record.history import History
 
