@@ -30,20 +30,8 @@ Point = tuple[float, float]
 
 def arrow(ax: Any, start: Point, end: Point, colour: str = INK, width: float = 1.8, style: str = "-|>") -> None:
     """A straight arrow in data coordinates."""
-    ax.annotate(
-        "",
-        end,
-        start,
-        arrowprops={
-            "arrowstyle": style,
-            "color": colour,
-            "lw": width,
-            "shrinkA": 0,
-            "shrinkB": 0,
-            "mutation_scale": 12,
-        },
-        zorder=6,
-    )
+    props = {"arrowstyle": style, "color": colour, "lw": width, "shrinkA": 0, "shrinkB": 0, "mutation_scale": 12}
+    ax.annotate("", end, start, arrowprops=props, zorder=6)
 
 
 def text(ax: Any, place: Point, words: str, colour: str = INK, size: float = SIZE, **options: Any) -> None:

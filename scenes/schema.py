@@ -24,7 +24,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import SchemaSerializer, core_schema
 from rich.console import Console
 
-from scenes.specs.file_kinds import FILE_KINDS
+from scenes.specs.file_kinds import file_kinds
 from scenes.yaml.standard_output import to_stdout
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 @cache
 def _models() -> dict[str, type[Spec]]:
     """Name of each kind of file -> model of what it may say; all modules of them are imported here."""
-    return {kind.name: kind.model for kind in FILE_KINDS}
+    return {kind.name: kind.model for kind in file_kinds()}
 
 
 def __getattr__(name: str) -> Any:
@@ -60,16 +60,17 @@ def json_schema(name: str) -> dict[str, Any]:
     Raises:
         KeyError: another name.
     """
-    schema = _models()[name].model_json_schema(schema_generator=_Generator)
+    schema = _models()[name].model_json_schema(schema_generator=WithUnits)
     for model in (schema, *schema.get("$defs", {}).values()):
         _describe(model)
     return {"$schema": DIALECT, **schema}
 
 
-class _Generator(GenerateJsonSchema):
+class WithUnits(GenerateJsonSchema):
     """Writes the defaults of quantities as text with a unit, as they stand in files."""
 
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> JsonSchemaValue:
+        """Return the schema of a key, its default as files write it."""
         result = super().default_schema(schema)
         if isinstance(schema.get("default"), float | tuple) and schema["default"] != ():
             result["default"] = SchemaSerializer(schema["schema"]).to_python(schema["default"], mode="json")

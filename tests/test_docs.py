@@ -42,7 +42,7 @@ from twin.orbit.measured.measurement_tables import COLUMNS
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
     *(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")),
-    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted(page for page in (ROOT / "docs").rglob("*.md") if ROOT / "docs/site" not in page.parents),
 ]
 _FENCE = re.compile(r"^```(\S*)[^\n]*\n(.*?)^```", re.M | re.S)
 
@@ -128,6 +128,7 @@ def models_of(text: str) -> list[type[Any]]:
     return found
 
 
+@pytest.mark.second
 def test_yaml_is_a_file_that_can_be_read(instrument, backend) -> None:
     for block in blocks("yaml"):
         models = models_of(block.text)
@@ -141,6 +142,7 @@ def test_yaml_is_a_file_that_can_be_read(instrument, backend) -> None:
             build_instrument(spec, {site.camera: load_camera(site.camera) for site in spec.cameras.values()}, backend)
 
 
+@pytest.mark.second
 def test_a_table_is_one_that_can_be_read(instrument, tmp_path: Path) -> None:
     """As measurements or nodes, as files of frames, or as a course; every row of it."""
     for number, block in enumerate(block for block in blocks("csv") if block.page != ORBIT_FILES):
@@ -245,6 +247,7 @@ def check_module(module: str, arguments: list[str]) -> None:
                     raise
 
 
+@pytest.mark.second
 def test_a_command_line_is_one_that_its_parser_takes() -> None:
     lines = command_lines()
     assert len(lines) > 200

@@ -6,12 +6,16 @@ import html
 import importlib
 import io
 import json
+import os
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +24,6 @@ import xarray as xr
 from scipy import stats
 
 import scenes.schema
-import scenes.specs.file_kinds
 import twin
 import twin.export.__main__
 import twin.lab
@@ -28,18 +31,17 @@ import twin.render
 import twin.validate
 from analysis.arrays import ARCSEC
 from analysis.monitor import recovery
-from analysis.monitor.estimators import Formula, OfEachCamera
+from analysis.monitor.estimators import Estimator
 from analysis.monitor.parameters import CameraCalibration, Parameter
 from analysis.spots.centroid import gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
 from optics.geometry.aperture import Circle
 from optics.geometry.sag_terms import SAG_TERMS, grown
 from optics.geometry.tree import Motion, State
-from optics.geometry.vector_shape import Polygon
-from optics.numerics.number_tree import FrozenMap
+from optics.numerics.backend import load_backend
+from optics.numerics.extension_table import PREFIX, EntryPointError, ExtensionTable, entries
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.targets.target_shapes import Target
 from optics.waves.pupil_stack import circular_pupil
 from scenes.models.camera_model import surface_of
 from scenes.models.obstruction import find_obstructions
@@ -58,22 +60,25 @@ from scenes.yaml.named import FileKind
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
+from tests.toy_twin import AGAIN, BAR, Cylinder, Half, TwoLevels, one_bar
 from tests.twin import test_path_tracing as path_figure
 from tests.twin import test_prism_images
 from tests.twin.commands import invoke
 from tests.twin.path_bench import IDEAL
 from tests.twin.study_bench import write_study as write_study_file
 from tests.twin.test_target_images import F_NUMBER, PITCH, REGION, identity, line_ccd
+from twin.framework import provenance
 from twin.framework.artefact import Table
 from twin.framework.data_files import FrameFacts
 from twin.framework.page import RunFacts, write_test
 from twin.framework.report import Report, Section
 from twin.framework.run_folder import RunFolder, write_manifest
 from twin.live.live_bench import LiveBench
+from twin.monitor import calibration_cache
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.orbit import Orbit, acceleration, propagate
-from twin.path_tracing.sinks import NOMINAL
+from twin.path_tracing.path_result import NOMINAL
 from twin.path_tracing.source import RaySource
 from twin.path_tracing.stray_light import monitor_families
 from twin.path_tracing.tracer import PathTracer
@@ -116,51 +121,32 @@ def registered(place: str) -> tuple[Any, str, Any]:
 def add(patch: pytest.MonkeyPatch, place: str, name: Any, toy: Any) -> None:
     """Register a toy as a contributor would, until the test ends."""
     owner, attribute, there = registered(place)
-    if isinstance(there, dict):
+    if isinstance(there, ExtensionTable):
         assert name not in there
         patch.setitem(there, name, toy)
     else:
         patch.setattr(owner, attribute, (*there, toy))
 
 
-def rows() -> list[tuple[str, str, str]]:
-    """(task, place, test) of the page's table."""
+def rows() -> list[tuple[str, str, str, str]]:
+    """(task, place, group of entry points, test) of the page's table."""
     text = PAGE.read_text("utf-8").partition("## Where to add")[2].partition("\n## ")[0]
-    return re.findall(r"^\| ([^|]+?) \| `([a-z0-9_.]+\.[A-Z_]+)`[^|]*\| `(test_\w+)` \|$", text, re.M)
+    return re.findall(r"^\| ([^|]+?) \| `([a-z0-9_.]+\.[A-Z_]+)`[^|]*\| `(\w+)` \| `(test_\w+)` \|$", text, re.M)
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_page_lists_the_places_that_are_tried_here_and_no_others() -> None:
-    found = {place: test for _, place, test in rows()}
+    found = {place: test for _, place, _, test in rows()}
     assert found == TOYS
     assert len(rows()) == len(found) >= 9
+    assert all(registered(place)[2].group == PREFIX + group for _, place, group, _ in rows() if place != GROUPS)
 
 
 # --- a detector's noise -----------------------------------------------------------------------------------------------
 
 NOISE = "twin.sensors.area_detector.NOISE_TERMS"
-
-
-@dataclass(frozen=True)
-class TwoLevels:
-    """Half of the pixels read too high, half too low, by as many electrons: a fixed pattern that is not normal."""
-
-    step_e: float
-
-    @property
-    def fixed_variance_e2(self) -> float:
-        return self.step_e**2
-
-    def temporal_variance_e2(self, electrons: Any) -> float:
-        return 0.0
-
-    def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-        return self.step_e * (2.0 * rng.integers(0, 2, shape) - 1.0)
-
-    def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> None:
-        return
 
 
 def sheet_file(folder: Path, noise: str) -> Path:
@@ -217,27 +203,6 @@ ESTIMATORS = "analysis.monitor.estimators.ESTIMATORS"
 TARGETS = "optics.targets.target_shapes.TARGETS"
 SECTIONS = "twin.framework.report.SECTIONS"
 FRAMES = "twin.framework.data_files.FRAME_FORMATS"
-BAR = (8, 60)
-"""Width and length of the toy target, pixels."""
-
-
-DERIVED = Formula("derived", "")
-"""The corrected formulas themselves."""
-
-
-class Half(OfEachCamera):
-    """Half of what the corrected formulas say."""
-
-    title = "half"
-    note = "half of what derived says"
-
-    def camera_gain(self, camera: CameraCalibration, covariance: np.ndarray) -> np.ndarray:
-        return 0.5 * DERIVED.camera_gain(camera, covariance)
-
-
-def one_bar(pitch: float, region: int) -> Target:
-    half = 0.5 * pitch * np.array(BAR)
-    return Target(0.0, ((1.0, Polygon(half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))),))
 
 
 def as_npy(frames: np.ndarray, facts: FrameFacts) -> bytes:
@@ -246,6 +211,7 @@ def as_npy(frames: np.ndarray, facts: FrameFacts) -> bytes:
     return out.getvalue()
 
 
+@pytest.mark.second
 @extends(ESTIMATORS)
 def test_an_estimator(experiment: Callable[[str], MonitorExperiment], monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of what ``derived`` reads, with half of its noise, for every camera and for the angle between them."""
@@ -267,6 +233,20 @@ def test_an_estimator(experiment: Callable[[str], MonitorExperiment], monkeypatc
     np.testing.assert_allclose(angles["half"].change_rad, 0.5 * angles["derived"].change_rad, rtol=1e-3)
 
 
+CENTROIDS = "analysis.spots.CENTROIDS"
+
+
+@extends(CENTROIDS)
+def test_a_centroid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jobs may name it; spots are measured by it, and the title of one is in a report below."""
+    job = "{instrument: gf7_pair, analysis: {centroid: again}}"
+    with pytest.raises(InputError, match=r"centroid: not one of the choices; .* Found 'again', allowed: ml, gaus"):
+        validate(JobSpec, parse_yaml(job))
+    add(monkeypatch, CENTROIDS, "again", AGAIN)
+    assert validate(JobSpec, parse_yaml(job)).analysis.centroid == "again"
+    assert json_schema("job")["$defs"]["AnalysisSpec"]["properties"]["centroid"]["enum"][-1] == "again"
+
+
 READINGS = "analysis.monitor.parameters.CAMERA_PARAMETERS"
 READ_JOB = """instrument: gf7_pair
 disturbances: launch
@@ -282,7 +262,7 @@ def test_a_reading(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The change of the principal distance as a part of it: one entry, seen in every view of the table of readings."""
     toy, key, symbol = "a part of the principal distance", "d_f_relative_ppm", "Δf/f"
     relative: Callable[[CameraCalibration], Any] = lambda c: (0.0, 0.0, 0.0, 1.0 / c.geometry.principal_distance_m)  # noqa: E731
-    add(monkeypatch, READINGS, None, Parameter(key, symbol, toy, 3, relative))
+    add(monkeypatch, READINGS, key, Parameter(key, symbol, toy, 3, relative))
     (tmp_path / "job.yaml").write_text(READ_JOB, "utf-8")
     folder = tmp_path / "run"
     done = invoke(twin.render.app, tmp_path / "job.yaml", "--out", folder)
@@ -326,6 +306,7 @@ def bar_size(image: np.ndarray) -> tuple[float, float]:
     return float(columns.sum() / columns.max()), float(rows.sum() / inside)
 
 
+@pytest.mark.second
 @extends(TARGETS)
 def test_a_target(monkeypatch: pytest.MonkeyPatch) -> None:
     """A job may name it, and a camera's image of it is as wide and long as it is."""
@@ -369,9 +350,9 @@ def twice(numbers: Mapping[str, Any]) -> Section:
 @extends(SECTIONS)
 def test_a_report_section(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It stands in the report of its test, and of no other, before how to reproduce it; its table is a file."""
-    add(monkeypatch, SECTIONS, ("focus", "twice"), twice)
-    add(monkeypatch, SECTIONS, ("turntable", "toy"), lambda numbers: Section("Of another test"))
-    add(monkeypatch, SECTIONS, ("focus", "silent"), lambda numbers: None)
+    add(monkeypatch, SECTIONS, "focus twice", twice)
+    add(monkeypatch, SECTIONS, "turntable toy", lambda numbers: Section("Of another test"))
+    add(monkeypatch, SECTIONS, "focus silent", lambda numbers: None)
     write_toy(tmp_path / "run")
     page = page_text(tmp_path / "run")
     assert re.findall(r"<h2>(.*)</h2>", page) == ["Own section", "Twice is 42", "How to reproduce"]
@@ -397,28 +378,6 @@ SAGS = "optics.geometry.sag_terms.SAG_TERMS"
 PLACES = np.linspace(-0.2, 0.2, 9)
 RADIUS, ACROSS = 2.5, 4.0
 """Of the sphere and of the cylinder on it, metres: 5 mm of sag at the edge."""
-
-
-@dataclass(frozen=True)
-class Cylinder:
-    """A circular cylinder about the y axis, z = c x^2 / (1 + sqrt(1 - c^2 x^2)); ``step`` is a slope, to have a number
-    without unit.
-    """
-
-    POWERS: ClassVar[Mapping[str, int]] = FrozenMap(curvature=-1, step=0)
-    curvature: Any = 0.0
-    step: Any = 0.0
-
-    def sag(self, x: Any, y: Any) -> Any:
-        c = self.curvature
-        return c * x * x / (1.0 + np.sqrt(1.0 - (c * x) ** 2)) + self.step * y
-
-    def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        import drjit as dr
-
-        c = self.curvature
-        root = dr.sqrt(dr.maximum(1.0 - (c * x) ** 2, 1e-6))
-        return c * x * x / (1.0 + root) + self.step * y, c * x / root, self.step + 0.0 * y
 
 
 def astigmatic(x: np.ndarray, y: np.ndarray, size: float = 1.0) -> np.ndarray:
@@ -663,7 +622,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
     """Makes anew what reads the list of tests once, when a program starts; and again when the test ends."""
 
     def start() -> None:
-        for module in (scenes.specs.file_kinds, scenes.schema, twin.lab):
+        for module in (scenes.schema, twin.lab):
             importlib.reload(module)
 
     yield start
@@ -777,3 +736,150 @@ def test_a_check_of_a_paper(
     (found,) = read(tmp_path / "run", "validation")["checks"]
     assert (found["id"], found["measured"], found["verdict"]) == (SUM.id, 1.0 + one, verdict)
     assert "One and one are two." in html.unescape((tmp_path / "run" / "validation.html").read_text("utf-8"))
+
+
+# --- other distributions ----------------------------------------------------------------------------------------------
+
+INSTALLED = {
+    "estimators": "half = toy_twin:Half",
+    "noise_terms": "two_levels = toy_twin:TwoLevels",
+    "centroids": "again = toy_twin:AGAIN",
+    "targets": "one_bar = toy_twin:one_bar",
+    "sag_terms": "cylinder = toy_twin:Cylinder",
+}
+
+
+def install(folder: Path, groups: Mapping[str, str], name: str = "toy-twin") -> Path:
+    """Write a distribution as pip does into a folder of the path: its module, its name and its entry points."""
+    about = folder / f"{name.replace('-', '_')}-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", "utf-8")
+    text = "".join(f"[{PREFIX}{group}]\n{lines}\n" for group, lines in groups.items())
+    (about / "entry_points.txt").write_text(text, "utf-8")
+    shutil.copy(Path(__file__).with_name("toy_twin.py"), folder)
+    return folder
+
+
+def run_with(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    """Run Python with a folder of distributions on its path."""
+    path = os.pathsep.join((str(PAGE.parents[1]), str(folder)))
+    environment = {**os.environ, "PYTHONPATH": path, "COLUMNS": "500"}
+    return subprocess.run([sys.executable, *map(str, words)], env=environment, capture_output=True, text=True)
+
+
+@pytest.fixture
+def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Path], None]]:
+    """Puts a folder of distributions on the path of this process until the test ends."""
+    kept = (entries, provenance.sources, provenance.program_digest, calibration_cache._machine)
+
+    def add_folder(folder: Path) -> None:
+        monkeypatch.syspath_prepend(folder)
+        for function in kept:
+            function.cache_clear()
+
+    yield add_folder
+    monkeypatch.undo()
+    for function in kept:
+        function.cache_clear()
+
+
+def noisy_job(folder: Path) -> Path:
+    """A job with small CCDs that have a noise of another distribution, and a study of it of two blocks."""
+    one = "kind: monte_carlo, runs: 100, seed: 3}", "kind: monte_carlo, runs: 26, seed: 3}"
+    path = write_study_file(folder, one, ("true_df: {key: [truth, cameras, forward, d_f_um]}", HALVED))
+    sheet_file(folder, "{two_levels: 300.0}")
+    small = (folder / "small.yaml").read_text("utf-8")
+    (folder / "small.yaml").write_text(small.replace("detector: monitor_ccd", "detector: noisy.yaml"), "utf-8")
+    (folder / "job.yaml").write_text(
+        "instrument: small.yaml\nrender: {frames: 1, seed: 1}\nanalysis: {centroid: again}\n", "utf-8"
+    )
+    return path
+
+
+HALVED = "half: {key: [recovered, cameras, forward, half, d_f_um]}"
+
+
+def test_another_distribution(tmp_path: Path) -> None:
+    """Estimator, noise and centroid of entry points count in a job of a process that knows nothing else of them."""
+    path, folder = install(tmp_path / "path", INSTALLED), tmp_path / "run"
+    noisy_job(tmp_path)
+    code = (
+        "from optics.targets.target_shapes import TARGETS; from optics.geometry.sag_terms import SAG_TERMS\n"
+        "import twin.render; assert {'one_bar', 'cylinder'} < {*TARGETS, *SAG_TERMS}; twin.render.app()"
+    )
+    done = run_with(path, "-c", code, tmp_path / "job.yaml", "--out", folder, "--quiet")
+    assert done.returncode == 0, done.stderr
+    forward = read(folder, "recovered")["cameras"]["forward"]
+    assert forward["half"]["d_f_um"] == pytest.approx(0.5 * forward["derived"]["d_f_um"], rel=1e-5)
+    assert AGAIN.title in page_text(folder)
+    # without light a pixel reads 100 + 0.16 (+-300) grey values
+    frame = tifffile.imread(next((folder / "images").glob("*before*.tiff"))).astype(float)
+    border = np.concatenate([frame[..., 0, :].ravel(), frame[..., -1, :].ravel()])
+    assert np.std(border) == pytest.approx(0.16 * 300.0, rel=0.2)
+    assert read(folder, "manifest")["versions"]["toy-twin"] == "1.0"
+
+
+@pytest.mark.second
+def test_another_distribution_in_workers(tmp_path: Path) -> None:
+    """Worker processes see its entries; a study does not go on with another version of it."""
+    path, study, out = install(tmp_path / "path", INSTALLED), noisy_job(tmp_path), tmp_path / "run"
+    done = run_with(path, "-m", "twin.study", study, "--out", out, "--workers", 2, "--quiet")
+    assert done.returncode == 0, done.stderr
+    with xr.open_dataset(out / "study.nc", engine="h5netcdf") as data:
+        assert np.std(data["half"].values) > 0.0
+    (path / "toy_twin.py").write_text((path / "toy_twin.py").read_text("utf-8").replace("0.5 *", "0.25 *"), "utf-8")
+    done = run_with(path, "-m", "twin.study", study, "--out", out, "--workers", 2, "--quiet", "--resume")
+    assert done.returncode != 0
+    assert "changed: toy_twin.py" in done.stderr
+
+
+def test_another_distribution_is_part_of_the_program(tmp_path: Path, installed: Callable[[Path], None]) -> None:
+    """Its version and the content of its module count where those of the program do."""
+    keys, entry = [], partial(calibration_cache.CacheEntry.of, load_backend(), ())
+    keys.append((entry().key, provenance.source_digest(), provenance.program_digest()))
+    folder = install(tmp_path, INSTALLED)
+    for text in ("", "# another\n"):
+        with (folder / "toy_twin.py").open("a", encoding="utf-8") as file:
+            file.write(text)
+        installed(folder)
+        SAG_TERMS.__dict__.pop("data", None)
+        keys.append((entry().key, provenance.source_digest(), provenance.program_digest()))
+    SAG_TERMS.__dict__.pop("data", None)
+    assert provenance.versions()["toy-twin"] == "1.0"
+    assert all(None not in column and len(set(column)) == 3 for column in zip(*keys, strict=True))
+
+
+def test_entries_that_cannot_be_used(tmp_path: Path, installed: Callable[[Path], None]) -> None:
+    """What is wrong is said with distribution, group, name and remedy when that entry is used, and not before."""
+    install(tmp_path, {"toys": "gone = no_such_module:Toy\nnumber = toy_twin:BAR\nown = toy_twin:Half"})
+    installed(install(tmp_path, {"toys": "half = toy_twin:Half\ntwice = toy_twin:Half"}, "a-toy"))
+    (tmp_path / "toy_twin-1.0.dist-info/entry_points.txt").open("a").write("twice = toy_twin:Half\n")
+    own = Half()
+    table = ExtensionTable("toys", {"own": own, "other": own}, Estimator)
+    assert [*table] == ["own", "other", "half", "twice", "gone", "number"]
+    assert (table["other"], table["half"].title) == (own, "half")
+    for name, said in (
+        ("gone", r"toy-twin 1.0: the entry gone = no_such_module:Toy of space_camera_twin.toys cannot be loaded \(Mod"),
+        ("number", "number = toy_twin:BAR of space_camera_twin.toys is of type tuple, not Estimator; mend"),
+        ("own", "own = .* has the name of an entry of the twin or .*; rename .* pip uninstall toy-twin"),
+        ("twice", "toy-twin 1.0: .* has the name of an entry of a-toy; rename it there, or pip uninstall toy-twin"),
+    ):
+        with pytest.raises(EntryPointError, match=said):
+            table[name]
+    with pytest.raises(KeyError):
+        table["none"]
+
+
+def test_help_and_messages_with_an_entry_that_cannot_be_used(tmp_path: Path) -> None:
+    path = install(tmp_path, {"procedures": "lab level = no_such_module:LEVEL"})
+    (tmp_path / "bad.yaml").write_text("instrument: gf7_pair\nno_such_key: 1\n", "utf-8")
+    shown = run_with(path, "-m", "twin.lab", "--help")
+    assert shown.returncode == 0
+    assert re.search(
+        r"focus +Align .*\n(.*\n)*.*level +toy-twin 1.0: the entry lab level = no_such_module", shown.stdout
+    )
+    refused = run_with(path, "-m", "twin.lab", "level", "level.yaml", "--out", tmp_path / "run")
+    assert refused.returncode == 1
+    assert "(ModuleNotFoundError: No module named 'no_such_module'); mend or update it" in refused.stderr
+    told = run_with(path, "-m", "twin.render", tmp_path / "bad.yaml")
+    assert (told.returncode, "bad.yaml:2: no_such_key: unknown key" in told.stderr) == (2, True)

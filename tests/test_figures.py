@@ -2,7 +2,7 @@
 
 import pytest
 
-from docs.figures.pages import filled, pages, places
+from docs.figures.__main__ import filled, pages, places
 from docs.figures.sources import RUNS, SUMMARY, Figure, of_validation, read_figures
 
 FIGURES = read_figures()

@@ -51,6 +51,7 @@ def hits(place: Path) -> str:
     return (place / "hit").read_text("utf-8") if (place / "hit").exists() else ""
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("module", quick(1, ["twin.render", "scenes.lens", "analysis.mtf"]))
 def test_a_module_runs_nothing_of_the_folder_where_it_is_started(tmp_path, module):
     """One of the program's own name cannot be helped: Python looks for that there before this program is found."""
@@ -109,6 +110,7 @@ def test_the_console_command_knows_every_program(tmp_path):
     assert started(tmp_path, script, "--version").stdout.endswith(f" from {ROOT}\n")
 
 
+@pytest.mark.second
 def test_the_console_command_lists_without_importing_what_it_lists(tmp_path):
     done = started(tmp_path, "-X", "importtime", console(tmp_path), "--help")
     found = set(re.findall(r"\| +([\w.]+)$", done.stderr, re.M))
@@ -116,6 +118,7 @@ def test_the_console_command_lists_without_importing_what_it_lists(tmp_path):
     assert not {"numpy", "pydantic", "rich", "optics", "scenes", *(module for module, _ in PROGRAMS.values())} & found
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("typed", "offered"), quick(1, [("or", {"orbit"}), ("lab f", {"focus"}), ("mtf --pitc", {"--pitch"})])
 )

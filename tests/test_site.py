@@ -8,19 +8,14 @@ from pathlib import Path
 import pytest
 
 import twin
-from docs.site.api_page import api_page
-from docs.site.build import NEEDED, BuildError, build
+from docs.site.__main__ import HERE, NEEDED, BuildError, build, run_sphinx, with_policy
 from docs.site.command_pages import command_page, commands, programs
-from docs.site.file_pages import READ_BY, file_pages
-from docs.site.link_check import faults
+from docs.site.file_pages import ACTIONS, file_pages, node_table
 from docs.site.markdown import slug
-from docs.site.node_pages import ACTIONS, node_table
-from docs.site.policy import with_policy
-from docs.site.spec_examples import accepted, examples, kinds_of, shipped
-from docs.site.spec_keys import flow
+from docs.site.run_pages import described, golden_runs
+from docs.site.spec_keys import accepted, example, flow, keys, kinds_of, sections, shipped
 from scenes.schema import MODELS, json_schema
 from scenes.yaml.yaml_file import parse_yaml
-from tests.twin.study_bench import REFUSED
 from twin.framework.page import checksum
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -63,15 +58,17 @@ def test_every_key_stands_in_the_reference(pages: dict[str, str]) -> None:
 @pytest.mark.second
 def test_every_example_is_taken_by_its_model() -> None:
     """As it is shown: the line is read as YAML and put into the mapping that it is an example in."""
-    for kind in MODELS:
-        for (model, name), example in examples(kind).items():
-            data = parse_yaml(example.text).data
-            assert list(data) == [name]
-            assert accepted(model, {**example.mapping, **data}), example.text
-            assert not accepted(model, {**example.mapping, "no_such_key": 1})
-    (model, _), example = next((key, one) for key, one in examples("job").items() if key[1] == "frames")
-    assert not accepted(model, {**example.mapping, "frames": 0})
-    assert not accepted(model, {**example.mapping, "frames": "9 s"})
+    for kind, model in ((kind, model) for kind, file in MODELS.items() for model in sections(file)):
+        for key in keys(model):
+            mapping = example(kind, model, key.name)
+            data = parse_yaml(f"{key.name}: {flow(mapping[key.name])}\n").data
+            assert list(data) == [key.name]
+            assert accepted(model, {**mapping, **data}), data
+            assert not accepted(model, {**mapping, "no_such_key": 1})
+    (model,) = (model for model in sections(MODELS["job"]) if model.__name__ == "RenderSpec")
+    mapping = example("job", model, "frames")
+    assert not accepted(model, {**mapping, "frames": 0})
+    assert not accepted(model, {**mapping, "frames": "9 s"})
 
 
 def test_a_value_in_one_line_of_yaml_reads_back() -> None:
@@ -80,17 +77,17 @@ def test_a_value_in_one_line_of_yaml_reads_back() -> None:
         assert parse_yaml(f"x: {flow(value)}\n").data == {"x": value}
 
 
+@pytest.mark.second
 def test_every_sort_of_file_says_what_reads_it_and_ships_an_example(pages: dict[str, str]) -> None:
-    assert set(READ_BY) == set(MODELS)
     assert all(shipped().values())
-    words = " ".join(READ_BY.values())
-    for line in re.findall(r"python -m ([\w.]+(?: [a-z]+)?)", words):
-        assert line.split(" ")[0] in programs()
-        assert line in commands(line.split(" ")[0]) or line.split(" ")[0] == line
     for kind, files in shipped().items():
+        page = pages[f"reference/files/{kind}.md"]
+        read = re.search(r"^Read (.*)\.$", page, re.M)[1]
+        for line in re.findall(r"python -m ([\w.]+(?: [a-z]+)?)", read):
+            assert line in commands(line.split(" ")[0])
         for file in files:
             assert kinds_of(file) == (kind,)
-            assert file.read_text("utf-8").rstrip() in pages[f"reference/files/{kind}.md"]
+            assert file.read_text("utf-8").rstrip() in page
 
 
 # --- nodes, commands, library ----------------------------------------------------------------------------
@@ -124,7 +121,7 @@ def test_every_command_and_every_option_stands_in_the_reference() -> None:
 
 
 def test_everything_in_the_library_stands_in_the_reference_and_has_a_docstring() -> None:
-    page = api_page()
+    page = (HERE / "pages/reference/api.md").read_text("utf-8")
     for name in twin.__all__:
         assert f"## `twin.{name}`" in page
         thing = getattr(twin, name)
@@ -134,19 +131,45 @@ def test_everything_in_the_library_stands_in_the_reference_and_has_a_docstring()
             assert all(inspect.getdoc(member) for member in public)
 
 
+def test_every_file_of_a_run_folder_is_described() -> None:
+    for command, files in golden_runs().items():
+        assert described(command)
+        assert files
+    golden_runs()["twin.camera"]["strange.json"] = []
+    try:
+        with pytest.raises(LookupError, match=r"strange\.json"):
+            described("twin.camera")
+    finally:
+        del golden_runs()["twin.camera"]["strange.json"]
+
+
 # --- the site --------------------------------------------------------------------------------------------
 
 
-def write_site(folder: Path, **pages: str) -> Path:
-    for name, text in pages.items():
-        (folder / f"{name}.html").write_text(f"<html><body>{text}</body></html>")
-    return folder
+FAULTS = {
+    "[x](docs/gone.md)": "cross-reference target not found: 'docs/gone.md'",
+    "[x](docs/there.md#nowhere)": "local id not found in doc 'docs/there': 'nowhere'",
+    "[x](#nowhere)": "cross-reference target not found: 'nowhere'",
+    "[x](scenes)": "cross-reference target not found: 'scenes'",
+    "![x](docs/gone.png)": "image file not readable: docs/gone.png",
+}
+"""Markdown -> what Sphinx says of it."""
 
 
-@pytest.mark.parametrize(("page", "said"), REFUSED["sites"])
-def test_a_broken_site_is_found(page: str, said: str | None, tmp_path: Path) -> None:
-    found = faults(write_site(tmp_path, index=page, other='<p id="here"></p>'))
-    assert (said is None and found == []) or any(said in line for line in found if said)
+@pytest.mark.second
+def test_a_broken_site_is_refused(tmp_path: Path) -> None:
+    for name in NEEDED:
+        pytest.importorskip(name)
+    tree = "```{toctree}\ndocs/there\n```\n"
+    (tmp_path / "a/docs").mkdir(parents=True)
+    (tmp_path / "a/index.md").write_text("\n\n".join(["# Index", *FAULTS, "[x](docs/there.md#here)", tree]))
+    (tmp_path / "a/docs/there.md").write_text("# There\n\n## Here\n")
+    (tmp_path / "a/docs/lost.md").write_text("# In no tree\n")
+    with pytest.raises(BuildError) as told:
+        run_sphinx(tmp_path / "a", tmp_path / "site", "off")
+    for words in (*FAULTS.values(), "docs/lost.md: WARNING: document isn't included in any toctree"):
+        assert words in str(told.value)
+    assert len(str(told.value).splitlines()) == len(FAULTS) + 1
 
 
 def test_a_folder_with_other_things_is_not_replaced(tmp_path: Path) -> None:
@@ -177,5 +200,12 @@ def test_a_page_of_the_site_may_do_what_it_is_made_of():
     assert rules["script-src"] == ["'self'", "file:", checksum("a()")]
     assert rules["style-src-elem"] == ["'self'", "file:", checksum("p {}")]
     assert not re.search(r"https?:|\*|unsafe-eval", content[1])
-    with pytest.raises(ValueError, match="onclick"):
-        with_policy("<head></head><p onclick='x()'>")
+    for wrong, said in (
+        ("<p onclick='x()'>", "onclick"),
+        ('<img alt="" src="https://example.org/a.png">', r"loads https://example\.org/a\.png from the network"),
+        ("<script src=//cdn.example.org/a.js></script>", r"loads //cdn\.example\.org/a\.js"),
+        ('<link rel="stylesheet" href="https://example.org/a.css">', r"loads https://example\.org/a\.css"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            with_policy(f"<head></head>{wrong}")
+    with_policy('<head></head><a href="https://example.org">x</a>')

@@ -12,7 +12,7 @@ What is called, each with its own help, as help(twin.load):
     load(what)          an instrument: InstrumentTwin, with perturbed, render, recover, camera, jacobian, to_yaml
     load_camera(what)   a camera by itself, with wavefront, spot, mtf, each of which has plot()
     study(pair, vary)   an instrument many times, with what varies: a table of all runs
-    perform(name, file) a test of the laboratory or of the orbit: TestResult
+    perform(name, file) what a command runs on a file, such as "lab focus" or "tolerance": TestResult
 
 What comes back:
 

@@ -9,13 +9,10 @@ if __name__ == "__main__":
 
     end_quietly()
 
-import typer
-
+from twin.framework.cli import program
 from twin.framework.command import add_tests
 
-app = typer.Typer(
-    add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True
-)
+app = program(no_args_is_help=True)
 
 
 @app.callback()

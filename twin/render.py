@@ -25,21 +25,20 @@ if TYPE_CHECKING:
 
 RESOLVE = Named("scenes.specs.resolved:resolve")
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = cli.program()
 
 
 @app.command()
+@cli.with_options("export")
 def main(
     # readable=False: our own loader says what is wrong with a file, in the same words for all files
     job: Annotated[
         Path, typer.Argument(readable=False, help="YAML file of the job, e.g. scenes/examples/perturb.yaml.")
     ],
-    out: cli.Out = None,
-    seed: cli.Seed = None,
+    options: cli.Options,
     frames: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Frames per state; overrides the file's.")
     ] = None,
-    backend: cli.BackendName = "llvm",
     picture: Annotated[
         bool,
         typer.Option("--picture", help="Also render pictures of the instrument itself: picture.png and two close-ups."),
@@ -51,10 +50,6 @@ def main(
             help="Print the nodes of the job's instrument, their pivots and what each allows; run nothing.",
         ),
     ] = False,
-    force: cli.Force = False,
-    as_json: cli.AsJson = False,
-    quiet: cli.Quiet = False,
-    strict: cli.Strict = False,
 ) -> None:
     """Perturb an instrument, render the spot images of its autocollimation monitor and recover the perturbation from
     them.
@@ -102,20 +97,15 @@ def main(
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     if list_nodes:
-        print_nodes(job, backend, as_json)
+        print_nodes(job, options.backend, options.as_json)
         return
 
     def work(resolved: ResolvedJob, session: Session) -> Result:
         from twin.main_job.render_command import run_render
 
-        return run_render(resolved, session, frames, seed, picture)
+        return run_render(resolved, session, frames, options.seed, picture)
 
-    run_command(
-        job.stem,
-        cli.Options(out, seed, backend, force, as_json, quiet, strict=strict),
-        lambda: read_for("twin.render", job, RESOLVE),
-        work,
-    )
+    run_command(job.stem, options, lambda: read_for("twin.render", job, RESOLVE), work)
 
 
 def print_nodes(job: Path, backend: str, as_json: bool) -> None:

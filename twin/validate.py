@@ -33,7 +33,7 @@ LISTED = (
 )  # fmt: skip
 """What ``--list --json`` tells of a row."""
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = cli.program()
 
 
 @app.command()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # what computes is imported when it is needed
     from twin.compare.folder_state import FolderState
     from twin.compare.verification import Repetition
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = cli.program()
 
 
 @app.command()

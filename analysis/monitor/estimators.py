@@ -23,6 +23,7 @@ from analysis.monitor import model_fit, monitoring
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
 from analysis.monitor.parameters import CameraCalibration
+from optics.numerics.extension_table import ExtensionTable
 
 PARAMETERS_EACH = 4
 """Parameters of one camera."""
@@ -218,7 +219,7 @@ class Posterior(Estimator):
         return stated.best_gain(shifts.covariance)
 
 
-ESTIMATORS: dict[str, Estimator] = {
+_ESTIMATORS: dict[str, Estimator] = {
     "paper_single": Formula(
         "paper_single",
         "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed, one change at a time",
@@ -231,6 +232,7 @@ ESTIMATORS: dict[str, Estimator] = {
     "model": LeastSquares(),
     "posterior": Posterior(),
 }
+ESTIMATORS = ExtensionTable("estimators", _ESTIMATORS, Estimator)
 """Name in the results -> estimator, in the order of tables. A new one is added here: it then stands in recovered.json,
 crosstalk.json, the tables and the figures.
 """

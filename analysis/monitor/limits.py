@@ -73,7 +73,7 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
     out = [
         Quantity(name, one, row @ unit[count * c : count * (c + 1)])
         for c, (name, camera) in enumerate(cameras.items())
-        for one, row in zip(parameters.CAMERA_PARAMETERS, parameters.rows_of(camera), strict=True)
+        for one, row in zip(parameters.CAMERA_PARAMETERS.values(), parameters.rows_of(camera), strict=True)
     ]
     if len(cameras) == 2:
         first, second = (camera.look_rad for camera in cameras.values())

@@ -20,6 +20,7 @@ from analysis.arrays import ARCSEC, UM_PER_M, Array, shows
 from analysis.monitor.monitoring import GroundGeometry, MonitorGeometry
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_template import SpotTemplate
+from optics.numerics.extension_table import ExtensionTable
 
 PAIR = ("left", "right")
 """Names of the channels at the +Y and at the -Y end of a line, which paper 001 numbers 1 and 2."""
@@ -94,15 +95,15 @@ class Parameter:
         symbol: its name in tables, figures and sentences.
         meaning: what it is, with its sign.
         decimals: that the terminal shows.
-        of: of a camera: what it is made of, (4,) SI units per rad and m of d_alpha, d_beta, d_gamma and d_f, given the
-            camera's calibration; None for a reading of two cameras together.
+        of: of a camera: what it is made of, (4,) SI units per rad and m of d_alpha, d_beta, d_gamma and d_f, or those
+            given the camera's calibration; None for a reading of two cameras together.
     """
 
     key: str
     symbol: str
     meaning: str
     decimals: int
-    of: Callable[[CameraCalibration], ArrayLike] | None = None
+    of: Callable[[CameraCalibration], ArrayLike] | tuple[float, ...] | None = None
 
     @property
     def file_unit(self) -> str:
@@ -125,37 +126,29 @@ class Parameter:
         return _PER_SI[self.file_unit]
 
 
-@dataclass(frozen=True)
-class _Alone:
-    """One of the four that are estimated, by itself; what is sent to another process is no lambda."""
-
-    number: int
-
-    def __call__(self, camera: CameraCalibration) -> ArrayLike:
-        return tuple(float(k == self.number) for k in range(4))
-
-
-CAMERA_PARAMETERS = (
+ESTIMATED = (
     Parameter(
         "d_alpha_arcsec", "Δα", "turn of the camera about its Y, right-handed, perturbed minus nominal", 4,
-        _Alone(0),
+        (1.0, 0.0, 0.0, 0.0),
     ),
     Parameter(
         "d_beta_arcsec", "Δβ", "turn of the camera about its X, right-handed, perturbed minus nominal", 4,
-        _Alone(1),
+        (0.0, 1.0, 0.0, 0.0),
     ),
     Parameter(
         "d_gamma_arcsec", "Δγ", "turn of the camera about its Z, the line of sight, perturbed minus nominal", 3,
-        _Alone(2),
+        (0.0, 0.0, 1.0, 0.0),
     ),
     Parameter(
         "d_f_um", "Δf", "change of the principal distance, in pixels of the line CCD, longer positive", 2,
-        _Alone(3),
+        (0.0, 0.0, 0.0, 1.0),
     ),
 )  # fmt: skip
-"""What is read of every camera. The first four are what estimators estimate; a further one is a combination of them."""
-ESTIMATED = CAMERA_PARAMETERS[:4]
 """Those that estimators estimate, in the order of a camera's vector of changes."""
+CAMERA_PARAMETERS = ExtensionTable("camera_parameters", {one.key: one for one in ESTIMATED}, Parameter)
+"""What is read of every camera, by its key. The first four are what estimators estimate; a further one is a combination
+of them, and its name here is its key.
+"""
 ANGLE = Parameter("change_arcsec", "Δθ", "change of the angle between the cameras' lines of sight, opening positive", 4)
 """What is read of the angle between two cameras."""
 GROUND = (
@@ -172,4 +165,5 @@ def rows_of(camera: CameraCalibration) -> Array:
     Args:
         camera: its calibration.
     """
-    return np.array([one.per_si * np.array(one.of(camera)) for one in CAMERA_PARAMETERS if one.of is not None])
+    made_of = ((one.per_si, one.of) for one in CAMERA_PARAMETERS.values() if one.of is not None)
+    return np.array([unit * np.array(of(camera) if callable(of) else of) for unit, of in made_of])

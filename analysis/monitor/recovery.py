@@ -34,7 +34,8 @@ from analysis.monitor.estimators import PARAMETERS_EACH, Shifts, applicable
 from analysis.monitor.limits import quantities
 from analysis.monitor.monitoring import CameraParameters, GroundError, GroundGeometry, IntersectionAngleChange, exact
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
-from analysis.spots.centroid import CENTROIDS, mean_frames
+from analysis.spots import CENTROIDS
+from analysis.spots.centroid import mean_frames
 from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, require_rest, widened
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
 
@@ -441,12 +442,12 @@ def measure_spots(
         mean: mean frames, (B, H, W), grey values.
         frames: number of frames of each mean.
         calibration: of the nominal instrument.
-        centroid: name of a method of `analysis.spots.centroid.CENTROIDS`.
+        centroid: name of a method of `analysis.spots.CENTROIDS`.
         threads: for the fits; results do not depend on it.
     """
     if centroid not in CENTROIDS:
         raise ValueError(f"recovery: no centroid {centroid!r}; there are {', '.join(CENTROIDS)}")
-    return require_rest(CENTROIDS[centroid](mean, frames, calibration.noise, calibration.template, threads))
+    return require_rest(CENTROIDS[centroid].measure(mean, frames, calibration.noise, calibration.template, threads))
 
 
 def judged_spots(

@@ -14,7 +14,6 @@ edge; ValueError for input of the wrong shape.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,10 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
 from analysis.spots import spot_image
-from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotPositions
-from analysis.spots.spot_template import SpotTemplate
 
 # How far the Gaussian's centre may wander from the first guess, px.
 _GAUSS_MOVE_PX = 4
@@ -218,15 +215,3 @@ def _gauss(image: Array, frames: int, noise: NoiseModel, radius: float, elliptic
     return spot_image.positions(
         place, everywhere, whole, frames, noise, True, flux, theta[:, 3], converged, iteration, chi
     )
-
-
-CENTROIDS: dict[str, Callable[[Array, int, NoiseModel, SpotTemplate, int], SpotPositions]] = {
-    "ml": lambda mean, frames, noise, template, threads: maximum_likelihood_fit(
-        mean, frames, noise, template, threads=threads
-    ),
-    "gaussian": lambda mean, frames, noise, template, threads: gaussian_fit(mean, frames, noise),
-    "energy": lambda mean, frames, noise, template, threads: energy_centroid(mean, frames, noise),
-}
-"""Name -> method, which makes centres of B spots of mean frames (B, H, W), the number of frames of each, the detector's
-noise, the calibrated shapes and a number of threads. Job files name one under ``analysis: {centroid: ...}``.
-"""

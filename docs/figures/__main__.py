@@ -1,16 +1,25 @@
-"""Measured figures of README and docs: `python -m docs.figures` measures them, writes figures.yaml and the pages."""
+"""Measured figures of README and docs: `python -m docs.figures` measures them, writes figures.yaml and the pages.
+
+A page marks a place that quotes a figure with a comment behind the number, ``0.195<!-- 004.table1.P -->``, which no
+reader of the page sees. A number in the form ``0.149 ± 0.001`` is quoted with its sigma. ``:1`` behind the name asks
+for another number of decimals than the figure's own, ``:-1`` for tens.
+"""
 
 from __future__ import annotations
 
+import re
 import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from docs.figures.pages import fill
-from docs.figures.sources import measure, read_figures, write_figures
+from docs.figures.sources import ROOT, Figure, measure, read_figures, write_figures
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+_PLACE = re.compile(r"(?P<text>−?\d+(?:\.\d+)?(?: ± \d+(?:\.\d+)?)?)<!-- (?P<name>[\w.]+)(?::(?P<digits>-?\d))? -->")
+_MARK = re.compile(r"<!-- [\w.]+(?::-?\d)? -->")
 
 
 @app.command()
@@ -31,6 +40,60 @@ def main(
         write_figures(measure(read_figures(), only))
     for page in fill(read_figures()):
         sys.stdout.write(f"{page}\n")
+
+
+def pages() -> list[Path]:
+    """README and all Markdown pages of docs."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def places(text: str, figures: Mapping[str, Figure]) -> Iterator[tuple[str, str, str]]:
+    """Name of the figure, what stands there and what should, for each marked place of a page.
+
+    Raises:
+        ValueError: a mark without a number before it, or one that names no figure.
+    """
+    found = list(_PLACE.finditer(text))
+    if len(found) != len(_MARK.findall(text)):
+        loose = sorted({*_MARK.findall(text)} - {place[0][len(place["text"]) :] for place in found})
+        raise ValueError(f"no number stands before: {loose}")
+    for place in found:
+        yield place["name"], place["text"], _quoted(place, figures)
+
+
+def filled(text: str, figures: Mapping[str, Figure]) -> str:
+    """A page with the figures as they are now; errors as `places`."""
+    list(places(text, figures))
+    return _PLACE.sub(lambda place: _quoted(place, figures) + place[0][len(place["text"]) :], text)
+
+
+def fill(figures: Mapping[str, Figure]) -> list[Path]:
+    """Write the figures into all pages; returns those that changed."""
+    changed = []
+    for page in pages():
+        text = page.read_text("utf-8")
+        new = filled(text, figures)
+        if new != text:
+            page.write_text(new, "utf-8")
+            changed.append(page)
+    return changed
+
+
+def _quoted(place: re.Match[str], figures: Mapping[str, Figure]) -> str:
+    if place["name"] not in figures:
+        raise ValueError(f"no such figure: {place['name']}")
+    figure = figures[place["name"]]
+    digits = figure.digits if place["digits"] is None else int(place["digits"])
+    text = _decimal(figure.value, digits)
+    if "±" in place["text"]:
+        if figure.sigma is None:
+            raise ValueError(f"{place['name']} has no sigma")
+        text += f" ± {_decimal(figure.sigma, digits)}"
+    return text
+
+
+def _decimal(value: float, digits: int) -> str:
+    return f"{round(value, digits):.{max(digits, 0)}f}".replace("-", "−")
 
 
 if __name__ == "__main__":

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -45,42 +46,11 @@ class Figure:
     seed: int | None
 
 
-CHECKS: Mapping[str, tuple[int, float, str]] = {
-    "000.height.alpha": (1, 1.0, "m"),
-    "001.eq2": (3, 1.0, ""),
-    "001.eq3": (3, 1.0, ""),
-    "001.eq5": (4, 1.0, ""),
-    "001.eq7": (4, 1.0, ""),
-    "001.table1.d_f": (5, 1.0, ""),
-    "001.table3.centroid": (4, 1.0, "arcsec"),
-    "001.table3.coordinate_thermal": (4, 1.0, "arcsec"),
-    "001.table3.prism_180_thermal": (3, 1.0, "arcsec"),
-    "001.table3.prism_0_thermal": (4, 1.0, "arcsec"),
-    "001.table3.prism_180_rotation": (4, 1.0, "arcsec"),
-    "001.table3.prism_0_rotation": (4, 1.0, "arcsec"),
-    "001.table3.central_prism_thermal": (5, 1.0, "arcsec"),
-    "001.table4.root_sum": (3, 1.0, "arcsec"),
-    "001.table4.together": (3, 1.0, "arcsec"),
-    "001.table5.d_alpha": (3, 1.0, "arcsec"),
-    "001.table5.d_beta": (3, 1.0, "arcsec"),
-    "001.table5.d_gamma": (2, 1.0, "arcsec"),
-    "001.table5.d_f": (3, 1.0, "mm"),
-    "003.before.plan": (0, 1.0, "m"),
-    "003.before.height": (0, 1.0, "m"),
-    "003.scheme1.plan": (1, 1.0, "m"),
-    "003.scheme4.plan": (1, 1.0, "m"),
-    "003.scheme5.plan": (1, 1.0, "m"),
-    "003.scale50000.height": (1, 1.0, "m"),
-    "004.alignment.confocal": (1, 1e3, "um"),
-    "004.table1.P": (3, 1.0, ""),
-    "004.table1.B1": (3, 1.0, ""),
-    "004.table1.B2": (3, 1.0, ""),
-    "004.table1.B3": (3, 1.0, ""),
-    "004.table1.B4": (3, 1.0, ""),
-    "004.table2.compensation": (0, 1.0, "%"),
-    "004.table2.reduction": (0, 1.0, "%"),
-}
-"""Check of a paper -> decimals, factor from the summary's unit, unit."""
+def _checks() -> Iterator[tuple[str, int, float, str]]:
+    """Checks of the papers whose figures pages quote: name, decimals, factor from the summary's unit, unit."""
+    with FILE.with_name("checks.csv").open(encoding="utf-8", newline="") as lines:
+        for row in csv.DictReader(lines):
+            yield row["check"], int(row["digits"]), float(row["factor"]), row["unit"]
 
 
 def _at(file: str, *keys: str, per: float = 1.0) -> Read:
@@ -216,7 +186,7 @@ def of_validation(summary: str) -> dict[str, Figure]:
             cells = line.strip("| ").split(" | ")
             rows |= dict.fromkeys(re.findall(r"`([^`]+)`", cells[0]), cells[4])
     out = {}
-    for name, (digits, factor, unit) in CHECKS.items():
+    for name, digits, factor, unit in _checks():
         number = _NUMBER.match(rows[name].replace("−", "-"))
         if number is None:
             raise ValueError(f"{name}: no number: {rows[name]}")
@@ -233,11 +203,11 @@ def _modules() -> dict[str, tuple[Callable[[], Mapping[str, tuple[float, int, st
     """Beginning of the names of figures that no command writes -> what measures them (value, decimals, unit), and the
     seed of its random numbers. The modules are imported here, since they need what ``setup.sh --test`` installs.
     """
-    from docs.figures import ccd_growth, libraries, loop_orbit, simulated_years
+    from docs.figures import ccd_growth, libraries, simulated_years
 
     return {
         "ccd": (ccd_growth.measured, ccd_growth.SEED),
-        "loop": (loop_orbit.measured, loop_orbit.SEED),
+        "loop": (simulated_years.loop_measured, simulated_years.SEED),
         "libraries": (libraries.measured, libraries.SEED),
         "operation": (simulated_years.measured, simulated_years.SEED),
     }

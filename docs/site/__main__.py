@@ -1,16 +1,39 @@
-"""Build the documentation: `python -m docs.site --out DIR`."""
+"""Build the documentation: `python -m docs.site --out DIR`.
+
+The pages in docs, the notebooks and the reference, which is made from the program, are gathered in a folder, where each
+has the place that it has in the project, so that its links hold; Sphinx makes the site of them.
+"""
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from docs.site.build import BuildError, build
+from twin.framework.page import NOTHING, checksum, policy
 
+ROOT = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).resolve().parent
+NEEDED = ("sphinx", "myst_nb", "furo", "sphinx_copybutton")
+OWN = "'self' file:"
+"""Files of the site, on a server or in a folder; not every browser takes a folder for one origin."""
+_INLINE = re.compile(r"<(script|style)\b([^>]*)>(.*?)</\1>", re.S | re.I)
+_HEAD = re.compile(r"<head[^>]*>\s*(<meta charset=[^>]*>)?", re.I)
+_EVENT = re.compile(r"<[a-z][^<>]*\s(on[a-z]+)\s*=", re.I)
+_REMOTE = re.compile(r"<(?!a\s)[a-z][^<>]*\s(?:src|data|href)\s*=\s*[\"']?((?:https?:)?//[^\"'\s>]+)", re.I)
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+class BuildError(Exception):
+    """The site cannot be built, or is not as it should be; the message says all that is wrong."""
 
 
 @app.command()
@@ -21,7 +44,7 @@ def main(
     notebooks: Annotated[bool, typer.Option(help="Whether to run the notebooks (minutes).")] = True,
 ) -> None:
     """Build the documentation as web pages that need no network: guides, notebooks, and the reference, made from the
-    program. Sphinx's warnings are errors, every link is followed. Needs the extra `docs`.
+    program. Sphinx's warnings are errors, every link within the site is followed. Needs the extra `docs`.
     """
     try:
         count = build(out, notebooks)
@@ -29,6 +52,128 @@ def main(
         sys.stderr.write(f"{error}\n")
         raise typer.Exit(1) from None
     sys.stdout.write(f"{count} pages: {out / 'index.html'}\n")
+
+
+def build(out: Path, notebooks: bool = True) -> int:
+    """Build the site.
+
+    Args:
+        out: folder for the pages; what a former build left there is replaced.
+        notebooks: whether to run the notebooks; otherwise they are shown as they are.
+
+    Returns:
+        Number of pages.
+
+    Raises:
+        BuildError: a package is missing, the reference cannot be made, Sphinx warns, or a page needs the network.
+    """
+    if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
+        raise BuildError(f"not installed: {', '.join(missing)}; install the extra `docs`: pip install -e .[docs]")
+    if out.exists() and any(out.iterdir()) and not (out / "objects.inv").exists():
+        raise BuildError(f"{out} holds something else than a site; choose another folder")
+    with tempfile.TemporaryDirectory(prefix="docs-") as place:
+        source, made = Path(place, "source"), Path(place, "site")
+        stage(source)
+        pages = run_sphinx(source, made, "force" if notebooks else "off")
+        if out.exists():
+            shutil.rmtree(out)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(made, out)
+    return pages
+
+
+def stage(source: Path) -> None:
+    """Put everything that the site is made of into a new folder.
+
+    Raises:
+        BuildError: a key has no example, or a file of a run folder no description.
+    """
+    # what the pages are made from takes seconds to import
+    from docs.site.command_pages import command_page
+    from docs.site.file_pages import file_pages
+    from docs.site.run_pages import run_pages
+
+    shutil.copytree(HERE / "pages", source)
+    # notebooks write beside themselves
+    shutil.copytree(ROOT / "docs", source / "docs", ignore=shutil.ignore_patterns("site"))
+    shutil.copy(ROOT / "README.md", source)
+    for linked in ("optics", "scenes", "tests"):
+        (source / linked).symlink_to(ROOT / linked)
+    try:
+        made = {"reference/commands.md": command_page(), **file_pages(), **run_pages()}
+    except (LookupError, TypeError, ValueError) as error:
+        raise BuildError(f"the reference cannot be made: {error}") from error
+    for name, text in made.items():
+        (source / name).parent.mkdir(exist_ok=True)
+        (source / name).write_text(text, "utf-8")
+
+
+def run_sphinx(source: Path, made: Path, notebooks: str) -> int:
+    """Make pages in a process that imports this checkout, and return their number.
+
+    Args:
+        source: folder with the pages' sources, of which index is the first.
+        made: folder for the site.
+        notebooks: ``nb_execution_mode`` of MyST-NB.
+
+    Raises:
+        BuildError: Sphinx warns: of a link or its place that is not there, a page that no other leads to, and more; or
+            a page needs the network.
+    """
+    environment = os.environ | {"JUPYTER_PLATFORM_DIRS": "1"}
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    words = ["-b", "html", "-q", "-W", "--keep-going", "-c", HERE, "-D", f"nb_execution_mode={notebooks}"]
+    command = [sys.executable, "-m", "sphinx", *words, "-d", source.with_name("state"), source, made]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, cwd=ROOT)
+    if done.returncode:
+        raise BuildError(done.stderr.replace(f"{source}/", "").strip() or "Sphinx failed")
+    pages = sorted(made.rglob("*.html"))
+    for page in pages:
+        try:
+            page.write_text(with_policy(page.read_text("utf-8")), "utf-8")
+        except ValueError as error:
+            raise BuildError(f"{page.relative_to(made)}: {error}") from None
+    (made / ".buildinfo").unlink(missing_ok=True)
+    return len(pages)
+
+
+def with_policy(text: str) -> str:
+    """A page with its Content-Security-Policy at the beginning of its head: its own files, and what Sphinx writes into
+    it.
+
+    Scripts and style sheets that stand in the page are allowed by their checksums; all text is the project's own.
+    ``style`` attributes are allowed, since figures and highlighted programs have them.
+
+    Raises:
+        ValueError: the page has no head, loads something from the network, or has attributes that hold programs, which
+            no checksum covers.
+    """
+    head = _HEAD.search(text)
+    if head is None:
+        raise ValueError("the page has no head")
+    for attribute in _EVENT.findall(text):
+        raise ValueError(f"the page has an attribute {attribute}, which its policy forbids")
+    for address in _REMOTE.findall(text):
+        raise ValueError(f"the page loads {address} from the network")
+    inline: dict[str, dict[str, None]] = {"script": {}, "style": {}}
+    for tag, attributes, inside in _INLINE.findall(text):
+        if "src=" not in attributes:
+            inline[tag.lower()][checksum(inside)] = None
+    allowed = policy(
+        {
+            **NOTHING,
+            "script-src": " ".join([OWN, *inline["script"]]),
+            "style-src-elem": " ".join([OWN, *inline["style"]]),
+            "style-src-attr": "'unsafe-inline'",
+            "img-src": f"{OWN} data:",
+            "font-src": f"{OWN} data:",
+            # the search reads pages for its excerpts, and its field is a form
+            "connect-src": OWN,
+            "form-action": OWN,
+        }
+    )
+    meta = f'<meta http-equiv="Content-Security-Policy" content="{allowed}">'
+    return text[: head.end()] + meta + text[head.end() :]
 
 
 if __name__ == "__main__":

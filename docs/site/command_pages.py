@@ -11,6 +11,7 @@ from textwrap import dedent
 from typing import Any
 
 from docs.site.markdown import anchor, code, prose, sentence, table
+from docs.site.spec_keys import bound_text
 from twin.framework.console import parser
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,8 +51,7 @@ def commands(program: str) -> dict[str, Any]:
 
 def command_page() -> str:
     """Markdown of the page."""
-    parts = [
-        """# Commands
+    introduction = """# Commands
 
 Each is `.venv/bin/python -m NAME` (an environment of your own: `python -m NAME`), or `camtwin` with the last part of
 the name, `camtwin render`, and has a `--help` that says the same as this page. All that make a run folder share
@@ -59,20 +59,15 @@ the name, `camtwin render`, and has a `--help` that says the same as this page. 
 what is in the folders says [the next page](run_folders/index.md). Exit codes: 0 success, 2 bad input (one line for
 each fault with file, line and key; nothing is written), 1 anything else, 130 interrupted.
 """
-    ]
-    for program in programs():
-        parts.append(_program(program))
-    return "\n".join(parts)
+    return "\n".join([introduction, *map(_program, programs())])
 
 
 def _program(program: str) -> str:
-    group = parser(program)
-    below = getattr(group, "commands", None)
-    if not below:
+    group, below = parser(program), commands(program)
+    if program in below:
         return f"## {code(program)}\n\n{_command(program, group)}"
     parts = [f"## {code(program)}\n\n{help_text(group)}"]
-    parts += [f"### {code(f'{program} {name}')}\n\n{_command(f'{program} {name}', one)}" for name, one in below.items()]
-    return "\n".join(parts)
+    return "\n".join([*parts, *(f"### {code(words)}\n\n{_command(words, one)}" for words, one in below.items())])
 
 
 def help_text(command: Any) -> str:
@@ -108,9 +103,8 @@ def _takes(param: Any) -> str:
     if getattr(param, "is_flag", False):
         return "nothing"
     sort = getattr(param.type_descriptor, "annotation", str)
-    words = {int: "whole number", float: "number", str: "text", Path: "path"}
-    what = words.get(sort, getattr(sort, "__name__", str(sort)))
-    bounds = [f"{word} {value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if value != 2**63 - 1 else f"{word} 2⁶³ − 1"
-              for word, value in (("at least", getattr(param, "min", None)), ("at most", getattr(param, "max", None)))
-              if value is not None]  # fmt: skip
+    known = {int: "whole number", float: "number", str: "text", Path: "path"}
+    what = known.get(sort, getattr(sort, "__name__", str(sort)))
+    limits = (("at least", getattr(param, "min", None)), ("at most", getattr(param, "max", None)))
+    bounds = [f"{words} {bound_text(value)}" for words, value in limits if value is not None]
     return "; ".join((what, *bounds))

@@ -1,6 +1,4 @@
-"""Settings of Sphinx for the documentation; docs/site/build.py gathers the pages and calls it."""
-
-import os
+"""Settings of Sphinx for the documentation; docs/site/__main__.py gathers the pages and calls it."""
 
 from pygments.lexers.special import TextLexer
 from sphinx.application import Sphinx
@@ -8,13 +6,13 @@ from sphinx.application import Sphinx
 project = "Space camera twin"
 author = "the space-camera-twin authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
-exclude_patterns = ["_build"]
-templates_path: list[str] = []
+include_patterns = ["index.md", "README.md", "docs/**", "reference/**"]
 html_theme = "furo"
 html_title = "Space camera twin"
-html_static_path = ["_static"]
+html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_copy_source = False
+html_show_sourcelink = False
 html_show_copyright = False
 html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True, "top_of_page_buttons": []}
@@ -25,15 +23,13 @@ myst_enable_extensions = ["attrs_block"]
 # files beside the pages, as programs and examples, are offered for download
 suppress_warnings = ["mystnb.unknown_mime_type"]
 
-nb_execution_mode = os.environ.get("DOCS_NOTEBOOKS", "force")
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 
-autodoc_typehints = "signature"
+autodoc_default_options = {"members": True}
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
-napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 add_module_names = False

@@ -1,70 +1,28 @@
-"""Pages of the YAML files: every key of every sort of file, with what it means, takes, defaults to, and an example."""
+"""Pages of the YAML files and of what jobs name in them: every key of every sort of file, with what it means, takes,
+defaults to, and an example; every node of the shipped instruments.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
+import twin
 from docs.site.markdown import anchor, code, prose, sentence, table
-from docs.site.spec_examples import Example, example, shipped
-from docs.site.spec_keys import Key, Section, sections, summary
+from docs.site.spec_keys import Key, Spec, Takes, example, flow, keys, sections, shipped, summary
 from scenes.schema import MODELS
-from scenes.specs.load import SCENES
+from scenes.specs.file_kinds import file_kinds
+from scenes.specs.load import INSTRUMENTS, SCENES, library_names
+from scenes.specs.perturbation import NodeInfo
 
-FOLDER = "reference/files"
-READ_BY = {
-    "job": "`python -m twin.render FILE`; in a script `twin.load(FILE)`; a study's base `render`",
-    "measurement": "`python -m twin.recover FILE`",
-    "instrument": 'jobs and tests, which name it: `instrument: gf7_pair`; in a script `twin.load("gf7_pair")`',
-    "as_built_instrument": "jobs and tests, which name it as their instrument: `instrument: as_built_pair.yaml`",
-    "camera": "`python -m twin.camera FILE`; instruments, tests and designs, which name it: `camera: gf7`",
-    "camera_design": "`python -m twin.design FILE`",
-    "monitor_design": "`python -m twin.design monitor FILE`",
-    "detector": "instruments, bands of cameras and lines of payloads, which name it: `detector: monitor_ccd`",
-    "disturbances": "jobs, instruments and error budgets, which name it: `disturbances: orbit`",
-    "error_budget": "`python -m twin.validate --only 001.table3,001.table4,001.table5`",
-    "principle_experiment": "`python -m twin.validate --only 001.table2`",
-    "focus_test": "`python -m twin.lab focus FILE`",
-    "distortion_test": "`python -m twin.lab distortion FILE`",
-    "measured_adjust": "`python -m twin.orbit adjust FILE`",
-    "measured_calibration": "`python -m twin.orbit calibrate FILE`",
-    "measured_angle": "`python -m twin.orbit angle FILE`",
-    "orbit_data": "tests on measurements, which name its folder: `data: DIR`",
-    "turntable_test": "`python -m twin.lab turntable FILE`; a distortion test, which names it: `turntable: turntable`",
-    "measured_focus": "`python -m twin.lab focus FILE`",
-    "measured_distortion": "`python -m twin.lab distortion FILE`",
-    "measured_turntable": "`python -m twin.lab turntable FILE`",
-    "orbit_adjust": "`python -m twin.orbit adjust FILE`",
-    "orbit_angle": "`python -m twin.orbit angle FILE`",
-    "orbit_calibration": "`python -m twin.orbit calibrate FILE`",
-    "orbit_simulate": "`python -m twin.orbit simulate FILE`",
-    "orbit_monitor": "`python -m twin.orbit monitor FILE`",
-    "orbit_check": "`python -m twin.orbit check FILE`",
-    "orbit_match": "`python -m twin.orbit match FILE`",
-    "orbit_jitter": "`python -m twin.orbit jitter FILE`",
-    "measured_jitter": "`python -m twin.orbit jitter FILE`",
-    "tolerance": "`python -m twin.tolerance FILE`",
-    "asbuilt": "`python -m twin.asbuilt FILE`, `python -m twin.asbuilt check FILE`",
-    "telemetry": "`python -m twin.operate ingest RECORD FILE`",
-    "operation": "`python -m twin.operate init RECORD INSTRUMENT --plan FILE`, `status|forecast RECORD FILE`",
-    "three_line_camera": "tests in orbit, which name it: `camera: th1`",
-    "study": "`python -m twin.study FILE`",
-}
-"""Sort of file -> what reads it."""
-ORDER = ("job", "instrument", "as_built_instrument", "disturbances", "camera", "detector", "study", "camera_design")
-"""Sorts that stand first in the list, what a new user meets first."""
-
-
-def kinds() -> list[str]:
-    """All sorts of file in the order of the list."""
-    return sorted(
-        MODELS, key=lambda kind: (ORDER.index(kind) if kind in ORDER else len(ORDER), list(MODELS).index(kind))
-    )
+ACTIONS = ("rotate", "shift", "scale", "figure", "radius", "conic", "index", "abbe", "temperature")
+"""Columns of the tables of nodes, as they are written in a job."""
 
 
 def file_pages() -> dict[str, str]:
     """Path of a page in the site's source -> Markdown."""
-    pages = {f"{FOLDER}/{kind}.md": _page(kind) for kind in kinds()}
-    return {f"{FOLDER}/index.md": _index(), **pages}
+    pages = {f"reference/files/{kind}.md": _page(kind) for kind in MODELS}
+    return {"reference/files/index.md": _index(), **pages, "reference/nodes.md": _node_page()}
 
 
 def title(kind: str) -> str:
@@ -72,16 +30,23 @@ def title(kind: str) -> str:
     return kind.replace("_", " ").capitalize()
 
 
+def read_by(kind: str) -> str:
+    """Which command reads a sort of file, and where its name stands in others."""
+    (known,) = (one for one in file_kinds() if one.name == kind)
+    command = f"by {code(f'python -m {known.command}')}" if known.command else ""
+    return ", or ".join(filter(None, (command, known.place and f"in {known.place}")))
+
+
 def _index() -> str:
-    rows = [
+    rows = (
         [
             f"[{title(kind)}]({kind}.md)",
-            prose(sentence(summary(MODELS[kind]))),
-            READ_BY[kind],
+            prose(sentence(summary(model))),
+            read_by(kind),
             ", ".join(code(path.stem) for path in shipped()[kind]),
         ]
-        for kind in kinds()
-    ]
+        for kind, model in MODELS.items()
+    )
     return f"""# Files: every key
 
 Every quantity carries its unit, `2 arcsec`; any unit of the same dimension may be written. Three quantities of one
@@ -93,81 +58,88 @@ These pages are made from the models that check the files. The same models give 
 completes keys and marks mistakes while typing: `python -m scenes.schema --out schemas`, then as the first line of a
 file `# yaml-language-server: $schema=schemas/job.schema.json`.
 
-{table(["File", "What it says", "Read by", "Shipped"], rows, "files")}
+{table(["File", "What it says", "Read", "Shipped"], rows, "files")}
 ```{{toctree}}
 :hidden:
 
-{chr(10).join(kinds())}
+{chr(10).join(MODELS)}
 ```
 """
 
 
 def _page(kind: str) -> str:
-    model = MODELS[kind]
     files = shipped()[kind]
-    parts = [f"# {title(kind)}\n\n{prose(sentence(summary(model)))}\n\nRead by {READ_BY[kind]}.\n"]
-    parts += [_section(kind, section) for section in sections(model)]
+    parts = [f"# {title(kind)}\n\n{prose(sentence(summary(MODELS[kind])))}\n\nRead {read_by(kind)}.\n"]
+    parts += [_section(kind, model, places) for model, places in sections(MODELS[kind]).items()]
     if files:
-        parts.append("## Shipped files\n\n" + "\n".join(_shipped(path, path == _shortest(files)) for path in files))
+        smallest = min(files, key=lambda path: path.stat().st_size)
+        parts.append("## Shipped files\n\n" + "\n".join(_shipped(path, path == smallest) for path in files))
     return "\n".join(parts)
 
 
-def _shortest(files: tuple[Path, ...]) -> Path:
-    return min(files, key=lambda path: path.stat().st_size)
-
-
 def _shipped(path: Path, opened: bool) -> str:
-    name = path.relative_to(SCENES.parent).as_posix()
-    text = path.read_text("utf-8").rstrip()
-    opening = " open" if opened else ""
-    return f"<details{opening}><summary><code>{name}</code></summary>\n\n```yaml\n{text}\n```\n\n</details>\n"
+    name, text = path.relative_to(SCENES.parent).as_posix(), path.read_text("utf-8").rstrip()
+    opening = "<details open>" if opened else "<details>"
+    return f"{opening}<summary><code>{name}</code></summary>\n\n```yaml\n{text}\n```\n\n</details>\n"
 
 
-def _section(kind: str, section: Section) -> str:
-    if section.places == ("",):
-        head = "## The file"
-        said = ""
+def _section(kind: str, model: type[Spec], places: list[str]) -> str:
+    if places == [""]:
+        head, said = "## The file", ""
     else:
-        head = f"## {code(section.places[0])}"
-        others = section.places[1:]
-        said = prose(sentence(section.summary)) + "\n"
-        if others:
-            said += f"\nThe same at {', '.join(map(code, others))}.\n"
-    rows = [_row(kind, section, key) for key in section.keys]
+        head, said = f"## {code(places[0])}", f"{prose(sentence(summary(model)))}\n"
+        if places[1:]:
+            said += f"\nThe same at {', '.join(map(code, places[1:]))}.\n"
+    rows = (_row(kind, model, places[0], key) for key in keys(model))
     return f"{head}\n\n{said}\n{table(['Key', 'Meaning', 'Takes', 'Default', 'Example'], rows, 'keys')}"
 
 
-def _row(kind: str, section: Section, key: Key) -> list[str]:
-    place = section.places[0]
-    full = f"{place}.{key.name}".lstrip(".")
-    if key.takes.below:
-        between, _ = key.takes.below[0]
-        shown = f"see {code(f'{full}{between}')} below"
-        known = example(kind, section, key)
-        if not isinstance(known.mapping[key.name], dict | list):
-            shown = f"{_shown(known)}, or {shown}"
-    else:
-        shown = _shown(example(kind, section, key))
-    default = "must be written" if key.required else _default(key)
-    return [f"{anchor(full)}{code(key.name)}", prose(sentence(key.meaning)), takes_text(key), default, shown]
-
-
-def _default(key: Key) -> str:
+def _row(kind: str, model: type[Spec], place: str, key: Key) -> list[str]:
+    full, value = f"{place}.{key.name}".lstrip("."), example(kind, model, key.name)[key.name]
+    shown = code(f"{key.name}: {flow(value)}")
+    if key.below:
+        below = f"see {code(f'{full}{key.below[0][0]}')} below"
+        shown = below if isinstance(value, dict | list) else f"{shown}, or {below}"
     words = ("none", "empty", "its own defaults")
-    return key.default if key.default in words else code(key.default)
+    default = (key.default if key.default in words else code(key.default)) or "must be written"
+    return [f"{anchor(full)}{code(key.name)}", prose(sentence(key.meaning)), _takes(key.takes), default, shown]
 
 
-def _shown(one: Example) -> str:
-    return code(one.text)
-
-
-def takes_text(key: Key) -> str:
+def _takes(takes: Takes) -> str:
     """What may stand after a key, its units and limits, in a line."""
-    units = f"in {', '.join(map(code, key.takes.units))}" if key.takes.units else ""
-    what = key.takes.what
-    if what.startswith("one of ") or "each one of " in what:
-        before, _, names = what.partition("one of ")
-        what = f"{before}one of {', '.join(map(code, names.split(', ')))}"
-    elif what.startswith(("mapping of the terms", "mapping (")):
-        return what
-    return "; ".join(part for part in (f"{what} {units}".strip(), key.takes.limits) if part)
+    units = f"in {', '.join(map(code, takes.units))}" if takes.units else ""
+    before, one_of, names = takes.what.partition("one of ")
+    # names that something else follows stay as they are
+    what = f"{before}one of {', '.join(map(code, names.split(', ')))}" if one_of and " or " not in names else takes.what
+    return "; ".join(filter(None, (f"{what} {units}".strip(), takes.limits)))
+
+
+def _node_page() -> str:
+    parts = [
+        """# Nodes of the shipped instruments
+
+What stands under `perturb:` in a job, `base/forward/M2`, is the path of a body in the tree of parts: what is done to
+a body happens to all that it carries. `rotate` and `scale` act about a *pivot*, `origin` where none is named. Axes
+and signs are those of [conventions](../docs/conventions.md); keys and limits those of [a job](files/job.md).
+
+In a script the same table is `twin.load("gf7_pair").nodes`. An instrument of your own has the nodes of its own
+cameras: their names are those of its file, mirrors those of the camera's file.
+"""
+    ]
+    for name in library_names(INSTRUMENTS):
+        nodes = twin.load(name).experiment.instrument.nodes
+        parts.append(f"## {code(name)}\n\n{len(nodes)} nodes.\n\n{node_table(name, nodes)}")
+    return "\n".join(parts)
+
+
+def node_table(name: str, nodes: Mapping[str, NodeInfo]) -> str:
+    """The table of one instrument: path of a node -> what may be done to it, in the order of the paths."""
+    rows = (
+        [
+            f"{anchor(f'{name}-{path}')}{code(path)}",
+            *("✓" if action in info.allows else "" for action in ACTIONS),
+            ", ".join(code(pivot) for pivot in dict.fromkeys(("origin", *info.pivots))),
+        ]
+        for path, info in sorted(nodes.items())
+    )
+    return table(["Node", *map(code, ACTIONS), "Pivots"], rows, "nodes")

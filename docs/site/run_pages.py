@@ -1,52 +1,304 @@
-"""The pages of the run folders: every file that a command leaves, and every field, column, variable and tag in it."""
+"""The pages of the run folders: every file that a command leaves, and every field, column, variable and tag in it, read
+off the golden runs of every command; meanings and units are those of the records that make the files.
+"""
 
 from __future__ import annotations
 
+import ast
+import importlib
+import json
+import re
+from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from docs.site.markdown import code, prose, sentence, table
-from docs.site.run_files import (
-    EVERYWHERE,
-    artefact_title,
-    commands,
-    described,
-    field_tree,
-    files,
-    known,
-    leaves,
-    mapping_meaning,
-    meaning,
-    shown_path,
-    unit,
-)
+from docs.site.spec_keys import attributes
+from scenes.specs.study import UNITS, unit_of
+from scenes.yaml.yaml_file import read_yaml
+from tests.golden.digest import sorts
+from tests.golden.golden import golden_file
+from tests.golden.jobs import ALL
+from twin.framework.quantity import Record
 from twin.framework.reference_frames import FRAMES
+from twin.framework.run_folder import Manifest
 
+ROOT = Path(__file__).resolve().parents[2]
 FOLDER = "reference/run_folders"
+DESCRIBED = read_yaml(Path(__file__).with_name("run_files.yaml")).data
+PRINTED = ("exit", "stdout", "stderr", "exact")
+"""Keys of a golden run that are no files."""
+SHOWN_NAMES = 4
+Tree = dict[str, Any]
+"""Segment of a path -> what is below it; a leaf is the sort of the value, as text."""
+_LISTS = re.compile(r"(\[\])*$")
+
+
+# --- what golden runs left -------------------------------------------------------------------------------
+
+
+def kept_fields(job: str) -> dict[str, Any]:
+    """Return file -> what stands in it without the values, of a golden run; empty for one without files.
+
+    ``fields`` of JSON: path of a value -> its sort. ``columns`` of CSV. ``variables`` of netCDF: name -> dimensions,
+    sort of number and attributes, and ``attributes`` of its groups. ``dtype`` and ``tags`` of TIFF.
+    """
+    run = json.loads(golden_file(job).read_text("utf-8"))["run"]
+    return {name: _fields(name, tree) for name, tree in run.items() if name not in PRINTED}
+
+
+def _fields(name: str, tree: dict[str, Any]) -> dict[str, Any]:
+    if name.endswith(".json") and "definitions" not in tree:
+        return {"fields": sorts(tree)}
+    if name.endswith(".csv"):
+        return {"columns": tree["head"]}
+    if name.endswith(".nc"):
+        variables = {
+            f"{group.rstrip('/')}/{variable}".lstrip("/"): told
+            for group, data in tree.items()
+            for variable, told in data["variables"].items()
+        }
+        return {"variables": variables, "attributes": [key for data in tree.values() for key in sorted(data["attrs"])]}
+    if name.endswith(".tiff"):
+        return {"dtype": tree["pixels"]["kind"], "tags": sorted(tree["tags"])}
+    return {}
+
+
+@cache
+def golden_runs() -> dict[str, dict[str, list[Any]]]:
+    """Command -> file of its run folders -> what stands in it in each golden job that has it."""
+    out: dict[str, dict[str, list[Any]]] = {}
+    for job in ALL:
+        words = [word for word in job.words[1:2] if re.fullmatch(r"[a-z]+", word)]
+        words += [word for word in job.words if word == "--gradient"]
+        command = " ".join([job.words[0], *words])
+        if command in DESCRIBED["commands"]:
+            for name, told in kept_fields(job.name).items():
+                out.setdefault(command, {}).setdefault(name, []).append(told)
+    return out
+
+
+def described(command: str) -> list[dict[str, str]]:
+    """The files of a command's run folder as the reference lists them.
+
+    Raises:
+        LookupError: a golden run has a file that is not described.
+    """
+    everywhere, there = DESCRIBED["everywhere"], []
+    for name in golden_runs()[command]:
+        for entry in (*DESCRIBED["commands"][command], *everywhere):
+            if re.fullmatch(entry.get("pattern") or re.escape(entry["file"]), name):
+                there.append(entry)
+                break
+        else:
+            raise LookupError(f"{command}: run_files.yaml does not say what {name} is")
+    return [*DESCRIBED["commands"][command], *(entry for entry in everywhere if entry in there)]
+
+
+# --- fields of JSON files --------------------------------------------------------------------------------
+
+
+def field_tree(several: list[Any]) -> Tree:
+    """The fields of a JSON file in all the runs that wrote it, things of one sort together."""
+    tree: Tree = {}
+    for told in several:
+        for path, sort in told["fields"].items():
+            # names in braces may have dots
+            *above, last = re.findall(r"(?:\{[^{}]*\}|[^.{}])+", path)
+            here = tree
+            for part in above:
+                if not isinstance(here.get(part), dict):
+                    here[part] = {}
+                here = here[part]
+            before = here.get(last, "")
+            if isinstance(before, str):
+                here[last] = " or ".join(sorted({*before.split(" or "), *sort.split(" or ")} - {""}))
+    return grouped(tree)
+
+
+def grouped(tree: Tree, above: str = "") -> Tree:
+    """The tree with mappings that have the same below them under one segment, ``{a|b}``; numbers, too, where the key
+    ``above`` them has their unit, for then their own keys are names.
+    """
+    below = {key: grouped(one, key) if isinstance(one, dict) else one for key, one in tree.items()}
+    named = bool(unit((above,)))
+    alike: dict[str, list[str]] = {}
+    for key, one in below.items():
+        leaf = not isinstance(one, dict) and not named and not key.startswith("{")
+        alike.setdefault(f"leaf {key}" if leaf else f"{one!r}{lists(key)}", []).append(key)
+    return {_together(keys): below[keys[0]] for keys in alike.values()}
+
+
+def names(part: str) -> list[str]:
+    """The names that a segment of a path stands for."""
+    return _LISTS.sub("", part).strip("{}").split("|")
+
+
+def lists(part: str) -> str:
+    """The brackets at the end of a segment."""
+    return part[len(_LISTS.sub("", part)) :]
+
+
+def _together(keys: list[str]) -> str:
+    if len(keys) == 1:
+        return keys[0]
+    every = dict.fromkeys(name for key in keys for name in names(key))
+    return f"{{{'|'.join(every)}}}{lists(keys[0])}"
+
+
+def leaves(tree: Tree, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
+    """(segments, sort) of every field."""
+    for key, below in tree.items():
+        if isinstance(below, dict):
+            yield from leaves(below, (*above, key))
+        else:
+            yield (*above, key), below
+
+
+def shown_path(path: tuple[str, ...]) -> str:
+    """A path as the reference writes it; of many names the first few."""
+
+    def few(found: re.Match[str]) -> str:
+        listed = found[1].split("|")
+        more = ["…"] if len(listed) > SHOWN_NAMES or "..." in listed else []
+        return f"{{{'|'.join([*(name for name in listed[:SHOWN_NAMES] if name != '...'), *more])}}}"
+
+    return re.sub(r"\{(.*?)\}", few, ".".join(path))
+
+
+def unit(path: tuple[str, ...]) -> str:
+    """The unit that the key of a field says, or the nearest key above it that says one."""
+    for part in reversed(path):
+        key = names(part)[0].removesuffix("_sigma")
+        inverse = re.search(r"_per_(mm|m|px)$", key)
+        if inverse and "/" not in unit_of((key,)):
+            return f"1/{inverse[1]}"
+        inner = [UNITS[word] for word in key.split("_")[1:] if len(word) > 1 and word in UNITS]
+        if found := unit_of((key,)) or "".join(inner[-1:]):
+            return found
+        if not part.startswith("{"):
+            break
+    return ""
+
+
+# --- what the fields mean --------------------------------------------------------------------------------
+
+
+def meaning(kind: str, path: tuple[str, ...]) -> str:
+    """What a field holds, as far as the source says; ``kind`` is the file's name without .json."""
+    key = names(path[-1])[0]
+    if kind == "manifest":
+        return attributes(Manifest).get(names(path[0])[0], "")
+    if said := declared(kind, path)[0]:
+        return said
+    if key.endswith("sigma"):
+        return f"standard deviation of {key.removesuffix('_sigma')}" if key != "sigma" else "standard deviation"
+    return str(DESCRIBED["meanings"].get(key, ""))
+
+
+def declared(kind: str, path: tuple[str, ...]) -> tuple[str, str]:
+    """What the record of a kind of file says of the field at the end of a path, and what the record below it says of
+    itself.
+    """
+    record = _records().get(kind)
+    here, said = record, ""
+    for part in path:
+        found = next((one for one in here or () if one.key in names(part)), None)
+        if found is not None:
+            said, here = found.meaning, found.below
+        elif not part.startswith("{") and (here is None or here is record):
+            # a name of a mapping leads to the record that the mapping holds; anything else is not declared
+            return "", ""
+    return said, "" if here is None else here.meaning
+
+
+def _sources() -> Iterator[tuple[Path, ast.Module]]:
+    for path in sorted((ROOT / "twin").rglob("*.py")):
+        yield path.relative_to(ROOT), ast.parse(path.read_text("utf-8"))
+
+
+@cache
+def _records() -> Mapping[str, Record[Any]]:
+    """Kind of file -> the record whose meaning begins with the file's name."""
+    out = {}
+    for path, module in _sources():
+        for node in module.body:
+            if isinstance(node, ast.AnnAssign | ast.Assign) and isinstance(node.value, ast.Call) and node.value.args:
+                target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
+                if said := re.match(r"([a-z_]+)\.json\b", _text(node.value.args[0], "")):
+                    home = importlib.import_module(".".join(path.with_suffix("").parts))
+                    out[said[1]] = getattr(home, ast.unparse(target))
+    return {kind: record for kind, record in out.items() if isinstance(record, Record)}
+
+
+@cache
+def artefact_titles() -> tuple[tuple[str, str, str], ...]:
+    """(folder of the source, regular expression of an artefact's name, its title), of all calls that name and title
+    one.
+    """
+    out = []
+    for path, module in _sources():
+        for node in ast.walk(module):
+            if isinstance(node, ast.Call):
+                given = dict(zip(("name", "title"), node.args, strict=False))
+                given |= {one.arg: one.value for one in node.keywords if one.arg in ("name", "title")}
+                if len(given) == 2 and (title := _text(given["title"], "…"))[:1].isupper():
+                    out.append((path.parent.as_posix(), _text(given["name"], r"[\w-]+"), title))
+    # a name in so many words before one that is partly filled in
+    return tuple(sorted(out, key=lambda found: "[" in found[1]))
+
+
+def _text(node: ast.expr, hole: str) -> str:
+    """A literal or formatted text with something in place of what is filled in; empty for anything else."""
+    if isinstance(node, ast.JoinedStr):
+        return "".join(str(part.value) if isinstance(part, ast.Constant) else hole for part in node.values)
+    return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ""
+
+
+def artefact_title(command: str, file: str) -> str:
+    """What a figure or table in artefacts/ shows; empty where the source does not say it in so many words."""
+    folders, stem = DESCRIBED["folders"], Path(file).stem
+    place = next((folder for words, folder in folders.items() if command.startswith(words)), command.replace(".", "/"))
+    found = [(home, said) for home, name, said in artefact_titles() if re.fullmatch(name, stem)]
+    here = [said for home, said in found if home.startswith(place)]
+    # made where no other command has its reports
+    shared = [said for home, said in found if not home.startswith(tuple(folders.values()))]
+    return (here or [said for said in shared if len(shared) == 1] or [""])[0]
+
+
+# --- pages -----------------------------------------------------------------------------------------------
 
 
 def run_pages() -> dict[str, str]:
     """Path of a page in the site's source -> Markdown."""
-    names = {
+    files = {
         command: command.replace("twin.", "").replace(" --", "-").replace(".", "-").replace(" ", "-")
-        for command in commands()
+        for command in golden_runs()
     }
-    pages = {f"{FOLDER}/{name}.md": _page(command) for command, name in names.items()}
-    return {f"{FOLDER}/index.md": _index(names), **pages}
+    pages = {f"{FOLDER}/{name}.md": _page(command) for command, name in files.items()}
+    return {f"{FOLDER}/index.md": _index(files), **pages}
 
 
-def _index(names: dict[str, str]) -> str:
-    rows = [[code(one.shown), prose(sentence(one.what))] for one in EVERYWHERE]
-    listed = [[f"[{code(command)}]({name}.md)", _kinds(command)] for command, name in names.items()]
+def _list(entries: list[dict[str, str]]) -> str:
+    return table(
+        ["File", "What is in it"], ([code(one["file"]), prose(sentence(one["what"]))] for one in entries), "files"
+    )
+
+
+def _index(files: dict[str, str]) -> str:
+    every = DESCRIBED["everywhere"]
+    kinds = {command: [code(one["file"]) for one in described(command) if one not in every] for command in files}
+    rows = ([f"[{code(command)}]({name}.md)", ", ".join(kinds[command])] for command, name in files.items())
     return f"""# Run folders
 
 Every command writes into a folder of its own, `--out DIR` or else the first free of `runs/NAME-001`, `-002`, ... It
 appears complete or not at all. Every folder has:
 
-{table(["File", "What is in it"], rows, "files")}
+{_list(every)}
 and what the command adds:
 
-{table(["Command", "Files"], listed, "files")}
+{table(["Command", "Files"], rows, "files")}
 The names of a number end in its unit: `d_f_um`, `change_arcsec`; `_sigma` after it is its standard deviation in the
 same unit. In the paths of fields `{{forward|backward}}` stands for the names that the instrument or the file has,
 here those of the examples, and `[]` for the items of a list. Frames are 16-bit TIFF, one page a frame, grey values;
@@ -57,101 +309,63 @@ These pages are made from small runs of every command; a run has fewer files whe
 ```{{toctree}}
 :hidden:
 
-{chr(10).join(names.values())}
+{chr(10).join(files.values())}
 ```
 """
 
 
-def _kinds(command: str) -> str:
-    shown = [one.shown for one in _files_shown(command) if one not in EVERYWHERE]
-    return ", ".join(map(code, dict.fromkeys(shown)))
-
-
-def _files_shown(command: str) -> list[Any]:
-    there = {described(command, name) for name in files(command)}
-    return [one for one in known(command) if one in there]
-
-
 def _page(command: str) -> str:
-    own = files(command)
-    rows = [[code(one.shown), prose(sentence(one.what))] for one in _files_shown(command)]
-    parts = [f"# Files of {code(command)}\n\n{table(['File', 'What is in it'], rows, 'files')}"]
-    artefacts = {name: told for name, told in own.items() if name.startswith("artefacts/")}
-    for name, several in own.items():
-        if name not in artefacts or name.endswith(".json"):
-            parts.append(_fields(name, several))
-    parts.append(_tiffs(own))
+    artefacts, tiffs, parts = [], [], [f"# Files of {code(command)}\n\n{_list(described(command))}"]
+    for name, several in golden_runs()[command].items():
+        columns = ", ".join(dict.fromkeys(code(column) for told in several for column in told.get("columns", ())))
+        if "fields" in several[0]:
+            parts.append(f"## {code(name)}\n\n{_json(Path(name).stem, several)}")
+        elif "variables" in several[0] and not name.startswith("artefacts/"):
+            parts.append(f"## {code(name)}\n\n{_netcdf(several)}")
+        elif columns and not name.startswith("artefacts/"):
+            parts.append(f"## {code(name)}\n\n{columns.count(',') + 1} columns: {columns}.\n")
+        if name.startswith("artefacts/"):
+            artefacts.append([code(Path(name).name), prose(artefact_title(command, name)), columns])
+        tiffs += [told for told in several if "tags" in told]
+    if tiffs:
+        kinds = ", ".join(dict.fromkeys(code(told["dtype"]) for told in tiffs))
+        tags = ", ".join(dict.fromkeys(code(tag) for told in tiffs for tag in told["tags"]))
+        parts.append(f"## Frames (TIFF)\n\nPixels are {kinds}. Tags: {tags}.\n")
     if artefacts and not command.startswith("twin.validate"):
-        parts.append(f"## {code('artefacts/')}\n\n{_artefacts(command, artefacts)}")
-    return "\n".join(part for part in parts if part)
+        shown = table(["File", "What it shows", "Columns"], artefacts, "artefacts")
+        parts.append(f"## {code('artefacts/')}\n\n{shown}")
+    return "\n".join(parts)
 
 
-def _fields(name: str, several: list[Any]) -> str:
-    if "fields" in several[0]:
-        return _json(name, several)
-    if "groups" in several[0]:
-        return _netcdf(name, several)
-    if "columns" in several[0]:
-        rows = [[code(column), ""] for column in dict.fromkeys(c for told in several for c in told["columns"])]
-        return f"## {code(name)}\n\n{len(rows)} columns: {', '.join(row[0] for row in rows)}.\n"
-    return ""
-
-
-def _json(name: str, several: list[Any]) -> str:
-    kind = Path(name).stem
+def _json(kind: str, several: list[Any]) -> str:
     blocks: dict[tuple[str, ...], list[list[str]]] = {}
     for path, sort in leaves(field_tree(several)):
-        if path[0] == "reference_frames":
-            continue
-        row = [code(shown_path(path[-1:])), code(unit(path)), sort or "list", prose(sentence(meaning(kind, path)))]
-        blocks.setdefault(path[:-1], []).append(row)
+        if path[0] != "reference_frames":
+            row = [code(shown_path(path[-1:])), code(unit(path)), sort or "list", prose(sentence(meaning(kind, path)))]
+            blocks.setdefault(path[:-1], []).append(row)
     parts = []
-    for above, rows in blocks.items():
+    if frames := FRAMES.get(kind, {}):
+        rows = ([code(quantity), prose(sentence(frame))] for quantity, frame in frames.items())
+        parts.append(f"`reference_frames`, what these refer to:\n\n{table(['Quantity', 'Frame'], rows, 'files')}\n")
+    for above, fields in blocks.items():
         if above:
-            about = prose(sentence(mapping_meaning(kind, above)))
-            parts.append(f"In {code(shown_path(above))}:{f' {about}' if about else ''}\n")
-        parts.append(table(["Field", "Unit", "Holds", "Meaning"], rows, "fields"))
-    frames = FRAMES.get(kind, {})
-    told = [[code(quantity), prose(sentence(frame))] for quantity, frame in frames.items()]
-    about = ""
-    if told:
-        about = f"`reference_frames`, what these refer to:\n\n{table(['Quantity', 'Frame'], told, 'files')}\n"
-    return f"## {code(name)}\n\n{about}{chr(10).join(parts)}"
+            parts.append(f"In {code(shown_path(above))}: {prose(sentence(declared(kind, above)[1]))}".rstrip() + "\n")
+        parts.append(table(["Field", "Unit", "Holds", "Meaning"], fields, "fields"))
+    return "\n".join(parts)
 
 
-def _netcdf(name: str, several: list[Any]) -> str:
-    rows: dict[str, list[str]] = {}
-    attributes: dict[str, None] = {}
-    for told in several:
-        for group, data in told["groups"].items():
-            attributes |= dict.fromkeys(data["attributes"])
-            for variable, one in data["variables"].items():
-                about = one["attributes"]
-                place = f"{group.rstrip('/')}/{variable}".lstrip("/")
-                rows[place] = [
-                    code(place),
-                    ", ".join(map(code, one["dims"])),
-                    code(about.get("units", "")),
-                    one["dtype"],
-                    prose(sentence(about.get("long_name", ""))),
-                ]
-    heads = ["Variable", "Dimensions", "Unit", "Holds", "Meaning"]
-    tail = f"\nAttributes: {', '.join(map(code, attributes))}.\n" if attributes else ""
-    return f"## {code(name)}\n\n{table(heads, rows.values(), 'fields')}{tail}"
-
-
-def _tiffs(own: dict[str, list[Any]]) -> str:
-    told = [one for name, several in own.items() if name.endswith(".tiff") for one in several]
-    if not told:
-        return ""
-    sorts = ", ".join(map(code, dict.fromkeys(one["dtype"] for one in told)))
-    tags = ", ".join(map(code, dict.fromkeys(tag for one in told for tag in one["tags"])))
-    return f"## Frames (TIFF)\n\nPixels are {sorts}. Tags: {tags}.\n"
-
-
-def _artefacts(command: str, artefacts: dict[str, list[Any]]) -> str:
-    rows = []
-    for name, several in artefacts.items():
-        columns = list(dict.fromkeys(c for told in several for c in told.get("columns", ())))
-        rows.append([code(Path(name).name), prose(artefact_title(command, name)), ", ".join(map(code, columns))])
-    return table(["File", "What it shows", "Columns"], rows, "artefacts")
+def _netcdf(several: list[Any]) -> str:
+    variables = {place: told for one in several for place, told in one["variables"].items()}
+    rows = (
+        [
+            code(place),
+            ", ".join(map(code, told["dims"])),
+            code(str(told["attrs"].get("units", ""))),
+            told["values"].get("kind", "text"),
+            prose(sentence(str(told["attrs"].get("long_name", "")))),
+        ]
+        for place, told in variables.items()
+    )
+    attrs = ", ".join(dict.fromkeys(code(key) for one in several for key in one["attributes"]))
+    shown = table(["Variable", "Dimensions", "Unit", "Holds", "Meaning"], rows, "fields")
+    return f"{shown}\nAttributes: {attrs}.\n" if attrs else shown

@@ -1,35 +1,48 @@
-"""Every key of every sort of YAML file, read off the models that check the files: what the reference says of it."""
+"""Every key of every sort of YAML file, read off the JSON Schemas of the models that check the files, with an example
+that its model takes.
+"""
 
 from __future__ import annotations
 
 import inspect
 import json
 import re
-import types
 import typing
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, WithJsonSchema
-from pydantic.fields import FieldInfo
+from pydantic import ValidationError
 
-from scenes.yaml.quantity import Quantity, Terms, Vector
-from scenes.yaml.spec import Catalogued, OneOf, Spec
-from scenes.yaml.units import Kind, format_quantity, unit_ratio
+from scenes.schema import MODELS, WithUnits
+from scenes.specs.load import SCENES
+from scenes.yaml.errors import InputError
+from scenes.yaml.spec import Catalogued, Spec, validate
+from scenes.yaml.yaml_file import YamlFile, read_yaml
 
-NAMED, NODE, LISTED = "NAME", "NODE", "[]"
+NAMED, NODE, LISTED = ".NAME", ".NODE", "[]"
 """How a key path writes what stands under a name of the user's choice, under a node's path, and the items of a list."""
+LONGEST = 70
+"""Characters of an example in a table; of longer ones a shorter one is looked for."""
+BY_HAND = Path(__file__).with_name("examples.yaml")
+"""Model -> mappings with keys that no shipped file has; what a mapping lacks a shipped one of its model adds."""
 _ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)
-_ARTICLE = re.compile(r"^(an?|the) ")
+_QUANTITY = re.compile(r"(?:an? |the )?(.*) with its unit \((.*)\), e\.g\. '[^']*'(?:; (.*))?")
 _SI_UNIT = re.compile(r",? (?:metres|radians|seconds|kelvin)\b")
 _PLAIN = re.compile(
     r"(?!(?:true|false|null)$)[A-Za-z/][\w/.+*^-]*(?: [\w/.(+*^-][\w/.+*^()-]*)*"
     r"|[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)? [\w/^%-]+",
     re.I,
 )
-_WORDS = {bool: "true or false", int: "whole number", float: "number", str: "text"}
+_WORDS = {"boolean": "true or false", "integer": "whole number", "number": "number", "string": "text"}
+_BOUNDS = {
+    "exclusiveMinimum": "greater than",
+    "minimum": "at least",
+    "exclusiveMaximum": "less than",
+    "maximum": "at most",
+}
 
 
 @dataclass(frozen=True)
@@ -40,85 +53,84 @@ class Takes:
         what: in words: "angle", "3 × length", "one of traced, ignore".
         units: that are suggested; others of the same dimension are read, too.
         limits: in words, empty for none.
-        below: specifications that it holds, with what stands between in a key path: "", ".NAME", "[]".
-        example: as it may be written where no shipped file has it, None where nothing is known.
-        kind: measure of a quantity.
+        below: names of the specifications that it holds, each after what stands between in a key path: "", ".NAME",
+            "[]".
     """
 
     what: str
     units: tuple[str, ...] = ()
     limits: str = ""
-    below: tuple[tuple[str, type[Spec]], ...] = ()
-    example: Any = None
-    kind: Any = None
+    below: tuple[tuple[str, str], ...] = ()
+
+    def within(self, what: str, between: str) -> Takes:
+        """The same for each of several that stand together."""
+        each = "" if what.startswith("mapping") and self.what == "mapping" else f", each {self.what}"
+        below = tuple((f"{between}{more}", model) for more, model in self.below)
+        return Takes(f"{what}{each}", self.units, self.limits, below)
 
 
 @dataclass(frozen=True)
 class Key:
-    """One key of a section.
+    """One key of a mapping.
 
     Attributes:
         name: of the key.
         meaning: what the docstring says, without the SI unit that only the program knows.
         takes: what may stand after it.
         default: what holds where it is not written, as YAML; empty where it must be written.
-        required: whether it must be written.
+        below: models of what it holds, each after what stands between in a key path.
     """
 
     name: str
     meaning: str
     takes: Takes
     default: str
-    required: bool
+    below: tuple[tuple[str, type[Spec]], ...]
 
 
-@dataclass(frozen=True)
-class Section:
-    """A mapping in a file: a model with its keys.
-
-    Attributes:
-        model: that checks it.
-        summary: of its docstring.
-        keys: in the order of the model.
-        places: key paths at which it stands in the file, "" for the file itself.
+def sections(model: type[Spec]) -> dict[type[Spec], list[str]]:
+    """All mappings of one sort of file in the order in which its keys lead to them: model -> key paths where it stands,
+    "" for the file itself.
     """
-
-    model: type[Spec]
-    summary: str
-    keys: tuple[Key, ...]
-    places: tuple[str, ...] = field(default=())
-
-
-def sections(model: type[Spec]) -> tuple[Section, ...]:
-    """All mappings of one sort of file, each model once, in the order in which the file's keys lead to them."""
     places: dict[type[Spec], list[str]] = {}
-    _walk(model, "", places)
-    return tuple(Section(one, summary(one), keys(one), tuple(where)) for one, where in places.items())
 
+    def walk(here: type[Spec], place: str) -> None:
+        places.setdefault(here, []).append(place)
+        for key in keys(here):
+            for between, below in key.below:
+                walk(below, f"{place}.{key.name}{between}".lstrip("."))
 
-def _walk(model: type[Spec], place: str, places: dict[type[Spec], list[str]]) -> None:
-    places.setdefault(model, []).append(place)
-    for key in keys(model):
-        for between, below in key.takes.below:
-            _walk(below, f"{place}.{key.name}{between}".lstrip("."), places)
+    walk(model, "")
+    return places
 
 
 @cache
 def keys(model: type[Spec]) -> tuple[Key, ...]:
     """The keys of one mapping."""
-    said = attributes(model)
-    out = []
-    for name, info in model.model_fields.items():
-        takes = taken(info.annotation, info.metadata)
+    schema, said, out = model.model_json_schema(schema_generator=WithUnits), attributes(model), []
+    for field, item in schema["properties"].items():
+        info = model.model_fields[field]
+        parts = list(_parts((info.annotation, *info.metadata)))
+        catalogue = [", ".join(part.names) for part in parts if isinstance(part, Catalogued)]
+        takes = Takes(f"one of {catalogue[0]}") if catalogue else taken(item)
         # a model of a few keys may say all in a sentence
-        meaning = said.get(name) or summary(model)
-        if takes.kind is not None:
+        meaning = said.get(field) or summary(model)
+        if takes.units:
             meaning = _SI_UNIT.sub("", meaning)
         # what a program calls None is a key that is not written
         meaning = re.sub(r"\bNone (?=for|where|if|when|in)", "left out ", meaning)
-        default = "" if info.is_required() else default_text(info, takes)
-        out.append(Key(name, meaning, takes, default, info.is_required()))
+        models = {part.__name__: part for part in parts if inspect.isclass(part) and issubclass(part, Spec)}
+        # what else the schema names has a page of its own
+        below = tuple((between, models[name]) for between, name in takes.below if name in models)
+        out.append(Key(field, meaning, takes, "" if info.is_required() else _default(item, takes), below))
     return tuple(out)
+
+
+def _parts(hints: typing.Iterable[Any]) -> Iterator[Any]:
+    """Types and annotations at any depth of type hints."""
+    for hint in hints:
+        yield hint
+        yield from _parts(typing.get_args(hint))
 
 
 def summary(model: type[Any]) -> str:
@@ -129,214 +141,202 @@ def summary(model: type[Any]) -> str:
 def attributes(model: type[Any]) -> dict[str, str]:
     """What the docstrings of a class and of those it inherits from say of its attributes."""
     out: dict[str, str] = {}
-    for one in reversed(model.__mro__):
-        text = inspect.cleandoc(one.__dict__.get("__doc__") or "")
-        for names, said in _ATTRIBUTE.findall(text[text.find("Attributes:") :] if "Attributes:" in text else ""):
+    for base in reversed(model.__mro__):
+        text = inspect.cleandoc(base.__dict__.get("__doc__") or "").partition("Attributes:")[2]
+        for names, said in _ATTRIBUTE.findall(text):
             out |= {name: " ".join(said.split()) for name in names.split(", ")}
     return out
 
 
-def taken(annotation: Any, metadata: typing.Iterable[Any] = ()) -> Takes:
-    """What may stand where a model declares this type.
+def taken(schema: Mapping[str, Any]) -> Takes:
+    """What a JSON Schema lets stand after a key.
 
     Raises:
-        TypeError: a type that the reference cannot describe.
+        TypeError: a form that the reference cannot describe.
     """
-    annotation, marks = _unwrapped(annotation, list(metadata))
-    mark: Any
-    for mark in marks:
-        if isinstance(mark, Quantity):
-            return _quantity(mark)
-        if isinstance(mark, Vector):
-            one = _quantity(mark.of)
-            rows = [one.example] * mark.length
-            return Takes(f"{mark.length} × {one.what}", one.units, one.limits, (), rows, one.kind)
-        if isinstance(mark, Terms):
-            parts = [f"`{name}` ({item.kind.units[0]})" for name, item in mark.of.items()]
-            name, item = next(iter(mark.of.items()))
-            return Takes(f"mapping of the terms {', '.join(parts)}", (), "", (), {name: item.kind.example})
-        if isinstance(mark, Catalogued):
-            names = tuple(mark.names)
-            return Takes(f"one of {', '.join(names)}", example=names[0])
-        if isinstance(mark, OneOf):
-            names = tuple(mark.names())
-            return Takes(f"one of {', '.join(names)}", example=names[0])
-    if typing.get_origin(annotation) is typing.Literal:
-        choices = typing.get_args(annotation)
-        return Takes(f"one of {', '.join(map(str, choices))}", example=choices[0])
-    if isinstance(annotation, type) and issubclass(annotation, Spec):
-        return Takes("mapping", below=(("", annotation),))
-    if typing.get_origin(annotation) in (types.UnionType, typing.Union):
-        return _either([taken(one) for one in typing.get_args(annotation) if one is not types.NoneType])
-    if typing.get_origin(annotation) is tuple:
-        return _listed(typing.get_args(annotation), marks)
-    if typing.get_origin(annotation) is dict:
-        return _mapped(*typing.get_args(annotation))
-    if annotation in _WORDS:
-        return _plain(annotation, marks)
-    if any(hasattr(mark, "__get_pydantic_json_schema__") for mark in marks):
-        return _by_schema(TypeAdapter(typing.Annotated[(annotation, *marks)]).json_schema())
-    raise TypeError(f"no words for {annotation!r} {marks!r}")
+    if "$ref" in schema:
+        return Takes("mapping", below=(("", re.split("__|/", schema["$ref"])[-1]),))
+    if "anyOf" in schema:
+        return _either(schema["anyOf"])
+    if "enum" in schema:
+        return Takes(f"one of {', '.join(map(str, schema['enum']))}")
+    if "const" in schema:
+        return Takes(f"`{schema['const']}`")
+    if found := _QUANTITY.fullmatch(schema.get("description", "")):
+        units = tuple(unit or "1" for unit in re.split(", | or ", found[2]))
+        return Takes(found[1], units, found[3] or "")
+    if schema["type"] == "object":
+        return _mapping(schema)
+    if schema["type"] == "array":
+        return _list(schema)
+    limits = " and ".join(f"{words} {bound_text(schema[name])}" for name, words in _BOUNDS.items() if name in schema)
+    if schema.get("pattern", "").startswith("^[A-Za-z]"):
+        return Takes("name")
+    return Takes("name or path" if schema.get("minLength") else _WORDS[schema["type"]], limits=limits)
 
 
-def _by_schema(schema: dict[str, Any]) -> Takes:
-    """What a type of its own says in its JSON Schema: a mapping with its keys, at any depth.
+def _either(schemas: list[dict[str, Any]]) -> Takes:
+    # a mapping without keys stands in the place of the file that a name means; a vector may be a text as well
+    named = [one for one in schemas if one.get("type") != "null" and one.get("additionalProperties") is not True]
+    alike = {json.dumps(one.get("items", one).get("description", one)): one for one in reversed(named)}
+    several = [taken(one) for one in reversed(alike.values())]
+    words = list(dict.fromkeys(one.what for one in several))
+    what = (", or " if any(", each" in word for word in words) else " or ").join(words)
+    return Takes(what, several[0].units, several[0].limits, tuple(pair for one in several for pair in one.below))
 
-    Raises:
-        TypeError: neither a mapping with known keys nor a quantity nor a number.
-    """
+
+def _list(schema: Mapping[str, Any]) -> Takes:
+    items = schema.get("prefixItems") or [schema["items"]] * schema.get("minItems", 0)
+    if not items or schema.get("maxItems") != len(items):
+        return taken(schema["items"]).within("list", LISTED)
+    several = [taken(one) for one in items]
+    words = [one.what for one in several]
+    what = f"{len(items)} × {words[0]}" if len(set(words)) == 1 else f"list of {len(items)}: {', '.join(words)}"
+    below = tuple((f"{LISTED}{more}", model) for one in several for more, model in one.below)
+    return Takes(what, several[0].units, several[0].limits, tuple(dict.fromkeys(below)))
+
+
+def _mapping(schema: Mapping[str, Any]) -> Takes:
     if "properties" in schema:
-        below = {key: _by_schema(one) for key, one in schema["properties"].items()}
-        parts = [f"`{key}` in `{one.units[0]}`" if one.units else f"`{key}`: {one.what}" for key, one in below.items()]
-        key, one = next(iter(below.items()))
-        return Takes(f"mapping ({'; '.join(parts)})", example={key: one.example})
-    if schema.get("type") == "number":
-        return Takes("number", example=0.001)
-    if schema.get("type") == "string" and schema.get("examples"):
-        example = schema["examples"][0]
-        return Takes(
-            schema.get("description", "text").split(" with its unit")[0], (example.split(" ", 1)[1],), "", (), example
-        )
-    raise TypeError(f"no words for {schema!r}")
+        each = {key: taken(one) for key, one in schema["properties"].items()}
+        parts = (f"`{key}` in `{one.units[0]}`" if one.units else f"`{key}`: {one.what}" for key, one in each.items())
+        return Takes(f"mapping ({'; '.join(parts)})")
+    ((pattern, item),) = schema.get("patternProperties", {"": schema.get("additionalProperties")}).items()
+    if pattern.startswith("^[A-Za-z]"):
+        return taken(item).within("mapping by name", NAMED)
+    terms = pattern.startswith("^Z") or "propertyNames" in schema
+    return taken(item).within(f"mapping by {'Zernike term' if terms else 'node'}", NODE)
 
 
-def _unwrapped(annotation: Any, marks: list[Any]) -> tuple[Any, list[Any]]:
-    """A type without Annotated and without None, and all annotations on the way."""
-    while True:
-        if typing.get_origin(annotation) is typing.Annotated:
-            annotation, *more = typing.get_args(annotation)
-            marks = [*more, *marks]
-        elif typing.get_origin(annotation) in (types.UnionType, typing.Union):
-            rest = [one for one in typing.get_args(annotation) if one is not type(None)]
-            if len(rest) > 1:
-                break
-            annotation = rest[0]
-        else:
-            break
-    flat: list[Any] = []
-    for mark in marks:
-        flat += mark.metadata if isinstance(mark, FieldInfo) else [mark]
-    return annotation, flat
-
-
-def _quantity(mark: Quantity) -> Takes:
-    units = tuple(unit or "1" for unit in mark.kind.units)
-    return Takes(_ARTICLE.sub("", mark.kind.name), units, mark.limits, (), mark.kind.example, mark.kind)
-
-
-def _plain(sort: type, marks: list[Any]) -> Takes:
-    bounds = {name: getattr(mark, name) for mark in marks for name in ("gt", "ge", "lt", "le") if hasattr(mark, name)}
-    words = {"gt": "greater than", "ge": "at least", "lt": "less than", "le": "at most"}
-    limits = " and ".join(f"{words[name]} {_bound(bounds[name])}" for name in words if bounds.get(name) is not None)
-    example: Any = {bool: True, int: 1, float: 0.5, str: "name"}[sort]
-    if sort in (int, float) and bounds:
-        low, high = bounds.get("ge", bounds.get("gt")), bounds.get("le", bounds.get("lt"))
-        example = low if low is not None and "gt" not in bounds else high if high is not None else example
-    what = _WORDS[sort]
-    schemas = [mark.json_schema or {} for mark in marks if isinstance(mark, WithJsonSchema)]
-    for names in (schema["enum"] for schema in schemas if "enum" in schema):
-        return Takes(f"one of {', '.join(names)}", example=names[0])
-    if sort is str and any(str(getattr(mark, "pattern", None) or "").startswith("^[A-Za-z]") for mark in marks):
-        what = "name"
-    if sort is str and any(getattr(mark, "min_length", None) for mark in marks):
-        what = "name or path"
-    return Takes(what, (), limits, (), example)
-
-
-def _bound(value: float) -> str:
+def bound_text(value: float) -> str:
+    """A limit as the reference writes it."""
     if value == 2**63 - 1:
         return "2⁶³ − 1"
     return f"{value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if isinstance(value, int) else f"{value:g}"
 
 
-def _listed(items: tuple[Any, ...], marks: list[Any]) -> Takes:
-    if items[-1] is Ellipsis:
-        one = taken(items[0])
-        return Takes(
-            f"list, each {one.what}",
-            one.units,
-            one.limits,
-            _deeper(LISTED, one),
-            None if one.example is None else [one.example],
-            one.kind,
-        )
-    several = [taken(item) for item in items]
-    first = several[0]
-    if all(one.what == first.what for one in several):
-        what = f"{len(items)} × {first.what}"
-    else:
-        what = f"list of {len(items)}: {', '.join(one.what for one in several)}"
-    below = tuple(pair for one in several for pair in _deeper(LISTED, one))
-    return Takes(what, first.units, first.limits, below, [one.example for one in several], first.kind)
-
-
-def _mapped(name: Any, value: Any) -> Takes:
-    one = taken(value)
-    of = taken(name)
-    free = of.what == "name"
-    # what is no name of the user's choice is the path of a node, or the term of a figure
-    by = "name" if free else "Zernike term" if "_is_term" in str(name) else "node"
-    key = "Z5" if "_is_term" in str(name) else "name" if free else "base/forward/M2"
-    what = f"mapping by {by}, each {one.what}" if one.what != "mapping" else f"mapping by {by}"
-    example = None if one.example is None else {key: one.example}
-    return Takes(what, one.units, one.limits, _deeper(f".{NAMED if free else NODE}", one), example, one.kind)
-
-
-def _deeper(between: str, one: Takes) -> tuple[tuple[str, type[Spec]], ...]:
-    return tuple((f"{between}{more}", model) for more, model in one.below)
-
-
-def _either(several: list[Takes]) -> Takes:
-    words = list(dict.fromkeys(one.what for one in several))
-    below = tuple(pair for one in several for pair in one.below)
-    return Takes(" or ".join(words), several[0].units, several[0].limits, below, several[-1].example, several[0].kind)
-
-
-def default_text(info: FieldInfo, takes: Takes) -> str:
+def _default(schema: Mapping[str, Any], takes: Takes) -> str:
     """What holds where a key is not written, as it would be written."""
-    value = info.get_default(call_default_factory=True)
+    value = schema.get("default", {})
     if value is None:
         return "none"
-    if isinstance(value, Spec):
+    if "$ref" in schema or (takes.below and value):
         return "its own defaults"
-    if takes.kind is not None and isinstance(value, float):
-        return quantity_text(value, takes.kind)
-    if takes.kind is not None and isinstance(value, tuple) and all(isinstance(one, float) for one in value):
-        return flow([quantity_text(one, takes.kind) for one in value])
-    if isinstance(value, str) and not value:
-        return "empty"
-    if not isinstance(value, str | bool | int | float) and not value:
-        return "empty"
-    return flow(value)
-
-
-def quantity_text(value: float, kind: Kind) -> str:
-    """A quantity in a unit in which it is read easily; `format_quantity` writes few digits at any power of ten."""
-    text = format_quantity(value, kind)
-    if "e" not in text.split()[0]:
-        return text
-    numbers = {unit: value * unit_ratio(kind.si, unit) for unit in kind.units}
-    return min((f"{number:.12g} {unit}" for unit, number in numbers.items()), key=len)
+    text = flow(value) if value or isinstance(value, bool | int | float) else "empty"
+    # no power of ten where another unit does without
+    return re.sub(r"([\d.]+e\+\d+) um", lambda found: f"{1e-6 * float(found[1]):g} m", text)
 
 
 def flow(value: Any) -> str:
     """A value as one line of YAML."""
-    if isinstance(value, typing.Mapping):
+    if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {flow(one)}" for key, one in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(flow(one) for one in value) + "]"
-    if isinstance(value, bool) or value is None:
-        return {True: "true", False: "false", None: "null"}[value]
     if isinstance(value, float):
         return f"{value:g}" if float(f"{value:g}") == value else repr(value)
-    if isinstance(value, int):
-        return str(value)
     # what could be read as something else stands in quotes, in the way of JSON, which YAML reads
-    return str(value) if _PLAIN.fullmatch(str(value)) else json.dumps(str(value), ensure_ascii=False)
+    return value if isinstance(value, str) and _PLAIN.fullmatch(value) else json.dumps(value, ensure_ascii=False)
 
 
-def every_key(model: type[Spec]) -> Iterator[tuple[Section, Key]]:
-    """All keys of one sort of file, with the mapping that each stands in."""
-    for section in sections(model):
-        for key in section.keys:
-            yield section, key
+# --- examples --------------------------------------------------------------------------------------------
+
+
+@cache
+def shipped() -> dict[str, tuple[Path, ...]]:
+    """Sort of file -> the shipped files of that sort, in order.
+
+    Raises:
+        ValueError: a shipped file that is of no sort, or of several.
+    """
+    out: dict[str, list[Path]] = {kind: [] for kind in MODELS}
+    for path in sorted(SCENES.rglob("*.yaml")):
+        kinds = kinds_of(path)
+        if len(kinds) != 1:
+            raise ValueError(f"{path.name} can be read as: {', '.join(kinds) or 'nothing'}")
+        out[kinds[0]].append(path)
+    return {kind: tuple(paths) for kind, paths in out.items()}
+
+
+@cache
+def kinds_of(path: Path) -> tuple[str, ...]:
+    """The sorts of file that a file can be read as."""
+    yaml = _read(path)
+    out = []
+    for kind, model in MODELS.items():
+        if isinstance(yaml.data, dict) and set(yaml.data) <= set(model.model_fields):
+            try:
+                validate(model, yaml)
+            except InputError:
+                continue
+            out.append(kind)
+    return tuple(out)
+
+
+@cache
+def _read(path: Path) -> YamlFile:
+    return read_yaml(path)
+
+
+@cache
+def _instances(kind: str) -> dict[type[Spec], list[dict[str, Any]]]:
+    """Every mapping of each model in the shipped files of a sort."""
+    found: dict[type[Spec], list[dict[str, Any]]] = {}
+    for path in shipped()[kind]:
+        for model, data in _mappings(MODELS[kind], _read(path).data):
+            found.setdefault(model, []).append(data)
+    return found
+
+
+def _mappings(model: type[Spec], data: Any) -> Iterator[tuple[type[Spec], dict[str, Any]]]:
+    """All specifications within one, as plain data; nothing where a name stands in the place of a mapping."""
+    if isinstance(data, dict):
+        yield model, data
+        for key in keys(model):
+            for between, below in key.below if key.name in data else ():
+                values = [data[key.name]]
+                for step in re.findall(r"\.\w+|\[\]", between):
+                    sort = list if step == LISTED else dict
+                    held = (value for value in values if isinstance(value, sort))
+                    values = [one for value in held for one in (value.values() if sort is dict else value)]
+                for value in values:
+                    yield from _mappings(below, value)
+
+
+@cache
+def example(kind: str, model: type[Spec], name: str) -> dict[str, Any]:
+    """A mapping that a model takes, with the key in it: of a shipped file, of that sort if there is one, or `BY_HAND`.
+
+    Raises:
+        LookupError: there is none.
+    """
+    (key,) = (one for one in keys(model) if one.name == name)
+    shipped_ones = [data for other in (kind, *MODELS) for data in _instances(other).get(model, ())]
+    having = [data for data in _instances(kind).get(model, ()) if name in data]
+    having = having or [data for data in shipped_ones if name in data]
+    short = (data for data in having if key.takes.below or len(flow(data[name])) <= LONGEST)
+    by_hand = [data for base in model.__mro__ for data in read_by_hand().get(base.__name__, ()) if name in data]
+    candidates = [
+        *sorted(short, key=lambda data: len(flow(data[name]))),
+        *({**base, **data} for data in by_hand for base in ({}, *shipped_ones)),
+        *having,
+    ]
+    for data in candidates:
+        if accepted(model, data):
+            return data
+    raise LookupError(f"{kind}: no example of {model.__name__}.{name}; {BY_HAND.name} is the place for one")
+
+
+@cache
+def read_by_hand() -> dict[str, list[dict[str, Any]]]:
+    """Name of a model -> mappings."""
+    return dict(read_yaml(BY_HAND).data)
+
+
+def accepted(model: type[Spec], data: Any) -> bool:
+    """Whether the model takes the mapping."""
+    try:
+        model.model_validate(data)
+    except (ValidationError, InputError):
+        return False
+    return True

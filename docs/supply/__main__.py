@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import typer
 
 from docs.supply.make_lock import SupplyError, make_lock
-from twin.framework.lock_file import LAYERS, LockError
+from twin.framework.lock_file import FOLDER, LAYERS, LockError
 
 app = typer.Typer(
     add_completion=False,
@@ -96,38 +99,56 @@ def licences() -> None:
         rows = update()
         for licence, number in Counter(row.licence for row in rows).most_common():
             sys.stdout.write(f"{number:4d}  {licence}\n")
-        for row in rows:
-            if row.copyleft != "no":
-                sys.stdout.write(f"{row.copyleft} copyleft: {row.package} ({row.licence}), for {row.for_}\n")
-        for inner in read_carried():
-            if inner.copyleft != "no":
-                sys.stdout.write(
-                    f"{inner.copyleft} copyleft: {inner.library} ({inner.licence}) within {inner.package}\n"
-                )
+        asking = [(row, f"{row.package} ({row.licence}), for {row.for_}") for row in rows]
+        asking += [(inner, f"{inner.library} ({inner.licence}) within {inner.package}") for inner in read_carried()]
+        for licensed, text in asking:
+            if licensed.copyleft != "no":
+                sys.stdout.write(f"{licensed.copyleft} copyleft: {text}\n")
         sys.stdout.write(f"{len(rows)} packages: docs/supply/licences.csv\n")
 
 
 @app.command()
 def audit(
-    layers: Layer = ALL, service: Annotated[str, typer.Option(help="Who is asked: pypi or osv.")] = "pypi"
+    layers: Layer = ALL, service: Annotated[Literal["pypi", "osv"], typer.Option(help="Who is asked.")] = "pypi"
 ) -> None:
     """Ask for known vulnerabilities of the locked packages, those of this Python and platform. Needs the network. Exit
     code 0: none is known; 1: some are, and listed; 2: not all packages could be checked.
 
     Example: python -m docs.supply audit --for install,runtime
     """
-    from docs.supply.audit import SERVICES
-    from docs.supply.audit import audit as ask
-
-    if service not in SERVICES:
-        _refuse(f"no such service: {service}; there are {', '.join(SERVICES)}")
-    with _told():
-        number, found = ask(_layers(layers), service)
-    for one in found:
-        mended = f"; mended in {', '.join(one.mended_in)}" if one.mended_in else "; not mended"
-        sys.stdout.write(f"{one.package} {one.version}: {one.number}{mended}\n")
+    lists = [word for layer in _layers(layers) for word in ("-r", str(FOLDER / f"{layer}.txt"))]
+    # everything is pinned: nothing is to be resolved or installed
+    options = ["--disable-pip", "--no-deps", "--require-hashes", "--progress-spinner", "off"]
+    with _told(), tempfile.TemporaryDirectory(prefix="audit-") as place:
+        out = Path(place, "answer.json")
+        command = [sys.executable, "-m", "pip_audit", "-s", service, "-f", "json", "-o", str(out), *options, *lists]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if not out.exists():
+            said = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
+            raise SupplyError(f"pip-audit got no answer: {said[0]}")
+        number, found = findings(out.read_text("utf-8"))
+    sys.stdout.write("".join(f"{line}\n" for line in found))
     sys.stdout.write(f"{number} packages checked, {len(found)} known vulnerabilities\n")
     raise typer.Exit(1 if found else 0)
+
+
+def findings(answer: str) -> tuple[int, list[str]]:
+    """How many packages pip-audit's JSON answers for, and a line for each known vulnerability.
+
+    Raises:
+        SupplyError: it does not answer for all packages; pip-audit itself takes one that its service does not know for
+            a good one.
+    """
+    packages = json.loads(answer)["dependencies"]
+    skipped = [p["name"] for p in packages if "skip_reason" in p]
+    if skipped or not packages:
+        which = ", ".join(skipped[:5]) + (", ..." if len(skipped) > 5 else "")
+        raise SupplyError(f"the service has no answer for {len(skipped)} of {len(packages)} packages: {which}")
+    return len(packages), [
+        f"{p['name']} {p['version']}: {v['id']}; mended in {', '.join(v['fix_versions']) or 'no version'}"
+        for p in packages
+        for v in p.get("vulns", ())
+    ]
 
 
 if __name__ == "__main__":

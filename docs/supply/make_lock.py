@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sysconfig
 import tempfile
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -126,11 +125,3 @@ def run_uv(words: list[str]) -> str:
     if done.returncode != 0:
         raise SupplyError(done.stderr.strip() or f"uv ended with exit code {done.returncode}")
     return done.stdout
-
-
-def direct(extras: Iterable[str] | None = None) -> list[str]:
-    """Requirements of pyproject.toml itself, with those of extras; None for all of them."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    optional: dict[str, list[str]] = project["optional-dependencies"]
-    named = optional if extras is None else {name: optional[name] for name in extras}
-    return [*project["dependencies"], *(line for lines in named.values() for line in lines)]

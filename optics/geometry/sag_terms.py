@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
 from optics.geometry import zernike
+from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
 
 
+@runtime_checkable
 class SagTerm(Protocol):
     """What a kind has to be, beside a frozen dataclass of numbers without a ``__post_init__``.
 
@@ -190,7 +192,7 @@ class ZernikeSag:
         return height, slope_x * scale, slope_y * scale
 
 
-SAG_TERMS: dict[str, type[SagTerm]] = {"polynomial": XYPolynomial, "zernike": ZernikeSag}
+SAG_TERMS = ExtensionTable[type[SagTerm]]("sag_terms", {"polynomial": XYPolynomial, "zernike": ZernikeSag}, SagTerm)
 """Name that a mirror's file may write under ``sag`` -> kind, whose numbers stand there by name. A new one is added
 here: the traces, their derivatives, the path tracer, meshes and the reader of files know it from this entry.
 """

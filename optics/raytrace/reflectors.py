@@ -33,6 +33,7 @@ from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body
 from optics.numerics.array_math import UnphysicalError, inner, norm
+from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Element, Interaction
 
@@ -435,7 +436,7 @@ def facet_block(
     return Solid(path, material, tuple(faces), transparent=False)
 
 
-REFLECTORS: dict[str, Reflector] = {
+_REFLECTORS: dict[str, Reflector] = {
     "lateral_transfer": Reflector(True, ("window", "mirror", "roof_a", "roof_b"), prism_180, roof_offset, null_point),
     "rhomboid": Reflector(False, ("entry", "mirror_a", "mirror_b", "exit"), prism_0),
     "hollow_transfer": Reflector(
@@ -443,6 +444,7 @@ REFLECTORS: dict[str, Reflector] = {
     ),
     "periscope": Reflector(False, ("mirror_a", "mirror_b"), periscope, transparent=False),
 }
+REFLECTORS = ExtensionTable("reflectors", _REFLECTORS, Reflector)
 """Name that an instrument's file may write as ``kind`` of ``monitor.prism_180``, if it returns the beam, or of
 ``monitor.prism_0`` -> kind. A new one is added here: the reader of files, the instrument, its images, heat, stray light
 and pictures know it from this entry.

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from optics.geometry.vector_shape import BEND_TOLERANCE, Disk, HalfPlane, PointMap, Polygon, Shape
+from optics.numerics.extension_table import ExtensionTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +138,7 @@ def pinhole_target(pitch: float, region: int) -> Target:
     return pinhole(PINHOLE * pitch)
 
 
-TARGETS: dict[str, Callable[[float, int], Target]] = {"star": star_target, "pinhole": pinhole_target}
+TARGETS = ExtensionTable[Callable[[float, int], Target]]("targets", {"star": star_target, "pinhole": pinhole_target})
 """Name -> target of finite shapes about the middle of a window, of a pixel pitch, metres on the nominal image, and the
 window's side, pixels. Each can be imaged by the cameras of a job beside the edges and bars, whose MTF the job measures
 itself. A new one is added here.

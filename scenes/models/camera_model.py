@@ -5,14 +5,25 @@ line. A mirror's own frame stands at its vertex, turned as the file says. Camera
 scene, Y = along the line CCD (= prescription x), X = Y x Z, the flight direction; its origin is the point where the
 centre's chief ray meets the first mirror. Focal-plane frame: origin at the line's centre, Y as the camera's, Z square
 to the image plane and toward the scene, X = Y x Z.
+
+The axis of a camera: the ray that its paraxial data are about, the beam along it that the entrance pupil states, and
+what has no focus at all.
+
+Shared by the derivation of a camera and by whoever judges one in a state, where the same ray of the scene is traced
+through the bodies as they stand.
+
+Are the focal length and the entrance pupil that a camera's file states those of its surfaces, and if not, which
+number is wrong?
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,22 +32,349 @@ from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Body, RigidTree, State
 from optics.materials.glass import ABBE_LINES
-from optics.numerics.array_math import norm, turned
+from optics.numerics.array_math import PhysicalError, norm, turned
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from optics.raytrace.first_order import FirstOrder, Paraxial, RayMatrix, first_order, ray_matrix
+from optics.raytrace.first_order import (
+    FirstOrder,
+    Paraxial,
+    RayMatrix,
+    equal_area_radius,
+    first_order,
+    paraxial,
+    ray_matrix,
+)
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
 from optics.waves.imaging import aim_collimated
-from scenes.models import camera_axis
-from scenes.models.camera_axis import LAUNCH_DISTANCE, LINE_AXIS, AfocalError, CameraAxis
-from scenes.models.stated_focal_length import TracedFocalLengths, check_entrance_pupil, check_focal_length
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.perturbation import NodeInfo, perturbation_issues
-from scenes.yaml.errors import InputError
+from scenes.yaml.errors import InputError, KeyPath, key_text
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+
+LARGEST_DIFFERENCE = 0.1
+"""Share by which the traced focal length may differ from the stated one. The library's cameras need 0.5 % along the
+line and 8 % across it; a wrong sign or unit is seldom below a third.
+"""
+
+LARGEST_PUPIL_DIFFERENCE = 0.4
+"""Share by which the traced entrance pupil may differ from the stated one where the stop's diameter is stated as well.
+Of off-axis cameras the pupil of the axis is up to some 10 % from that of the field's middle, and the smallest mistake,
+a radius in place of a diameter, is a factor of two."""
+
+SAME_PUPIL = 0.01
+"""Share by which the beam that fills the stop may differ from the beam that made it: none about an axis; cameras with
+turned surfaces map one circle to another curve and back."""
+
+
+class TracedFocalLengths(NamedTuple):
+    """Focal lengths of a camera about the chief ray of its field's middle, metres.
+
+    Attributes:
+        image: change of the image's place per angle, along the line and across it, (2,): on the plane that the file
+            states, in focus or not.
+        light: of parallel light, wherever its focus is: in the two principal directions about that ray, infinite
+            without power, and the effective focal length about the axis, (3,); negative where light diverges after the
+            last surface.
+    """
+
+    image: np.ndarray
+    light: np.ndarray
+
+
+FocalLengths = Callable[[CameraSpec], TracedFocalLengths]
+
+_MOST_NAMED = 3  # causes in a message
+
+_UNITS = ((1000.0, "m in place of mm"), (0.001, "mm in place of m"))
+
+_NO_LIGHT = (AimError, BeamMissedError, ArithmeticError, np.linalg.LinAlgError, ValueError)
+
+
+def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengths: FocalLengths) -> None:
+    """Check the stated focal length against the traced one.
+
+    Either of the two directions will do, since cameras with surfaces off the axis differ in them. A camera that is only
+    out of focus is none of another focal length, unless a single number explains it: it can be refocused.
+
+    Args:
+        spec: the camera.
+        traced: its focal lengths.
+        focal_lengths: how those of a changed camera are traced; asked only to find out what is wrong.
+
+    Raises:
+        InputError: they differ by more than ``LARGEST_DIFFERENCE``; with the number whose other sign or unit brings
+            the focal length to the stated one, where there is one.
+    """
+    stated, real = spec.focal_length, bool(np.all(traced.light > 0.0))
+    in_place, in_focus = (_difference(np.abs(one), stated) <= LARGEST_DIFFERENCE for one in traced)
+    if in_focus and in_place and real:
+        return
+    cause, suggestion = _cause(spec, float(traced.image[0]), focal_lengths, in_focus and real)
+    if suggestion is None and in_focus:
+        return
+    off = float(traced.light[-1] if in_place else traced.image[0])
+    problem = f"the focal length is stated as {stated:.4g} m, but light through the surfaces has one of {off:.4g} m"
+    allowed = f"the traced focal length within {100 * LARGEST_DIFFERENCE:.0f} %, or surfaces that have the stated one"
+    raise spec.error(problem + cause, ("focal_length",), allowed=allowed, suggestion=suggestion)
+
+
+def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
+    """Check the stated entrance pupil of a camera against the traced diameter, metres.
+
+    Raises:
+        InputError: they differ by more than ``LARGEST_PUPIL_DIFFERENCE`` where the stop is stated, else at all: other
+            rays than those of the stated beam meet the rim of the stop.
+    """
+    off = abs(traced / spec.entrance_pupil - 1.0)
+    if spec.stop_diameter is None and off > SAME_PUPIL:
+        problem = "rays of other heights than the stated beam's meet the rim of the stop, which stands near their focus"
+        raise spec.error(problem, ("stop",), allowed="a stop that rays of different heights meet in different places")
+    if off > LARGEST_PUPIL_DIFFERENCE:
+        stated, found = (format_quantity(float(f"{d:.4g}"), LENGTH) for d in (spec.entrance_pupil, traced))
+        problem = f"a stop of this size has an entrance pupil of {found} on the axis; the file states one of {stated}"
+        allowed = f"both within {100 * LARGEST_PUPIL_DIFFERENCE:.0f} %, or the entrance pupil alone"
+        raise spec.error(problem, ("stop_diameter",), allowed=allowed)
+
+
+def _difference(traced: np.ndarray, stated: float) -> float:
+    """Relative difference of the nearer direction."""
+    return float(np.min(np.abs(traced / stated - 1.0)))
+
+
+def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths, place: bool) -> tuple[str, str | None]:
+    """What is likely wrong, in words and as the line that would be right; nothing where no single number is."""
+    for factor, what in _UNITS:
+        if abs(factor * traced / spec.focal_length - 1.0) <= LARGEST_DIFFERENCE:
+            right = format_quantity(spec.focal_length / factor, LENGTH)
+            return f"; the stated one is likely {what}", f"focal_length: {right}"
+    # surfaces that have the stated focal length are right: only where the image is taken may be wrong
+    for among in (_places(spec),) if place else (_single(spec), _places(spec), _together(spec)):
+        fits = []
+        for words, line, changed in among:
+            try:
+                off = max(_difference(one, spec.focal_length) for one in focal_lengths(changed))
+            except _NO_LIGHT:
+                continue
+            if off <= LARGEST_DIFFERENCE:
+                fits.append((off, words, line))
+        if fits:
+            fits.sort()
+            others = ", ".join(words for _, words, _ in fits[1:_MOST_NAMED])
+            also = f" (or {others})" if others else ""
+            return f"; the likely cause is {fits[0][1]}{also}", fits[0][2]
+    return "", None
+
+
+Candidates = Iterator[tuple[str, str, CameraSpec]]
+"""What may be wrong, the line that would be right, and the camera with it."""
+
+
+def _single(spec: CameraSpec) -> Candidates:
+    """One number of one surface."""
+    for name, mirror in spec.mirrors.items():
+        for key, words, value, text in _changes(mirror):
+            mirrors = {**spec.mirrors, name: mirror.model_copy(update={key: value})}
+            line = f"{key_text(('mirrors', name, key))}: {text}"
+            yield f"{words} of {name}", line, spec.model_copy(update={"mirrors": FrozenMap(mirrors)})
+
+
+def _together(spec: CameraSpec) -> Candidates:
+    """The sign of all radii, as another program has it."""
+    turned = {name: mirror.model_copy(update={"radius": -mirror.radius}) for name, mirror in spec.mirrors.items()}
+    line = "radius of every surface with the other sign: positive if its centre of curvature lies toward +z"
+    yield "the sign of every radius", line, spec.model_copy(update={"mirrors": FrozenMap(turned)})
+
+
+def _places(spec: CameraSpec) -> Candidates:
+    """One number of the image or the field."""
+    image = spec.image
+    changes: list[tuple[KeyPath, str, dict[str, Any]]] = []
+    for z, words in _lengths("z", image.z):
+        changes.append((("image", "z"), words, {"image": image.model_copy(update={"z": z})}))
+    if image.tilt:
+        tilted = image.model_copy(update={"tilt": -image.tilt})
+        changes.append((("image", "tilt"), "the sign of the tilt", {"image": tilted}))
+    if spec.field_bias:
+        changes.append((("field_bias",), "the sign of the bias", {"field_bias": -spec.field_bias}))
+    for key, words, update in changes:
+        changed = spec.model_copy(update=update)
+        value = changed.field_bias if key == ("field_bias",) else getattr(changed.image, str(key[1]))
+        text = format_quantity(value, LENGTH if key[-1] == "z" else ANGLE)
+        whose = "field" if key == ("field_bias",) else "image"
+        yield f"{words} of the {whose}", f"{key_text(key)}: {text}", changed
+
+
+def _changes(mirror: MirrorSpec) -> Iterator[tuple[str, str, Any, str]]:
+    """Key, what is wrong with it, its other value, and that as text."""
+    if math.isfinite(mirror.radius):
+        for value, words in _lengths("radius", mirror.radius):
+            yield "radius", words, value, format_quantity(value, LENGTH)
+    for value, words in _lengths("z", mirror.z):
+        yield "z", words, value, format_quantity(value, LENGTH)
+    if mirror.conic:
+        yield "conic", "the sign of the conic constant", -mirror.conic, f"{-mirror.conic:g}"
+    for key, words, kind in (("rotate", "the tilt about", ANGLE), ("decentre", "the decentre along", LENGTH)):
+        given = getattr(mirror, key) or ()
+        for axis, value in enumerate(given):
+            if value:
+                other = (*given[:axis], -value, *given[axis + 1 :])
+                text = ", ".join(format_quantity(v, kind) for v in other)
+                yield key, f"the sign of {words} {'xyz'[axis]}", other, f"[{text}]"
+
+
+def _lengths(what: str, value: float) -> Iterator[tuple[float, str]]:
+    """Other signs and units of a length."""
+    if value:
+        yield -value, f"the sign of the {what}"
+        for factor, words in _UNITS:
+            yield value / factor, f"the unit of the {what} ({words})"
+
+
+PARENT_AXIS, LINE_AXIS = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+LAUNCH_DISTANCE = 3.0
+"""How far before the prescription's origin beams from the scene are launched, metres."""
+AFOCAL = 1000.0
+"""Focal length, over the distance that light goes from the first surface to the image, from which on a system has no
+focus: the longest telescopes have some 20, and an afocal one whose spacing is rounded to 10 um some 10 000."""
+_RIM = 48
+
+
+class AfocalError(PhysicalError, ValueError):
+    """Parallel light leaves a system parallel: it has no focal length and makes no image."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraAxis:
+    """The light along the axis of a camera, in the prescription frame.
+
+    Attributes:
+        direction: in which it travels, unit, (3,): along the parent axis, or along the light of the field's middle
+            where none comes through along that axis.
+        base: launch point of the ray that paraxial data are about, (3,), metres: on the parent axis where all mirrors
+            and lenses are about it, else that of the ray through the middle of the stop.
+        centre: launch point of the ray through the middle of the stop, (3,), metres.
+        on_axis: whether it travels along the parent axis.
+    """
+
+    direction: np.ndarray
+    base: np.ndarray
+    centre: np.ndarray
+    on_axis: bool
+
+    def moved(self, pose: Pose) -> CameraAxis:
+        """Return the axis of a camera whose prescription frame has a pose in the world."""
+        turned = pose.rotation @ self.direction
+        return CameraAxis(turned, pose.apply(self.base), pose.apply(self.centre), self.on_axis)
+
+
+def find_axis(
+    spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, middle: np.ndarray
+) -> tuple[CameraAxis, float]:
+    """Return the axis of a camera and the radius of its stop, metres.
+
+    The stop is as large as the file states, or as the beam along the axis makes it that has the diameter of the
+    entrance pupil before the first surface: its rays are traced to the stop, and the area that they enclose there is
+    the stop's.
+
+    Args:
+        spec: the camera.
+        backend: where to trace.
+        to_stop: one system, from the scene to the stop.
+        imaging: one system, from the scene to the image.
+        middle: direction of the light of the field's middle, prescription frame, (3,).
+
+    Raises:
+        AimError, BeamMissedError: no light comes through, neither along the parent axis nor along the field's middle.
+    """
+    try:
+        return _along(spec, backend, to_stop, imaging, PARENT_AXIS)
+    except (AimError, BeamMissedError):
+        return _along(spec, backend, to_stop, imaging, middle)
+
+
+def _along(
+    spec: CameraSpec, backend: Backend, to_stop: SystemBatch, imaging: SystemBatch, direction: np.ndarray
+) -> tuple[CameraAxis, float]:
+    """``find_axis`` along one direction. Raises AimError, BeamMissedError."""
+    start, on_axis = -LAUNCH_DISTANCE * direction, np.array_equal(direction, PARENT_AXIS)
+    centre = aim_collimated(backend, to_stop, direction[None], start[None], np.zeros((1, 2)))[0][0, 0]
+    optics = [mirror for mirror in spec.mirrors.values() if mirror.light != "passes"]
+    centred = on_axis and not any(one.decentre or one.rotate or one.sag for one in optics)
+    axis = CameraAxis(direction, start if centred else centre, centre, on_axis)
+    _require_light(backend, imaging, axis.base[None], direction)
+    if spec.stop_diameter is not None:
+        return axis, 0.5 * spec.stop_diameter
+    ring = centre + 0.5 * spec.entrance_pupil * _ring() @ transverse_axes(direction, LINE_AXIS)
+    return axis, equal_area_radius(_require_light(backend, to_stop, ring, direction))
+
+
+def _ring() -> np.ndarray:
+    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
+    return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+
+
+def _require_light(backend: Backend, systems: SystemBatch, launch: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return where rays from launch points (N, 3) end on the last surface, (N, 2). Raises BeamMissedError."""
+    place, _, _, valid = trace(backend, systems, make_rays(backend, launch, direction)).numpy()
+    if not np.all(valid):
+        raise BeamMissedError("the beam along the axis misses a surface")
+    return np.asarray(place[0, :, :2])
+
+
+def pupil_diameter(backend: Backend, to_stop: SystemBatch, axis: CameraAxis, radius: float) -> float:
+    """Return the diameter of the entrance pupil: that of the round beam along the axis with the area of the light,
+    before the first surface, that fills the stop, metres.
+
+    Args:
+        backend: where to trace.
+        to_stop: one system, from the scene to the stop.
+        axis: in the same frame as the system.
+        radius: of the stop, metres.
+
+    Raises:
+        AimError: the beam does not reach the stop.
+    """
+    rays, axes = aim_collimated(backend, to_stop, axis.direction[None], axis.centre[None], radius * _ring())
+    return 2.0 * equal_area_radius(rays[0] @ axes[0].T)
+
+
+def axis_data(
+    backend: Backend, imaging: SystemBatch, spec: CameraSpec, axis: CameraAxis, first: np.ndarray
+) -> Paraxial:
+    """Return the paraxial data about the axis of a camera.
+
+    Args:
+        backend: where to trace.
+        imaging: one system, from the scene to the image.
+        spec: the camera.
+        axis: in the same frame as the system.
+        first: near this direction of that frame lies the first axis of the launch plane, (3,).
+
+    Raises:
+        AfocalError: parallel light leaves the system parallel.
+    """
+    count, launch, direction = len(imaging.structure), axis.base[None], axis.direction[None]
+    traced = trace(backend, imaging, make_rays(backend, launch, axis.direction), keep=range(count))
+    hits = np.stack([traced.hit(k)[0, 0] for k in range(count)])
+    world = np.einsum("kij,kj->ki", imaging.world.rotation[0], hits) + imaging.world.translation[0]
+    steps = np.linalg.norm(np.diff(np.concatenate([launch, world]), axis=0), axis=-1)
+    used = [k for k, mirror in enumerate(spec.mirrors.values()) if mirror.light != "passes"]
+    behind = float(np.sum(steps[used[-1] + 1 :])) if used else 0.0
+    before = float(np.sum(steps[: used[0] + 1])) if used else 0.0
+    stop = list(spec.mirrors).index(spec.stop)
+    matrix = ray_matrix(backend, imaging, stop, launch, direction, transverse_axes(direction, first[None]))
+    data = paraxial(matrix, before, behind)
+    # what is no number is afocal as well
+    if not data.focal_length < AFOCAL * (np.sum(steps) - before):
+        raise AfocalError(
+            f"the system is afocal, with an angular magnification of {data.angular_magnification:.5g}: parallel light "
+            "leaves it parallel, so that it has no focal length and makes no image"
+        )
+    return data
 
 
 def focal_plane_body(root: str) -> str:
@@ -336,8 +674,8 @@ def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLeng
     """`_focal_lengths` of a prescription. Raises AimError, BeamMissedError, AfocalError."""
     bare = _bare(spec, {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}, {})
     to_stop, imaging, _, matrix = _chief(spec, backend, bare)
-    axis, _ = camera_axis.find_axis(spec, backend, to_stop, imaging, field_direction(spec, 0.0, 0.0))
-    return _focal_lengths(matrix, camera_axis.axis_data(backend, imaging, spec, axis, LINE_AXIS))
+    axis, _ = find_axis(spec, backend, to_stop, imaging, field_direction(spec, 0.0, 0.0))
+    return _focal_lengths(matrix, axis_data(backend, imaging, spec, axis, LINE_AXIS))
 
 
 def _chief(
@@ -363,9 +701,9 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     to_stop, imaging, launch, matrix = _chief(spec, backend, bare)
     chief = first_order(matrix)
     centre = field_direction(spec, 0.0, 0.0)
-    axis, stop_radius = camera_axis.find_axis(spec, backend, to_stop, imaging, centre)
-    about_axis = camera_axis.axis_data(backend, imaging, spec, axis, LINE_AXIS)
-    pupil = camera_axis.pupil_diameter(backend, to_stop, axis, stop_radius)
+    axis, stop_radius = find_axis(spec, backend, to_stop, imaging, centre)
+    about_axis = axis_data(backend, imaging, spec, axis, LINE_AXIS)
+    pupil = pupil_diameter(backend, to_stop, axis, stop_radius)
     if stated:
         traced_here = _focal_lengths(matrix, about_axis)
         check_focal_length(spec, traced_here, lambda other: _traced_focal_lengths(other, backend))
@@ -528,6 +866,7 @@ def _apertures(
         half, middle = 0.5 * (high - low), 0.5 * (high + low)
         box = Rectangle(float(half[0]), float(half[1]), (float(middle[0]), float(middle[1])))
         hits = np.where(valid[0, :, None], traced.hit(i)[0, :, :2], np.nan).reshape(len(fields), _RIM_POINTS, 2)
+        hits = hits[~np.isnan(hits).all(axis=(1, 2))]  # fields whose light is lost say nothing of an outline
         out[name] = box if spec.mirrors[name].light == "passes" else _made(box, hits, spec, name)
     return out
 

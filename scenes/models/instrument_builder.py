@@ -38,10 +38,9 @@ from scenes.models.camera_model import (
     shape_changes,
 )
 from scenes.models.camera_sharpness import no_cameras
-from scenes.models.clearance import check_clearance, check_solids
 from scenes.models.instrument_model import Instrument, MisplacedError
 from scenes.models.monitor_chain import square_facets
-from scenes.models.obstruction import check_beams
+from scenes.models.obstruction import check_beams, check_clearance, check_solids
 from scenes.specs.baffle import Plate
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE, CENTRAL_PRISM, Channel, InstrumentSpec

@@ -28,8 +28,7 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.reflectors import Mount, Reflector, ReflectorParts
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.camera_axis import LINE_AXIS
-from scenes.models.camera_model import REFERENCE, CameraModel
+from scenes.models.camera_model import LINE_AXIS, REFERENCE, CameraModel
 from scenes.models.instrument_model import MisplacedError, key_of
 from scenes.specs.instrument import (
     BASE,

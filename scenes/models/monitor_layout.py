@@ -17,9 +17,8 @@ from optics.geometry.solid import solid_mesh
 from optics.materials.material import material
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
-from scenes.models.clearance import convex_hull
 from scenes.models.instrument_model import Instrument
-from scenes.models.obstruction import imaging_segments, rays_taken
+from scenes.models.obstruction import convex_hull, imaging_segments, rays_taken
 from scenes.specs import instrument as instruments
 from scenes.specs import load
 from scenes.specs.camera import CameraSpec, MonitorDesignSpec, PrismChoiceSpec

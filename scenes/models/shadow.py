@@ -32,9 +32,8 @@ from optics.waves.imaging import ImagingRays
 from optics.waves.pupil_shadow import SMALLEST, separate
 from optics.waves.pupil_terms import products, to_terms
 from scenes.models.camera_model import CameraModel
-from scenes.models.clearance import convex_bodies
 from scenes.models.instrument_model import Instrument
-from scenes.models.obstruction import imaging_segments, rays_taken
+from scenes.models.obstruction import convex_bodies, imaging_segments, rays_taken
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE
 

@@ -1,11 +1,12 @@
 """All kinds of YAML files, how one is told from its keys, and which command reads it."""
 
 import csv
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from optics.numerics.extension_table import EntryPointError
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.named import FileKind
@@ -20,17 +21,15 @@ _MOST = 2
 """Kinds that a file may be and be told as such; of more its keys say nothing."""
 
 
-def _listed() -> Iterator[FileKind]:
-    """Kinds in the table beside this module."""
+def file_kinds() -> tuple[FileKind, ...]:
+    """Return every kind, in the order in which their schemas are listed: those in the table beside this module, then
+    those that are registered with a test.
+    """
     with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as rows:
-        yield from (FileKind(**row) for row in csv.DictReader(rows))
+        listed = [FileKind(**row) for row in csv.DictReader(rows)]
+    tests = PROCEDURES.items()
+    return (*listed, *(replace(kind, command=f"twin.{name}") for name, test in tests for kind in test.files))
 
-
-FILE_KINDS = (
-    *_listed(),
-    *(replace(kind, command=f"twin.{name}") for name, procedure in PROCEDURES.items() for kind in procedure.files),
-)
-"""Every kind, in the order in which their schemas are listed; those that are registered with a test come last."""
 
 _RESOLVED = {"job": "job", "study": "study"}
 """Key of a config.yaml that names its kind; those of tests have ``test``, which is told as its own file would be."""
@@ -49,10 +48,10 @@ def kinds_of(data: Any) -> tuple[FileKind, ...]:
     keys = {key for key in data if isinstance(key, str)}
     for key, name in _RESOLVED.items():
         if key in keys:
-            return (next(kind for kind in FILE_KINDS if kind.name == name),)
+            return (next(kind for kind in file_kinds() if kind.name == name),)
     if "test" in keys:
         return kinds_of(data["test"])
-    found = [(strange, kind) for kind in FILE_KINDS if (strange := kind.strangers(keys)) is not None]
+    found = [(strange, kind) for kind in file_kinds() if (strange := kind.strangers(keys)) is not None]
     least = min((strange for strange, _ in found), default=SLIPS + 1)
     return tuple(kind for strange, kind in found if strange == least <= SLIPS)
 
@@ -73,7 +72,7 @@ def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Give
     except InputError as error:
         try:
             kinds = kinds_of(read_yaml(file).data)
-        except InputError:
+        except (InputError, EntryPointError):
             raise error from None
         if not kinds or len(kinds) > _MOST or any(kind.command == command for kind in kinds):
             raise

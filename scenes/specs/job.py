@@ -24,6 +24,7 @@ from scenes.specs.perturbation import (
     perturbation_issues,
 )
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
+from scenes.yaml.named import Named
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Flag, NothingIsEmpty, OneOf, Paths, Ref, Seed, Spec, Whole
 from scenes.yaml.units import ANGLE, SCALE
@@ -175,7 +176,7 @@ class RenderSpec(Spec):
 class AnalysisSpec(Spec):
     """How the images are analysed: by which method the centres of the spots are found."""
 
-    centroid: Literal["ml", "gaussian", "energy"] = "ml"
+    centroid: Annotated[str, OneOf(Named("analysis.spots:CENTROIDS").get)] = "ml"
 
 
 def pivot_problem(

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.named import FileKind, Named
 
@@ -25,7 +26,7 @@ class Procedure:
 
     Attributes:
         kind: for example ``focus``; KIND.json has the numbers.
-        setup: class of the simulated test with all it refers to, an `ExperimentSetup`.
+        setup: class of the simulated test with all it refers to, an `ExperimentSetup`; or what reads its file.
         run: set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
         numbers: run -> what KIND.json holds, plain data; keys end in their unit.
         report: run -> `twin.framework.report.Report`.
@@ -64,11 +65,12 @@ class Procedure:
         """Class of the simulated test's set-up."""
         return Named(self.setup).get() if isinstance(self.setup, str) else self.setup
 
-    def resolve(self, path: Path | str) -> Any:
+    def resolve(self, path: Path | str, *named: str | None) -> Any:
         """Read a test with all it refers to.
 
         Args:
             path: of its file or of a run's config.yaml, or the name of a test in the library.
+            named: what else is named of a set-up that is read by a function.
 
         Raises:
             InputError: a file cannot be read or is not valid, or they do not fit together.
@@ -77,7 +79,7 @@ class Procedure:
             measured = Named(self.measured).get()
             if measured.measured_by(Named("scenes.specs.resolved:test_keys")(path)):
                 return measured.read(path)
-        return self.model.read(path)
+        return getattr(self.model, "read", self.model)(path, *named)
 
 
 BASES: dict[str, Named] = {
@@ -96,13 +98,13 @@ def studied() -> tuple[str, ...]:
 SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
 """What the adjustment of a block can be asked to do without; the command's help names them."""
 
-PROCEDURES: dict[str, Procedure] = {
+_PROCEDURES: dict[str, Procedure] = {
     "lab focus": Procedure(
         "focus",
         setup="scenes.specs.resolved:FocusSetup",
         measured="scenes.specs.resolved:MeasuredFocusSetup",
         run="twin.laboratory.focus_run:run_focus",
-        numbers="twin.laboratory.focus_numbers:focus_numbers",
+        numbers="twin.laboratory.focus_run:focus_numbers",
         report="twin.laboratory.focus_report:focus_report",
         export="twin.laboratory.export:export_focus",
         varied=True,
@@ -121,7 +123,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.resolved:DistortionSetup",
         measured="scenes.specs.resolved:MeasuredDistortionSetup",
         run="twin.laboratory.distortion_run:run_distortion",
-        numbers="twin.laboratory.distortion_numbers:DISTORTION",
+        numbers="twin.laboratory.distortion_run:DISTORTION",
         report="twin.laboratory.distortion_report:distortion_report",
         export="twin.laboratory.export:export_distortion",
         varied=True,
@@ -141,7 +143,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.resolved:TurntableSetup",
         measured="scenes.specs.resolved:MeasuredTurntableSetup",
         run="twin.laboratory.turntable_run:run_turntable_test",
-        numbers="twin.laboratory.turntable_numbers:TURNTABLE",
+        numbers="twin.laboratory.turntable_run:TURNTABLE",
         report="twin.laboratory.turntable_report:turntable_report",
         export="twin.laboratory.export:export_turntable",
         varied=True,
@@ -156,7 +158,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.orbit.setup:AdjustSetup",
         measured="scenes.specs.orbit.setup:MeasuredAdjustSetup",
         run="twin.operate.operated_block:run_operated_block",
-        numbers="twin.orbit.block.block_numbers:BLOCK",
+        numbers="twin.orbit.block.block_report:BLOCK",
         report="twin.orbit.block.block_report:block_report",
         varied=True,
         about="""
@@ -202,7 +204,7 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.orbit.calibration.calibration_run:run_calibration",
         numbers="twin.orbit.calibration.calibration_numbers:CALIBRATION",
         report="twin.orbit.calibration.calibration_report:calibration_report",
-        export="twin.orbit.calibration.calibration_export:exported",
+        export="twin.orbit.calibration.calibration_run:exported",
         varied=True,
         about="""
     Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
@@ -221,7 +223,7 @@ PROCEDURES: dict[str, Procedure] = {
         "check",
         setup="scenes.specs.orbit.setup:CheckSetup",
         run="twin.orbit.conventions.check_run:run_check",
-        numbers="twin.orbit.conventions.check_numbers:CHECK",
+        numbers="twin.orbit.conventions.check_report:CHECK",
         report="twin.orbit.conventions.check_report:check_report",
         export="twin.orbit.conventions.check_run:exported",
         judged=False,
@@ -304,9 +306,9 @@ PROCEDURES: dict[str, Procedure] = {
         "simulate",
         setup="scenes.specs.orbit.setup:SimulateSetup",
         run="twin.orbit.images.simulate_run:run_simulation",
-        numbers="twin.orbit.images.simulate_numbers:SIMULATE",
+        numbers="twin.orbit.images.simulate_run:SIMULATE",
         report="twin.orbit.images.simulate_report:simulation_report",
-        export="twin.orbit.calibration.calibration_export:simulation_exported",
+        export="twin.orbit.images.simulate_run:simulation_exported",
         about="""
     Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
     model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
@@ -381,5 +383,38 @@ PROCEDURES: dict[str, Procedure] = {
     Example: `python -m twin.asbuilt check scenes/examples/asbuilt_gf7.yaml`
     """,
     ),
+    "camera": Procedure(
+        "optics",
+        setup="scenes.specs.resolved:resolve_camera",
+        run="twin.camera.camera_run:run_camera",
+        numbers="twin.camera.camera_run:CAMERA",
+        report="twin.camera.camera_report:camera_report",
+    ),
+    "recover": Procedure(
+        "recovered",
+        setup="scenes.specs.monitor_frames:MeasurementSetup",
+        run="twin.recover.recover_run:run_recover",
+        numbers="twin.recover.recover_run:recover_numbers",
+        report="twin.recover.recover_report:recover_report",
+        judged=False,
+    ),
+    "tolerance": Procedure(
+        "tolerance",
+        setup="scenes.specs.tolerance:ToleranceSetup",
+        run="twin.tolerance.tolerance_run:run_tolerance",
+        numbers="twin.tolerance.tolerance_run:TOLERANCE",
+        report="twin.tolerance.tolerance_report:tolerance_report",
+        judged=False,
+    ),
+    "uncertainty": Procedure(
+        "uncertainty",
+        setup="scenes.specs.resolved:resolve_with",
+        run="twin.uncertainty.coverage:run_uncertainty",
+        numbers="twin.uncertainty.uncertainty_numbers:uncertainty_numbers",
+        report="twin.uncertainty.uncertainty_report:uncertainty_report",
+        judged=False,
+        seeded=False,
+    ),
 }
+PROCEDURES = ExtensionTable("procedures", _PROCEDURES, Procedure)
 """Name of the command after ``twin.`` -> the test. A test is its own modules and one entry here."""

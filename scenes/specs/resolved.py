@@ -68,6 +68,15 @@ class ResolvedJob(Spec):
         targets = self.job.render.targets or TargetsSpec()
         return targets if targets.frames else targets.model_copy(update={"frames": self.frames})
 
+    @property
+    def seed(self) -> int:
+        """Seed of all noise."""
+        return self.job.render.seed
+
+    def with_seed(self, seed: int) -> ResolvedJob:
+        """Return the job with another seed and its number of frames."""
+        return self.with_render(self.frames, seed)
+
     def with_job(self, job: JobSpec) -> ResolvedJob:
         """Return the same with another job on the same instrument."""
         return self.model_copy(update={"job": job})
@@ -265,11 +274,20 @@ class ExperimentSetup(Spec, Generic[TestType]):
         """Return whether a file with these keys is a test of this kind on measurements; asked of set-ups that are."""
         return MEASURED in keys
 
+    @property
+    def seed(self) -> int:
+        """Seed of all that is drawn; 0 where nothing is."""
+        return getattr(self.test, "seed", 0)
+
     def with_seed(self, seed: int) -> Self:
         """Return the set-up with another seed, for one that a command overrides; where nothing is drawn, itself."""
         if "seed" not in type(self.test).model_fields:
             return self
-        return self.model_copy(update={"test": self.test.model_copy(update={"seed": seed})})
+        return self.with_test(seed=seed)
+
+    def with_test(self, **values: Any) -> Self:
+        """Return the set-up with other values of the test's keys, which are checked already."""
+        return self.model_copy(update={"test": self.test.model_copy(update=values)})
 
     def to_yaml(self) -> str:
         """Text of a config.yaml, which ``read`` reads back to the same values."""
@@ -414,6 +432,11 @@ class CameraSetup(Spec):
     instrument: InstrumentSpec | None = None
     cameras: Paths[CameraSpec] = Field(default_factory=FrozenMap)
     perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
+    seed: ClassVar[int] = 0
+
+    def with_seed(self, seed: int) -> CameraSetup:
+        """Return the camera, of which nothing is drawn."""
+        return self
 
     @property
     def standing(self) -> tuple[InstrumentSpec, Mapping[str, CameraSpec], str]:

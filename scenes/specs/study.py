@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
+from optics.numerics.extension_table import ExtensionTable
 from scenes.specs.motion_text import key_below, motion_of
 from scenes.specs.procedures import studied
 from scenes.yaml.errors import KeyPath, Problem, key_text, shown, unknown
@@ -79,11 +80,12 @@ def _monte_carlo(runs: int, factors: int, generator: np.random.Generator) -> np.
     return generator.random((runs, factors))
 
 
-SAMPLERS: dict[str, Sampler] = {
+_SAMPLERS: dict[str, Sampler] = {
     "latin_hypercube": Sampler("Latin hypercube", _latin_hypercube, even=True),
     "sobol": Sampler("scrambled Sobol sequence", _sobol, even=True),
     "monte_carlo": Sampler("Monte Carlo", _monte_carlo),
 }
+SAMPLERS = ExtensionTable("samplers", _SAMPLERS, Sampler)
 """Kind of a design that draws -> its sampler. A new one is added here, and its name can be written in a study."""
 
 

@@ -103,7 +103,7 @@ class Problem(ValueError):
         """Tell the problem at a key within the value."""
         return Problem(self.problem, self.found, self.allowed, self.suggestion, (*key, *self.within))
 
-    def at(self, file: str, line: int | None = None, key: KeyPath = ()) -> Issue:
+    def at(self, file: str = "", line: int | None = None, key: KeyPath = ()) -> Issue:
         """The fault of the file in which the value stands."""
         return Issue(self.problem, file, line, (*key, *self.within), self.found, self.allowed, self.suggestion)
 

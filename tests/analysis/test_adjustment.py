@@ -116,6 +116,7 @@ def test_stepwise_ends_where_the_simultaneous_one_does_and_as_slowly_as_predicte
     assert steps.rounds > 100
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("robust", quick(1, ["huber", "igg"]))
 def test_wrong_matches_lose_their_weight(robust):
     """3 per cent of the image points are off by 10 to 60 px."""
@@ -176,6 +177,7 @@ def test_variance_components_find_wrong_sigmas():
         assert found.sigma[name] == pytest.approx(right.sigma[name], rel=0.15)
 
 
+@pytest.mark.second
 def test_variance_factors_are_bounded():
     """Exact data: no noise at all is found, and the factors end where they must."""
     found = adjust([measured(VIEW)], LABORATORY, NOISE, gauge=HOLD_XY, variance_components=True)
@@ -183,6 +185,7 @@ def test_variance_factors_are_bounded():
     assert found.values == pytest.approx(truth(found.names), rel=1e-6)
 
 
+@pytest.mark.second
 def test_priors_pull_as_their_weight_says():
     """A monitor that knows the difference of two principal points to a nanometre fixes it, and its sigma."""
     prior = Prior({"forward y": 1.0, "nadir y": -1.0}, -23e-6, 1e-9, "monitor")

@@ -50,6 +50,7 @@ def test_only_the_part_along_the_track_counts():
     assert dihedral == pytest.approx(np.hypot(30, 120) * ARCSEC, abs=0.1 * ARCSEC)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("ahead", [0.0, 25 * DEG], ids=["parallel", "far apart"])
 def test_covariance_is_propagated(ahead):
     """Every coordinate of station and points moved and all fitted anew. The signed angle of parallel planes is not

@@ -31,6 +31,7 @@ def noisy(sigma: float, seed: int, angle: np.ndarray = ANGLE) -> np.ndarray:
     return wave(angle) + sigma * np.random.default_rng(seed).standard_normal(len(angle))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", LINEAR)
 def test_linear_fits_are_their_weights(name: str) -> None:
     """They add up to one, so that a shift of all values shifts the curve; and the curve is the same where angles are
@@ -65,6 +66,7 @@ def test_smoothing_spline_is_scipys() -> None:
     np.testing.assert_allclose(made(BETWEEN), peer(BETWEEN / step), rtol=0.0, atol=1e-7)
 
 
+@pytest.mark.second
 def test_network_derivative_is_that_of_the_trained_network(monkeypatch: pytest.MonkeyPatch) -> None:
     """Central differences of weights found by BFGS from a loss that is written down here; more decay than in use, so
     that the minimum is sharp enough for differences.
@@ -103,6 +105,7 @@ def test_network_derivative_is_that_of_the_trained_network(monkeypatch: pytest.M
     assert np.max(np.abs(told)) > 0.5
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", quick(2, sorted(LINEAR, key="fourier".__eq__)))
 def test_cross_validation_does_not_see_what_it_predicts(name: str) -> None:
     """A left-out value that changes by one changes its residual by exactly one, whatever a fit selects."""

@@ -5,6 +5,7 @@ whole series that knows which these are, and nothing jumps where nothing did.
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 from scipy.stats import binom, multivariate_normal
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
@@ -14,6 +15,8 @@ from analysis.statistics import limit_of
 from tests.analysis.followed_series import follow, of_shifts
 from tests.analysis.stated_motions import SpotNoise, disturbances
 from tests.analysis.test_series_smoother import conditioned
+
+pytestmark = pytest.mark.second
 
 NOISE, COUNT, EVERY, DAYS = 0.001, 6, 900.0, 30
 DRIFT = 60.0

@@ -38,6 +38,7 @@ def vector(f, degrees):
     return np.array([-f * math.sin(math.radians(degrees)), f * math.cos(math.radians(degrees))])
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("how", ["vector", "length", "found"])
 @pytest.mark.parametrize("degrees", quick(2, [2, 10, 3, 5]))
 @pytest.mark.parametrize("f", [0.1, 0.2, 0.25, 0.3, 0.45, 0.5])
@@ -158,6 +159,7 @@ def repeats(contrast, use_model, count=200, f=0.5):
     return [measure_bars(draw(mean), draw(low), draw(high), vector(f, 4), noise=noise) for _ in range(count)]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("use_model", quick(1, [True, False]))
 @pytest.mark.parametrize("f", quick(1, [0.2, 0.5]))
 def test_sigma_agrees_with_the_scatter(f, use_model):

@@ -42,6 +42,7 @@ def compared(block):
     return results
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("law", quick(1, LAWS))
 def test_every_law_as_one_dense_matrix_has_it(law):
     attitude = (TRACKER, Term(LAWS[law], "block" if law == "orbital" else "pass"))

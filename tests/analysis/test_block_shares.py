@@ -11,7 +11,7 @@ from analysis.block.processes import Law
 from tests.analysis.drawn_blocks import ARCSEC, PITCH, Plan, draw, without_errors_in_images
 from tests.analysis.refusals import refuses
 from twin.framework.cluster import ClusterError
-from twin.orbit.block.point_workers import point_workers
+from twin.orbit.block.block_run import point_workers
 
 LAWS = (
     Term(Law("tracker bias", "constant", (3 * ARCSEC,) * 3), "tracker"),

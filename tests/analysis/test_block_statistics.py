@@ -53,6 +53,7 @@ def _two_sided(square, freedom):
 _ALARM = 1e-4
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("law", quick(1, [WHITE, WALK]), ids=["white", "walk"])
 def test_chi_square_and_check_points_with_and_without_all_sensors(law):
     for missing in ((), SENSORS):
@@ -76,6 +77,7 @@ def test_a_wrong_law_is_told_and_a_right_one_is_not(stated, true):
             assert "not that of the readings" in str(test)
 
 
+@pytest.mark.second
 def test_one_tenth_of_gross_errors_is_found_by_name():
     drawn = draw(plan(WHITE, ties=60, half=4e3), np.random.default_rng(2))
     random = np.random.default_rng(3)

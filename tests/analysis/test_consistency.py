@@ -34,6 +34,7 @@ def test_the_limit_is_that_of_the_rate(stated, rate) -> None:
         assert one.agrees is agrees
 
 
+@pytest.mark.second
 def test_noise_moves_the_chi_square_by_what_is_said(stated) -> None:
     """Over draws of the noise on one shift; 4000 of them tell a scatter to 1.1 %, of which 5 sigma are allowed."""
     noise = np.diag(np.linspace(1e-4, 4e-4, COUNT))

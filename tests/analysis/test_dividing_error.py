@@ -74,6 +74,7 @@ def test_what_normal_noise_loses(n: int) -> None:
     assert normal_reduction(n) < 0.93
 
 
+@pytest.mark.second
 def test_repeatability_is_unbiased() -> None:
     """The trimming is undone: 200 series of 41 angles. Their 74 000 degrees of freedom give 0.3%."""
     told = np.array([series(seed).repeatability for seed in range(200)])
@@ -127,6 +128,7 @@ def test_misfits_are_told_apart() -> None:
     assert np.mean(common) == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.second
 def test_covariance_of_two_sets_of_readings() -> None:
     calibration = series(6)
     choice = choose(calibration, names=("fourier",))

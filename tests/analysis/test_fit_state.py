@@ -40,6 +40,7 @@ def good(fit, clean):
     return fit(clean)
 
 
+@pytest.mark.second
 def test_calibrated_spots_fit_and_keep_their_sigma(good) -> None:
     states = fit_states(good)
     assert states.fits.all()
@@ -61,6 +62,7 @@ def test_few_electrons_have_fewer_degrees_of_freedom() -> None:
     assert found[0] == pytest.approx(2.0 * 1000.0 / 2.5)
 
 
+@pytest.mark.second
 def test_another_shape_is_found_and_widened(fit, good, clean) -> None:
     ghost = clean[:4] + GAIN * 2000 * np.stack([airy(r + 9, c) for r, c in PLACES[:4]])
     found = fit(ghost)

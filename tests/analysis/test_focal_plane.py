@@ -73,6 +73,7 @@ def test_scatter_agrees_with_covariance():
     assert (height[0], sigma[0]) == pytest.approx((row @ expected[:, 0], np.sqrt(row @ known @ row)), rel=1e-9)
 
 
+@pytest.mark.second
 def test_predicted_defocus_after_the_correction():
     """True defocus that remains when the fitted motion is made: 400 assemblies, each measured with noise. The
     prediction's error has the covariance stated.

@@ -74,6 +74,7 @@ def found_minus_true(across, changes):
     return found, other
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("place", [0, 4, 8])
 @pytest.mark.parametrize("camera", [0, 1])
 @pytest.mark.parametrize("parameter", range(4), ids=NAMES)

@@ -71,6 +71,7 @@ def test_gross_errors_are_left_out_and_named(kind: str) -> None:
     assert found.freedom == alone.freedom
 
 
+@pytest.mark.second
 def test_points_without_gross_errors_stay() -> None:
     """In 200 files a false alarm of 1e-3 leaves out a point of one in the mean; of more than six once in 10 000."""
     place, spread = points(20, 6)

@@ -35,6 +35,7 @@ def frames_or_sentence(path):
     return told
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("compression", [None, "lzw", "zlib", "deflate", "lzma", "zstd", "packbits"])
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("big", [False, True])
@@ -109,6 +110,7 @@ def test_what_is_not_grey_is_told(tmp_path):
         np.testing.assert_allclose(grey[0], np.tensordot([0.2126, 0.7152, 0.0722], FRAMES[:, :, 1:], 1), rtol=1e-12)
 
 
+@pytest.mark.second
 def test_fits_primary_extension_cube_and_scaling(tmp_path):
     path = tmp_path / "a.fits"
     for frames in (FRAMES, FRAMES[0], FRAMES.astype(np.int16), FRAMES.astype(np.float32), FRAMES.astype(np.int32),

@@ -76,6 +76,7 @@ def common_noise():
     return (shapes.T * sizes**2) @ shapes + np.eye(55) * (0.04 * ARCSEC) ** 2
 
 
+@pytest.mark.second
 def test_scatter_agrees_with_sigmas():
     """Noise of the angles that many points share: its covariance and that of the residuals by dense
     matrices, the slope of the angles' noise by a complex step; chi-squares of 200 draws at 1e-6."""

@@ -93,6 +93,7 @@ def test_the_phase_counts_from_the_epoch_and_the_course_has_a_covariance_that_ho
     assert low < np.sum(square) < high
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("gap", "blind"), [(GAPS[0], 8.224), (GAPS[1], 9.766)])
 def test_a_pair_is_blind_where_a_period_lies_between_its_sights(gap: float, blind: float) -> None:
     """A jitter of ten times the noise stays unseen at 1/dt, is named as unseeable, and is found a hertz beside it."""
@@ -116,6 +117,7 @@ def test_two_gaps_together_see_what_each_is_blind_for() -> None:
         assert not [span for span in found.before.intervals() if span[0] > 1.0]
 
 
+@pytest.mark.second
 def test_the_response_is_that_of_a_difference() -> None:
     found = periodogram(Pass(count=800).observed(3), 2.0, 12.0)
     assert_allclose(found.response[:, 0], 2.0 * np.abs(np.sin(np.pi * found.frequency * GAPS[0])), rtol=0, atol=0.06)
@@ -148,6 +150,7 @@ def test_wrong_matches_hide_nothing_and_add_nothing() -> None:
     assert not len(search(Pass(wrong=0.1).observed(5), 0.1, 6.0, RATE).lines.frequency)
 
 
+@pytest.mark.second
 def test_the_variance_of_the_noise_need_not_be_known() -> None:
     """Covariances that are ten times too small give no line, and sigmas of lines follow the noise that there is."""
     quiet, none = Pass(((2.0, 0.4, 0.0),)).observed(6), Pass().observed(7)
@@ -205,6 +208,7 @@ FAST = 8.0 * 3.0 + SLOW
 """Hertz, of an oscillation on rows of 8 a second, and as which it shows there."""
 
 
+@pytest.mark.second
 def test_an_alias_of_a_faster_oscillation_is_recognised() -> None:
     """On rows of 8 Hz, uneven by 4 ms, 26.7 Hz shows at 2.7 Hz with certainty, and explains it better."""
     given = Pass(((FAST, 0.5, 0.3),), GAPS, rows=0.125, scatter=4e-3).observed(8)
@@ -230,6 +234,7 @@ def test_what_even_rows_cannot_tell_apart_is_named(true: float) -> None:
     )
 
 
+@pytest.mark.second
 def test_slow_oscillations_at_random_moments_have_no_alias() -> None:
     lines = search(Pass(((0.65, 1.0, 0.5), (3.4, 0.15, 1.0))).observed(4), 0.1, 6.0, RATE, beyond=300.0).lines
     assert np.sort(lines.frequency) == pytest.approx([0.65, 3.4], abs=0.02)

@@ -50,6 +50,7 @@ def core(place, radius):
     return np.hypot(row - place[0], column - place[1]) < radius
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("case", quick(1, ["alike", "core", "holes"]))
 def test_influence_of_the_image_before_is_the_derivative_of_the_shift(case):
     """Whole chains, learning included, with the image before changed by a little noise along and against, of the

@@ -22,6 +22,7 @@ def scene(seed, count, wrong, sigma=0.05, height=False):
     return place, found, level, bad, shift
 
 
+@pytest.mark.second
 def test_covariances_weigh_and_scatter_is_what_they_lack():
     """Sigmas from 0.02 to 0.5 px: at the stated rate none of them is lost for being poor."""
     sigma = np.random.default_rng(1).uniform(0.02, 0.5, 2000)

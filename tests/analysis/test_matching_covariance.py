@@ -10,6 +10,8 @@ from analysis.matching.correlation import MatchOptions, Reason
 from tests.analysis.stereo_pairs import Pair, layered, textured
 from tests.tiers import quick
 
+pytestmark = pytest.mark.second
+
 # texture slope (0.5 sharp, 2 soft), noise of both images over contrast, relief in px with its length, radiometry
 EASY = {"slope": 1.0, "noise": 0.1, "relief": 0.0, "length": 12.0, "radiometry": "same"}
 SMALL = [
@@ -45,7 +47,6 @@ def test_errors_keep_in_their_covariances(changes) -> None:
     assert (np.abs(error[used]).max(axis=1) > 0.5).mean() < 0.05
 
 
-@pytest.mark.second
 def test_covariances_are_neither_too_large_nor_too_small() -> None:
     """400 points of even texture: the mean half of chi-square is 1, with a standard deviation of 1/20; 3.3 of it."""
     used, _, square, _ = judged(textured(20, **EASY | {"noise": 0.25}))
@@ -53,7 +54,6 @@ def test_covariances_are_neither_too_large_nor_too_small() -> None:
     assert abs(square.mean() - 1.0) < 3.3 / np.sqrt(len(square))
 
 
-@pytest.mark.second
 def test_windows_over_edges_between_layers_are_refused() -> None:
     """Two textures, the near one 1.5 px before the far one and hiding some of it: half of the windows hold an edge.
     Those without one are used, and what is used is right within its covariance.
@@ -72,7 +72,6 @@ def test_windows_over_edges_between_layers_are_refused() -> None:
     assert square.mean() < HIGH * stats.chi2.isf(1e-3, 2 * len(square)) / (2 * len(square))
 
 
-@pytest.mark.second
 def test_windows_too_weak_to_show_a_step_are_refused_only_where_others_have_one() -> None:
     """Noise of half the contrast, steps of 1.5 px; the same noise and more without steps refuses none."""
     pair, _edge = layered(9, step=1.5, noise=0.5, seed=24)

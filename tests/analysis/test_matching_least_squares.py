@@ -58,6 +58,7 @@ def test_windows_that_leave_the_image_on_any_side_are_told(texture, clean):
     assert np.all(np.isnan(fits.place[5:]))
 
 
+@pytest.mark.second
 def test_affine_change_without_noise(texture, templates):
     matrix = np.array([[1.03, 0.02], [-0.04, 0.98]])
     shift = np.array([12.3, 20.7])
@@ -90,6 +91,7 @@ def test_other_radiometry_and_sharpness(texture, clean, sharp, largest, sharpnes
     assert np.abs(error.mean(axis=0)).max() < 0.001
 
 
+@pytest.mark.second
 def test_scatter_reaches_the_bound(texture, clean, templates):
     """Cramer-Rao bound for place, affine change, offset, gain and sharpness from the texture's exact derivatives and
     the known noise of each pixel. Equal weights lose a per cent to it; the noise's estimate has 4 per cent a point.

@@ -76,6 +76,7 @@ def test_repeated_pattern_is_ambiguous_and_an_edge_is_uncertain():
     assert not found.accepted[0]
 
 
+@pytest.mark.second
 def test_search_is_good_to_tenths(texture, frame, points):
     places = points[:100] + 0.3
     peaks = search(frame, texture.patches(places), places + np.array([30.0, -30.0]), 40)
@@ -146,6 +147,7 @@ def test_second_peaks_count_from_four_pixels_on():
     assert _second(corner, 0, 1) == 0.0
 
 
+@pytest.mark.second
 def test_thresholds_are_options(texture, frame, points):
     patches = texture.patches(points[:30])
     strict = match(frame, patches, points[:30], reach=5, options=MatchOptions(largest_sigma=0.005))

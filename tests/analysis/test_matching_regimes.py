@@ -22,6 +22,7 @@ def squares(pair: Pair) -> np.ndarray:
     return 0.5 * np.einsum("ni,nij,nj->n", error[used], np.linalg.inv(found.covariance[used]), error[used])
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("name", "share"),
     quick(1, [("PRNU of 1%, noise 4", 0.8), ("checks of 12 px, noise 4", 0.4), ("stripes, texture 10", 0.0)]),

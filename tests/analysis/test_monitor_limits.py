@@ -140,6 +140,7 @@ def test_rows_of_the_angle_and_of_parameters():
         assert some[-1].row[[0, 4]] == pytest.approx(first * found[0].row[0] * np.array([1.0, -1.0]))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("cameras", quick(1, [1, 2]))
 def test_false_alarms_and_power_of_the_chi_square(cameras):
     """1000 drawn shifts. Noise is a hundredth of the motions, so that three times them are three times the spread

@@ -137,6 +137,7 @@ def test_pages_between_which_the_edge_moves_are_laid_over_each_other(tmp_path, f
     assert np.max(np.abs(moved)) < 5.0
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("imagej", [False, True])
 def test_still_pages_are_averaged_to_the_bit(tmp_path, imagej):
     """One page in 10 000 images would be laid over each other by chance."""
@@ -275,6 +276,7 @@ def test_images_beyond_memory_are_refused_by_their_header(tmp_path):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - begin < 100_000  # kB
 
 
+@pytest.mark.second
 def test_of_a_plain_tiff_only_the_region_is_read(tmp_path):
     """A sparse file of 1.8 GB that holds the edge in one corner, low byte first or last."""
     path = tmp_path / "large.tiff"

@@ -110,6 +110,7 @@ def test_normal_equations_that_cannot_be_solved(monkeypatch):
     refuses(CalibrationError, "cannot be solved for", normal_equations._inverse, indefinite.toarray())
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("cut", ["block", "rounds", "calibration", "strip", "intersection", "half widths"])
 def test_what_does_not_converge_is_no_result(monkeypatch, cut):
     """Each iteration is cut short; what it would return is where it stands, which no sigma covers."""

@@ -104,6 +104,7 @@ def test_three_pixels_tell_no_spot(template):
     refuses(SpotError, "too few good pixels", fit_screened, image, np.full((64, 64), 9.0), good, NOISE, template)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("measure", MEASURES)
 @pytest.mark.parametrize("kind", ["holes", "beside", "all"])
 def test_the_influence_of_every_pixel_is_the_change_it_makes(template, measure, kind):

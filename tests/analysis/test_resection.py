@@ -56,6 +56,7 @@ def test_unequal_look_angles_and_distortion():
     assert result.chi_square < 1e-10
 
 
+@pytest.mark.second
 def test_covariance_is_that_of_a_numerical_jacobian():
     """Points moved one by one in the input: the sum of squares of what the answer does, times the variance."""
     scene = descending_pass(n=4)

@@ -22,6 +22,7 @@ def drawn(true, noise):
     return np.hypot(true + noise[0], noise[1])
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("true", [0.0, 0.3, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 def test_the_mean_report_is_the_bias_at_the_true_value(true, noise):
     """In sigmas. Nothing that is worked out from the measured modulus has the right mean everywhere; what is reported
@@ -38,6 +39,7 @@ def test_the_mean_report_is_the_bias_at_the_true_value(true, noise):
         assert guessed > 0.14 > error + SCATTER
 
 
+@pytest.mark.second
 def test_the_report_falls_with_the_modulus_and_goes_with_the_unit():
     modulus = np.linspace(0.0, 50.0, 5001)
     bias = measured_bias(modulus, 1.0)

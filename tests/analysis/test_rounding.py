@@ -29,6 +29,7 @@ def mean_of(frames, light, noise, rng):
     return total / frames
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("gain", "read", "electrons"),
     [

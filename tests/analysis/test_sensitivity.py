@@ -15,6 +15,7 @@ def table(scene=SCENE, method="tls", **options):
     return sensitivity(Station.of(scene.station, 0.5), strips, PAIRS, method=method, **options)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("method", METHODS)
 def test_linear_derivative_agrees_with_recomputation(method):
     """Second order of 10 m over 500 km is 2e-5 of the slope, with factors up to 5. On noisy points, where the

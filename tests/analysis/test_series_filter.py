@@ -50,6 +50,7 @@ def series(count: int, size: float, seed: int = 1) -> tuple[np.ndarray, np.ndarr
     return times, size * rng.normal(size=(count, SPOTS))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("laws", [(law,) for law in LAWS] + [LAWS], ids=lambda laws: str(len(laws)))
 def test_the_same_as_the_joint_normal_of_the_series(laws) -> None:
     """Values to 1e-9 of sigma and covariances to 1e-9 of themselves, at readings, between, before and after them."""

@@ -105,6 +105,7 @@ def test_a_walk_of_the_attitude_is_as_large_whatever_the_interval_of_its_values(
     assert sizes[1] == pytest.approx(sizes[0], rel=1e-6)
 
 
+@pytest.mark.second
 def test_rows_of_shared_noise_are_derivatives_of_the_misclosures():
     """Central differences through the corrected rays, for readings of attitude and of station. A z of one sigma moves
     the image by 1e-6 m at most, of which the second order is 1e-12; rounding of 1e-17 m leaves 1e-10 of it."""

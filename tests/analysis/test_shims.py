@@ -55,6 +55,7 @@ def random_correction(rng, tilt=5 * ARCMIN, piston=0.3 * MM):
     return RigidMotion.of(rng.uniform(-1, 1, 3) * tilt, [0, 0, rng.uniform(-1, 1) * piston])
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("angle", "azimuth", "count"), [(0, 0, 3), (20 * DEG, 0, 4), (6 * DEG, 90 * DEG, 6)])
 def test_exact_shims_reproduce_the_wanted_motion(angle, azimuth, count):
     """Unrounded: pads thickened along n and slid in the surface carry a rigid body by just the wanted motion."""

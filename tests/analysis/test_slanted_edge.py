@@ -95,6 +95,7 @@ def chi_square_limits(count):
 # --- accuracy ---
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("pitch", [PAN, MULTISPECTRAL])
 @pytest.mark.parametrize("size", quick(1, [64, 96, 128]))
 @pytest.mark.parametrize("degrees", [2, 3, 5, 7, 10])

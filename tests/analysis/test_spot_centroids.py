@@ -107,6 +107,7 @@ def agrees(error, covariance):
 
 # Without noise. The likelihood fit has only the interpolation error (1e-4 px asked of the template, 2e-6 px reached).
 # The others are exact by symmetry but for the pixels that their window's edge cuts: some 1e-4 px.
+@pytest.mark.second
 @pytest.mark.parametrize(("name", "limit"), [("likelihood", 1e-5), ("energy", 3e-4), ("gauss", 1e-4)])
 def test_bias_without_noise(name, limit, template, places, light):
     clean = GAIN * light[:60] + OFFSET
@@ -118,6 +119,7 @@ def test_bias_without_noise(name, limit, template, places, light):
     assert error.max() < 0.25 * found.sigma_row.min()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", quick(2, ALL))
 def test_scatter_agrees_with_stated_sigma(name, template, places, before):
     found = measure(name, before, template)
@@ -168,6 +170,7 @@ def test_the_bound_of_an_image_is_that_of_its_shape(template):
     assert np.diagonal(found, axis1=1, axis2=2) == pytest.approx(np.diagonal(bound, axis1=1, axis2=2), rel=5e-3)
 
 
+@pytest.mark.second
 def test_shape_that_does_not_fit_shows_in_chi_square(template, light, before, places):
     good = maximum_likelihood_fit(before, FRAMES, NOISE, template).reduced_chi_square
     # each has 9212 degrees of freedom: sigma 1.5%; 6 sigma on 200 spots is a false alarm of 4e-7

@@ -61,6 +61,7 @@ def test_elasticities_are_derivatives_of_sigma() -> None:
     assert sum(one.elasticity for one in found.values()) + noise == pytest.approx(np.ones(4))
 
 
+@pytest.mark.second
 def test_heavy_tails_are_those_of_drawn_states() -> None:
     """200 000 states drawn number by number: a rms with four degrees of freedom scatters by some per cent."""
     degrees, count = 6.0, 200_000

@@ -8,6 +8,8 @@ from analysis.matching.least_squares import noise_energy, template_noise
 from analysis.matching.spline import SplineStack, low_passed
 from tests.analysis.stereo_pairs import Pair
 
+pytestmark = pytest.mark.second
+
 HALF, REACH = 15, 12
 SHIFT = np.array([0.37, -0.21])
 ROW, COLUMN = (grid.ravel().astype(float) for grid in np.mgrid[-REACH : REACH + 1, -REACH : REACH + 1])
@@ -98,7 +100,6 @@ def edges(count, *, noise, faint, seed):
     return Pair(np.hstack(images[0]), np.hstack(images[1]), places, places + SHIFT)
 
 
-@pytest.mark.second
 def test_places_on_edges_keep_in_their_covariances():
     """Edges whose faint texture tells the place along them: half of chi-square is 1 within the limits of so many
     windows (one false alarm in 1000), and the long axis lies along the edge. Without texture, however strong the edge,

@@ -271,6 +271,7 @@ def test_errors_are_told_in_east_north_and_up():
     assert (errors.plan_rms, errors.height_rms) == pytest.approx((5, 2), abs=1e-6)
 
 
+@pytest.mark.second
 def test_intersection_covariance_holds():
     """Mahalanobis squares of 400 points: chi-square of 1200, within 5 of its sigmas (false alarm 6e-7)."""
     noise = Noise(0.3 * PITCH, 0.5 * ARCSEC, 0.3)

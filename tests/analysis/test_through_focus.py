@@ -51,6 +51,7 @@ def steps(step, low, high):
     return np.arange(round(low / step), round(high / step) + 1) * step
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("frequency", "step", "low", "high", "middle", "lobe_um", "parabola_um"),
     [
@@ -77,6 +78,7 @@ def test_bias_over_sampling_phases(monkeypatch, frequency, step, low, high, midd
     assert lobe_um < plain.max() < parabola_um
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("frequency", "step", "half", "noise"),
     [(PAN, 50 * UM, 0.6e-3, 0.02), (PAN, 50 * UM, 0.6e-3, 0.05), (MS, 50 * UM, 1e-3, 0.02), (MS, 100 * UM, 6e-4, 0.02)],
@@ -134,6 +136,7 @@ def test_peak_outside_the_scan(focus, frequency, reason, remedy):
     assert caught.value.faults == {(): reason}
 
 
+@pytest.mark.second
 def test_flat_curves():
     """1000 curves of noise alone: less than 1% of them get any other name than flat, and none a vertex; each of them
     gets the same name alone.

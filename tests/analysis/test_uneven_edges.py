@@ -109,6 +109,7 @@ def test_errors_are_those_of_sigma():
     assert np.all((low < square) & (square < 1.25 * high)), square
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("bow", [(0.0, 0.5), (0.3, -2.0), (0.1, 0.0, 0.6), (0.0, 0.5, 0.0, 0.8)])
 def test_a_bowed_edge_is_followed(bow):
     """Without noise the error of following is below 5e-4; a straight line would lose up to a half."""
@@ -119,6 +120,7 @@ def test_a_bowed_edge_is_followed(bow):
     assert measure_edge(edge(64, 64, 5, 0.5), saturation=np.inf).order == 1
 
 
+@pytest.mark.second
 def test_uneven_light_is_fitted_and_reported():
     """1 % across, as of any collimator: 0.0057 too low at 0.05 cycles/px if it counts as blur."""
     image = edge(64, 64, -7, 0.6, light=plane(0.2, 0.01))
@@ -130,6 +132,7 @@ def test_uneven_light_is_fitted_and_reported():
     assert abs(measure_edge(image, saturation=np.inf, even=True).at(0.05)[0] - truth(0.05, -7, 0.6)) > 0.004
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     "light",
     [

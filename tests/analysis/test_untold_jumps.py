@@ -39,6 +39,7 @@ def series(
     return times, moved + NOISE * rng.normal(size=(count, 4))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("amounts", quick(1, [((0.35, 0.1, 0.0),), ((0.0, 0.0, 0.0),), ((0.0, 0.0, 0.8),)]))
 def test_what_is_known_now_is_the_mixture_of_all_jumps_there_may_be(amounts: tuple[float, ...]) -> None:
     """Every place, body and size by itself, known and weighed by the density of all readings: the same to rounding."""

@@ -33,6 +33,7 @@ LIGHT = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("light", quick(3, LIGHT))
 def test_the_pupil_is_found_by_its_light(light):
     """To a tenth of a pixel where a radius has a hundred: half a pixel in the edge's steps, of which there are many."""
@@ -58,6 +59,7 @@ def test_light_without_a_round_edge_needs_a_stated_pupil():
     refuses(MapError, "radii are positive", Pupil, 1.0, 2.0, 0.0)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("light", ["disk", "ring", "spiders", "cut"])
 def test_coefficients_come_back_exactly(light):
     x, y = disk(90, 44.3, 45.1, 40.0)

@@ -109,6 +109,7 @@ def test_readings_that_look_alike_are_named_together():
     }
 
 
+@pytest.mark.second
 def test_the_right_reading_is_rejected_as_often_as_stated():
     expected, covariance = camera(5e-9, 0.5e-6)
     rng = np.random.default_rng(8)

@@ -99,6 +99,7 @@ def text_of(order: str, size: str, unit: str, form: str) -> str:
     return head + body
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("order", ["noll", "fringe", "ansi"])
 @pytest.mark.parametrize("size", ["rms", "peak"])
 @pytest.mark.parametrize("unit", UNITS)

@@ -24,6 +24,7 @@ def halved(seed, displacement=None, noise=0.3):
     return window_halves(design, fitted(design, grey)[1], SIDE), NONE + noise**2
 
 
+@pytest.mark.second
 def test_differences_of_halves_keep_in_their_covariances():
     """Of white noise: chi-square of two degrees of freedom in each of the four splits, to four sigmas."""
     halves, variance = halved(1)
@@ -35,6 +36,7 @@ def test_differences_of_halves_keep_in_their_covariances():
     assert COUNT * 0.02 < (chance < 0.05).sum() < COUNT * 0.05 + 4 * np.sqrt(COUNT * 0.05)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("split", quick(1, range(4)))
 def test_a_step_between_halves_is_found_as_often_as_the_power_says(split):
     """A step of STEP along rows between halves, in noise that the weakest split can hardly see it in."""
@@ -51,6 +53,7 @@ def test_a_step_between_halves_is_found_as_often_as_the_power_says(split):
     assert found > power.mean() - 4 * np.sqrt(0.25 / COUNT)
 
 
+@pytest.mark.second
 def test_covariance_of_relief_is_that_of_fields_drawn():
     """Displacements of both axes drawn from the field's covariance, hardly any noise: chi-square of the differences in
     the covariance for tau of 1 px has two degrees of freedom, to four sigmas.

@@ -46,6 +46,7 @@ def test_what_cannot_be_compared_is_said(monkeypatch, tmp_path) -> None:
         pass
 
 
+@pytest.mark.second
 def test_the_command_prints_finite_numbers_and_refuses_unknown_names() -> None:
     done = CliRunner().invoke(app, ["--only", "psf", "--quick", "--json"])
     assert done.exit_code == 0, done.output

@@ -1,11 +1,13 @@
 """What speed rests on and can be told without a clock: kernels compiled once."""
 
 import drjit as dr
+import pytest
 
 from tests.benchmarks.monitor_speed import random_states
 from twin.monitor.truth import trace_truth
 
 
+@pytest.mark.second
 def test_other_numbers_compile_no_new_kernel(experiment, backend) -> None:
     setup = experiment("gf7_pair")
 

@@ -14,8 +14,7 @@ import numpy as np
 
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.camera_axis import LINE_AXIS
-from scenes.models.camera_model import CameraModel, collimated, field_direction
+from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, field_direction
 from tests.benchmarks.number import Number, Speed
 from tests.benchmarks.stopwatch import Spent, Work, in_turns
 from tests.benchmarks.workbench import Workbench, absent, installed

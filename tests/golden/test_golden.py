@@ -114,6 +114,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", quick(8, CHANGES))
 def test_a_change_is_found(both, name) -> None:
     """Its place, and both values."""

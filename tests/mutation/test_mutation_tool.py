@@ -133,6 +133,7 @@ def test_what_runs_at_import_is_met_by_all_tests_of_the_file() -> None:
     assert known.covering("toy.py", (7, 7)) == ["c", "a"]
 
 
+@pytest.mark.second
 def test_every_equivalent_mutant_gives_a_reason_and_every_planted_fault_is_in_the_source() -> None:
     from tests.mutation.__main__ import equivalents, planted
 

@@ -105,6 +105,7 @@ CURVATURE, CONIC = st.floats(-0.5, 0.5), st.floats(-4.0, 2.0)
 PLACES = np.random.default_rng(1).uniform(-0.5, 0.5, (2, 40))
 
 
+@pytest.mark.second
 @given(CURVATURE, CONIC)
 def test_a_conic_is_a_quadric(curvature, conic) -> None:
     """c (r^2 + (1 + k) z^2) = 2 z, on the sheet through the vertex."""

@@ -43,6 +43,7 @@ def ends(backend, systems, rays, keep=(0, 2), **how) -> list[np.ndarray]:
     return [*found.numpy(), *found.numpy(found.world), *map(found.hit, keep)]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("section", [2, trace_module.SECTION])
 def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, section: int, monkeypatch) -> None:
     """The same recording serves any number of systems and rays."""

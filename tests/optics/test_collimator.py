@@ -62,6 +62,7 @@ def curvatures(pupil: PupilFunction, without: PupilFunction) -> tuple[float, flo
     return float(terms[3]), float(terms[5])
 
 
+@pytest.mark.second
 def test_a_moved_target_is_a_moved_detector(bench, gf7) -> None:
     """Curvature of the added wavefront against that of a detector moved along Z', axis by axis: s (f / F)^2 with the
     focal length of chief rays, which differ by 2.9% in this camera. Downstream image, so upstream detector.
@@ -80,6 +81,7 @@ def test_a_moved_target_is_a_moved_detector(bench, gf7) -> None:
     assert np.all(moved > 0.0)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("place", [MIDDLE, EDGE])
 @pytest.mark.parametrize("term", quick(3, [2, 5, 8, 6, 7, 11]))
 def test_the_wavefront_appears_in_the_pupil(bench, term: int, place: np.ndarray) -> None:

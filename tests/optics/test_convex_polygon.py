@@ -150,6 +150,7 @@ def test_a_sliver_within_a_pupil_has_its_area_and_no_more(thin: float, across: f
         assert np.max(np.abs(points)) < 1.0
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("count", quick(1, [40, 300]))
 def test_random_shadows_in_a_pupil_take_what_a_dense_raster_of_it_says(count) -> None:
     """Of pupils with one to six shadows, slivers and outlines that touch the rim or each other among them."""

@@ -38,6 +38,7 @@ def beams(gf7):
     return beams_of(gf7.spec)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("measure", quick(1, ["wavefront", "spot"]))
 def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) -> None:
     operands = Operands(650e-9, principal_distance=5.5, measure=measure, distortion=1.0)
@@ -63,6 +64,7 @@ def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) 
     assert compared > 3 * len(EVERY)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", quick(1, ["gf7", "gf7_conic"]))
 def test_errors_and_envelope_are_those_of_the_camera(backend, camera, name: str) -> None:
     """Against wavefronts of the camera as told to users, and heights of all that its clear apertures hold."""
@@ -89,6 +91,7 @@ def test_axes_of_a_beam() -> None:
     np.testing.assert_allclose(np.linalg.det(frames), 1.0, rtol=1e-14)
 
 
+@pytest.mark.second
 def test_a_detuned_camera_comes_back(backend, gf7, beams) -> None:
     """From its own conics and from conics that are wrong by a percent gf7 gets to one optimum, no worse than itself."""
     nominal = prescription_of(gf7.spec)
@@ -143,6 +146,7 @@ def test_starts(backend, gf7, beams) -> None:
     assert search(backend, nominal, CONICS, beams, Operands(650e-9), starts=1).local
 
 
+@pytest.mark.second
 def test_constraints_that_cannot_be_held(backend, gf7, beams) -> None:
     """An envelope of half the length with nothing to vary but the image plane."""
     nominal = prescription_of(gf7.spec)

@@ -56,6 +56,7 @@ EDGES = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", quick(1, EDGES))
 def test_shadows_are_what_edges_block(name: str) -> None:
     edges = EDGES[name]
@@ -137,6 +138,7 @@ def test_clear_edges_beyond_the_light_are_followed_nowhere() -> None:
     assert not edge_shadow.outlines_on_stop(wild[None], edges, NODES, lit=lit[None]).clear
 
 
+@pytest.mark.second
 def test_a_stop_without_its_shadows() -> None:
     """Area and moments of a ring, and whether it is one: a vane or a shift makes it none."""
     ring = edge_shadow.settled_shadows(by_sides([Edge(Circle(0.6), True)]), 1)[0]

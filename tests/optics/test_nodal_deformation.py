@@ -37,6 +37,7 @@ def moved(points: np.ndarray, turn: np.ndarray = TURN, shift: np.ndarray = SHIFT
     return size * Rotation.from_rotvec(turn).apply(points) + shift - points
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("aperture", quick(1, APERTURES), ids=["disk", "ring", "rectangle", "ellipse"])
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
 @pytest.mark.parametrize(("times", "growth"), [(1.0, 0.0), (100.0, 3e-4)], ids=["small", "large and grown"])
@@ -52,6 +53,7 @@ def test_a_rigid_motion_and_a_growth_are_exact(aperture: Aperture, uneven: bool,
     assert not face.printed_through
 
 
+@pytest.mark.second
 def test_figure_and_ripple_come_back_with_their_sizes() -> None:
     """Amplitudes of terms are rms, half of a ripple's amplitude is its rms; the mesh says how well it knows them. Nodes
     slide along the surface by 1 um: where they end up counts.

@@ -22,6 +22,7 @@ def oversampled(n: int, disk: float, shift: tuple[float, float], fine: int) -> n
     return spot.reshape(n, fine, n, fine).mean(axis=(1, 3))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("disk", [0.0, 20e-6])
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.37, -0.21)])
 def test_against_brute_force(disk: float, shift: tuple[float, float]) -> None:

@@ -14,6 +14,7 @@ def disk_moment(a: int, b: int, inner: float = 0.0) -> float:
     return azimuth * (1.0 - inner ** (a + b + 2)) / (a + b + 2)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("inner", [0.0, 0.3])
 @pytest.mark.parametrize(("rings", "arms"), [(1, 4), (3, 12), (6, 24), (12, 40)])
 def test_disk_is_exact_up_to_its_degree(rings: int, arms: int, inner: float) -> None:

@@ -15,8 +15,7 @@ from scipy.stats import chi2
 
 from optics.materials import scatter as finishes
 from optics.materials.scatter import STEPS, ABg, HarveyShack, ScatterTable, acceptance, sample_distance, total_scatter
-from scenes.models.scenery import MeasuredFinishes
-from scenes.models.scenery_parts import Finishes
+from scenes.models.scenery import Finishes, MeasuredFinishes
 
 INCIDENCE = np.radians([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0])
 HALF = np.radians(np.linspace(0.0, 180.0, 19))
@@ -50,6 +49,7 @@ def test_lamberts_total_is_its_albedo(angle) -> None:
     assert lambert(0.3).total(np.radians(angle)) == pytest.approx(0.3, rel=2e-3)
 
 
+@pytest.mark.second
 def test_the_total_is_the_integral_of_the_interpolated_table() -> None:
     rng = np.random.default_rng(1)
     table = ScatterTable(

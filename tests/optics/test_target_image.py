@@ -103,6 +103,7 @@ def test_middle_of_a_disk_is_the_encircled_energy(radius: float) -> None:
     assert middle == pytest.approx(1.0 - j0(z) ** 2 - j1(z) ** 2, abs=FAINT)
 
 
+@pytest.mark.second
 def test_shift_of_the_target_is_a_phase_of_the_transfer_function() -> None:
     shift = (2.3e-6, -1.7e-6)
     x, y = centred(28, PITCH), centred(24, PITCH)

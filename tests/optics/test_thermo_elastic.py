@@ -116,6 +116,7 @@ def test_a_disks_volume_converges_with_the_fourth_power_of_the_cells() -> None:
     assert errors[1] < errors[0] / 12.0
 
 
+@pytest.mark.second
 def test_uniform_expansion_is_exact() -> None:
     body = thermo_elastic.ElasticBody(mirror_mesh(Surface(1 / 3, -1.0), Circle(0.3, (0.0, -0.4)), 0.06, 1, 12), SILICA)
     support = thermo_elastic.Kinematic(np.array([[0.2, -0.4, 0.1], [-0.1, -0.2, 0.1], [-0.1, -0.6, 0.1]]))
@@ -151,6 +152,7 @@ def test_the_exact_field_turns_by_a_g_cross_r() -> None:
     assert np.all(field(np.array([[0.1, 0.2, 0.3]])) == 0.0)
 
 
+@pytest.mark.second
 def test_the_kinematic_support_holds_its_six_components() -> None:
     body, support = bar()
     (u,) = body.solve_many([linear(0.3, (1.0, 2.0, -3.0))], support)
@@ -179,6 +181,7 @@ def test_every_point_of_a_curved_face_is_found_in_its_own_cell(aperture, cells: 
     np.testing.assert_allclose(Displacement(body.nodes, body.nodes, body._finder).at(points), points, atol=1e-9)
 
 
+@pytest.mark.second
 def test_load_cases_add_up_and_differ_not_from_single_ones() -> None:
     body, support = bar()
     fields = [lambda p: p[:, 0] ** 2, lambda p: np.sin(30 * p[:, 1])]
@@ -240,6 +243,7 @@ def test_a_foundation_that_expands_alike_leaves_no_stress() -> None:
     assert np.max(np.abs(alone.values)) > 1e-8
 
 
+@pytest.mark.second
 def test_a_gradient_through_a_plate_is_a_defocus_of_radius_one_over_a_g() -> None:
     g = 100.0
     aperture, radius = Rectangle(0.2, 0.15), 0.25

@@ -126,6 +126,7 @@ def lenses(draw) -> Lens:
     return Lens(draw(surfaces()), draw(surfaces()), draw(surfaces()), draw(st.floats(1.3, 1.9)), tilts)
 
 
+@pytest.mark.second
 @given(lens=lenses())
 def test_hits_and_the_laws_of_reflection_and_refraction(backend, lens) -> None:
     """n d before and n' d' after a surface differ along its normal only; the normal is from differences of the sag over
@@ -154,6 +155,7 @@ def test_hits_and_the_laws_of_reflection_and_refraction(backend, lens) -> None:
         before, way, index = hit, leaving, after
 
 
+@pytest.mark.second
 @given(lens=lenses(), motion=motions(), base=poses())
 def test_moving_everything_is_moving_the_rays(backend, lens, motion, base) -> None:
     """Rigidly: paths stay. Grown by a factor: paths grow by it."""

@@ -315,6 +315,7 @@ def test_polychromatic_mean(traced: PupilFunction) -> None:
     assert got.shape == (2, 30)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("band", "dz"), quick(1, [(BAND, 0.0), (BAND, -1e-3), (BAND[:1], 3e-4)]))
 def test_table(traced: PupilFunction, band: np.ndarray, dz: float) -> None:
     weights = np.linspace(1.0, 2.0, len(band))

@@ -195,6 +195,7 @@ def test_turns_about_one_axis_add(axis, first, second) -> None:
     np.testing.assert_allclose(rotation_vector(rotation_matrix(axis)), axis, atol=ROUNDING)
 
 
+@pytest.mark.second
 @given(poses(), poses(), poses())
 def test_poses_are_a_group_and_keep_distances(a, b, c) -> None:
     points = np.array([[0.3, -0.7, 1.1], [2.0, 0.1, -0.4]])
@@ -208,6 +209,7 @@ def test_poses_are_a_group_and_keep_distances(a, b, c) -> None:
     assert abs(np.linalg.norm(moved[1] - moved[0]) - np.linalg.norm(points[1] - points[0])) < ROUNDING
 
 
+@pytest.mark.second
 @given(motions(), motions())
 def test_a_motion_and_its_inverse_leave_everything_where_it_was(first, second) -> None:
     """In either order, of a body and of what it carries."""

@@ -43,6 +43,7 @@ def frequencies(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return fx.ravel(), fy.ravel()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     "vertices", quick(1, [SQUARE, ARROW, BAR, SQUARE + 2e-3]), ids=["square", "arrow", "bar", "far"]
 )

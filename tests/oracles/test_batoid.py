@@ -38,6 +38,7 @@ STATES: dict[str, State] = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("state", quick(1, ["moved far", "moved", "nominal"]))
 @pytest.mark.parametrize("name", ["gf7", "monitor", "gf7_conic"])
 def test_rays_are_where_batoid_puts_them(backend, camera, name: str, state: str) -> None:

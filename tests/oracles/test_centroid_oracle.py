@@ -40,6 +40,7 @@ def distance(shape: tuple[int, ...], place: tuple[float, float]) -> np.ndarray:
     return np.hypot(rows - place[0], columns - place[1])
 
 
+@pytest.mark.second
 def test_energy_centroid(setup, spots) -> None:
     """Ours is the first moment in a window about itself: photutils' moment of the same pixels has to be there.
 

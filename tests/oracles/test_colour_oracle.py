@@ -65,6 +65,7 @@ def test_lateral_colour_of_batoids_chief_rays(case) -> None:
     assert np.max(np.abs(own[1:])) > 1e-10  # there is some
 
 
+@pytest.mark.second
 def test_axial_colour_of_batoids_beams(case, backend) -> None:
     """Through the same search for the best plane, and against the defocus that is left on it by Zernike terms."""
     optics, peer = case

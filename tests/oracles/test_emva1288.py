@@ -77,6 +77,7 @@ def of_the_standard(campaign):
     return Results1288(Data1288(loaded.data, **quiet).data, **quiet)
 
 
+@pytest.mark.second
 def test_the_reference_implementation_returns_the_data_sheet(detector, standard):
     # a variance from two frames of P pixels is known to sqrt(2 / P); five sigma of it, with some 15 levels in the fits
     # known better than one

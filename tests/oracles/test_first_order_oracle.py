@@ -165,6 +165,7 @@ def by_batoid(system: System) -> dict[str, float]:
     }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", quick(5, SYSTEMS))
 def test_first_order_data(backend, name: str) -> None:
     pytest.importorskip("batoid")
@@ -177,6 +178,7 @@ def test_first_order_data(backend, name: str) -> None:
     assert ours["diameter"] == pytest.approx(SYSTEMS[name].pupil, rel=SAME)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["lens, stop behind", "Cassegrain, stop on M2"])
 def test_the_focal_length_does_not_move_with_the_image_plane(backend, name: str) -> None:
     """The principal distance does, and so did what was called the focal length."""
@@ -216,6 +218,7 @@ def test_paraxial_data_of_optiland(backend, camera, name: str) -> None:
     assert told["exit_pupil_m"] == pytest.approx(abs(float(np.ravel(paraxial.XPD())[0])), rel=1e-9)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", NAMES)
 def test_wavefronts_of_batoids_rays(backend, camera, name: str) -> None:
     """batoid traces; its paths to the reference sphere are found by the quadratic, and poppy's Zernike terms fitted."""

@@ -35,6 +35,7 @@ def point(request, backend, gf7) -> FarPoint:
     return FarPoint(backend, gf7, np.radians(1.0), np.radians(0.05), STATES[request.param])
 
 
+@pytest.mark.second
 def test_image_of_the_same_samples(point) -> None:
     """The same sum by other code: rounding, 1e-16 times the root of some ten thousand terms and the phases' size."""
     grid = pupil_grid(fitted(point), 128)
@@ -61,6 +62,7 @@ def test_image_from_the_stops_quadrature(point) -> None:
     assert ours.max() * STEP**2 > 0.01  # there is an image
 
 
+@pytest.mark.second
 def test_transfer_function(point) -> None:
     """MTF and phase by the transform of poppy's image on a large field against the pupil's autocorrelation.
 

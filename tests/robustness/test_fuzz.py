@@ -24,6 +24,8 @@ from tests.robustness.cases import cases
 from tests.robustness.mutate import Mutant, form_of
 from tests.robustness.spoilt_run import mutant, run_mutant
 
+pytestmark = pytest.mark.second
+
 QUICK = ("table ", "file ", "config", "measured", "Zemax", "CODE V", "batoid", "study")
 """Beginnings of the kinds of files of which a kept mutant is run: those that cost least."""
 KEPT = 3
@@ -38,7 +40,6 @@ def table() -> dict[str, Case]:
     return cases()
 
 
-@pytest.mark.second
 def test_spoilt_files_are_refused_or_taken(table, tmp_path) -> None:
     cheap = [name for name, case in table.items() if case.kind.startswith(QUICK)]
     ends = require_good(run_many([(name, KEPT) for name in cheap], tmp_path, table))
@@ -48,7 +49,6 @@ def test_spoilt_files_are_refused_or_taken(table, tmp_path) -> None:
     require_good(run_many([*FAILED, *new[:: max(1, len(new) // NEW)]], tmp_path, table, "soon"))
 
 
-@pytest.mark.second
 def test_every_case_is_good_as_it_is(table, tmp_path) -> None:
     """Else its mutants would test one refusal again and again. Of each kind of file the last case."""
     last = {case.kind: case for case in table.values() if case.kind.startswith(QUICK)}
@@ -58,7 +58,6 @@ def test_every_case_is_good_as_it_is(table, tmp_path) -> None:
         assert one.end in ("built", "ran"), f"{case.name}: {one.text}"
 
 
-@pytest.mark.second
 def test_mutants_are_the_same_every_time(table) -> None:
     assert len({case.kind for case in table.values()}) > 70
     assert {form_of(case.target) for case in table.values()} >= {"yaml", "json", "table", "image", "text"}
@@ -138,7 +137,6 @@ BEHAVIOURS = [
 ]
 
 
-@pytest.mark.second
 def test_the_judge_sees(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(spoilt_run, "SECONDS", {"soon": 0.5})
     monkeypatch.setattr(spoilt_run, "PATIENCE", 2.0)

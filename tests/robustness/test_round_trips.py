@@ -19,6 +19,8 @@ from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.sensor import Sensor
 
+pytestmark = pytest.mark.second
+
 TEXT = st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), max_size=20)
 SCALARS = st.none() | st.booleans() | st.integers(-(10**29), 10**29) | st.floats(allow_nan=False) | TEXT
 TREES = st.recursive(
@@ -26,7 +28,6 @@ TREES = st.recursive(
 )
 
 
-@pytest.mark.second
 @settings(max_examples=30)
 @given(st.dictionaries(TEXT, TREES, min_size=1, max_size=4))
 def test_yaml(data) -> None:
@@ -54,7 +55,6 @@ RESOLVERS = {
 }
 
 
-@pytest.mark.second
 def test_configurations_of_spoilt_files_that_are_good(tmp_path) -> None:
     """The config.yaml of whatever can be read is read back to the same text, wherever it lies."""
     table, good = cases(), 0

@@ -27,6 +27,7 @@ def built(spec, backend):
     return build_instrument(spec, load_cameras(spec), backend).as_built
 
 
+@pytest.mark.second
 def test_a_file_that_says_how_another_instrument_was_built(backend, tmp_path) -> None:
     text = HEAD + "  forward/M2: {shift: 0 0 3 um, pivot: centre}\n  base/central_prism: {rotate: 1 0 2 arcsec}\n"
     spec = read(tmp_path, text + "description: mine\n")

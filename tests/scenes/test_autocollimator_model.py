@@ -7,10 +7,10 @@ import pytest
 
 from optics.geometry.tree import Motion
 from optics.numerics.backend import Backend
-from scenes.models import autocollimator_model as model
 from scenes.specs.load import load_autocollimator_test
 from scenes.yaml.errors import InputError
-from twin.laboratory.autocollimator_images import AutocollimatorPath
+from twin.laboratory import autocollimator_bench as model
+from twin.laboratory.autocollimator_bench import AutocollimatorPath
 
 SPEC = load_autocollimator_test().spec
 ANGLES = [math.radians(15), math.radians(30)]

@@ -10,9 +10,7 @@ from typer import Exit
 from optics.geometry.tree import Motion
 from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.aim import AimError
-from scenes.models.camera_axis import AfocalError
-from scenes.models.camera_model import CameraModel, derive_camera
-from scenes.models.stated_focal_length import check_entrance_pupil
+from scenes.models.camera_model import AfocalError, CameraModel, check_entrance_pupil, derive_camera
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
@@ -64,6 +62,7 @@ def own_radius(model: CameraModel, pupil: float) -> float:
     return float(np.hypot(*ray.stop[0]))
 
 
+@pytest.mark.second
 def test_the_stop_is_as_large_as_the_marginal_ray_makes_it(backend) -> None:
     """Behind power that is not where a paraxial ray goes: the beam before the first surface has the stated width."""
     model = camera(backend, PETZVAL, "STOP", 0.055, "26 mm", 0.0797)
@@ -102,6 +101,7 @@ AFOCAL = {
 }  # fmt: skip
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("name", AFOCAL)
 def test_afocal_systems_are_no_cameras(backend, name: str, stated: bool) -> None:
@@ -114,6 +114,7 @@ def test_afocal_systems_are_no_cameras(backend, name: str, stated: bool) -> None
     assert told == pytest.approx(magnification, rel=1e-4)
 
 
+@pytest.mark.second
 def test_the_data_are_those_of_one_state(backend) -> None:
     """Two mirrors by hand, M2 a millimetre nearer to M1 and the image plane 5 mm farther out."""
     f1, f2, apart, place = 1.5, -0.5, 1.1, 0.63

@@ -10,17 +10,18 @@ from scipy.spatial import ConvexHull, Delaunay
 
 from optics.geometry.pose import rotation_matrix
 from scenes.models import instrument_builder, obstruction
-from scenes.models.clearance import (
+from scenes.models.instrument_model import MisplacedError
+from scenes.models.obstruction import (
     LEAST_GAP,
+    RAYS,
     check_clearance,
     check_solids,
     convex_bodies,
+    find_obstructions,
     find_overlaps,
     remedy,
     separation,
 )
-from scenes.models.instrument_model import MisplacedError
-from scenes.models.obstruction import RAYS, find_obstructions
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_cameras, load_instrument
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
@@ -75,6 +76,7 @@ def test_separation_of_crossed_edges() -> None:
         assert separation(first, second + np.array([0.0, 0.0, np.sqrt(2.0) + gap])) == pytest.approx(gap, abs=1e-12)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
 def test_reference_instruments_have_room(name, instrument) -> None:
     model = instrument(name)
@@ -130,6 +132,7 @@ OVERLAPS = {
 MOVE = re.compile(r"move it by ([+-])([xyz]) ([0-9.e+]+) mm of the base")
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", OVERLAPS)
 def test_bodies_in_each_other(name, bare) -> None:
     """A message names both bodies and how deep they reach into each other, and says how far and along which axis the
@@ -171,6 +174,7 @@ def test_a_gap_below_the_least(bare) -> None:
     check_clearance(bare(("distance: 0.5 m", "distance: 33.1 mm")))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", quick(1, ["gf7_pair", "monitor_pair"]))
 def test_only_its_own_prisms_stand_before_a_camera(name, instrument, backend) -> None:
     """Each 180-deg prism takes some 5 % of its camera's pupil, of which its channel uses the part that the return face

@@ -36,6 +36,7 @@ def put(place: Path, text: str) -> Path:
     return place
 
 
+@pytest.mark.second
 def test_a_bsdf_file(tmp_path) -> None:
     found = read_bsdf(put(tmp_path / "m.bsdf", bsdf_text()))
     assert found.stated == (0.2, 0.2, 0.2)

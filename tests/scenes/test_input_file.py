@@ -258,6 +258,7 @@ def test_too_many_values_are_refused_where_they_begin(monkeypatch: pytest.Monkey
     assert caught.value.key == ("b", 7)
 
 
+@pytest.mark.second
 def test_tabs_and_signs_of_units_are_texts() -> None:
     assert parse_yaml('note: "a\\tb\\nc µ ″"').data == {"note": "a\tb\nc µ ″"}
     for parse in (parse_yaml, parse_json):

@@ -46,6 +46,7 @@ def warmed(built: Instrument, temperatures: dict[str, Temperature]) -> State:
 # --- one material ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_one_material_keeps_its_angles_and_grows(backend) -> None:
     """Lenses and mount of one expansion, without dn/dT: every length grows by 1 + alpha dT, the wavefront error too."""
     built = instrument(colour_camera("achromat", mirrors=LIKE_ALUMINIUM), "aluminium", backend)
@@ -110,6 +111,7 @@ def singlet(backend) -> Instrument:
     return instrument(colour_camera("achromat", **shape), "Zerodur", backend)
 
 
+@pytest.mark.second
 def test_a_singlet_refocuses_as_first_order_says(singlet, backend) -> None:
     """Held by what does not expand: radii, thickness and index change where its light comes together."""
     for change in (WARM, -15.0):

@@ -52,6 +52,7 @@ disturbances:
 """
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("read", "file"),
     [
@@ -101,6 +102,7 @@ def specimens() -> list[Spec]:
     return found
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("spec", specimens(), ids=lambda spec: f"{type(spec).__name__}-{getattr(spec, 'name', '')}")
 def test_every_specification_is_a_value(spec: Spec) -> None:
     for twin in (

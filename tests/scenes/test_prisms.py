@@ -23,8 +23,7 @@ from optics.raytrace import reflectors
 from optics.raytrace.assembly import Assembly
 from optics.thermal.heat import Temperature
 from optics.thermal.thermo_elastic import free_linear_field
-from scenes.models.clearance import LEAST_GAP, find_overlaps, separation
-from scenes.models.obstruction import find_obstructions, rays_taken
+from scenes.models.obstruction import LEAST_GAP, find_obstructions, find_overlaps, rays_taken, separation
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.load import load_instrument
 from tests.optics.bench import run
@@ -72,6 +71,7 @@ def turned(vector, pivot: str = "apex") -> dict[str, Motion]:
     return {"glass": Motion(rotate=tuple(ARCSEC * np.array(vector)), pivot=pivot)}
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("hand", [1.0, -1.0])
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), *TURNS])
 @pytest.mark.parametrize("slant", [(0.0, 0.0), (0.004, -0.007)])
@@ -119,6 +119,7 @@ def frames(parts) -> dict[str, np.ndarray]:
     return {body.path.rpartition("/")[2]: body.pose.rotation for body in parts.bodies}
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("prism", "face"), [(prism, face) for prism, faces in FACES.items() for face in faces])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_angle_errors(backend, prism, face, axis) -> None:
@@ -267,6 +268,7 @@ def by_hand(parts, state, position, direction):
     return np.array(places), way, length
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", ["hollow_transfer", "periscope"])
 @pytest.mark.parametrize("turn", ATTITUDES)
 @pytest.mark.parametrize("slant", [(0.0, 0.0), (0.004, -0.007)])
@@ -307,6 +309,7 @@ def test_angle_errors_are_tilts_of_the_mirrors(kind) -> None:
         made(kind, errors={"window": (0.0, 0.0)})
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", ["hollow_transfer", "periscope"])
 @pytest.mark.parametrize("width", [0.02, 0.06, 0.15])
 @pytest.mark.parametrize("factor", [1.0, 1.3, 10.0])

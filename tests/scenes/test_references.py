@@ -13,7 +13,6 @@ from scenes.specs.load import EXAMPLES, SCENES, load_error_budget
 from scenes.specs.operation import read_operation
 from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import resolve, resolve_budget, resolve_on
-from scenes.specs.tolerance import ToleranceSetup
 from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from tests.scenes.refusals.readers import measurement
@@ -40,7 +39,6 @@ READERS: dict[str, Callable[[Path], Any]] = {
     **{name: procedure.resolve for name, procedure in PROCEDURES.items()},
     "render": resolve,
     "instrument": lambda path: resolve_on(Spec(), str(path)),
-    "tolerance": ToleranceSetup.read,
     "recover": frames,
     "operate": read_operation,
     "operate ingest": telemetry,

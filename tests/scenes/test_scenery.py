@@ -12,8 +12,16 @@ from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import Body, Motion, RigidTree
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.meshes import sheet_mesh
-from scenes.models.scenery import Scenery, build_scenery
-from scenes.models.scenery_parts import Detector, Finishes, SceneSurface, mirror_surface, plate_surfaces, solid_surfaces
+from scenes.models.scenery import (
+    Detector,
+    Finishes,
+    Scenery,
+    SceneSurface,
+    build_scenery,
+    mirror_surface,
+    plate_surfaces,
+    solid_surfaces,
+)
 from scenes.specs.baffle import box, ring, tube
 
 STATE = {
@@ -47,6 +55,7 @@ def contained(points: np.ndarray, surface: SceneSurface) -> np.ndarray:
     return inside
 
 
+@pytest.mark.second
 def test_the_window_of_the_180_degree_prism_has_two_apertures(scene) -> None:
     instrument, scenery = scene
     window = by_name(scenery, "base/forward/monitor/left/prism_180/window")
@@ -76,6 +85,7 @@ def test_mirrors_stand_and_grow_as_the_trace_has_them(scene) -> None:
         np.testing.assert_allclose(surface.surface.sag(x, y), z, atol=1e-16)
 
 
+@pytest.mark.second
 def test_triangles_reach_beyond_every_clear_aperture(scene) -> None:
     _, scenery = scene
     checked = 0
@@ -121,6 +131,7 @@ def test_light_meets_the_optical_side(scene) -> None:
             assert (surface.front, surface.back) == (front, back)
 
 
+@pytest.mark.second
 def test_faces_of_a_body_enclose_it_and_look_outward(scene) -> None:
     instrument, scenery = scene
     for solid in instrument.solids:

@@ -96,6 +96,7 @@ def test_times_that_are_read() -> None:
             parse_utc(none)
 
 
+@pytest.mark.second
 def test_lines_of_a_camera_of_ones_own(tmp_path: Path) -> None:
     """Other lines are no mistake, but then the file says which angles."""
     small = good("angle").replace("th1", "own.yaml")
@@ -111,6 +112,7 @@ def test_lines_of_a_camera_of_ones_own(tmp_path: Path) -> None:
     assert dict(orbit_setup.AngleSetup.read(write(tmp_path, small)).angles) == {"alpha": ("backward", "nadir")}
 
 
+@pytest.mark.second
 def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
     """By name or path; a configuration without its camera is refused."""
     setup = orbit_setup.AngleSetup.read(SCENES / ORBIT / "angle_gf7.yaml")
@@ -175,6 +177,7 @@ def test_a_motion_is_a_step_a_ramp_or_a_swing() -> None:
     assert shares((10.0, 20.0, 40.0), period=40.0) == pytest.approx([0.0, 1.0, -1.0])
 
 
+@pytest.mark.second
 def test_a_payload_of_ones_own_comes_through_config_yaml(tmp_path: Path) -> None:
     """Its detector is found beside it; an outline before the lens is kept."""
     sheet = (LIBRARY / "detectors/th1_line.yaml").read_text("utf-8").replace("name: th1_line", "name: mine")
@@ -199,6 +202,7 @@ def written(folder: Path, text: str) -> Path:
     return file
 
 
+@pytest.mark.second
 def test_the_example_says_its_limits_in_the_units_of_its_quantities() -> None:
     setup = read_operation(EXAMPLES / "operation.yaml")
     limits = {(one.group, one.key): (one.largest, one.probability) for one in setup.operation.requirements}
@@ -213,6 +217,7 @@ def test_the_example_says_its_limits_in_the_units_of_its_quantities() -> None:
     assert resolve_operation(again).model.plain() == setup.model.plain()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("instrument", quick(1, ["gf7_pair", "gf7_pair_two"]))
 def test_in_service_finds_its_bodies_in_both_instruments(instrument: str, tmp_path: Path) -> None:
     """Every cause has bodies, and the causes share a few laws of time, each of which an estimate carries along."""
@@ -265,6 +270,7 @@ def test_what_it_says() -> None:
     assert read_study(dump_yaml(study.plain())) == study
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("study_*.yaml")), ids=lambda file: file.stem)
 def test_the_examples_are_valid(file) -> None:
     study = validate(StudySpec, read_yaml(file))

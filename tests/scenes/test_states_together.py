@@ -43,6 +43,7 @@ def stated(request, backend):
     return stated_motions(resolved, built), ThermalModel(built)
 
 
+@pytest.mark.second
 def test_stated_states(stated) -> None:
     """Among them one at rest, one without heat, one without gradients and one in which a single body is warmer."""
     motions, heat = stated
@@ -68,6 +69,7 @@ def test_no_state(stated) -> None:
     assert states_of(np.empty((0, len(motions.components))), motions.components, heat) == []
 
 
+@pytest.mark.second
 def test_lenses(backend) -> None:
     """Carried by what bends in a gradient, and warmed themselves."""
     camera = colour_camera("achromat", mirrors=LIKE_ALUMINIUM.replace("thermal: [0, 0,", "thermal: [2e-6, 1e-8,"))

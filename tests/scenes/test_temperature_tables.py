@@ -11,8 +11,7 @@ import pytest
 
 from optics.thermal.nodal_deformation import nodal_deformation
 from scenes.models.instrument_builder import build_instrument
-from scenes.models.job_state import job_state
-from scenes.models.nodal_bodies import FINE_CELLS, HeatedBody, deformed_face, heated_bodies
+from scenes.models.job_state import FINE_CELLS, HeatedBody, deformed_face, heated_bodies, job_state
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec
@@ -88,6 +87,7 @@ def test_a_linear_table_is_the_linear_temperature(silica, tmp_path, body) -> Non
         )
 
 
+@pytest.mark.second
 def test_numbers_beside_a_table_are_added(silica, tmp_path) -> None:
     points = lattice(silica, M1, (7, 7, 3))
     write(tmp_path / "heat.csv", points, 0.5 + points @ SLOPE)
@@ -131,6 +131,7 @@ def test_a_quadratic_field_is_the_thermo_elastic_solution(silica, tmp_path) -> N
     assert body.warnings(M1) == ()
 
 
+@pytest.mark.second
 def test_zerodur_does_not_bend(gf7_pair, tmp_path) -> None:
     model = ThermalModel(gf7_pair)
     if model.materials[M1].expansion != 0.0:
@@ -300,6 +301,7 @@ def test_a_mesh_whose_reader_does_not_end_is_refused(tmp_path, monkeypatch) -> N
         read_nodes(tmp_path / "m1.vtu", unit="mm")
 
 
+@pytest.mark.second
 def test_the_job_knows_the_table_that_it_was_read_with(tmp_path, nodes) -> None:
     place = table(tmp_path / "m1.csv", nodes)
     resolved = resolve(deformed(tmp_path, place.name))

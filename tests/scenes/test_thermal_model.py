@@ -69,6 +69,7 @@ def test_temperature_is_inherited_until_a_body_has_its_own(model) -> None:
 # --- expansion --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_structure_carries_its_children_and_a_mirror_grows_about_its_centre(backend) -> None:
     """Camera of aluminium, mirrors of N-BK7: the mirror's centre rides on the camera, its vertex follows from that."""
     heat = ThermalModel(variant(backend, materials=MaterialsSpec(camera="aluminium", mirror="N-BK7")))
@@ -87,6 +88,7 @@ def test_a_structure_carries_its_children_and_a_mirror_grows_about_its_centre(ba
     np.testing.assert_array_equal(placed.rotation[0], placed.rotation[1])
 
 
+@pytest.mark.second
 def test_nested_structures_move_as_one_free_body(backend) -> None:
     """Base, camera, focal plane, boards: of one material, they follow the exact field of a single free body."""
     field = Temperature(1.5, (3.0, -2.0, 5.0))
@@ -190,6 +192,7 @@ def test_the_index_is_that_at_the_temperature_of_the_glass(gf7_pair, reference: 
             assert abs(slope / at_20 - 1.0) > 0.05  # so far apart that the one cannot pass for the other
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_glass_and_deformation_together(model, gf7_pair, backend, axis: int) -> None:
     """Exact geometry of a free prism with a linear temperature.
@@ -290,6 +293,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("own", ["0 K", "{change: 0 K}", "{gradient: [0 K/m, 0 K/m, 0 K/m]}"])
 def test_no_change_is_a_temperature_of_its_own(own: str, one_material, tmp_path) -> None:
     """A mirror that its warmed camera carries stays as large as it was, and only its mount is carried along."""

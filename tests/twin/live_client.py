@@ -13,10 +13,9 @@ from typing import Any
 
 from websockets.sync import client as client_of
 
+from twin.live.guard import COOKIE, Guard
 from twin.live.messages import Opened, packed
-from twin.live.server import LiveServer
-from twin.serving.guard import COOKIE, Guard
-from twin.serving.server import listen
+from twin.live.server import LiveServer, listen
 
 SECRET = "a-secret-of-enough-letters"
 

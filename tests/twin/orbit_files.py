@@ -11,8 +11,7 @@ from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.setup import CalibrationSetup, MeasuredCalibrationSetup
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
-from twin.orbit.calibration.calibration_export import files_of
-from twin.orbit.calibration.calibration_run import source_of
+from twin.orbit.calibration.calibration_run import files_of, source_of
 from twin.orbit.calibration.campaign import Campaign
 
 REFUSALS: dict[str, Any] = read_yaml(Path(__file__).with_name("orbit_refusals.yaml")).data

@@ -15,12 +15,11 @@ from optics.geometry.tree import Body, RigidTree
 from optics.materials.scatter import ABSORBER, BARE, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
-from scenes.models.camera_axis import LINE_AXIS
-from scenes.models.camera_model import collimated, field_direction
-from scenes.models.scenery import Scenery
-from scenes.models.scenery_parts import (
+from scenes.models.camera_model import LINE_AXIS, collimated, field_direction
+from scenes.models.scenery import (
     Detector,
     Finishes,
+    Scenery,
     SceneSurface,
     detector_surface,
     mirror_surface,

@@ -9,7 +9,7 @@ from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel
 from optics.numerics.number_tree import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
-from twin.orbit.calibration.strip import with_points
+from twin.orbit.calibration.schemes import with_points
 from twin.orbit.flight.earth import east_north_up
 
 

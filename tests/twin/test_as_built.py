@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, compose
-from scenes.models.clearance import convex_bodies
 from scenes.models.instrument_builder import build_instrument, squared_facets
+from scenes.models.obstruction import convex_bodies
 from scenes.specs.instrument import as_built_file
 from scenes.specs.load import load_cameras, load_instrument
 from scenes.specs.resolved import resolve, resolve_camera
@@ -46,6 +46,7 @@ def pair(backend, tmp_path_factory):
     return drawn, built, [(built.as_built, {}), (compose(built.as_built, THEN, bodies), THEN)]
 
 
+@pytest.mark.second
 def test_lines_of_sight(backend, pair) -> None:
     drawn, built, states = pair
     of_drawing, own = LineSight(drawn, backend), LineSight(built, backend)
@@ -56,6 +57,7 @@ def test_lines_of_sight(backend, pair) -> None:
         assert np.max(np.abs(seen - of_drawing.nominal)) > 1e-6
 
 
+@pytest.mark.second
 def test_spots_through_all_prisms(backend, pair) -> None:
     drawn, built, states = pair
     there, here = ([state[k] for state in states] for k in (0, 1))
@@ -68,6 +70,7 @@ def test_spots_through_all_prisms(backend, pair) -> None:
     assert np.all(np.max(np.abs(places[:, :1] - at_rest), axis=-1) > 0.5)
 
 
+@pytest.mark.second
 def test_bodies_that_are_drawn_and_hit(pair) -> None:
     drawn, built, ((there, _), _) = pair
     found, expected = convex_bodies(built), convex_bodies(drawn, drawn.assembly.place([there]))

@@ -259,6 +259,7 @@ def test_a_reference_of_another_size_is_refused(backend, tmp_path) -> None:
         bench_of(backend, tmp_path, {"wavefronts": measured}, simulate=None).data()
 
 
+@pytest.mark.second
 def test_an_orientation_is_found_after_a_move(backend, tmp_path) -> None:
     """With a move that is known the reading is found; of a camera that was only assembled others are named with it."""
     one, before = Orientation.named("mirrored diagonal", -1), TEXTS["mirrored"]

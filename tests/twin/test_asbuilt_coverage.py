@@ -24,6 +24,8 @@ from twin.asbuilt.built_instrument import CORRELATION, instrument_text, posterio
 from twin.asbuilt.measured_kinds import View
 from twin.monitor.monitor_experiment import MonitorExperiment
 
+pytestmark = pytest.mark.second
+
 TWENTY_FIVE = [[x, y] for x in (-1.0, -0.5, 0.0, 0.5, 1.0) for y in (-1.0, -0.5, 0.0, 0.5, 1.0)]
 DRAWS = 200
 
@@ -77,7 +79,6 @@ def judged(bench: AsBuiltBench, rng: np.random.Generator, count: int, unknown_fi
     return np.array(inside), np.array(agree)
 
 
-@pytest.mark.second
 def test_sigmas_hold_for_some_cameras(backend, tmp_path) -> None:
     """Wavefronts at 25 fields, line of sight, principal distance and the eight best known combinations of twelve
     cameras: each is covered as often as a binomial distribution lets it be, one of all fails once in a thousand times.
@@ -96,7 +97,6 @@ def test_sigmas_hold_for_some_cameras(backend, tmp_path) -> None:
     assert agree.sum() >= binom.ppf(1e-4, 12, 0.99)
 
 
-@pytest.mark.second
 def test_figures_that_the_prior_does_not_have_are_detected(backend, tmp_path) -> None:
     """40 nm of figure in terms beyond the prior's: the chi-square of every camera says so."""
     _, agree = judged(coverage_bench(backend, tmp_path), np.random.default_rng(2), 3, 40e-9)
@@ -106,7 +106,6 @@ def test_figures_that_the_prior_does_not_have_are_detected(backend, tmp_path) ->
 FRAMES = 9
 
 
-@pytest.mark.second
 def test_the_bias_of_the_drawings_model_goes_away(backend, tmp_path, record_property) -> None:
     """An instrument is drawn, measured at delivery (its spots, wavefronts and line of sight) and moved in orbit.
 

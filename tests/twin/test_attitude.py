@@ -84,6 +84,7 @@ def nadir_drift(path: Trajectory, t: float) -> np.ndarray:
     return np.asarray((tangents[1] - tangents[0]) / 0.02)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("nadir", ["geodetic", "geocentric"])
 @pytest.mark.parametrize("latitude", [0.0, 40.0, -60.0])
 def test_yaw_steering_stops_the_drift_along_the_line(nadir: str, latitude: float) -> None:

@@ -14,18 +14,21 @@ from analysis.monitor.autocollimator import exact_reading, relation_factor
 from optics.geometry.tree import Motion
 from optics.numerics.backend import Backend
 from optics.raytrace.trace import BeamMissedError
-from scenes.models.autocollimator_model import UNITS, autocollimator_body, axis_body, mirror_body
 from scenes.specs.autocollimators import AutocollimatorSetup, BenchErrorsSpec
 from scenes.specs.load import load_autocollimator_test
 from twin.laboratory.autocollimator_bench import (
+    UNITS,
     Reader,
     Series,
+    autocollimator_body,
+    axis_body,
     declared_spread,
+    mirror_body,
     run_autocollimator_test,
     series_per_axis,
     states_of,
+    window_pattern,
 )
-from twin.laboratory.autocollimator_images import window_pattern
 
 ARCSEC = math.pi / 648000
 SETUP = load_autocollimator_test()

@@ -16,6 +16,8 @@ from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import resolve_job
 from tests.oracles.test_reference_cameras import bundle, wavefront_error
 
+pytestmark = pytest.mark.second
+
 GF7 = (LIBRARY / "cameras" / "gf7.yaml").read_text("utf-8")
 M2 = "z: -2.01593047747168 m"
 STOP = "stop_diameter: 0.23980194283070688 m\n"
@@ -38,7 +40,6 @@ def with_camera(camera: CameraSpec):
     return job.model_copy(update={"cameras": FrozenMap({"gf7": camera})})
 
 
-@pytest.mark.second
 @pytest.mark.parametrize("name", library_names("cameras"))
 def test_the_librarys_cameras_are_sharp(backend, camera, name: str) -> None:
     """And as blurred as a full trace of their own fields says."""
@@ -54,7 +55,6 @@ def test_the_librarys_cameras_are_sharp(backend, camera, name: str) -> None:
     assert blur_warnings(with_camera(load_camera(name)), backend) == ()
 
 
-@pytest.mark.second
 @pytest.mark.parametrize(
     ("z", "waves", "left", "words"),
     [

@@ -4,7 +4,7 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
 from enum import Enum
 from pathlib import Path
@@ -84,6 +84,7 @@ def entry() -> CacheEntry:
     return CacheEntry.of(load_backend(), (), "some input")
 
 
+@pytest.mark.second
 def test_a_calibration_read_back_is_the_computed_one_bit_for_bit(folder: Path) -> None:
     os.environ[VARIABLE] = OFF
     computed = numbers(MonitorExperiment(job(), load_backend()))
@@ -144,6 +145,7 @@ def changed(value: Any) -> Iterator[Any]:
         yield 0.0
 
 
+@pytest.mark.second
 def test_every_value_of_every_input_is_part_of_the_key() -> None:
     resolved = job()
     given = resolved.instrument, dict(resolved.cameras), resolved.detector, resolved.disturbances
@@ -174,6 +176,7 @@ def test_an_experiment_names_each_of_its_inputs() -> None:
     assert len({*stated, one._entry.key}) == 3
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("owner", "name", "value"),
     [
@@ -193,7 +196,7 @@ def test_an_experiment_names_each_of_its_inputs() -> None:
 )
 def test_program_packages_and_machine_are_part_of_the_key(owner, name, value, entry, monkeypatch) -> None:
     backend = load_backend()
-    (monkeypatch.setitem if isinstance(owner, dict | os._Environ) else monkeypatch.setattr)(owner, name, value)
+    (monkeypatch.setitem if isinstance(owner, MutableMapping) else monkeypatch.setattr)(owner, name, value)
     calibration_cache._machine.cache_clear()
     other = CacheEntry.of(backend, (), "some input").key
     monkeypatch.undo()

@@ -11,16 +11,16 @@ from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup
-from twin.orbit.calibration.camera_drift import (
+from twin.orbit.calibration.campaign import line_model
+from twin.orbit.calibration.campaign_adjustment import simultaneous
+from twin.orbit.calibration.schemes import (
+    FieldErrors,
     adjust_field_with_readings,
     adjust_with_readings,
     flown,
     height_per_arcsec,
     with_monitor,
 )
-from twin.orbit.calibration.campaign import line_model
-from twin.orbit.calibration.campaign_adjustment import simultaneous
-from twin.orbit.calibration.schemes import FieldErrors
 from twin.orbit.calibration.schemes import tested as at_checks
 from twin.orbit.flight.line_camera import drifted_payload
 

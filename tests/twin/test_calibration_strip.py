@@ -12,9 +12,9 @@ from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup
 from tests.twin.strip_prediction import predicted
 from twin.orbit.calibration.flown_campaign import fly_fields
+from twin.orbit.calibration.schemes import adjusted_strip
 from twin.orbit.calibration.schemes import tested as at_checks
-from twin.orbit.calibration.strip import adjusted_strip
-from twin.orbit.calibration.strip import tested_in_strip as in_strip
+from twin.orbit.calibration.schemes import tested_in_strip as in_strip
 
 EXAMPLE = SCENES / ORBIT / "calibrate_strip.yaml"
 WHOLE = CalibrationSetup.read(EXAMPLE)

@@ -56,6 +56,7 @@ def test_kinds_of_aberration() -> None:
     assert {term: kind_of(term) for term in kinds} == kinds
 
 
+@pytest.mark.second
 def test_refocusing_finds_a_focal_plane_that_was_moved(backend) -> None:
     """Of a sharp camera 1 mm out of focus, and 5 mrad out of level: back to where its own best focus is."""
     camera = load_camera("gf7")
@@ -132,6 +133,7 @@ def test_what_it_refuses(tmp_path) -> None:
         assert not (tmp_path / "out").exists(), words
 
 
+@pytest.mark.second
 def test_a_camera_without_a_focus_cannot_be_refocused(tmp_path, backend) -> None:
     file = gf7_with(tmp_path, "-2.70 m", focal_length="21.4 m")
     result = invoke(app, file, "--refocus", "--out", tmp_path / "out")
@@ -146,7 +148,7 @@ def test_tilt_is_an_option(tmp_path, monkeypatch) -> None:
     """The word of earlier versions is read, and told how it is written."""
     asked = []
 
-    def run(setup, backend, refocus, tilt, advance):
+    def run(setup, backend, seed, advance, refocus, tilt):
         asked.append((refocus, tilt))
         raise InputError(Issue("enough"))
 

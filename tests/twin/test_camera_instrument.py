@@ -269,7 +269,7 @@ def test_the_config_of_a_job_is_the_job(tmp_path) -> None:
 def test_a_camera_is_perturbed_from_the_command_line(tmp_path, backend, monkeypatch) -> None:
     asked = []
 
-    def run(setup, *more):
+    def run(setup, *more, **named):
         asked.append(setup)
         raise InputError(Issue("enough"))
 

@@ -24,6 +24,7 @@ def gf7_alone(backend, gf7) -> CameraOptics:
     return CameraOptics.alone(gf7, backend)
 
 
+@pytest.mark.second
 def test_wavefronts_and_spots_of_rays_traced_in_the_prescription_frame(backend, gf7, gf7_alone) -> None:
     """Other launch points, another frame, another rule over the pupil: the same numbers."""
     for wave, spot in zip(gf7_alone.wavefronts(FIELDS), gf7_alone.spots(FIELDS), strict=True):

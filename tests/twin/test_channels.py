@@ -16,6 +16,8 @@ from tests.tiers import quick
 from tests.twin.test_path_tracing import out_and_back
 from twin.monitor.monitor_experiment import MonitorExperiment
 
+pytestmark = pytest.mark.second
+
 ARCSEC = np.pi / 648000.0
 STATES: list[State] = [
     {},
@@ -46,7 +48,6 @@ def hollow(backend, tmp_path_factory) -> MonitorExperiment:
 # --- light ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.second
 def test_a_pair_that_is_written_out_is_the_plain_pair(backend, tmp_path) -> None:
     """Bit by bit: bodies, elements, photons."""
     plain, written = (
@@ -61,7 +62,6 @@ def test_a_pair_that_is_written_out_is_the_plain_pair(backend, tmp_path) -> None
     np.testing.assert_array_equal(plain.path.expected_photons(STATES), written.path.expected_photons(STATES))
 
 
-@pytest.mark.second
 def test_the_printed_formulas_are_about_the_pair(two, backend, tmp_path) -> None:
     """Their L and field are those of left and right, not those of the channels that stand farthest out."""
     plain = experiment(monitor_layouts.pair(), tmp_path, backend)
@@ -71,7 +71,6 @@ def test_the_printed_formulas_are_about_the_pair(two, backend, tmp_path) -> None
         assert found.separation_m < max(c.ccd[1] for c in two.instrument.channels) * 1.99
 
 
-@pytest.mark.second
 def test_every_channel_gets_its_light(two) -> None:
     """All spots are whole and in the middle of their CCDs, and get their photons."""
     photons = two.path.expected_photons([{}])[0]
@@ -90,7 +89,6 @@ def test_every_channel_gets_its_light(two) -> None:
         assert np.abs(middle).max() < 1.0
 
 
-@pytest.mark.second
 def test_a_channels_own_photons_and_face(backend, tmp_path) -> None:
     """Half the light gives half the image; a narrower face the wider spot that it gives where all are so narrow."""
     data = monitor_layouts.two_beams()
@@ -116,7 +114,6 @@ def test_a_channels_own_photons_and_face(backend, tmp_path) -> None:
 # --- heat -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.second
 def test_heat_of_a_channels_prisms_moves_its_spot_alone(two) -> None:
     channel = next(c for c in two.instrument.channels if c.key == "forward/left_2")
     field = Temperature(0.0, (0.0, 0.02, 0.05))
@@ -145,7 +142,6 @@ def turned_by_heat(own: MonitorExperiment, prism: str) -> tuple[float, float]:
     return float(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=(1, 2))) / 2.0)), float(np.abs(moved[:, 3]).max())
 
 
-@pytest.mark.second
 def test_frames_keep_what_glass_turns(backend, tmp_path) -> None:
     """What docs/monitor_layout.md says: by how much a gradient turns the beams, in proportion to the expansion of a
     frame; 1 K everywhere turns nothing.
@@ -172,7 +168,6 @@ def test_frames_keep_what_glass_turns(backend, tmp_path) -> None:
 # --- path tracer, pictures --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.second
 @pytest.mark.parametrize("layout", quick(1, ["two", "hollow"]))
 def test_the_path_tracers_nominal_light_is_the_traced_light(layout, request, backend) -> None:
     """With a reflector turned."""

@@ -22,6 +22,7 @@ def achromat(backend) -> CameraOptics:
     return CameraOptics.alone(colour_camera("achromat"), backend)
 
 
+@pytest.mark.second
 def test_a_camera_of_one_colour_is_that_of_its_wavelength(achromat, backend) -> None:
     """The same file with another design wavelength, but for its stop and pupil."""
     blue = 486.1327e-9
@@ -38,6 +39,7 @@ def test_a_camera_of_one_colour_is_that_of_its_wavelength(achromat, backend) -> 
         achromat.at(5e-6)
 
 
+@pytest.mark.second
 def test_lateral_colour_is_in_the_pupils(achromat) -> None:
     """The phase of a line's transfer function is that of where its light falls, seen from the design's chief ray."""
     lines, field, frequency = np.array([486.1327e-9, 656.2725e-9]), (1.0, 0.0), np.array([0.0, 100.0, 40e3])

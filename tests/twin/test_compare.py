@@ -22,11 +22,13 @@ from twin.scripting.instrument_twin import load
 
 def write(folder: Path, name: str, shift: int = 3, seed: int = 1) -> None:
     """Data of a small job, as the command writes them."""
-    from twin.main_job.render_files import write_data
+    from twin.main_job.render_files import irradiance_file, write_results
 
     twin = load("monitor_pair").perturbed({"base/forward/M2": {"shift": f"0 0 {shift} um"}})
     with RunFolder(folder / name) as target:
-        write_data(render_job(twin.resolved, twin.experiment.backend, 2, seed, experiment=twin.experiment), target)
+        run = render_job(twin.resolved, twin.experiment.backend, 2, seed, experiment=twin.experiment)
+        write_results(run, target)
+        target.write_bytes("irradiance.nc", irradiance_file(run))
         write_manifest(target, "twin.render", 0.0, 1.0, seed=seed, warnings=[])
 
 

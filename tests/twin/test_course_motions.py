@@ -48,6 +48,7 @@ def experiment(backend, tmp_path_factory) -> MonitorExperiment:
     return MonitorExperiment(resolve(written(tmp_path_factory.mktemp("job"))), backend)
 
 
+@pytest.mark.second
 def test_a_table_is_the_same_course_written_out(tmp_path) -> None:
     out = f"""instrument: gf7_pair
 course:

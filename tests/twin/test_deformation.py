@@ -13,13 +13,13 @@ from optics.geometry.tree import Motion, compose
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import nodal_deformation
 from optics.thermal.nodal_temperature import Coverage
-from scenes.models.nodal_bodies import HeatedBody, HeatedFace
+from scenes.models.job_state import HeatedBody, HeatedFace
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.errors import InputError
 from tests.scenes.test_temperature_tables import lattice, quadratic, write
-from twin.main_job.job_tables import deformation_warnings
+from twin.main_job.render_files import deformation_warnings
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import series_states
 from twin.monitor.truth import trace_truth

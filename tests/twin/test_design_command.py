@@ -84,6 +84,7 @@ def test_a_telescope_about_its_axis_is_told_its_clearance(tmp_path) -> None:
     assert result.exit_code == 0, result.output
 
 
+@pytest.mark.second
 def test_a_run_folder(tmp_path) -> None:
     """A conic and the focus: nothing gets shorter, and little better; but the camera's file can be read."""
     result = run(tmp_path, "101 percent", vary="M3: [conic]")
@@ -126,6 +127,7 @@ def test_a_journal_that_cannot_be_kept_is_reported(tmp_path) -> None:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@pytest.mark.second
 def test_a_constraint_that_blocks_is_named(tmp_path) -> None:
     """A focal plane 5 mm off its place cannot be moved: the principal distance, which is to stay, would change."""
     gf7 = (LIBRARY / "cameras" / "gf7.yaml").read_text("utf-8")

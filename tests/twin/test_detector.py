@@ -42,9 +42,8 @@ from twin.sensors.area_detector import (
     coarse_warnings,
     told_of_steps,
 )
-from twin.sensors.charge_transfer import Collection, Motion
 from twin.sensors.exposure_kernel import FEWEST
-from twin.sensors.line_ccd import LineCcd
+from twin.sensors.line_ccd import Collection, LineCcd, Motion
 from twin.sensors.poisson_numbers import SERIES_END, TABLE_END, poisson_numbers, poisson_quantile
 
 FALSE_ALARM = 1e-6
@@ -267,6 +266,7 @@ def test_impossible_exposures_are_explained() -> None:
             call()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("part", "key", "value", "message"), REFUSED["detectors_in_files"])
 def test_detectors_that_cannot_work_are_told_by_file_and_line(tmp_path, part, key, value, message):
     """They were tracebacks, some of them after minutes."""
@@ -343,6 +343,7 @@ def is_quantile(number: np.ndarray, mean: np.ndarray, word: np.ndarray) -> np.nd
     return reached(number) & ((number == 0.0) | ~reached(np.maximum(number - 1.0, 0.0)))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("low", "high"), quick(2, [(0.5, 8.0), (TABLE_END, 300.0), (1e-6, 0.5), (8.0, TABLE_END), (300.0, SERIES_END)])
 )
@@ -428,6 +429,7 @@ def test_frames_in_a_file_are_those_in_memory(small: None, monkeypatch: pytest.M
     assert preview_png(stored[2]) == preview_png(kept[2])
 
 
+@pytest.mark.second
 def test_threads_do_not_change_the_frames_of_one_image(monkeypatch: pytest.MonkeyPatch) -> None:
     """Several pieces of one image: a thread must not draw the next one while another draws the last."""
     monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 32 * 24 * 32)

@@ -18,9 +18,8 @@ from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.measured import xml_file
 from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.dimap_file import read_dimap
-from twin.orbit.measured.dimap_sensor import read_scene
-from twin.orbit.measured.platform_files import platform_table, read_platform
-from twin.orbit.measured.platform_readings import OrbitReadings, require_own_velocity
+from twin.orbit.measured.orbit_files import OrbitReadings, require_own_velocity
+from twin.orbit.measured.platform_files import platform_table, read_platform, read_scene
 
 PLEIADES = Scene()
 SPOT = Scene(
@@ -55,6 +54,7 @@ def places(scene: Scene, count: int = 30) -> tuple[np.ndarray, np.ndarray, np.nd
     return row, column, random.uniform(-100.0, 4000.0, count)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", SCENES)
 def test_the_rigorous_model_is_that_of_the_format(tmp_path: Path, name: str) -> None:
     scene = SCENES[name]

@@ -82,6 +82,7 @@ def test_dirt_is_found_and_corrected(bench, kind):
             assert set(TOLD[one]) <= names or (kind == "all" and one == "saturation")
 
 
+@pytest.mark.second
 def test_clean_frames_are_not_touched(bench):
     found, told = squares(bench, (), range(2000, 2005))
     assert found.sum() < chi2.isf(1e-4, 10)
@@ -182,6 +183,7 @@ def test_a_spot_that_moves_far_is_no_spoilt_frame(bench, rms, monkeypatch):
             assert 0.5 * rms < size < 3.5 * rms
 
 
+@pytest.mark.second
 def test_findings_tell_places_on_the_ccd(bench):
     """Of a part of the CCD that was read out, too: a pixel, a column and a reflection have the same places as in all of
     it.

@@ -29,8 +29,7 @@ from tests.twin.study_bench import REFUSED
 from twin.framework.procedure import BenchError
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import CLOSED_FORMS, SimulatedDistortion, measure, reduce
-from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_run import run_turntable
+from twin.laboratory.turntable_run import TurntableModel, run_turntable
 
 UM, NM = 1e-6, 1e-9
 FALSE_ALARM = 1e-4

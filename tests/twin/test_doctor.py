@@ -100,6 +100,7 @@ def test_a_users_llvm_is_respected(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
         ensure_llvm()
 
 
+@pytest.mark.second
 def test_drjit_imported_too_early_is_told() -> None:
     """Either drjit found a usable LLVM by itself, or importing optics after it says what to do."""
     code = "import drjit; drjit.has_backend(drjit.JitBackend.LLVM); import optics"

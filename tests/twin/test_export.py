@@ -62,6 +62,7 @@ def test_a_trajectory_that_no_number_of_nodes_follows_is_refused(flight, monkeyp
         _isd(sensor)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["gf7_forward_fx", "th1_nadir_nofx"])
 def test_the_reader_agrees_with_the_communitys_model(name: str) -> None:
     table = np.loadtxt(CSM / f"{name}.csv", delimiter=",", skiprows=1)
@@ -93,6 +94,7 @@ def test_a_sensor_model_sees_what_the_rigorous_sensor_sees(flight, name, effects
     assert all(max(e.sample_px, e.line_px) < allowed for e in scanner.errors if e.height_m == height)
 
 
+@pytest.mark.second
 def test_a_trajectory_that_jitters_takes_more_nodes(flight) -> None:
     smooth, rough = (_sensor(flight, "nadir", NO_EFFECTS, measured) for measured in (False, True))
     one, (two, model) = _isd(smooth)[0], _isd(rough)
@@ -150,6 +152,7 @@ def test_gdal_finds_what_the_rigorous_sensor_finds(flight, name: str) -> None:
     assert max(rpc.error_px) < 1e-4
 
 
+@pytest.mark.second
 def test_polynomials_say_how_far_jitter_is_from_them(flight) -> None:
     sensor = _sensor(flight, "nadir", LightEffects(), measured=True)
     rpc = RationalPolynomial.fit(sensor, 0, sensor.camera.pixels, (0.0, 2000.0))

@@ -21,7 +21,7 @@ from twin.orbit.export.export_report import _warnings as export_warnings
 from twin.orbit.export.export_report import quality_warnings
 from twin.orbit.export.export_run import Controlled, Quality
 from twin.orbit.export.rational_polynomial import RationalPolynomial, read_rpc
-from twin.orbit.measured.dimap_sensor import read_scene
+from twin.orbit.measured.platform_files import read_scene
 
 run = partial(invoke, command.app)
 SCENE = Scene(lines=4000, pixels=6000)

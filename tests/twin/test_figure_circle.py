@@ -79,6 +79,7 @@ def test_a_mirror_about_its_axis_is_round(backend, tmp_path) -> None:
     assert isinstance(derive_camera(load_camera("gf7"), backend).apertures["M1"], Rectangle)
 
 
+@pytest.mark.second
 def test_terms_on_both_mirrors_of_a_telescope(backend, tmp_path) -> None:
     """Astigmatism of a mirror whose beam is r of its circle wide gives 2 r^2 times its amount, by its formula.
 
@@ -92,6 +93,7 @@ def test_terms_on_both_mirrors_of_a_telescope(backend, tmp_path) -> None:
     assert told[1] == pytest.approx(whole * (0.3 * SHARE / BY_HAND) ** 2, rel=0.02)
 
 
+@pytest.mark.second
 def test_a_stated_edge_comes_before_the_beams(backend, tmp_path) -> None:
     path = file_with(tmp_path, edges=[{"clear": "circle", "radius": "95 mm"}])
     bench = bench_of(tmp_path, path.name, backend, second="M2 figure Z6")
@@ -101,6 +103,7 @@ def test_a_stated_edge_comes_before_the_beams(backend, tmp_path) -> None:
     assert element.aperture.enclosing.radius < 0.09
 
 
+@pytest.mark.second
 def test_the_smallest_circle_of_every_shape() -> None:
     """No point of an outline lies outside, and some touch the circle on opposite sides."""
     for shape in (Circle(0.3, (0.1, 0.2), 0.05), Rectangle(0.3, 0.4, (1.0, 0.0)), Ellipse(0.5, 0.2)):
@@ -111,6 +114,7 @@ def test_the_smallest_circle_of_every_shape() -> None:
         assert np.min(touching @ touching.T) == pytest.approx(-(np.max(far) ** 2), rel=1e-3)
 
 
+@pytest.mark.second
 def test_a_drawn_figure_has_its_rms_over_the_clear_aperture(backend, tmp_path) -> None:
     """By the sag of each term at points drawn over the rectangle, about each surface's mean.
 

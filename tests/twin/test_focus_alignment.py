@@ -24,11 +24,9 @@ from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import FocusSetup
 from twin.framework.procedure import BenchError
 from twin.laboratory import focus_run
-from twin.laboratory.focus_bench import FocusBench
-from twin.laboratory.focus_numbers import focus_numbers
+from twin.laboratory.focus_bench import VERTEX_ERROR, FocusBench, Recorder, in_focus, scan
 from twin.laboratory.focus_report import focus_report as report
 from twin.laboratory.focus_run import FocusRun, SimulatedFocus, align, align_files, line_turn, mount_of, plan_shims
-from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, in_focus, scan
 from twin.targets.target_images import DIRECTIONS, TRACK
 
 FILE = SCENES / LAB / "focus.yaml"
@@ -199,7 +197,7 @@ def test_a_skew_of_all_curves_is_a_common_error(tmp_path):
         runs[name] = run = aligned(tmp_path / name, series(3, *sides))
         # normal but for the common error, which two curves of three hold
         assert abs(piston_pull(run)) < 3.0
-        data, warnings = focus_numbers(run), " ".join(report(run).warnings)
+        data, warnings = focus_run.focus_numbers(run), " ".join(report(run).warnings)
         assert ("wider on one side" in warnings) is (name == "skewed")
         assert (abs(data["skew_um"]) > 5.0 * data["skew_um_sigma"]) is (name == "skewed")
     even, skewed = (np.sqrt(runs[name].shimmings[0].plane_covariance[0, 0]) for name in ("even", "skewed"))
@@ -218,7 +216,7 @@ def test_rows_with_gross_errors_are_named_and_do_not_count(tmp_path):
     for k in wrong:
         rows[k][5] += float(rng.choice([-0.1, 0.1]))
     run = aligned(tmp_path / "run", rows)
-    named = [fault["line"] - 2 for fault in focus_numbers(run)["rows_excluded"]]
+    named = [fault["line"] - 2 for fault in focus_run.focus_numbers(run)["rows_excluded"]]
     assert set(named) <= set(wrong.tolist())
     # those that take part in a fit: half of the scan lies within half of the peak
     assert len(named) > 0.4 * len(wrong)
@@ -293,5 +291,5 @@ def test_sound_curves_lose_no_point():
 def test_copied_rows_are_said(tmp_path, copies):
     rows = series(5)
     run = aligned(tmp_path / "run", rows + rows[:copies])
-    assert focus_numbers(run)["files"][0]["copied"] == copies
+    assert focus_run.focus_numbers(run)["files"][0]["copied"] == copies
     assert ("were they copied?" in " ".join(report(run).warnings)) is (copies > 0)

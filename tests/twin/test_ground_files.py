@@ -17,9 +17,8 @@ from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.simulate_report import map_facts
-from twin.orbit.measured.datum import Geoid
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
-from twin.orbit.measured.map_part import UserMap
+from twin.orbit.measured.maps import Geoid, UserMap
 
 HEADS = ("point", "latitude [deg]", "longitude [deg]", "height [m]")
 SIGMAS = ("sigma_east [m]", "sigma_north [m]", "sigma_up [m]")

@@ -3,6 +3,8 @@
 import re
 import shlex
 
+import pytest
+
 from scenes.specs.file_kinds import kind_of
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.study_bench import ROOT
@@ -28,6 +30,7 @@ def helps():
             yield (program, name), below, below.help
 
 
+@pytest.mark.second
 def test_the_examples_of_a_help_can_be_run() -> None:
     """Program, options and files of every example are there."""
     for name, _, text in helps():

@@ -14,15 +14,16 @@ from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.specs.orbit.setup import CalibrationSetup, SimulateSetup
 from twin.orbit.calibration.calibration_run import true_values
-from twin.orbit.calibration.campaign import Campaign
+from twin.orbit.calibration.campaign import Campaign, FieldImages
 from twin.orbit.calibration.campaign_adjustment import simultaneous
-from twin.orbit.calibration.field_images import FieldImages
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.screening import screened
 from twin.orbit.images import image_points
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
-from twin.orbit.images.point_judgement import judged, true_ground
+from twin.orbit.images.patch import judged, true_ground
 from twin.orbit.images.simulate_run import Simulation, run_simulation
+
+pytestmark = pytest.mark.second
 
 SIMULATE, CALIBRATE = (SCENES / ORBIT / f"{name}.yaml" for name in ("simulate", "calibrate_images"))
 
@@ -46,7 +47,6 @@ def asked() -> ImagePointsSpec:
     return points
 
 
-@pytest.mark.second
 def test_map_points_are_where_the_sensor_has_them(flown: Simulation, control: MatchedPoints) -> None:
     """0.2 px: another season's light on a 5 m pixel; the predicted places are 10 to 35 px off. None of some 60 accepted
     may be wrong: 3 px are twenty sigmas."""
@@ -64,7 +64,6 @@ def test_map_points_are_where_the_sensor_has_them(flown: Simulation, control: Ma
     assert share == pytest.approx(0.25, abs=0.05)
 
 
-@pytest.mark.second
 def test_true_ground_is_the_map_less_its_errors(flown: Simulation, control: MatchedPoints) -> None:
     """Plan: 0.6 and -0.4 m and five times 0.5 m; height: five times 2 m, and slopes of 0.5 under 3 m."""
     east, north, height = flown.patch.frame.local(true_ground(flown.patch, control))
@@ -74,7 +73,6 @@ def test_true_ground_is_the_map_less_its_errors(flown: Simulation, control: Matc
     assert 0.0 < np.abs(control.height - height).max() < 12.0
 
 
-@pytest.mark.second
 def test_what_is_not_known_of_heights_adds_its_variance(flown: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three times the sigma of the reference's heights is nine times what it adds to a match's covariance."""
     agreed, seen = image_points.consensus, []
@@ -87,7 +85,6 @@ def test_what_is_not_known_of_heights_adds_its_variance(flown: Simulation, monke
     assert (one - none)[good].max() > 1e-3
 
 
-@pytest.mark.second
 def test_tie_points_are_five_times_better(flown: Simulation, control: MatchedPoints) -> None:
     """The same ground on the same day: 0.05 px."""
     spec = asked().model_copy(update={"tie": 40})
@@ -102,7 +99,6 @@ def test_tie_points_are_five_times_better(flown: Simulation, control: MatchedPoi
     assert alone.in_all.sum() >= 10
 
 
-@pytest.mark.second
 def test_ground_without_points_is_refused(flown: Simulation) -> None:
     """A map of other ground, a map and an image of one grey value."""
     patch, maps = flown.patch, flown.patch.control
@@ -121,7 +117,6 @@ def test_ground_without_points_is_refused(flown: Simulation) -> None:
             points(wrong, asked())
 
 
-@pytest.mark.second
 def test_matches_that_agree_on_nothing_are_refused(flown: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
     """Places all over the windows that are searched."""
     right, random = image_points.match, np.random.default_rng(1)
@@ -156,7 +151,6 @@ def parameters_fit(campaign: Campaign) -> None:
     assert error @ np.linalg.solve(spread, error) < chi2.isf(1e-4, len(chosen))
 
 
-@pytest.mark.second
 def test_calibration_from_images() -> None:
     """Two patches of one field."""
     setup = CalibrationSetup.read(CALIBRATE)

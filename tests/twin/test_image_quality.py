@@ -13,7 +13,7 @@ from optics.raytrace.assembly import points_to_world
 from optics.raytrace.first_order import chief_rays
 from optics.raytrace.system import assemble
 from optics.waves.imaging import aim_collimated, fit_wavefront, path_to_sphere
-from scenes.models.camera_axis import LAUNCH_DISTANCE
+from scenes.models.camera_model import LAUNCH_DISTANCE
 from twin.monitor.image_quality import FIELDS, QUALITY
 from twin.monitor.image_quality import image_quality as quality_of
 

@@ -62,6 +62,7 @@ def test_light_of_a_pupil_beyond_all_of_it_is_none(telescope, monkeypatch) -> No
         telescope.pupils([(0.0, 0.0)])
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
@@ -77,6 +78,7 @@ def test_statistics_of_a_wavefront_that_cannot_be_are_none(telescope, monkeypatc
         telescope.wavefront((1.0, 0.0), points=3)
 
 
+@pytest.mark.second
 def test_shares_of_bodies_beyond_the_stop_are_none(backend, gf7_pair, monkeypatch) -> None:
     """What a sliver of a shadow once made of image quality: 2.4e24 of the stop."""
     true = shadow.Shadows.shares

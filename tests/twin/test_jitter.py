@@ -11,10 +11,10 @@ from tests.tiers import quick
 from tests.twin.pushbroom_bench import LINE_TIME, PLACE, Ground, lines
 from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.ground.grid import GroundFrame, Terrain
-from twin.orbit.images.jitter_exposure import collected, exposures
+from twin.orbit.images.line_optics import collected, exposures
 from twin.orbit.images.patch import window_of
 from twin.orbit.images.pushbroom import PushbroomScene, render_patch
-from twin.sensors.charge_transfer import Collection, Motion
+from twin.sensors.line_ccd import Collection, Motion
 
 ARCSEC = np.pi / 648000.0
 NU = np.array([0.1, 0.25, 0.5, 1.0])
@@ -100,6 +100,7 @@ def test_gauss_rules_of_a_collection_mean_polynomials() -> None:
 # --- attitude ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_jitter_has_the_stated_amplitude_phase_and_level() -> None:
     one = stated({"lines": [{"frequency": "0.65 Hz", "amplitude": "2 1 0 arcsec", "phase": "30 90 0 deg"}]})
     t = np.linspace(-3.0, 5.0, 97)

@@ -7,7 +7,7 @@ import numpy as np
 
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.jump_detection import Jump
-from twin.main_job.assumptions import course_agrees
+from twin.main_job.systematics import course_agrees
 from twin.monitor.reading_table import ReadingTable
 from twin.monitor.time_series import SmoothedCourse, jump_text
 

@@ -224,6 +224,7 @@ def test_refinement_goes_round_what_stands_in_the_way(bench: LayoutBench) -> Non
     assert merit(way[-1].sigmas, bench) <= 1.01 * least * (1.0 + 0.1 / (FULLEST / 0.5))
 
 
+@pytest.mark.second
 def test_refinement_makes_room_with_numbers_that_no_goal_depends_on(bench: LayoutBench) -> None:
     """Bodies stand in the way beyond x = 0.12 unless the 0-deg prism is moved aside."""
     valley = Valley(bench, most_x=0.12, aside=True)

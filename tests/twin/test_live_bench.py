@@ -18,9 +18,8 @@ from twin.framework.provenance import program_digest
 from twin.live.camera_pictures import CameraPictures
 from twin.live.computer import Answers
 from twin.live.knobs import KINDS, knob_name, perturbation
-from twin.live.live_bench import LiveBench
+from twin.live.live_bench import LiveBench, course_text, job_text
 from twin.live.messages import AskedState, AskedView, BlindState
-from twin.live.recording import course_text, job_text
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.monitor.time_series import series_states
@@ -205,6 +204,7 @@ def test_hidden_motions_are_drawn_from_what_is_stated(bench, first):
     assert low < white @ white < high
 
 
+@pytest.mark.second
 def test_every_knob_moves_what_it_names(bench):
     """One knob of every kind at every body gives a perturbation of this body alone, with the number as typed."""
     first, nodes = bench.twin.resolved.job.plain()["perturb"], bench.twin.experiment.instrument.nodes

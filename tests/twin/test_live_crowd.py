@@ -16,8 +16,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.frames import Frame, Opcode
 
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
-from twin.serving import guard
-from twin.serving.guard import COOKIE, MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS, Guard, names_of_this_machine
+from twin.live import guard
+from twin.live.guard import COOKIE, MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS, Guard, names_of_this_machine
 
 WRONG = [
     b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(256)),  # TLS
@@ -109,6 +109,7 @@ def test_who_says_nothing_locks_nobody_out(capfd):
     assert (said.out, said.err) == ("", "")
 
 
+@pytest.mark.second
 def test_one_address_does_not_take_the_places_of_others():
     with serving(StandIn()) as (port, _), ExitStack() as stack:
         quiet = lines(stack, port, 5, source="127.0.0.9")
@@ -119,6 +120,7 @@ def test_one_address_does_not_take_the_places_of_others():
         assert sum(ended(line, 0.01) for line in loud) == 2 * MOST_OF_ONE
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     "said",
     [b"", b"GET / HTTP/1.1\r\nHo", b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 9000\r\n\r\nx"],
@@ -136,6 +138,7 @@ def test_what_is_never_said_whole_has_its_time(said, monkeypatch):
         assert len(server.connections) == 0
 
 
+@pytest.mark.second
 def test_the_next_request_of_a_connection_has_its_time_too(monkeypatch):
     monkeypatch.setattr(guard, "HEAD", 0.4)
     with serving(StandIn()) as (port, _), ExitStack() as stack:
@@ -146,6 +149,7 @@ def test_the_next_request_of_a_connection_has_its_time_too(monkeypatch):
         assert ended(line, 1.5)
 
 
+@pytest.mark.second
 def test_an_answer_that_is_not_taken_is_given_up(monkeypatch):
     monkeypatch.setattr(guard, "ANSWER", 0.5)
     with serving(StandIn()) as (port, server), ExitStack() as stack:
@@ -195,6 +199,7 @@ def test_text_that_is_not_utf_8_ends_the_page_without_a_traceback(pieces, capfd)
 # --- several servers, other names -------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_cookies_of_other_programs_do_not_hide_ours():
     with serving(StandIn()) as (port, _):
         mine = f"space_camera_twin_{port}={SECRET}"
@@ -203,6 +208,7 @@ def test_cookies_of_other_programs_do_not_hide_ours():
             assert ask(port, "/session", cookie=None, **headers)[0] == 200
 
 
+@pytest.mark.second
 def test_servers_on_one_host_and_a_restart_know_their_own_cookie():
     """A browser keeps the cookies of a host, whatever the port; with the same token it is known after a restart."""
     tokens = ["the-token-of-the-first-server", "the-token-of-the-second-one"]
@@ -241,6 +247,7 @@ def test_a_request_of_another_site_is_refused(site) -> None:
     assert found == ("" if site in (None, "none", "same-origin") else "the page comes from elsewhere")
 
 
+@pytest.mark.second
 @pytest.mark.skipif(not socket.has_ipv6, reason="no IPv6")
 def test_over_ipv6():
     try:

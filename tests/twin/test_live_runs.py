@@ -21,12 +21,11 @@ from scenes.yaml.errors import InputError
 from tests.twin.study_bench import REFUSED
 from twin.framework.run_folder import RunFolder, write_manifest
 from twin.live.camera_pictures import _with_targets
-from twin.live.live_bench import LiveBench
+from twin.live.live_bench import LiveBench, job_text
 from twin.live.messages import MOST_FRAMES, AskedState
-from twin.live.recording import job_text
 from twin.live.source import Source, read_source
-from twin.main_job.job_tables import config_text
 from twin.main_job.monitor_reading import stated
+from twin.main_job.render_files import config_text
 from twin.main_job.render_job import render_job
 from twin.orbit.monitoring.monitor_series import states_of
 from twin.scripting.instrument_twin import InstrumentTwin
@@ -151,7 +150,7 @@ def test_a_seed_of_63_bits_is_known_by_its_last_ones(pair, tmp_path):
 
 
 def test_a_server_that_cannot_be_is_told(monkeypatch):
-    server = pytest.importorskip("twin.serving.server", reason="the extra `live` is not installed")
+    server = pytest.importorskip("twin.live.server", reason="the extra `live` is not installed")
     with server.listen("127.0.0.1", 0) as taken:
         taken.listen()
         port = taken.getsockname()[1]
@@ -232,6 +231,7 @@ def test_a_measurement_without_an_instrument(tmp_path):
     assert "geometry of the cameras alone" in said
 
 
+@pytest.mark.second
 def test_a_run_of_uncertainty_opens_its_job(tmp_path):
     resolved = resolve(written(tmp_path, JOB))
     folder = run_folder(tmp_path / "run", "twin.uncertainty", resolved.to_yaml(), "uncertainty")
@@ -340,6 +340,7 @@ DATA = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("program", "test", "words"), REFUSED["shown_runs"])
 def test_run_folders_without_a_monitors_state(tmp_path, program, test, words):
     folder = run_folder(tmp_path / "run", program, DATA[program]() if program in DATA else None, test)
@@ -372,6 +373,7 @@ def test_folders_that_are_none_of_a_run(tmp_path):
         assert (code, words in said) == (2, True), said
 
 
+@pytest.mark.second
 def test_a_manifest_of_somebody_else_changes_nothing(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()

@@ -22,10 +22,9 @@ from twin.framework.cli import InputErrorText
 from twin.live.__main__ import TOKEN, _serve
 from twin.live.clients import BAD_MESSAGES, Client, Goodbye
 from twin.live.computer import CannotStart, ComputerLost
+from twin.live.guard import BadToken, Guard, new_token
 from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, read_message
-from twin.live.server import LiveServer
-from twin.serving.guard import BadToken, Guard, new_token
-from twin.serving.server import listen
+from twin.live.server import LiveServer, listen
 
 
 @contextmanager
@@ -281,6 +280,7 @@ def test_too_many_pages(running):
 
 
 # --- nothing piles up -------------------------------------------------------------------------------------------------
+@pytest.mark.second
 def test_of_1000_fast_states_the_last_is_shown_and_few_are_computed():
     computer = StandIn(seconds=0.02)
     with pages(computer) as (_, _, ws):
@@ -295,6 +295,7 @@ def test_of_1000_fast_states_the_last_is_shown_and_few_are_computed():
     assert len(numbers) < 100
 
 
+@pytest.mark.second
 def test_two_pages_take_turns():
     with pages(StandIn(seconds=0.02), 2) as (_, _, one, two):
         for n in range(1, 301):
@@ -333,6 +334,7 @@ def test_a_recording_is_bounded_and_has_no_hidden_states():
     assert [one.n for _, one in client.recorded] == list(range(5))
 
 
+@pytest.mark.second
 def test_the_computer_is_told_what_the_page_has():
     """Images before are sent again where noise, frames or seed are others."""
     computer = StandIn()
@@ -392,6 +394,7 @@ class Fragile(StandIn):
         return await super().ask(kind, question)
 
 
+@pytest.mark.second
 def test_a_lost_computer_is_told_to_every_page_and_what_was_asked_for_is_answered():
     computer = Fragile(1)
     with pages(computer, 2) as (_, _, ws, other):
@@ -416,6 +419,7 @@ def test_what_ends_it_twice_is_left_out():
     assert computer.started == 2
 
 
+@pytest.mark.second
 def test_a_computer_that_ends_while_nobody_asks_is_told_and_started_again():
     computer = StandIn()
     with pages(computer) as (_, _, ws):
@@ -426,6 +430,7 @@ def test_a_computer_that_ends_while_nobody_asks_is_told_and_started_again():
         assert told(ws) == [RUNS]
 
 
+@pytest.mark.second
 def test_a_stopped_computer_is_told_and_started_again_if_it_stays(monkeypatch):
     monkeypatch.setattr("twin.live.clients.STOPPED", 1.0)
     computer = StandIn()
@@ -483,6 +488,7 @@ def test_an_instrument_that_cannot_be_built_is_told_by_the_command(monkeypatch):
         _serve("job.yaml", None, "127.0.0.1", 0, True, "llvm", (), None)
 
 
+@pytest.mark.second
 def test_the_server_ends_when_the_last_page_is_closed(monkeypatch):
     monkeypatch.setattr("twin.live.server.LINGER", 0.3)
     with serving(StandIn(), stay=False) as (port, server):

@@ -254,6 +254,7 @@ def test_a_moved_focal_plane_and_a_moved_target(folder: Path) -> None:
     np.testing.assert_allclose(focus_of(folder).states[0].defocus, there, rtol=1e-9)
 
 
+@pytest.mark.second
 def test_reference_angles_and_positions_in_place_of_differences(folder: Path) -> None:
     """The reference counts from another zero and over a full turn; the table never stops at the same reading twice."""
     before = turntable_of(folder).series

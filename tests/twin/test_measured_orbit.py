@@ -24,14 +24,13 @@ from tests.twin.commands import invoke
 from tests.twin.orbit_files import FIELDS, WHOLE, edit, export, flown, read_back, scaled, set_keys, small
 from twin.orbit.angle.angle_run import run_angle
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
-from twin.orbit.calibration.calibration_export import simulation_exported
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.schemes import schemes_tested
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.images.simulate_run import run_simulation
+from twin.orbit.images.simulate_run import run_simulation, simulation_exported
 from twin.orbit.measured.measurement_tables import read_measurements
 
 run = partial(invoke, command.app)

@@ -136,6 +136,7 @@ def test_frames_in_a_file_take_no_more_than_a_gibibyte(experiment, monkeypatch) 
             assert size.bytes(detector) < 2**30
 
 
+@pytest.mark.second
 def test_a_large_ccd_is_refused_wherever_an_instrument_is_used(tmp_path, backend, monkeypatch) -> None:
     monkeypatch.setenv(LIMIT, "4 GB")
     job = Extreme(((r"rows: 96, columns: 96", "rows: 4096, columns: 4096"),)).write(tmp_path)

@@ -56,6 +56,7 @@ def measured(request, experiment, backend):
     return np.array(signs), out
 
 
+@pytest.mark.second
 def test_model_recovers_the_family(measured):
     signs, cameras = measured
     worst = np.zeros(4)

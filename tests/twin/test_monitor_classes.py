@@ -155,6 +155,7 @@ def one_by_one(setup) -> list[State]:
     return [{body.path: small} for body in setup.instrument.assembly.tree.bodies]
 
 
+@pytest.mark.second
 def test_cameras_whose_light_a_body_changes(setup) -> None:
     """To the bit: of the others not even the last digit of a spot's place moves, and of these some spot does."""
     path, states = setup.path, one_by_one(setup)

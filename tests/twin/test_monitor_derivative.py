@@ -14,6 +14,8 @@ from twin.monitor.monitor_derivative import spot_gradient, spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import FIGURE_TERMS, ElementaryMotion, line_family, other_motions
 
+pytestmark = pytest.mark.second
+
 
 @pytest.fixture(scope="module")
 def path(gf7_pair, backend):
@@ -100,7 +102,6 @@ def differences(
     return np.asarray((4.0 * narrow - wide) / 3.0)
 
 
-@pytest.mark.second
 def test_it_is_what_forward_mode_gives(coarse, motions, gradient, gf7_pair) -> None:
     """Same derivative, other order of summation: rounding only, of terms as large as the camera's turn makes."""
     some = [m for name in CAMERAS for m in (*line_family(name), *other_motions(gf7_pair, name))]
@@ -126,14 +127,12 @@ def check_differences(coarse, motions: Sequence[ElementaryMotion], exact: np.nda
     return int(np.count_nonzero(seen))
 
 
-@pytest.mark.second
 def test_it_is_what_the_spots_do(coarse, motions, gradient) -> None:
     """Every third motion of all parts: three of the seven kinds of each, others for the next part."""
     own = range(0, len(motions), 3)
     assert check_differences(coarse, [motions[k] for k in own], gradient[..., own]) > 60
 
 
-@pytest.mark.second
 def test_about_a_perturbed_state(coarse) -> None:
     """Derivatives by components of motions that are not zero: of a rotation vector, which does not just turn."""
     plane, mirror = f"{BASE}/forward/focal_plane", f"{BASE}/forward/M3"
@@ -170,7 +169,6 @@ def test_about_a_perturbed_state(coarse) -> None:
     assert np.count_nonzero(changed > 1e-5 * size) >= 5  # the state is not the nominal one
 
 
-@pytest.mark.second
 def test_another_pivot_than_the_states_is_refused(coarse) -> None:
     body = f"{BASE}/forward/M1"
     about = {body: Motion(rotate=(1e-6, 0.0, 0.0), pivot="centre")}

@@ -148,6 +148,7 @@ def test_information_of_frames_adds_and_light_counts_as_beams_do(bench: LayoutBe
     assert left == pytest.approx(root, rel=1e-5, abs=1e-9 * float(np.trace(root)))
 
 
+@pytest.mark.second
 def test_noise_of_shot_light_alone_is_that_of_an_airy_disk(bench: LayoutBench, path: MonitorPath) -> None:
     """N photons through a round aperture tell a place to wavelength / (2 pi NA sqrt(N)), and a shift is of two images.
     Pinhole and pixel, and rounding to grey values, fill the dark rings, which tell much of it.

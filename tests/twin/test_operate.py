@@ -60,6 +60,7 @@ def written(folder: Path, text: str, tables: dict[str, str]) -> Path:
 # --- what is taken ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_the_example_is_taken_once_and_told_the_second_time(tmp_path: Path) -> None:
     record, file = tmp_path / "record", EXAMPLES / "telemetry.yaml"
     assert run("init", record, "gf7_pair").exit_code == 0
@@ -136,6 +137,7 @@ def test_a_run_folder_is_a_reading_with_its_frames(record: Path, tmp_path: Path)
         assert (silent.exit_code, words in " ".join(silent.stderr.split())) == (2, True), silent.stderr
 
 
+@pytest.mark.second
 def test_a_run_of_measured_frames_states_its_instrument_below_model(record: Path, tmp_path: Path) -> None:
     """With an exposure of its own, which makes no other instrument."""
     model = json.loads(json.dumps(pair().plain()))
@@ -171,6 +173,7 @@ def rewritten(folder: Path, data: object) -> Path:
     return folder
 
 
+@pytest.mark.second
 def test_results_that_are_none_are_refused(record: Path, tmp_path: Path) -> None:
     apart, bare = "times and states that do not belong together", "a state without cameras or without a time"
     cases = [([], "no results"), ({"times_s": [0, 1], "series": [{"cameras": {}}]}, apart), ({"series": {}}, bare)]
@@ -347,6 +350,7 @@ def test_a_place_that_cannot_be_written_is_told(record: Path) -> None:
         assert (done.exit_code, told in " ".join(done.stderr.split())) == (code, True), done.stderr
 
 
+@pytest.mark.second
 def test_a_refused_row_of_a_growing_table_counts_once(record: Path, tmp_path: Path) -> None:
     """One row before its time and one without a number; the table grows, and a copy of it lies elsewhere."""
     rows = ["2026-01-02T00:00:00Z,20.0", "2026-01-01T00:00:00Z,20.1", "2026-01-03T00:00:00Z,warm"]
@@ -366,6 +370,7 @@ def test_a_refused_row_of_a_growing_table_counts_once(record: Path, tmp_path: Pa
 ATTACKS = INPUTS["attacks"]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("attached", [False, True])
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_the_database_refuses_to_replace_rows(attack: str, attached: bool, record: Path) -> None:
@@ -446,6 +451,7 @@ def test_a_clock_that_runs_backwards(record: Path) -> None:
         assert history.take(given("u", [replace(first, subject="base/forward/M1")])).new == 1
 
 
+@pytest.mark.second
 def test_a_late_reading_waits_for_who_knows(record: Path) -> None:
     early, late = temperatures(0, 1), temperatures(5, 1)
     with History(str(record)) as history:
@@ -506,6 +512,7 @@ def test_readings_of_another_instrument(record: Path, tmp_path: Path) -> None:
     assert "not of gf7_pair_two" in run("init", record, "gf7_pair_two").stderr
 
 
+@pytest.mark.second
 def test_a_reading_against_other_reference_images(record: Path, tmp_path: Path) -> None:
     """Those of the earliest reading count, in a file and after it; the same images with a pixel less are the same."""
 

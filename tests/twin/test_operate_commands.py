@@ -150,6 +150,7 @@ def test_a_forecast_begins_now_and_its_sigma_grows(record: Path, life: Path) -> 
     assert "forecast from 2026-06-25T00:00:00Z to 2026-07-25T00:00:00Z" in done.stdout
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("until", "text"), REFUSED["past_forecasts"])
 def test_a_forecast_of_what_is_past(until: str, text: str, record: Path, life: Path) -> None:
     done = run("forecast", record, life / "plan.yaml", "--until", until)
@@ -240,6 +241,7 @@ def clean(following: Following) -> Following:
     return replace(following, breaks=(), jumps=(), sensors=(), innovations=())
 
 
+@pytest.mark.second
 def test_what_contradicts_the_plan_is_in_the_numbers(following: Following) -> None:
     calm = replace(clean(following), widened=1.0, too_many_jumps=False, bad_readings=((1, "x"), (2, "y")))
     good = calm.to_dict()

@@ -35,6 +35,7 @@ def record(tmp_path: Path, empty: Path) -> Path:
 # --- entries ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_entries_after_a_place_in_their_order(record: Path) -> None:
     """Two bodies at the same minutes, the second one taken later."""
     with History(str(record)) as history:
@@ -127,6 +128,7 @@ def test_an_alarm_is_raised_once_and_acknowledged_once(record: Path) -> None:
 # --- plans -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_the_newest_plan_counts_and_reads_back(record: Path, tmp_path: Path) -> None:
     file = tmp_path / "plan.yaml"
     first = json.loads(invoke(app, "init", record, "gf7_pair", "--plan", EXAMPLES / "operation.yaml", "--json").stdout)
@@ -143,6 +145,7 @@ def test_the_newest_plan_counts_and_reads_back(record: Path, tmp_path: Path) -> 
             assert connection.exec_driver_sql("SELECT count(*) FROM plan").scalar() == 2
 
 
+@pytest.mark.second
 def test_an_estimate_rests_on_a_part_of_the_plan(tmp_path: Path) -> None:
     text = "instrument: gf7_pair\ndisturbances: in_service\n"
 
@@ -161,6 +164,7 @@ def test_an_estimate_rests_on_a_part_of_the_plan(tmp_path: Path) -> None:
     assert digest("") != own
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("text", "said"), REFUSED["plans"])
 def test_a_plan_that_is_not_of_the_record(text: str, said: str, record: Path, tmp_path: Path) -> None:
     (tmp_path / "plan.yaml").write_text(text)

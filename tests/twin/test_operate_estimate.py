@@ -182,6 +182,7 @@ def test_times_of_a_pass_go_together(known, tmp_path) -> None:
         posterior(estimate, [START - 1, START])
 
 
+@pytest.mark.second
 def test_a_slip_is_told_with_its_body(known, tmp_path) -> None:
     life = life_of(known[2], 120.0, 3.0, 5, {60.0: {motion(known, "backward/M2 shift z"): 4.0}})
     estimate = followed(known, tmp_path, entries_of(known, life, 5))
@@ -191,6 +192,7 @@ def test_a_slip_is_told_with_its_body(known, tmp_path) -> None:
     assert np.all(off(estimate, life)[18:23] < 5.0)
 
 
+@pytest.mark.second
 def test_what_a_slip_does_to_the_line_is_said_with_its_sigma(known, tmp_path) -> None:
     """Of two spots a mirror's slip is read as another turn and another principal distance than the line has of it."""
     _, experiment, stated = known
@@ -219,6 +221,7 @@ def test_what_a_slip_does_to_the_line_is_said_with_its_sigma(known, tmp_path) ->
     assert read == pytest.approx(1e6 * alone[3], rel=0.05)
 
 
+@pytest.mark.second
 def test_an_event_steps_what_the_plan_says(known, tmp_path) -> None:
     """A slip at a known event is no alarm, and sigma before it is that of a life without."""
     life = life_of(known[2], 60.0, 3.0, 6, {31.0: {motion(known, "forward/M3 shift y"): 1.5}})
@@ -253,6 +256,7 @@ def test_sensors_that_die_or_repeat_themselves_are_named(known, tmp_path) -> Non
     assert np.all(off(estimate, life) < 6.0)
 
 
+@pytest.mark.second
 def test_a_requirement_that_is_going_to_break(known, tmp_path) -> None:
     stated = known[2]
     life = life_of(stated, 60.0, 3.0, 9, {})
@@ -270,6 +274,7 @@ def test_a_requirement_that_is_going_to_break(known, tmp_path) -> None:
     assert found.breaks_us == int(life.times[-1])
 
 
+@pytest.mark.second
 def test_times_that_nobody_knows_anything_of(known, tmp_path) -> None:
     stated = known[2]
     estimate = followed(known, tmp_path, entries_of(known, life_of(stated, 12.0, 3.0, 1, {}), 1))
@@ -443,6 +448,7 @@ def test_a_person_decides(known, tmp_path) -> None:
     assert len(list(history.entries("decision"))) == 3
 
 
+@pytest.mark.second
 def test_a_contradicted_start_stays_in_sigma(known, tmp_path) -> None:
     """All motions are twelve times as large as stated: the first readings say so, and sigma still does at the end."""
     entries, life = readings(known, 24, 0.0, scale=12.0)

@@ -214,6 +214,7 @@ def problem(history: History, time: int, source: ExportSource | None = None) -> 
     return told.value
 
 
+@pytest.mark.second
 def test_times_of_which_nothing_is_known_are_refused(history: History, tmp_path: Path) -> None:
     end = START + 30 * 86400 * MICRO
     early, late, none = problem(history, START - 1), problem(history, end + 1), problem(made(tmp_path / "none"), START)
@@ -225,6 +226,7 @@ def test_times_of_which_nothing_is_known_are_refused(history: History, tmp_path:
     assert "twin.operate ingest" in (none.allowed or "")
 
 
+@pytest.mark.second
 def test_a_scene_that_its_orbit_does_not_cover_is_refused(history: History, tmp_path: Path) -> None:
     (tmp_path / "angle.yaml").write_text(SCENE.read_text("utf-8").replace("time: 0 s", "time: 59.9999 s"), "utf-8")
     source = read_source(tmp_path / "angle.yaml")
@@ -499,6 +501,7 @@ def test_products_are_the_same_whenever_and_by_whichever_plan_they_are_asked_for
     }
 
 
+@pytest.mark.second
 def test_the_files_of_a_record_are_its_estimate(followed: Followed, tmp_path: Path) -> None:
     """Motions of the job make the changes of the estimate, and the prior their covariance."""
     later = utc_text(followed.time + 3600 * MICRO)

@@ -97,6 +97,7 @@ def test_components_go_together_at_all_times_as_they_are_correlated() -> None:
     assert np.all(np.abs(found.T @ found / len(found) - wanted) < slack)  # 1.4: a sum over lags of exp(-2 n)
 
 
+@pytest.mark.second
 def test_steps_come_at_their_mean_rate_and_all_motions_of_a_body_step_together() -> None:
     stated = two(TimeLawSpec(jump="50 d"), correlation=0.5)
     days = np.linspace(0.0, 50_000.0, 1000)

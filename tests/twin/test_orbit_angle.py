@@ -141,6 +141,7 @@ def test_a_short_orbit_has_no_intersection() -> None:
     assert heights["beta"] > 5.0
 
 
+@pytest.mark.second
 def test_a_datum_shift_is_the_stations_shift_reversed() -> None:
     """Moving all points by s is moving the station by -s, with the linear slopes; second order is 1e-5 of it."""
     shift = (10.0, -4.0, 7.0)

@@ -56,6 +56,7 @@ def test_the_ground_tells_the_traced_angle(changed, state: str, effects: LightEf
 # Off-axis lines
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("effects", [NO_EFFECTS, LightEffects()], ids=["no effects", "effects corrected"])
 def test_off_axis_angles_come_back(effects: LightEffects) -> None:
     """Dihedral, look and along-track angles to 1e-4 arcsec, of near and far lines."""

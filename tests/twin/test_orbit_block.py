@@ -10,8 +10,7 @@ from scenes.yaml.errors import InputError
 from twin.framework.procedure import BenchError
 from twin.orbit.block.block_report import block_report
 from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
-from twin.orbit.block.measured_block import measured_block
-from twin.orbit.block.pass_knowledge import change_covariance
+from twin.orbit.block.measured_block import change_covariance, measured_block
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.measured.pass_measurements import GroundPoints

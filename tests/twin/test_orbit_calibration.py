@@ -18,12 +18,10 @@ from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration import campaign_adjustment
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import run_calibration, true_values
-from twin.orbit.calibration.campaign import Campaign, interior_names
-from twin.orbit.calibration.campaign_adjustment import GAUGE, simultaneous
+from twin.orbit.calibration.campaign import Campaign, PassData, image_sigma, interior_names
+from twin.orbit.calibration.campaign_adjustment import GAUGE, fitted, rate_priors, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import surprises
-from twin.orbit.calibration.latitude import fitted, rate_priors
-from twin.orbit.calibration.observations import PassData, image_sigma
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints
 
@@ -157,7 +155,7 @@ def test_covariances_of_line_and_pixel_keep_their_sign_in_the_focal_plane() -> N
     still = np.zeros(3)
     for name in LINES:
         spread = np.array([[0.04, 0.03], [0.03, 0.09]])
-        plain = replace(data, lines=None).places(name, np.array([0.0, 5999.5, 11_999.0]))
+        plain = data.places(name, np.array([0.0, 5999.5, 11_999.0]))
         assert plain == pytest.approx(SETUP.camera.pitch * np.array([[0.0, -5999.5], [0.0, 0.0], [0.0, 5999.5]]))
         line, pixel = 42_857.0, 6000.0
         row = ImagePoints.of([0], [line], [pixel], spread)

@@ -153,6 +153,7 @@ def test_the_noise_of_measured_lines_gives_rows_no_oscillation() -> None:
     assert not [seed for seed in range(3) if len(searched(one, seed).lines.frequency)]
 
 
+@pytest.mark.second
 def test_steady_readings_are_those_of_a_pass_without_noise() -> None:
     """Polynomials through exact readings: the orbit to a millimetre, the attitude to a thousandth of an arcsecond."""
     one = setup(attitude={"steering": "yaw"}, errors={})
@@ -171,6 +172,7 @@ def test_lines_without_points_cannot_be_searched() -> None:
         sights_of(measured, {"blue": line_cameras(one.camera)["blue"]}, None, one.test.search, LightEffects())
 
 
+@pytest.mark.second
 def test_lines_of_which_one_looks_elsewhere_cannot_be_searched() -> None:
     """A thousand pixels across, which no height explains: half of them in each line, where 200 may be."""
     one = setup()

@@ -63,6 +63,7 @@ def rows_of(file: Path) -> list[list[str]]:
 CASES = [(table, share) for share in (0.2, 0.04, 0.4) for table in ("image_points", "ground")]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("table", "share"), quick(1, CASES))
 def test_exchanged_names_are_found_and_no_others(file: Path, table: str, share: float) -> None:
     """In the images each line has pairs of its own, so that up to three times the share of the points is in one."""
@@ -82,6 +83,7 @@ def test_exchanged_names_are_found_and_no_others(file: Path, table: str, share: 
     assert found == wrong
 
 
+@pytest.mark.second
 def test_check_points_with_exchanged_coordinates_are_found(file: Path) -> None:
     def change(heads, rows):
         checks = [k for k, row in enumerate(rows) if row[1] == "check"]

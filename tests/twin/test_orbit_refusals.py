@@ -57,10 +57,9 @@ from twin.laboratory.distortion_run import _check_angles
 from twin.orbit.angle.angle_flight import angle_camera
 from twin.orbit.angle.angle_run import SimulatedAngleRun
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
-from twin.orbit.block import point_workers
-from twin.orbit.block.block_run import run_adjustment
-from twin.orbit.block.point_workers import PointWorkers
-from twin.orbit.calibration.observations import light_shift
+from twin.orbit.block import block_run
+from twin.orbit.block.block_run import PointWorkers, run_adjustment
+from twin.orbit.calibration.campaign import light_shift
 from twin.orbit.conventions.check_run import run_check
 from twin.orbit.export.export_run import read_exportable, run_export
 from twin.orbit.export.ground_accuracy import ground_rows
@@ -70,19 +69,17 @@ from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
-from twin.orbit.images.patch import Patch, PatchError
-from twin.orbit.images.point_judgement import true_ground
+from twin.orbit.images.patch import Patch, PatchError, true_ground
 from twin.orbit.images.simulate_run import run_simulation
 from twin.orbit.jitter import jitter_run, sights
 from twin.orbit.jitter.sights import SightsError, sights_of
 from twin.orbit.matching import match_run
 from twin.orbit.matching.match_run import run_match
-from twin.orbit.measured.dimap_sensor import read_scene
 from twin.orbit.measured.earth_orientation import read_earth_orientation
 from twin.orbit.measured.ground_files import read_ground_points
-from twin.orbit.measured.map_part import UserMap
+from twin.orbit.measured.maps import UserMap
 from twin.orbit.measured.pass_measurements import GroundPoints
-from twin.orbit.measured.platform_files import platform_table, read_platform
+from twin.orbit.measured.platform_files import platform_table, read_platform, read_scene
 from twin.orbit.monitoring import closed_loop, loop_run, monitoring_run
 from twin.orbit.monitoring.monitor_series import MonitorSeries
 
@@ -399,7 +396,7 @@ def test_what_is_refused(case: tuple[Any, ...], tmp_path: Path, monkeypatch: pyt
 def test_what_is_to_be_known_of_a_cluster_is_told(warnings: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("twin.framework.cluster.remote_workers", lambda *_: nullcontext(Ns(warnings=warnings, count=1)))
     told: list[str] = []
-    with point_workers.point_workers(None, "tcp://localhost:1", told.append):
+    with block_run.point_workers(None, "tcp://localhost:1", told.append):
         assert told == warnings
 
 

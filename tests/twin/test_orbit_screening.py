@@ -18,6 +18,7 @@ def residuals(rng, count, scale):
     return SimpleNamespace(residual=found), kept
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("count", [12, 60])
 def test_good_lines_keep_their_sigmas(count):
     """300 campaigns of six lines: a line stands out by chance in 3e-5 of normal ones; medians of 12 have a tail."""

@@ -10,8 +10,8 @@ import tests.twin.orbit_file_bench as bench
 from scenes.yaml.errors import InputError
 from tests.twin.test_platform_files import CSV_ATTITUDE, EARTH, read
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.measured.orbit_files import read_oem, read_sp3
-from twin.orbit.measured.platform_readings import known_frame
+from twin.orbit.measured.clock import Readings
+from twin.orbit.measured.orbit_files import OrbitReadings, Segment, known_frame, read_oem, read_sp3
 
 RADIUS, RATE = 6.878e6, 1.1068e-3
 
@@ -149,3 +149,9 @@ def test_older_and_unfinished_files_of_sp3(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["ECF", "IER97", "ITR97", "IGS14", "IGb08", "IGc20", "WGS84"])
 def test_frames_as_sp3_spells_them(name: str) -> None:
     assert known_frame(name, "a.sp3") == "ITRS"
+
+
+def test_a_cut_orbit_keeps_what_is_left_of_its_segments() -> None:
+    clock, place = Readings(np.full(90, 55625), np.arange(90.0)), np.zeros((90, 3))
+    orbit = OrbitReadings("a.oem", clock, place, None, segments=(Segment(0, 49), Segment(50, 79), Segment(80, 89)))
+    assert [(part.first, part.last) for part in orbit.taken(slice(40, 70)).segments] == [(0, 9), (10, 29)]

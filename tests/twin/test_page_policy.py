@@ -66,6 +66,7 @@ def test_what_matplotlib_writes_into_every_figure_is_what_the_policy_allows(figu
     assert re.findall(r"<style[^>]*>(.*?)</style>", figure, re.S) == [FIGURES]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("evil", EVIL)
 def test_a_text_of_a_users_file_brings_no_markup(evil):
     page = page_of(evil)
@@ -74,6 +75,7 @@ def test_a_text_of_a_users_file_brings_no_markup(evil):
     assert evil.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&#34;") in page
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("broken", REFUSED["breaches"])
 def test_a_breach_would_be_found(broken):
     assert breaches(page_of("plain").replace("<body>", f"<body>{broken}"))

@@ -15,8 +15,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import Body, RigidTree
 from optics.materials.scatter import ABSORBER, BARE, Finish, reflectance
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from scenes.models.scenery import Scenery
-from scenes.models.scenery_parts import Finishes, solid_surfaces
+from scenes.models.scenery import Finishes, Scenery, solid_surfaces
 from tests.optics.bench import unit
 from tests.twin.path_bench import facing, frame, glass_scene, screen, slab
 from twin.path_tracing.families import Event, decode

@@ -104,6 +104,7 @@ def test_scattered_directions_follow_the_bsdf(backend, scatter, index: float) ->
         assert abs((~stayed).mean() - total) < 3.3 * np.sqrt(total / N)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("near", [None, 0.5])
 def test_drawing_more_scatter_keeps_its_power(backend, near: float | None) -> None:
     """False alarms 1e-3 each; drawn near the specular direction, the innermost part of the lobe is found as well."""
@@ -223,6 +224,7 @@ def expected_cells(table: ScatterTable, angle: float, radial: np.ndarray, azimut
     return out
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("kind", "degrees"), quick(1, [("skewed", 52.0), ("skewed", 21.0), ("abg", 35.0)]))
 def test_drawn_directions_follow_the_table(backend, kind: str, degrees: float) -> None:
     """At whole degrees, where no neighbour is taken for the angle of incidence."""

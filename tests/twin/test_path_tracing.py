@@ -18,13 +18,12 @@ from optics.geometry.tree import AT_REST, Body, Motion, RigidTree, State
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.scenery import Scenery, build_scenery
-from scenes.models.scenery_parts import Detector, detector_surface, mirror_surface
+from scenes.models.scenery import Detector, Scenery, build_scenery, detector_surface, mirror_surface
 from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, facing, flat_mirror, glass_scene, screen, slab
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.families import nominal_codes
-from twin.path_tracing.sinks import NOMINAL
+from twin.path_tracing.path_result import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
 from twin.path_tracing.stray_light import monitor_families, trace_stray
 from twin.path_tracing.tracer import BALANCED, VARIANTS, PathTracer, Sampling, VariantUnavailable, load_mitsuba

@@ -50,6 +50,7 @@ def test_tables_of_the_simulation_come_back_bit_for_bit(tmp_path: Path) -> None:
     is_the_pass(table, 0.0, 0.0, 1e-15)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("scale", ["UTC", "GPS", "TAI", "TT", "BDT"])
 @pytest.mark.parametrize("kind", ["oem", "sp3", "csv"])
 def test_every_format_and_time_scale_is_the_same_pass(tmp_path: Path, kind: str, scale: str) -> None:

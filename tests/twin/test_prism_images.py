@@ -145,11 +145,13 @@ def imperfect(backend, instrument) -> MonitorPath:
     return MonitorPath(build_instrument(spec, cameras, backend), backend)
 
 
+@pytest.mark.second
 def test_squared_facets_absorb_the_errors(imperfect) -> None:
     """As made, the spots stand on the CCDs' middles again."""
     assert np.abs(spots(imperfect, [{}])).max() < 0.05
 
 
+@pytest.mark.second
 def test_a_beam_that_misses_its_prism_is_told_by_name(tmp_path):
     job = tmp_path / "job.yaml"
     prism = "base/forward/monitor/left/prism_180"

@@ -21,7 +21,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera
-from scenes.specs.procedures import Procedure
+from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
 from tests.twin.commands import files, invoke
@@ -29,7 +29,7 @@ from tests.twin.test_blurred_cameras import gf7_with
 from twin.framework import cli, reference_frames
 from twin.framework.artefact import PngFigure, SvgFigure, Table
 from twin.framework.cli import heartbeat
-from twin.framework.command import add_test, progress_shown
+from twin.framework.command import add_tests, progress_shown
 from twin.framework.procedure import Advance, BenchError
 from twin.framework.quantity import plain_data
 from twin.framework.report import Report, Section, answer
@@ -142,9 +142,10 @@ def program(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> typer.Typer:
     """Return a program with the test as its command, but for what is changed."""
     frames = {**reference_frames.FRAMES, "level": {"readings_arcsec": "about the level's own axis"}}
     monkeypatch.setattr(reference_frames, "FRAMES", FrozenMap(frames))
+    monkeypatch.setitem(PROCEDURES, "bench level", replace(LEVEL, **changes))
     app = typer.Typer()
     app.callback()(lambda: None)
-    add_test(app, "own.bench", "level", replace(LEVEL, **changes))
+    add_tests(app, "bench")
     return app
 
 
@@ -153,6 +154,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable:
     return partial(invoke, program(monkeypatch, run=lambda *given: LEVEL.run(*given)))
 
 
+@pytest.mark.second
 def test_progress_is_told_where_there_is_no_terminal(run: Callable, tmp_path: Path, monkeypatch) -> None:
     """Also while one part of the work takes long."""
     monkeypatch.setattr(cli, "TICK_SECONDS", 0.05)
@@ -194,6 +196,7 @@ def test_work_that_takes_long_says_so_once_by_its_first_pieces(silent: bool, mon
     assert said.getvalue() == ("" if silent else "note: passes: about 7 min left\n")
 
 
+@pytest.mark.second
 def test_a_terminal_shows_progress_itself() -> None:
     shown = io.StringIO()
     with heartbeat(Console(file=shown, force_terminal=True), lambda: "far", False, 0.02):
@@ -204,6 +207,7 @@ def test_a_terminal_shows_progress_itself() -> None:
     assert set(shown.getvalue().splitlines()) == {"progress: far"}
 
 
+@pytest.mark.second
 def test_command(run: Callable, tmp_path: Path) -> None:
     """What a test of one's own gives: --json, files, and the same again from its config.yaml."""
     path = tmp_path / "level.yaml"

@@ -139,6 +139,7 @@ def test_a_reading_whose_sigma_says_nothing_is_stated_whole(sigma) -> None:
     assert stated({"x": 1.0 / 3.0})["x"] == 1.0 / 3.0
 
 
+@pytest.mark.second
 def test_last_digits_are_not_stated() -> None:
     """What another kernel makes of readings, 1e-11 sigma, is gone from files but for one in 10^5."""
     rng = np.random.default_rng(3)

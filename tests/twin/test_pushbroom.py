@@ -100,6 +100,7 @@ def test_marks_lie_where_the_sensor_says(name: str) -> None:
         assert np.abs(level[0] - line).max() > 3.0
 
 
+@pytest.mark.second
 def test_grey_ground_has_the_grey_value_of_the_hand() -> None:
     """The Sun as a black body, Lambert's ground, pi/4 F^2, pixel, time, quantum efficiency and gain; quadrature and the
     finite point spread function agree to 1e-4, single precision to 1e-6."""
@@ -214,6 +215,7 @@ def test_steep_terrain_is_refused() -> None:
             looked()
 
 
+@pytest.mark.second
 def test_looks_that_cannot_be_followed_are_refused() -> None:
     """A window at the image's end, looks past the Earth, an attitude that no node follows."""
     flat, inside = Terrain.flat(600.0), Window(40, 6000, 10, 10)
@@ -226,6 +228,7 @@ def test_looks_that_cannot_be_followed_are_refused() -> None:
             look_map(sensor, FRAME, flat, window)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("limit", "value", "words"),
     [
@@ -261,6 +264,7 @@ def test_what_cannot_be_imaged() -> None:
         assert caught.value.part == part, str(caught.value)
 
 
+@pytest.mark.second
 def test_light_falls_off_along_the_line_by_the_fourth_power_of_the_cosine() -> None:
     """Even ground at the end of a line of 8 degrees to each side against its middle, noise-free: cos^4 of the field
     angle of a lens without distortion. The point spread function's cut and single precision leave 1e-5.

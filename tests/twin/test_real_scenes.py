@@ -15,7 +15,7 @@ import pytest
 
 from twin.orbit.export.quality_run import compared
 from twin.orbit.export.rational_polynomial import RationalPolynomial
-from twin.orbit.measured.dimap_sensor import read_scene
+from twin.orbit.measured.platform_files import read_scene
 
 REAL = Path(os.environ.get("TWIN_REAL", Path(__file__).parents[3] / "shared" / "real"))
 needed = pytest.mark.skipif(
@@ -53,6 +53,7 @@ def polynomials(root: ET.Element) -> RationalPolynomial:
     return RationalPolynomial(offset - [1.0, 1.0, 0.0, 0.0, 0.0], scale, *row, *column)
 
 
+@pytest.mark.second
 @needed
 def test_a_pleiades_scene_meets_its_own_polynomials(tmp_path: Path) -> None:
     """The ground segment's numbers in the elements of DIMAP 2: velocities are against the stars, and polynomials hold

@@ -40,8 +40,8 @@ from twin.recover import measured_frames, recover_run
 from twin.recover.__main__ import app
 from twin.recover.channel_measurement import ChannelMeasurement
 from twin.recover.measured_frames import ChannelFrames, StateFrames, order_warnings
-from twin.recover.recover_report import recover_numbers, recover_report
-from twin.recover.recover_run import RecoverRun, run_recover
+from twin.recover.recover_report import recover_report
+from twin.recover.recover_run import RecoverRun, recover_numbers, run_recover
 
 JOB = ROOT / "scenes/examples/perturb.yaml"
 HEAD = "instrument: gf7_pair\ndisturbances: launch\n"

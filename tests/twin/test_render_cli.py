@@ -21,7 +21,6 @@ import tifffile
 from rich.console import Console
 
 import twin.main_job.render_command
-import twin.main_job.render_drawings
 import twin.main_job.render_folder
 import twin.render as command
 from optics.numerics.backend import LIMIT
@@ -29,7 +28,7 @@ from scenes.specs.load import EXAMPLES
 from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from tests.twin.study_bench import REFUSED
-from twin.main_job.render_drawings import (
+from twin.main_job.render_folder import (
     IRRADIANCE,
     SCENE,
     SUMMARY,
@@ -91,7 +90,7 @@ def ready(computed, monkeypatch):
     def few(run):
         return {SUMMARY: bytes, IRRADIANCE: drawings(run)[IRRADIANCE]}
 
-    monkeypatch.setattr(twin.main_job.render_drawings, "instrument_drawings", lambda *_: {SCENE: bytes})
+    monkeypatch.setattr(twin.main_job.render_folder, "instrument_drawings", lambda *_: {SCENE: bytes})
     monkeypatch.setattr(twin.main_job.render_folder, "drawings", few)
     monkeypatch.setattr(twin.main_job.render_folder, "limits_drawing", lambda _: {})
     monkeypatch.setattr(twin.main_job.render_folder, "render_report", lambda *_: "")
@@ -193,6 +192,7 @@ def complains(result, *words: object) -> str:
     return result.stderr
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("case", BAD_FILES)
 def test_bad_files(case, tmp_path):
     content, words = BAD_FILES[case]

@@ -17,7 +17,8 @@ from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
 from twin.main_job.result_sections import residual_section
 from twin.main_job.systematics import systematics
-from twin.pictures.scene_file import write_scene
+from twin.pictures.light_paths import trace_light_paths
+from twin.pictures.scene_file import scene_bytes
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +27,10 @@ def run(backend) -> RenderRun:
 
 
 @pytest.fixture(scope="module")
-def page(run, tmp_path_factory) -> str:
-    scene = tmp_path_factory.mktemp("scene") / "scene.glb"
-    write_scene(run.experiment, run.state, scene)
-    return render_report(run, scene=scene.read_bytes())
+def page(run) -> str:
+    instrument = run.experiment.instrument
+    paths = trace_light_paths(instrument, run.experiment.backend, run.state)
+    return render_report(run, scene=scene_bytes(instrument, run.state, paths))
 
 
 @pytest.mark.second
@@ -58,7 +59,7 @@ def test_crosstalk_explains_the_systematic_residuals(run):
     for name in run.crosstalk:
         for estimator in ("model", "posterior"):  # which takes the spots of both cameras together
             bias = systematics(run, name).bias[estimator]
-            for k, p in enumerate(PARAMETERS):
+            for k, p in enumerate(PARAMETERS.values()):
                 own = run.recovered_dict()["cameras"][name][estimator]
                 error = own[p.key] - run.truth_dict()["cameras"][name][p.key]
                 largest = max(largest, abs(error) / own[f"{p.key}_sigma_noise"])

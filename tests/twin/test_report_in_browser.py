@@ -10,7 +10,8 @@ from optics.geometry.tree import Motion
 from scenes.specs.resolved import resolve
 from twin.main_job.render_folder import render_report
 from twin.main_job.render_job import render_job
-from twin.pictures.scene_file import write_scene
+from twin.pictures.light_paths import trace_light_paths
+from twin.pictures.scene_file import scene_bytes
 
 CHROMIUM = shutil.which("chromium")
 pytestmark = [pytest.mark.second, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
@@ -29,9 +30,10 @@ def run(backend):
 def report(run, tmp_path_factory) -> Path:
     """The main report, with a view of a focal plane that is turned and shifted."""
     place = tmp_path_factory.mktemp("report")
-    motion = Motion(rotate=(0.0, 0.0, 1e-4), shift=(0.0, 1e-5, 0.0))
-    write_scene(run.experiment, {"base/backward/focal_plane": motion}, place / "scene.glb")
-    page = render_report(run, scene=(place / "scene.glb").read_bytes())
+    state = {"base/backward/focal_plane": Motion(rotate=(0.0, 0.0, 1e-4), shift=(0.0, 1e-5, 0.0))}
+    instrument = run.experiment.instrument
+    paths = trace_light_paths(instrument, run.experiment.backend, state)
+    page = render_report(run, scene=scene_bytes(instrument, state, paths))
     (place / "report.html").write_text(page, encoding="utf-8")
     return place / "report.html"
 

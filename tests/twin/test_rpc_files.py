@@ -19,7 +19,7 @@ from twin.orbit.export.rational_polynomial import (
     read_rpc,
 )
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.measured.dimap_sensor import read_scene
+from twin.orbit.measured.platform_files import read_scene
 
 SCENE = Scene()
 HEIGHTS = (0.0, 2000.0)

@@ -31,10 +31,9 @@ from twin.framework.data_files import (
 )
 from twin.framework.run_folder import RunFolder, write_manifest
 from twin.main_job.monitor_reading import stated
-from twin.main_job.render_files import write_data
+from twin.main_job.render_files import irradiance_file, write_results
 from twin.main_job.render_job import render_job
-from twin.recover.recover_report import recover_numbers
-from twin.recover.recover_run import run_recover
+from twin.recover.recover_run import recover_numbers, run_recover
 
 JOB = ROOT / "tests/golden/jobs/perturb.yaml"
 SEED, FRAMES = 5, 3
@@ -51,7 +50,8 @@ def run(job, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "first"
     points = [["sort", "point", "line", "height_m", "status"], ["tie", 0, 3.5, 120.25, ""], ["tie", 1, "", 7.0, "dark"]]
     with RunFolder(folder) as target:
-        write_data(job, target)
+        write_results(job, target)
+        target.write_bytes("irradiance.nc", irradiance_file(job))
         target.write_bytes("artefacts/points.csv", csv_table(points))
         write_manifest(target, "twin.render", 0.0, 1.0, seed=SEED)
     return folder

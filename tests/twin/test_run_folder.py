@@ -345,6 +345,7 @@ def kill_a_run(target: Path, act: str = "") -> None:
     assert done.returncode == -signal.SIGKILL
 
 
+@pytest.mark.second
 def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
     kill_a_run(tmp_path / "other")
     assert {path.suffix for path in tmp_path.iterdir()} == {f".{PARTIAL}", f".{LOCK}"}
@@ -354,6 +355,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"run", ".mine.partial", ".mine.01234567.partial"}
 
 
+@pytest.mark.second
 def test_what_a_living_run_has_is_left_alone(tmp_path):
     with RunFolder(tmp_path / "run") as folder:
         folder.write_text("a.txt", "mine")

@@ -14,7 +14,9 @@ import pytest
 import twin
 from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PARAMETERS
+from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
+from tests.twin.commands import files
 from tests.twin.study_bench import TEXTS, refusals
 from twin.main_job.monitor_reading import stated
 from twin.monitor.truth import trace_truth
@@ -23,6 +25,7 @@ from twin.study.runs.setup import study_from_text
 from twin.study.scripted import config_text, tell_through
 
 DESPACE = {"base/forward/M2": {"shift": "0 0 3 um"}}
+JOBS = Path(__file__).resolve().parents[1] / "golden/jobs"
 TURN = {"base/backward/focal_plane": {"rotate": "2 -1.5 10 arcsec", "pivot": "rear_node"}}
 
 
@@ -165,6 +168,35 @@ def test_a_wrong_motion_is_explained(pair: twin.InstrumentTwin, motion: str, fou
         pair.jacobian([motion])
     assert found in str(error.value)
     assert says in str(error.value)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("asbuilt check", JOBS / "asbuilt_check.yaml"),
+        ("camera", "monitor"),
+        ("design camera", JOBS / "design.yaml"),
+        ("recover", "frames.yaml"),
+        ("tolerance", JOBS / "tolerance.yaml"),
+        ("uncertainty", "gf7_pair"),
+    ],
+)
+def test_a_script_gets_a_commands_run_folder(name: str, file: Path | str, shot: twin.Shot, tmp_path: Path) -> None:
+    if name == "recover":
+        file = tmp_path / file
+        shot.save(tmp_path / "run")
+        file.write_text("instrument: gf7_pair\ndisturbances: launch\nframes: run/images\n", "utf-8")
+    folders = tmp_path / "command", tmp_path / "script"
+    command = [sys.executable, "-m", *f"twin.{name}".split(), str(file), "--out", str(folders[0]), "--quiet"]
+    subprocess.run(command, check=False)
+    twin.perform(name, file).save(folders[1])
+    assert files(folders[0]) == files(folders[1])
+    for kept in ("config.yaml", f"{PROCEDURES[name].kind}.json"):
+        assert (folders[0] / kept).read_bytes() == (folders[1] / kept).read_bytes()
+    manifests = [json.loads((folder / "manifest.json").read_text("utf-8")) for folder in folders]
+    for key in ("program", "test", "seed", "again", "checks", "inputs", "warnings"):
+        assert manifests[0].get(key) == manifests[1].get(key), key
 
 
 def test_wrong_names_are_explained(pair: twin.InstrumentTwin) -> None:

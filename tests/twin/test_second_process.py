@@ -98,6 +98,7 @@ def test_it_works_while_the_first_does_not_know_all_tasks_yet() -> None:
     assert len({found[str(k)][1] for k in range(10)}) == 2
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("wanted", [True, False])
 def test_what_a_task_raises_comes_out(wanted) -> None:
     with pytest.raises(ValueError, match="not this one"):
@@ -105,6 +106,7 @@ def test_what_a_task_raises_comes_out(wanted) -> None:
     assert not children()
 
 
+@pytest.mark.second
 def test_a_process_that_dies_loses_nothing() -> None:
     with SecondProcess(nothing) as beside:
         beside.start({str(k): partial(end_itself, os.getpid()) for k in range(6)})
@@ -113,6 +115,7 @@ def test_a_process_that_dies_loses_nothing() -> None:
     assert found == {str(k): 5 for k in range(6)}
 
 
+@pytest.mark.second
 def test_a_process_that_hangs_is_ended(monkeypatch) -> None:
     monkeypatch.setattr(module, "PATIENCE", 0.3)
     own = os.getpid()
@@ -145,6 +148,7 @@ def test_no_second_process_on_one_core_or_beside_other_threads(monkeypatch) -> N
     assert found == [os.getpid()] * 2
 
 
+@pytest.mark.second
 def test_nothing_is_left_behind() -> None:
     before = open_files()
     for stop in (False, True):
@@ -160,6 +164,7 @@ def test_nothing_is_left_behind() -> None:
         beside.start({str(k): nothing for k in range(MOST_TASKS + 1)})
 
 
+@pytest.mark.second
 def test_it_ends_with_a_command_that_is_killed() -> None:
     """Also its copy of what the command had open, so that a reader of the output sees the end and a lock is free."""
     code = (

@@ -74,6 +74,7 @@ def places(camera: LineCamera, count: int, seed: int) -> tuple[np.ndarray, ...]:
     return line, pixel, rng.uniform(-100.0, 8000.0, count)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("effects", EFFECTS, ids=words)
 @pytest.mark.parametrize("name", quick(1, NAMES))
 def test_round_trip(cameras, trajectory, name: str, effects: LightEffects) -> None:

@@ -18,8 +18,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import Body, Motion, RigidTree
 from optics.materials.scatter import CoatingTable, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from scenes.models.scenery import Scenery, build_scenery
-from scenes.models.scenery_parts import Finishes, mirror_surface
+from scenes.models.scenery import Finishes, Scenery, build_scenery, mirror_surface
 from tests.tiers import quick
 from tests.twin.path_bench import IDEAL, facing, scene_beam, screen, ways_and_search
 from twin.path_tracing.clear_ways import ClearWays
@@ -87,6 +86,7 @@ def test_paths_whose_first_surface_is_searched_are_those_of_a_search(backend, gf
     same(*runs)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("metal", "steps"),
     [
@@ -106,6 +106,7 @@ def test_paths_at_other_finishes_of_glass_are_those_of_a_search(backend, gf7_pai
     same(*found.runs)
 
 
+@pytest.mark.second
 def test_steps_say_what_nominal_light_does(backend, gf7_pair) -> None:
     scenery = build_scenery(gf7_pair, {})
     families, channel = monitor_families(scenery, gf7_pair), gf7_pair.channels[0]
@@ -228,6 +229,7 @@ def same(one: PathResult, other: PathResult) -> None:
     assert one.balance.absorbed == pytest.approx(other.balance.absorbed, rel=1e-9, abs=1e-15)
 
 
+@pytest.mark.second
 def test_light_out_and_back_has_clear_ways_everywhere(gf7_pair) -> None:
     """From the pinhole to the area CCD there are 25 surfaces: 25 ways between them and the detector, and the first."""
     scenery = build_scenery(gf7_pair, {}, IDEAL)

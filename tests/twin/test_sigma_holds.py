@@ -43,6 +43,7 @@ def blurred(pair):
     return pair.perturbed(BLURRED).render(frames=2, seed=1)
 
 
+@pytest.mark.second
 def test_an_aberrated_spot_is_marked_and_its_sigma_widened(pair, blurred) -> None:
     """2 um of coma on M1: chi-squares of hundreds, and d_alpha was 41 661 sigma off without a word."""
     assert "σ does not hold for this measurement" in blurred.verdict

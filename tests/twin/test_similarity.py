@@ -139,6 +139,7 @@ def test_targets_are_imaged_on_the_same_pixels(with_camera, backend) -> None:
             np.testing.assert_allclose(new, old, rtol=0, atol=1e-7)
 
 
+@pytest.mark.second
 def test_detectors_of_the_path_tracer_have_grown_pixels(with_camera, backend) -> None:
     instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
     nominal, warm = (build_scenery(instrument, s) for s in ({}, heated(instrument, ALUMINIUM)))
@@ -193,6 +194,7 @@ def test_an_area_ccd_that_alone_is_warm_has_larger_pixels(with_camera, backend) 
 # --- glass ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("camera", ["gf7", "monitor"])
 def test_the_index_of_the_prisms_turns_no_beam(camera: str, with_camera, backend) -> None:
     """The change of index is no similarity: it moves beams sideways in tilted prisms, by less than 0.1 um for 5 K.

@@ -95,6 +95,7 @@ def test_other_software_finds_the_ground(folder: Path) -> None:
 BAD = REFUSED["simulated_files"]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input(case: str, tmp_path: Path) -> None:
     old, new, key, words = BAD[case]

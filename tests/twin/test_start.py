@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from scenes.specs.file_kinds import FILE_KINDS
+from scenes.specs.file_kinds import file_kinds
 from tests.tiers import quick
 from tests.twin.study_bench import ROOT
 from twin.framework import cluster
@@ -90,6 +90,7 @@ for name, module, words in json.loads(sys.argv[1]):
 """
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("command", quick(1, ["status", "ingest", "products"]))
 def test_a_record_that_is_not_there_waits_for_no_database(command: str, tmp_path: Path) -> None:
     words = [command, str(tmp_path / "none"), *(["a.yaml"] if command == "ingest" else [])]
@@ -123,7 +124,7 @@ def test_import_twin_imports_nothing() -> None:
 
 def test_a_kind_is_told_by_keys_that_its_model_requires() -> None:
     """`FileKind.needs` is looked at before the model is imported, so it must say no more than the model does."""
-    for kind in FILE_KINDS:
+    for kind in file_kinds():
         required = {name for name, item in kind.model.model_fields.items() if item.is_required()}
         assert kind.needs, kind.name
         assert set(kind.needs.split()) <= required, kind.name

@@ -14,8 +14,7 @@ from scipy.stats import chi2, norm, t
 from optics.geometry.tree import Motion
 from optics.materials.scatter import MIRROR, Finish
 from scenes.models.instrument_builder import build_instrument
-from scenes.models.scenery import build_scenery
-from scenes.models.scenery_parts import Finishes
+from scenes.models.scenery import Finishes, build_scenery
 from scenes.specs.baffle import BaffleSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY
@@ -23,7 +22,7 @@ from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.path_tracing.sinks import GHOST, NOMINAL, STRAY
+from twin.path_tracing.path_result import GHOST, NOMINAL, STRAY
 from twin.path_tracing.stray_light import (
     REACH,
     NominalPathLost,

@@ -27,6 +27,8 @@ from twin.study.runs.blocks import Engine, journal_of
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 
+pytestmark = pytest.mark.second
+
 run = partial(invoke, command.app)
 
 
@@ -57,7 +59,6 @@ def done(tmp_path_factory):
     return folder / "run", path, json.loads(out)
 
 
-@pytest.mark.second
 def test_dataset(done) -> None:
     folder, _, numbers = done
     with xr.open_dataset(folder / "study.nc", engine="h5netcdf") as data:
@@ -76,7 +77,6 @@ def test_dataset(done) -> None:
     assert (last["df [um]"], last["failed"]) == ("", "1")
 
 
-@pytest.mark.second
 def test_two_workers_give_the_same_numbers(done, workers, tmp_path) -> None:
     folder, _, _ = done
     # from the config.yaml, which needs no other file
@@ -91,7 +91,6 @@ def test_two_workers_give_the_same_numbers(done, workers, tmp_path) -> None:
         np.testing.assert_array_equal(result.sigmas[:, 0], data["df_sigma"].values)
 
 
-@pytest.mark.second
 def test_noise_that_cannot_be_is_bad_input_and_nothing_is_lost(done, monkeypatch) -> None:
     """Everything is written and shown; the file is to blame, at its key."""
     folder, path, _ = done
@@ -105,7 +104,6 @@ def test_noise_that_cannot_be_is_bad_input_and_nothing_is_lost(done, monkeypatch
     assert re.search(r"study.yaml:8: responses.df.sigma: states too much; allowed: the noise alone", result.stderr)
 
 
-@pytest.mark.second
 def test_nobody_else_can_talk_to_the_workers(workers) -> None:
     """Whoever may send them a task runs programs as this user: without the study's own key nobody may."""
     from distributed.security import Security
@@ -147,7 +145,6 @@ async def greet(address: str, security: Any) -> object:
         return await asyncio.wait_for(it.identity(), 5)
 
 
-@pytest.mark.second
 def test_workers_that_do_not_come_back_are_not_waited_for(monkeypatch) -> None:
     monkeypatch.setattr(cluster, "WORKER_SECONDS", 1.0)
     with local_workers(1) as alone:
@@ -158,7 +155,6 @@ def test_workers_that_do_not_come_back_are_not_waited_for(monkeypatch) -> None:
             alone.next_finished()
 
 
-@pytest.mark.second
 def test_resume_of_a_finished_study_computes_nothing(done) -> None:
     folder, path, _ = done
     before = same_bytes(folder)
@@ -173,7 +169,6 @@ def test_resume_of_a_finished_study_computes_nothing(done) -> None:
     assert not folder.with_name("run.blocks").exists()
 
 
-@pytest.mark.second
 @pytest.mark.parametrize(
     ("address", "told"),
     [
@@ -188,7 +183,6 @@ def test_a_scheduler_that_cannot_be_reached_by_what_is_given(tmp_path, address, 
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.second
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
     """A signal to the whole group of processes, as the terminal's Ctrl-C is, or to the command alone, as kill is."""
@@ -212,7 +206,6 @@ def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.second
 def test_a_real_scheduler_with_two_workers(done, tmp_path) -> None:
     """A cluster by TLS, as a user sets it up by hand, gives the numbers of the local processes."""
     from distributed.security import Security
@@ -250,7 +243,6 @@ def test_a_real_scheduler_with_two_workers(done, tmp_path) -> None:
             process.wait(60)
 
 
-@pytest.mark.second
 def test_killed_workers_and_commands_lose_nothing(tmp_path) -> None:
     """A worker is killed and replaced, then the command itself; gone on with, every byte is as if nobody had killed."""
     path = write_study(tmp_path, ("runs: 100", "runs: 300"))

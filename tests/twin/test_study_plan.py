@@ -56,6 +56,7 @@ def test_drawn_designs_follow_their_distributions(tmp_path, kind) -> None:
     assert not np.any(column(other, "m2z") == z)
 
 
+@pytest.mark.second
 def test_a_grid_is_every_combination(tmp_path) -> None:
     plan = plan_of(
         tmp_path,
@@ -108,6 +109,7 @@ def test_a_table_of_other_than_text_is_told_with_its_line(tmp_path) -> None:
 M2 = "base/forward/M2"
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("key", TEXTS["neutral"])
 @pytest.mark.parametrize("order", quick(1, [-1, 1]))
 def test_a_place_without_a_value_starts_where_nothing_happens(tmp_path, key, order) -> None:

@@ -15,9 +15,9 @@ from tests.twin.study_bench import TEXTS
 from tests.twin.study_data import columns, dataset, study_of
 from twin.study.report import study_statistics as estimates
 from twin.study.report.conclusions import conclusions, warnings
-from twin.study.report.linear_model import linear_model
 from twin.study.report.sensitivity_indices import NoIndices, axis_functions, sensitivity_indices
 from twin.study.report.study_analysis import STATISTICS, StudyAnalysis, convergences, pareto_front, ranks_of
+from twin.study.report.study_statistics import linear_model
 from twin.study.runs.plan import quantiles
 
 FALSE_ALARM = 1e-6
@@ -63,6 +63,7 @@ def test_ranks_by_the_binomial_distribution() -> None:
         assert high == 1.0 if met == count else stats.binom.cdf(met, count, high) == pytest.approx(0.025, rel=1e-9)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("ways", list(itertools.product(("min", "max"), repeat=2)))
 def test_fronts_by_brute_force(ways) -> None:
     rng = np.random.default_rng(4)
@@ -295,6 +296,7 @@ def test_few_failed_runs_widen_the_intervals() -> None:
                 assert high - low > 0.02
 
 
+@pytest.mark.second
 def test_a_total_index_is_no_less_than_the_first_order() -> None:
     """A step with noise, of which 40 runs show little: without care half of the totals were less."""
     for seed in range(8):
@@ -340,6 +342,7 @@ def test_a_grid_is_taken_apart_exactly() -> None:
     np.testing.assert_allclose(found["main_effects"][0]["means"], [-3.0, 0.0, 3.0], atol=1e-12)
 
 
+@pytest.mark.second
 def test_enough_runs() -> None:
     few, many = ({c.name: c for c in convergences(draws(n))} for n in (100, 20_000))
     assert not few["mean"].enough

@@ -21,8 +21,7 @@ from optics.waves.diffraction import Grid, image
 from optics.waves.imaging import imaging_rays, pupil_field
 from optics.waves.pupil_stack import circular_pupil
 from optics.waves.transfer import polychromatic_transfer
-from scenes.models.camera_axis import LAUNCH_DISTANCE
-from scenes.models.camera_model import ROOT, build_camera_under_test, camera_alone
+from scenes.models.camera_model import LAUNCH_DISTANCE, ROOT, build_camera_under_test, camera_alone
 from scenes.specs.camera import BandSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec, CollimatorSpec
 from scenes.specs.load import load_camera, load_detector
@@ -115,6 +114,7 @@ def detector_mtf(fx: np.ndarray, fy: np.ndarray, diffusion: float) -> np.ndarray
     return np.sinc(PITCH * fx) * np.sinc(PITCH * fy) * smear * spread
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_perfect_pupil(perfect, direction):
     worst = []
@@ -346,6 +346,7 @@ def test_sense_of_the_axes(path) -> None:
     assert place[:, 0] @ axes[:, 0] > 0.99
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("number", range(len(PLACES)))
 def test_local_map_between_its_points(path, number: int) -> None:
     """Chief rays of 40 random directions inside the map's reach, in a bent camera."""

@@ -32,6 +32,7 @@ def test_local_coordinates_are_exact() -> None:
     assert np.linalg.norm(steps[3] - steps[2]) == pytest.approx(2.0, rel=1e-9)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("spec", quick(1, [TerrainSpec(), FRACTAL]), ids=["real", "fractal"])
 def test_one_function(spec: TerrainSpec) -> None:
     """On a grid and at places the same number, to rounding; slopes are its derivatives; it goes on beyond its edges."""

@@ -70,6 +70,7 @@ def test_a_compensator_without_a_range_changes_nothing(
     np.testing.assert_array_equal(other.try_out(drawn * other.sizes).parts, bench.try_out(drawn * bench.sizes).parts)
 
 
+@pytest.mark.second
 def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBench, drawn, backend, tmp_path) -> None:
     def squares(one: ToleranceBench, moves: np.ndarray) -> np.ndarray:
         amounts = np.concatenate([drawn * one.sizes, moves], axis=1)
@@ -91,6 +92,7 @@ def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBe
     assert np.any(best < 0.999 * without)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("motion", ["M2 shift x", "focal_plane shift z"])
 def test_rays_go_through_the_stop_where_adjustments_have_brought_it(motion: str, backend, tmp_path) -> None:
     """M2 is the stop; rays are aimed once where an adjustment leaves it alone."""

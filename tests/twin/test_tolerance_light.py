@@ -120,6 +120,7 @@ ALTERED: dict[str, tuple[dict[str, float], dict[str, float]]] = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("case", ALTERED)
 def test_wavefronts_over_the_light_are_those_of_our_own_trace(case: str, bench: ToleranceBench) -> None:
     """With focus refound. A lens that is moved along the camera's x moves along the line."""
@@ -140,6 +141,7 @@ def test_wavefronts_over_the_light_are_those_of_our_own_trace(case: str, bench: 
     assert abs(abs(tried.moves[0, 0]) - abs(focus)) < 2e-6
 
 
+@pytest.mark.second
 def test_an_abbe_number_acts_at_a_design_wavelength_beside_the_d_line(backend: Backend, tmp_path: Path) -> None:
     """The camera of one line, C, is one whose crown has another index there."""
     red = colour_camera("achromat").model_copy(update={"wavelength": 656.2725e-9, "spectrum": None})
@@ -156,6 +158,7 @@ def test_an_abbe_number_acts_at_a_design_wavelength_beside_the_d_line(backend: B
     assert np.max(np.abs(both[0] - both[2])) > 1e-3
 
 
+@pytest.mark.second
 def test_mtfs_over_the_light_are_those_of_the_camera_program(bench: ToleranceBench) -> None:
     x = np.array([[0.0] * 4, [0.8, -0.9, 0.0, 1.0], [0.8, -0.9, 0.6, 1.0]])
     tried = bench.try_out(x * bench.sizes)

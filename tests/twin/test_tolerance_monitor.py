@@ -150,6 +150,7 @@ def test_area_ccds_are_set_to_their_spots(bench: ToleranceBench) -> None:
     np.testing.assert_allclose(moved, still, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.second
 def test_bodies_take_what_image_quality_says(bench: ToleranceBench, backend) -> None:
     """Of the beams of the pixels that are looked at there, in states in which a prism and a mirror are moved."""
     x = amounts(bench, {}, {"prism": 1.0}, {"prism": -0.5, "tilt": 0.5})

@@ -12,15 +12,14 @@ from rich.console import Console
 
 import twin.main_job.render_job as render_job_module
 from analysis.monitor.limits import Split
-from analysis.monitor.parameters import ANGLE, GROUND
-from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
+from analysis.monitor.parameters import ANGLE, CAMERA_PARAMETERS, GROUND
 from scenes.specs.resolved import resolve
 from twin.framework.artefact import FAR
 from twin.main_job import verdict
-from twin.main_job.assumptions import assumed
 from twin.main_job.render_command import _table
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
+from twin.main_job.systematics import assumed
 from twin.main_job.verdict import FALSE_ALARM, Judgement, alarm_limit, judge, readings, recovered_numbers
 
 OUTSIDE = "a motion outside the family of the model"
@@ -51,7 +50,9 @@ def good(run: RenderRun) -> tuple[int, int]:
     contents.
     """
     recovered, truth, own = run.recovered_dict(), run.truth_dict(), run.judged
-    pairs = [(recovered["cameras"][c][own], truth["cameras"][c], p.key) for c in truth["cameras"] for p in PARAMETERS]
+    pairs = [
+        (recovered["cameras"][c][own], truth["cameras"][c], p) for c in truth["cameras"] for p in CAMERA_PARAMETERS
+    ]
     pairs.append((recovered["intersection_angle"][own], truth["intersection_angle"], ANGLE.key))
     pairs += [(recovered["ground"][own], truth["ground"], p.key) for p in GROUND]
     return sum(abs(r[key] - t[key]) <= FAR * r[f"{key}_sigma"] for r, t, key in pairs), len(pairs)
@@ -62,6 +63,7 @@ def all_of(told: Judgement) -> str:
     return " ".join((told.verdict, *told.more))
 
 
+@pytest.mark.second
 def test_nothing_perturbed(job) -> None:
     told = judge(job("{}"))
     assert told.verdict.startswith("Nothing was perturbed, and all 12 readings of the model are within 3 σ of zero")
@@ -93,6 +95,7 @@ def moved(run: RenderRun, parameter: int, sigmas: float) -> RenderRun:
     return replace(run, recovery=replace(run.recovery, parameters=parameters))
 
 
+@pytest.mark.second
 def test_beneath_the_noise(job, monkeypatch) -> None:
     run = job("{base/forward/focal_plane: {shift: [0.003 um, 0 um, 0 um]}}")
     told = judge(run)
@@ -108,6 +111,7 @@ def test_beneath_the_noise(job, monkeypatch) -> None:
         assert ("frames would reveal" in all_of(judge(run))) == said
 
 
+@pytest.mark.second
 def test_recovered(job) -> None:
     run = job("{base/forward/focal_plane: {shift: [3 um, -2 um, 0 um], rotate: [0 arcsec, 0 arcsec, 5 arcsec]}}")
     told = judge(run)
@@ -120,6 +124,7 @@ def test_recovered(job) -> None:
     assert [w for w in told.warnings if w.startswith("Δγ of forward [arcsec] is misread by more than the change")]
 
 
+@pytest.mark.second
 def test_another_motion_is_named_with_its_share(job) -> None:
     run = job("{base/forward/M2: {shift: [0 um, 0 um, 3 um]}}", frames=9)
     told = judge(run)
@@ -133,6 +138,7 @@ def test_another_motion_is_named_with_its_share(job) -> None:
     assert f"{100.0 * abs(worst.error / worst.true):.0f} % of the change" in told.verdict
 
 
+@pytest.mark.second
 def test_readings_larger_than_the_change(job) -> None:
     run = job("{base/forward/focal_plane: {rotate: [20 arcsec, 0 arcsec, 0 arcsec]}}")
     told = judge(run)
@@ -296,7 +302,7 @@ def test_motions_far_from_what_is_stated_are_found_out(job) -> None:
         run = job(f"{{{body}: {motion}}}", more)
         told = judge(run)
         (warning,) = [text for text in told.warnings if "contradict" in text]
-        assert run.consistency is not None
+        assert run.reading.consistency is not None
         assert "contradict the prior launch: chi-square" in warning
         assert f"where {run.consistency.limit:.1f} is exceeded with a chance of 0.001" in warning
         assert f"motions of {run.consistency.suspects[0].body} would explain them best" in warning

@@ -12,18 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 
 import twin
-from docs.site.golden_fields import kept_fields
-from optics.numerics.number_tree import FrozenMap
+from docs.site.run_pages import kept_fields
 from scenes.specs.resolved import resolve
 from scenes.specs.study import UNITS, unit_of
 from tests.golden.digest import expanded
 from tests.twin.commands import invoke
-from tests.twin.test_procedure import FILE, LEVEL
-from twin.framework import reference_frames
-from twin.framework.command import add_test
+from tests.twin.test_procedure import FILE, LEVEL, program
 from twin.framework.provenance import VERDICT, negative_verdicts
 from twin.framework.quantity import Quantity, Record
 from twin.main_job.render_job import render_job
@@ -36,7 +32,7 @@ WARNED_ELSEWHERE = {
     ("Sensitivity to a factor", "rbd_fast_agrees"): "twin.study.report.study_analysis",
     ("block.json", "agrees"): "twin.orbit.block.block_report",
     ("The loop closed and open", "stable"): "that of margins_hold",
-    ("course.json", "sigma_holds"): "twin.monitor.time_series, and twin.main_job.assumptions for single times",
+    ("course.json", "sigma_holds"): "twin.monitor.time_series, and twin.main_job.systematics for single times",
     ("What random states gave", "sigma_holds"): "twin.uncertainty.uncertainty_report",
     ("focus.json of a measured series", "curves_agree"): "twin.laboratory.focus_report",
     ("turntable.json", "heldout_agrees"): "twin.laboratory.turntable_report",
@@ -139,11 +135,7 @@ def test_strict_ends_with_a_code_of_its_own(
     good: bool, options: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also with --quiet, where the warnings stand in JSON; the run folder is complete."""
-    monkeypatch.setattr(reference_frames, "FRAMES", FrozenMap({**reference_frames.FRAMES, "level": {}}))
-    app = typer.Typer()
-    app.callback()(lambda: None)
-    judged = replace(LEVEL, numbers=lambda run: {**LEVEL.numbers(run), "fit": {"agrees": good}})
-    add_test(app, "own.bench", "level", judged)
+    app = program(monkeypatch, numbers=lambda run: {**LEVEL.numbers(run), "fit": {"agrees": good}})
     (tmp_path / "level.yaml").write_text(FILE, "utf-8")
     done = invoke(app, "level", tmp_path / "level.yaml", "--out", tmp_path / "run", "--quiet", *options)
     assert done.exit_code == code, done.stderr
@@ -213,6 +205,7 @@ def test_every_number_has_the_unit_that_its_key_says() -> None:
     assert by_hand == CONVERTED_BY_HAND
 
 
+@pytest.mark.second
 def test_no_key_of_a_result_hides_its_unit() -> None:
     """In the results of all commands a key with the word of a unit is known to be in that unit."""
     for file in GOLDEN.glob("*.json"):

@@ -64,6 +64,7 @@ def flip(place: Path, at: int) -> None:
     place.write_bytes(content)
 
 
+@pytest.mark.second
 def test_every_changed_byte_of_the_manifest_is_found(folder) -> None:
     """Whatever it hits: a number, a checksum, a name of a file or of a key, white space, a bracket."""
     kept = (folder / MANIFEST).read_bytes()

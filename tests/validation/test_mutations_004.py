@@ -29,6 +29,8 @@ from twin.validation.paper_004 import distortion, focus_checks, turntable_checks
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
+pytestmark = pytest.mark.second
+
 GROUPS = tuple(group for group in registry.GROUPS if group.prefix.startswith("004."))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}
 TESTS = 4
@@ -77,7 +79,6 @@ def turned(monkeypatch):
     return check
 
 
-@pytest.mark.second
 def test_adjustments_turn_and_shift_the_line_about_the_middle_of_the_mount():
     """To first order; the second is the square of the turns at the middle's distance."""
     bench = alignment().bench
@@ -94,7 +95,6 @@ def test_adjustments_turn_and_shift_the_line_about_the_middle_of_the_mount():
     np.testing.assert_allclose(moved[3:], (shift * axes)[:, :2], rtol=0, atol=1e-15)
 
 
-@pytest.mark.second
 def test_inputs_as_they_are_chosen_give_what_is_measured(turned, monkeypatch):
     """What a row says of other inputs begins with the number that it has with these."""
 
@@ -196,7 +196,6 @@ MUTATIONS = {
 }  # fmt: skip
 
 
-@pytest.mark.second
 @pytest.mark.parametrize(("formula", "mutation"), MUTATIONS)
 def test_a_broken_formula_turns_verdicts(formula, mutation, turned, monkeypatch):
     *where, only, ids = MUTATIONS[formula, mutation]

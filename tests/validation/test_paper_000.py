@@ -52,6 +52,7 @@ def false_on(scene: Pass, lines: Sequence[str] = LINES) -> set[Sentence]:
     return {sentence for sentence in SENTENCES if not sentence.holds(found.rises, found.growth)}
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("yaw", [True, False], ids=["yaw-steered", "inertial"])
 def test_sentences_over_40_north_116_east(yaw):
     """Every sign and every ranking of the text, whatever the heading, but not what the checks expect to be wrong."""
@@ -60,6 +61,7 @@ def test_sentences_over_40_north_116_east(yaw):
     assert len(wrong) == 3
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("lat", "lon"), [(45, 120), (40, 126), (48, 120)])
 def test_farther_to_the_north_east_the_sentence_on_x_and_z_holds_too(lat, lon):
     """Which axes are alike depends on the place of the test field; the paper does not name it."""

@@ -7,34 +7,10 @@ if __name__ == "__main__":
 
     end_quietly()
 
-from typing import Any
-
-import typer
-from typer.core import TyperGroup
-
+from twin.framework.cli import program, unnamed
 from twin.framework.command import add_tests
 
-
-class _Estimate(TyperGroup):
-    """A program whose subcommand ``estimate`` need not be named."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments with the subcommand that may have been left out."""
-        return list(super().parse_args(ctx, self.whole(args)))
-
-    def whole(self, args: list[str]) -> list[str]:
-        """Arguments with the subcommand before them, where they begin with none."""
-        named = not args or args[0] in self.commands or args[0] == "--help"
-        return args if named else ["estimate", *args]
-
-
-app = typer.Typer(
-    cls=_Estimate,
-    add_completion=False,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-    no_args_is_help=True,
-)
+app = program(cls=unnamed(lambda args: "estimate"), no_args_is_help=True)
 
 
 @app.callback()

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from optics.geometry.tree import Motion
-from scenes.models.disturbances import HEAT, Component
-from scenes.models.joint_disturbances import joint_disturbances, joint_files
+from scenes.models.disturbances import HEAT, Component, joint_disturbances, joint_files
 from scenes.specs.instrument import as_built_file
 from scenes.specs.load import CAMERAS, INSTRUMENTS, is_path, library_names
 from twin.asbuilt.asbuilt_run import AsBuiltRun

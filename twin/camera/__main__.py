@@ -7,24 +7,23 @@ if __name__ == "__main__":
 
     end_quietly()
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
-from twin.framework.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet
-from twin.framework.command import Result, finished, run_command
-from twin.framework.procedure import Session
+from scenes.specs.procedures import PROCEDURES
+from twin.framework import cli
+from twin.framework.command import run_test
 
-if TYPE_CHECKING:
-    from scenes.specs.resolved import CameraSetup
+TILT = "tilt"
 
-PROGRAM, KIND, TILT = "twin.camera", "optics", "tilt"
-
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = cli.program()
 
 
 @app.command()
+@cli.with_options("seed", "export", "strict")
 def main(
     file: Annotated[
         Path,
@@ -33,6 +32,7 @@ def main(
             help="Camera, instrument or job: a name of the library (gf7), a YAML file, or the config.yaml of a run.",
         ),
     ],
+    options: cli.Options,
     what: Annotated[str | None, typer.Argument(hidden=True, metavar="")] = None,
     camera: Annotated[str | None, typer.Option("--camera", help="Which camera, where there are several.")] = None,
     refocus: Annotated[
@@ -46,11 +46,6 @@ def main(
         str | None, typer.Option("--temperature", metavar="TEXT", help='Warm all of it, "+2 K".')
     ] = None,
     tilt: Annotated[bool, typer.Option("--tilt", help="With --refocus: turn the image about the line, too.")] = False,
-    out: Out = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Look at a camera as an optical designer does: layout with rays, first-order data, wavefronts, spots, MTF,
     through focus, distortion, field curvature and illumination over the field; first of all how good it is, where it
@@ -78,36 +73,24 @@ def main(
     """
     turned = tilt or what is not None  # what stood there in earlier versions
 
-    def resolve() -> CameraSetup:
+    def read() -> Any:
         from scenes.specs.instrument import BASE
-        from scenes.specs.resolved import resolve_camera
 
         if what is not None and (what != TILT or not refocus):
-            raise InputErrorText(f"{what!r} has no meaning here; there is --refocus --{TILT}")
+            raise cli.InputErrorText(f"{what!r} has no meaning here; there is --refocus --{TILT}")
         if tilt and not refocus:
-            raise InputErrorText(f"--{TILT} goes with --refocus")
+            raise cli.InputErrorText(f"--{TILT} goes with --refocus")
         if what is not None:
             typer.echo(f"--refocus {TILT} is written --refocus --{TILT}; this version still reads it", err=True)
         warmed = [] if temperature is None else [f"{BASE} temperature {temperature}"]
-        return resolve_camera(file, camera).perturbed([*(perturb or ()), *warmed])
+        return procedure.resolve(file, camera).perturbed([*(perturb or ()), *warmed])
 
-    def work(setup: CameraSetup, session: Session) -> Result:
-        from scenes.models.camera_sharpness import blur_warnings
-        from twin.camera.camera_report import camera_report
-        from twin.camera.camera_run import CAMERA, camera_data, run_camera
-        from twin.framework.data_files import netcdf
-
-        run = run_camera(setup, session.backend, refocus, turned, session.advance)
-        # what a refocused camera's file lacked has been done; how good it is now its verdict says
-        warnings = () if refocus else blur_warnings(setup, session.backend)
-        session.folder.write_bytes("optics.nc", netcdf(camera_data(run)))
-        options = (*(("--refocus",) if refocus else ()), *((f"--{TILT}",) if turned else ()))
-        again = (PROGRAM, "config.yaml", *options, "--backend", session.backend.name)
-        shown, config = camera_report(run, warnings), setup.to_yaml()
-        return finished(session, KIND, shown, CAMERA(run), config=config, program=PROGRAM, again=again)
-
-    stem = file.stem if camera is None else f"{file.stem}-{camera}"
-    run_command(stem, Options(out, None, backend, force, as_json, quiet), resolve, work)
+    procedure = PROCEDURES["camera"]
+    # what a refocused camera's file lacks has then been done; how good it is now its verdict says
+    run = partial(procedure.run, refocus=refocus, tilt=turned)
+    words = (*(("--refocus",) if refocus else ()), *((f"--{TILT}",) if turned else ()))
+    named = file if camera is None else Path(f"{file.stem}-{camera}.yaml")
+    run_test("camera", named, options, read=read, words=words, run=run, judged=not refocus)
 
 
 if __name__ == "__main__":

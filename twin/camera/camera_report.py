@@ -12,11 +12,12 @@ from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
-from twin.camera.camera_run import CameraRun, built_text, perturbed_text, refocus_text, verdict
+from twin.camera.camera_run import CameraRun, built_text, camera_data, perturbed_text, refocus_text, verdict
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, unstated_shadows
 from twin.camera.layout_plot import layout_figure
 from twin.framework.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
+from twin.framework.data_files import netcdf
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import look, to_svg
 
@@ -24,13 +25,8 @@ _TOLD_TERMS = 15
 """Zernike terms in the table of fields; the others are in optics.json and optics.nc."""
 
 
-def camera_report(run: CameraRun, warnings: tuple[str, ...] = ()) -> Report:
-    """Report of a judged camera.
-
-    Args:
-        run: the camera.
-        warnings: what is wrong with it, to be told before all else.
-    """
+def camera_report(run: CameraRun) -> Report:
+    """Report of a judged camera."""
     texts = refocus_text(run), built_text(run), perturbed_text(run)
     told, more = answer(*verdict(run), "see the wavefronts and the layout")
     sections = [
@@ -49,7 +45,7 @@ def camera_report(run: CameraRun, warnings: tuple[str, ...] = ()) -> Report:
         _facts(run),
         first_order_table(run),
         tuple(sections),
-        warnings=warnings,
+        files={"optics.nc": netcdf(camera_data(run))},
     )
 
 

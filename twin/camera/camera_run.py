@@ -171,16 +171,22 @@ def kind_of(index: int) -> str:
 
 
 def run_camera(
-    setup: CameraSetup, backend: Backend, refocus: bool = False, tilt: bool = False, advance: Advance = silent
+    setup: CameraSetup,
+    backend: Backend,
+    seed: int = 0,
+    advance: Advance = silent,
+    refocus: bool = False,
+    tilt: bool = False,
 ) -> CameraRun:
     """Judge a camera.
 
     Args:
         setup: the camera.
         backend: where to trace.
+        seed: of nothing; nothing is drawn.
+        advance: told what is being done.
         refocus: find the best focal plane first and judge the camera with it.
         tilt: let it turn about the line, too.
-        advance: told what is being done.
 
     Raises:
         InputError: light of the field does not come through, or has no focus after the last mirror.

@@ -22,8 +22,16 @@ from optics.raytrace.first_order import Paraxial, equal_area_radius, first_order
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import aim_collimated
-from scenes.models.camera_axis import LINE_AXIS, axis_data, pupil_diameter
-from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction, focal_plane_body
+from scenes.models.camera_model import (
+    IMAGE,
+    LINE_AXIS,
+    CameraModel,
+    axis_data,
+    collimated,
+    field_direction,
+    focal_plane_body,
+    pupil_diameter,
+)
 from scenes.specs.camera import BandSpec, CameraSpec, LineSpec
 from twin.camera.camera_optics import CameraOptics, rim
 from twin.framework.quantity import Quantity, Record

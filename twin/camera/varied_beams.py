@@ -26,8 +26,7 @@ from optics.waves.edge_shadow import LitStop
 from optics.waves.imaging import path_to_sphere
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, to_terms
-from scenes.models.camera_axis import LAUNCH_DISTANCE
-from scenes.models.camera_model import glass_steps, in_glass
+from scenes.models.camera_model import LAUNCH_DISTANCE, glass_steps, in_glass
 from twin.camera.camera_optics import CameraOptics
 
 AT_ONCE = 200

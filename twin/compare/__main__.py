@@ -14,19 +14,21 @@ from typing import Annotated
 import typer
 
 from scenes.yaml.yaml_file import dump_yaml
-from twin.framework.cli import AsJson, Force, Options, Out, Quiet
+from twin.framework import cli
 from twin.framework.command import Result, finished, run_command
 from twin.framework.procedure import Session
 
 DIFFERENT = 1
 """Exit code where results differ, as that of diff."""
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = cli.program()
 
 
 @app.command()
+@cli.with_options("seed", "export", "backend", "strict")
 def main(
     runs: Annotated[list[Path], typer.Argument(readable=False, help="Run folders; the first is the reference.")],
+    options: cli.Options,
     rtol: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Numbers that agree to this part of the larger are the same.")
     ] = 1e-9,
@@ -38,10 +40,6 @@ def main(
             "all to --rtol.",
         ),
     ] = None,
-    out: Out = None,
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Compare run folders of one kind: what went in, what came out, and the images.
 
@@ -67,7 +65,7 @@ def main(
         facts = {"config": dump_yaml(config), "again": (PROGRAM, *map(str, runs), *limits), "given": tuple(runs)}
         return finished(session, KIND, report, numbers(comparison), backend="", program=PROGRAM, **facts)
 
-    run_command("compare", Options(out, None, "llvm", force, as_json, quiet), lambda: None, work)
+    run_command("compare", options, lambda: None, work)
 
 
 if __name__ == "__main__":

@@ -7,36 +7,23 @@ if __name__ == "__main__":
 
     end_quietly()
 
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from optics.numerics.backend import cores
 from scenes.specs.file_kinds import kind_of
 from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import read_yaml
-from twin.framework.cli import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed
-from twin.framework.command import add_test, run_test
-
-PROGRAM = "twin.design"
+from twin.framework import cli
+from twin.framework.command import add_tests, run_test
 
 
-class _ByFile(TyperGroup):
-    """A program whose subcommand need not be named: the file says which it is."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments with the subcommand that may have been left out."""
-        return list(super().parse_args(ctx, self.whole(args)))
-
-    def whole(self, args: list[str]) -> list[str]:
-        """Arguments with the subcommand of the file among them before them, where they begin with none."""
-        words = [word for word in args if not word.startswith("-")]
-        if not words or args[0] in self.commands or "--help" in args:
-            return args
-        return ["monitor" if any(_is_layout(word) for word in words) else "camera", *args]
+def _meant(args: Sequence[str]) -> str:
+    """Return the subcommand of the file among the words after the program."""
+    return "monitor" if any(_is_layout(word) for word in args if not word.startswith("-")) else "camera"
 
 
 def _is_layout(word: str) -> bool:
@@ -48,9 +35,7 @@ def _is_layout(word: str) -> bool:
     return kind is not None and kind.name == "monitor_design"
 
 
-app = typer.Typer(
-    cls=_ByFile, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True
-)
+app = cli.program(cls=cli.unnamed(_meant), no_args_is_help=True)
 
 
 @app.callback()
@@ -64,22 +49,18 @@ def main() -> None:
     """
 
 
-add_test(app, PROGRAM, "camera", PROCEDURES["design camera"])
+add_tests(app, "design", apart=("monitor",))
 
 
 @app.command("monitor")
+@cli.with_options("export", "strict")
 def monitor(
-    file: File,
-    out: Out = None,
+    file: cli.File,
+    options: cli.Options,
     workers: Annotated[
         int | None, typer.Option(min=0, max=1024, help="Number of worker processes. Default: one for each core.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a search that was broken off.")] = False,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Find the layout of a pair's monitor: how many beams, where in the pupil, through which prisms; by what their
     light can know of the cameras under stated disturbances, what they take of the pupil, and what they weigh.
@@ -95,14 +76,12 @@ def monitor(
     from twin.framework.run_folder import KeptWork
 
     count = cores() if workers is None else workers
-    procedure = PROCEDURES["design monitor"]
 
     def run(*given: Any) -> Any:
-        return procedure.run(*given, workers=count, journal=kept.begin() / "trials.journal")
+        return PROCEDURES["design monitor"].run(*given, workers=count, journal=kept.begin() / "trials.journal")
 
-    options = Options(out, seed, backend, force, as_json, quiet)
-    kept = KeptWork(out, file.stem, "search", resume)
-    run_test(PROGRAM, "monitor", replace(procedure, run=run), file, options, kept)
+    kept = KeptWork(options.out, file.stem, "search", resume)
+    run_test("design monitor", file, options, kept, run=run)
 
 
 if __name__ == "__main__":

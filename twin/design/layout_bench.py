@@ -20,10 +20,9 @@ from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models import monitor_layout
-from scenes.models.clearance import LEAST_GAP, convex_bodies, separation
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
-from scenes.models.obstruction import monitor_beams, rays_taken
+from scenes.models.obstruction import LEAST_GAP, convex_bodies, monitor_beams, rays_taken, separation
 from scenes.specs.instrument import CENTRAL_PRISM, SIDES, prism_of
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate

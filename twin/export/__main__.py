@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from scenes.yaml.errors import nearest
 from scenes.yaml.yaml_file import dump_yaml
-from twin.framework.cli import AsJson, Force, InputErrorText, Options, Out, Quiet
+from twin.framework import cli
 from twin.framework.command import Result, finished, run_command
 from twin.framework.procedure import Session
 
@@ -23,18 +22,16 @@ if TYPE_CHECKING:
 
 PROGRAM = "twin.export"
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = cli.program()
 
 
 @app.command()
+@cli.with_options("seed", "export", "backend", "strict")
 def main(
     run: Annotated[Path, typer.Argument(readable=False, help="Run folder of any command.")],
+    options: cli.Options,
     frames: Annotated[str, typer.Option(help="Recorded frames and expected images: fits or none.")] = "fits",
     tables: Annotated[str, typer.Option(help="Tables: csv, parquet, fits or none.")] = "csv",
-    out: Out = None,
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Write frames and results of a run folder as files that other programs read: FITS, CSV and Parquet.
 
@@ -60,12 +57,9 @@ def main(
         from twin.framework.data_files import TABLE_FORMATS
 
         for option, value, allowed in (("--frames", frames, FRAMES), ("--tables", tables, (*TABLE_FORMATS, NONE))):
-            if value not in allowed:
-                near = nearest(value, allowed)
-                meant = f"; did you mean {near!r}?" if near else ";"
-                raise InputErrorText(f"{option}: no such format, {value!r}{meant} allowed: {', '.join(allowed)}")
+            cli.require_one_of(option, value, allowed)
         if frames == tables == NONE:
-            raise InputErrorText("with --frames none and --tables none there is nothing to export")
+            raise cli.InputErrorText("with --frames none and --tables none there is nothing to export")
         return read_source(run)
 
     def work(manifest: Manifest, session: Session) -> Result:
@@ -77,8 +71,7 @@ def main(
         facts = {"config": config, "again": again, "given": (run,)}
         return finished(session, KIND, export_report(done), done.numbers(), backend="", program=PROGRAM, **facts)
 
-    stem = f"{run.resolve().name}-files"
-    run_command(stem, Options(out, None, "llvm", force, as_json, quiet), read, work)
+    run_command(f"{run.resolve().name}-files", options, read, work)
 
 
 if __name__ == "__main__":

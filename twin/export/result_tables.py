@@ -244,7 +244,7 @@ def _column(name: str, values: Sequence[Any], named: Mapping[str, str] = FrozenM
     own, unit = (head["name"], head["unit"]) if head is not None else (name, "")
     if own in named:
         return DataColumn.of(own, values, unit, named[own])
-    read = (*parameters.CAMERA_PARAMETERS, parameters.ANGLE, *parameters.GROUND)
+    read = (*parameters.CAMERA_PARAMETERS.values(), parameters.ANGLE, *parameters.GROUND)
     known = {**DESCRIPTIONS, **{one.key: (one.file_unit, one.meaning) for one in read}}
     if own in known and not unit:
         return DataColumn.of(own, values, *known[own])

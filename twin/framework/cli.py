@@ -6,19 +6,22 @@ import errno
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 from rich import box, progress
 from rich.console import Console
 from rich.table import Table
+from typer.core import TyperGroup
 
 from optics.numerics.backend import NAMES
-from scenes.yaml.errors import InputError
+from scenes.yaml.errors import InputError, nearest
 from scenes.yaml.standard_output import BAD_INPUT, FAILURE, code_of, print_error
 
 DOUBTFUL, INTERRUPTED = 3, 128 + signal.SIGINT
@@ -41,31 +44,96 @@ Export = Annotated[Path | None, typer.Option("--export", readable=False, metavar
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 STRICT_HELP = "Exit with code 3 where a sigma does not hold or another verdict on the result is negative."
 Strict = Annotated[bool, typer.Option("--strict", help=STRICT_HELP)]
+WORKERS_HELP = "Number of worker processes. Default: one for each core."
+Workers = Annotated[int | None, typer.Option(min=1, max=1024, help=WORKERS_HELP)]
+SCHEDULER_HELP = "Use a running Dask cluster, as of `python -m twin.study --scheduler`."
+Scheduler = Annotated[str | None, typer.Option(help=SCHEDULER_HELP)]
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the user chose.
+    """What the user chose: every field is an option of the commands that make a run folder, see `with_options`.
 
     Attributes:
         out: run folder, None for the next free one.
         seed: None for the file's.
+        export: folder for what was measured, None for none.
         backend: where to trace.
         force: replace the run folder.
         as_json: print the numbers as JSON.
         quiet: print nothing.
-        export: folder for what was measured, None for none.
         strict: end with the exit code DOUBTFUL where a verdict on the result is negative.
     """
 
-    out: Path | None
-    seed: int | None
-    backend: str
-    force: bool
-    as_json: bool
-    quiet: bool
-    export: Path | None = None
-    strict: bool = False
+    out: Out = None
+    seed: Seed = None
+    export: Export = None
+    backend: BackendName = "llvm"
+    force: Force = False
+    as_json: AsJson = False
+    quiet: Quiet = False
+    strict: Strict = False
+
+    @property
+    def silent(self) -> bool:
+        """Whether no progress is shown."""
+        return self.as_json or self.quiet
+
+
+Command = Callable[..., None]
+"""Function of whose signature Typer makes a command with its arguments and options."""
+
+
+def program(**more: Any) -> typer.Typer:
+    """Return a program without commands, set up as all are; ``more`` goes to Typer."""
+    return typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, **more)
+
+
+def unnamed(meant: Callable[[Sequence[str]], str]) -> type[TyperGroup]:
+    """Return the class of a program whose subcommand need not be named.
+
+    Args:
+        meant: words after the program, of which the first is no subcommand -> the subcommand.
+    """
+
+    class Group(TyperGroup):
+        def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+            return list(super().parse_args(ctx, self.whole(args)))
+
+        def whole(self, args: list[str]) -> list[str]:
+            """Return the arguments with the subcommand before them."""
+            named = not args or args[0] in self.commands or args[0] == "--help"
+            return args if named else [meant(args), *args]
+
+    return Group
+
+
+def with_options(*without: str) -> Callable[[Command], Command]:
+    """Return what gives a command the options of `Options`, for its parameter ``options``, after its own.
+
+    Args:
+        without: fields of `Options` that are no options of the command.
+    """
+    hints = get_type_hints(Options, include_extras=True)
+    chosen = {one.name: one.default for one in fields(Options) if one.name not in without}
+    shared = [Parameter(name, Parameter.KEYWORD_ONLY, default=chosen[name], annotation=hints[name]) for name in chosen]
+
+    def made(work: Command) -> Command:
+        def command(**given: Any) -> None:
+            options = Options(**{name: given.pop(name) for name in chosen})
+            work(**given, options=options)
+
+        own = [one for one in signature(work, eval_str=True).parameters.values() if one.name != "options"]
+        return with_parameters(wraps(work)(command), [*own, *shared])
+
+    return made
+
+
+def with_parameters(command: Command, parameters: Sequence[Parameter]) -> Command:
+    """Return a command that takes its arguments by name, with the parameters of which Typer makes them."""
+    command.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {one.name: one.annotation for one in parameters}
+    return command
 
 
 def end_strictly(errors: Console, numbers: Any) -> None:
@@ -100,6 +168,18 @@ class Incomplete(Exception):
     def __init__(self, message: str, trace: str = "") -> None:
         super().__init__(message)
         self.trace = trace
+
+
+def require_one_of(option: str, value: str, allowed: Collection[str]) -> None:
+    """Complain about a format that an option does not have.
+
+    Raises:
+        InputErrorText: the value is none of those allowed.
+    """
+    if value not in allowed:
+        near = nearest(value, allowed)
+        meant = f"; did you mean {near!r}?" if near else ";"
+        raise InputErrorText(f"{option}: no such format, {value!r}{meant} allowed: {', '.join(allowed)}")
 
 
 def check_backend(name: str) -> None:
@@ -150,12 +230,13 @@ def explained(errors: Console, left: Callable[[], str] = nothing_kept) -> Iterat
         # the work that failed has imported these; help and a bad file do not wait for them
         from optics.numerics.array_math import PhysicalError, UnphysicalError
         from optics.numerics.backend import BackendUnavailable
+        from optics.numerics.extension_table import EntryPointError
         from optics.numerics.llvm import LibraryMissing
         from twin.framework.run_folder import RunFolderError
 
         # a number that cannot be is a fault of the program; light that a state loses is one of what was asked for
         asked = isinstance(error, RunFolderError | PhysicalError) and not isinstance(error, UnphysicalError)
-        if not asked and not isinstance(error, BackendUnavailable | LibraryMissing):
+        if not asked and not isinstance(error, BackendUnavailable | EntryPointError | LibraryMissing):
             raise
         print_error(errors, str(error))
         raise typer.Exit(code_of(error.__cause__) if asked else FAILURE) from None

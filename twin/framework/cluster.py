@@ -372,7 +372,7 @@ def _differences(client: Client) -> list[str]:
             text = f"the worker {address} cannot import the twin ({found}); start it from the twin's environment"
             raise cli.InputErrorText(text)
         if found[1] != source:
-            text = f"the worker {address} has other source files of the twin than this command; install the same there"
+            text = f"the worker {address} has other source files of the twin or its extensions; install the same there"
             raise cli.InputErrorText(text)
         different = [
             f"{name} {found[0].get(name)} instead of {own}" for name, own in ours.items() if found[0].get(name) != own

@@ -7,7 +7,7 @@ import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from inspect import Signature, signature
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -16,11 +16,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
+from optics.numerics.extension_table import EntryPointError
 from scenes.specs.file_kinds import read_for
-from scenes.specs.procedures import PROCEDURES, Procedure
+from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.framework import cli, durable
-from twin.framework.procedure import Advance, Session, performed
+from twin.framework.procedure import Advance, Session, performed, seeded
 
 if TYPE_CHECKING:
     from twin.framework.report import Report
@@ -59,6 +60,7 @@ def finished(session: Session, kind: str, report: Report, numbers: Mapping[str, 
 
     told = report.told(numbers)
     known = {"started": session.started, "seconds": session.seconds, "backend": session.backend.name}
+    known["checks"] = report.checks
     write_test(kind, told, report, RunFacts(**{**known, **facts}), session.folder)
     return Result(
         reference_frames.described(kind, told), lambda console: print_report(report, console), code=report.code
@@ -99,8 +101,7 @@ def run_command(
         started, clock = time.time(), time.monotonic()
         tracer = load_backend(options.backend)
         provenance.program_digest()  # of the files that compute, which may be others when the run ends
-        silent = options.as_json or options.quiet
-        with durable.exit_on_terminate(), folder, progress_shown(errors, silent) as advance:
+        with durable.exit_on_terminate(), folder, progress_shown(errors, options.silent) as advance:
             result = work(given, Session(folder, tracer, advance, started, clock))
         if kept is not None:
             kept.finish()
@@ -160,78 +161,67 @@ def _advance(bar: Progress, standing: cli.Standing, say: Callable[[str], None]) 
 
 
 def add_tests(app: typer.Typer, program: str, apart: Collection[str] = ()) -> None:
-    """Add to a program all its tests of `PROCEDURES`: ``lab focus`` to ``lab``, as ``twin.lab focus``.
+    """Add to a program all its tests of `PROCEDURES`, ``lab focus`` to ``lab``, with the options that all have.
+
+    A test that exports has an option ``--export``.
 
     Args:
         app: of the program.
         program: first word of the tests' names.
         apart: commands that have options of their own and are added by the program itself.
     """
-    for name, procedure in PROCEDURES.items():
-        of, command = name.split()
+    for name in PROCEDURES:
+        of, _, command = name.partition(" ")
         if of == program and command not in apart:
-            add_test(app, f"twin.{program}", command, procedure)
+            try:
+                procedure = PROCEDURES[name]
+            except EntryPointError as error:
+                _add_unusable(app, command, error)
+                continue
+            without = ("export",) if procedure.export is None else ()
+            test = cli.with_options(*without)(partial(_test, name))
+            app.command(command, help=procedure.about)(test)
 
 
-def add_test(app: typer.Typer, program: str, command: str, procedure: Procedure) -> None:
-    """Add a test to a program as a subcommand with the options that all tests have.
+def _add_unusable(app: typer.Typer, command: str, error: EntryPointError) -> None:
+    """Add a test of another distribution that cannot be used: its help says why, and the others work."""
 
-    Args:
-        app: of the program.
-        program: as the user calls it, ``twin.lab``.
-        command: the subcommand, ``focus``.
-        procedure: the test; one that exports has an option ``--export``.
-    """
+    @app.command(command, help=str(error), context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+    def unusable() -> None:
+        with cli.explained(Console(stderr=True)):
+            raise error
 
-    def test(
-        file: cli.File,
-        out: cli.Out = None,
-        seed: cli.Seed = None,
-        export_to: cli.Export = None,
-        backend: cli.BackendName = "llvm",
-        force: cli.Force = False,
-        as_json: cli.AsJson = False,
-        quiet: cli.Quiet = False,
-        strict: cli.Strict = False,
-    ) -> None:
-        options = cli.Options(out, seed, backend, force, as_json, quiet, export_to, strict)
-        run_test(program, command, procedure, file, options)
 
-    if procedure.export is None:
-        # Typer makes the options from the signature
-        kept = [one for name, one in signature(test, eval_str=True).parameters.items() if name != "export_to"]
-        test.__signature__ = Signature(kept)  # type: ignore[attr-defined]
-        del test.__annotations__["export_to"]
-    app.command(command, help=procedure.about)(test)
+def _test(name: str, file: cli.File, options: cli.Options) -> None:
+    run_test(name, file, options)
 
 
 def run_test(
-    program: str,
-    command: str,
-    procedure: Procedure,
+    name: str,
     file: Path,
     options: cli.Options,
     kept: KeptWork | None = None,
-    changed: Callable[[Any], Any] | None = None,
+    read: Callable[[], Any] | None = None,
+    words: tuple[str, ...] = (),
+    **changes: Any,
 ) -> None:
     """Read a test, run it, write its run folder and print what it gave.
 
     Args:
-        program: as the user calls it, ``twin.lab``.
-        command: its subcommand, ``focus``.
-        procedure: the test; ``test`` of its set-up has a ``seed``.
-        file: of the test.
+        name: of the test in `PROCEDURES`: program and subcommand.
+        file: of the test; the run folder is called like it.
         options: what the user chose.
         kept: see `run_command`.
-        changed: set-up -> the one that is run, by options that this test alone has. Raises InputError.
+        read: reads the set-up, by options that this test alone has; None for that of the file. Raises InputError.
+        words: further options with which the run is made again from its config.yaml.
+        changes: attributes of the `Procedure` that are others by options that this test alone has.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
     """
-
-    def resolve(path: Path) -> Any:
-        setup = procedure.resolve(path)
-        return setup if changed is None else changed(setup)
+    procedure = replace(PROCEDURES[name], **changes)
+    called = f"twin.{name}"
+    program, _, command = called.partition(" ")
 
     def work(setup: Any, session: Session) -> Result:
         from twin.framework.report import numbers_only, with_warnings
@@ -239,7 +229,7 @@ def run_test(
 
         # a folder that cannot be made is told before the run
         folder = None if options.export is None else _export_folder(setup, options.export, options.force)
-        number = setup.test.seed if options.seed is None else options.seed
+        setup, number, facts = seeded(procedure, setup, options.seed)
         run, given = performed(procedure, setup, session.backend, number, session.advance)
         if folder is not None:
             with folder:
@@ -251,17 +241,13 @@ def run_test(
             made, problem = procedure.report(run), ""
         except Exception as error:  # minutes or hours of computing are not thrown away for a figure
             problem = "the report could not be made"
-            made = numbers_only(f"{program} {command}", f"{procedure.kind}.json", error)
+            made = numbers_only(called, f"{procedure.kind}.json", error)
             Console(stderr=True).print(traceback.format_exc(), markup=False, highlight=False, soft_wrap=True)
-        seeded = setup.with_seed(number)
-        drawn = number if procedure.seeded and "seed" in type(setup.test).model_fields else None
-        facts = {"config": seeded.to_yaml(), "named": seeded.plain(), "seed": drawn, "command": command}
         shown, numbers = with_warnings(made, given), procedure.numbers(run)
-        done = finished(session, procedure.kind, shown, numbers, program=program, **facts)
-        return replace(done, problem=problem)
+        facts |= {"program": program, "command": command, "options": words}
+        return replace(finished(session, procedure.kind, shown, numbers, **facts), problem=problem)
 
-    name = f"{program} {command}"
-    run_command(file.stem, options, lambda: read_for(name, file, resolve), work, kept)
+    run_command(file.stem, options, read or partial(read_for, called, file, procedure.resolve), work, kept)
 
 
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:

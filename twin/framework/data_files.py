@@ -25,6 +25,7 @@ import cv2
 import numpy as np
 import tifffile
 
+from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.frame_store import FileRoom, in_file, mean_of, parts
 
@@ -309,7 +310,7 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes | memoryview:
     return stream.contents() if isinstance(stream, FileRoom) else stream.getvalue()
 
 
-FRAME_FORMATS: dict[str, Callable[[np.ndarray, FrameFacts], bytes | memoryview]] = {"tiff": tiff}
+FRAME_FORMATS = ExtensionTable[Callable[[np.ndarray, FrameFacts], bytes | memoryview]]("frame_formats", {"tiff": tiff})
 """Ending of a file of recorded frames -> its contents, of frames uint16 (N, H, W) and what is known of them. A new one
 is added here.
 """
@@ -508,5 +509,7 @@ def _fits(table: DataTable) -> bytes:
     return out.getvalue()
 
 
-TABLE_FORMATS: dict[str, Callable[[DataTable], bytes]] = {"csv": _csv, "parquet": _parquet, "fits": _fits}
+TABLE_FORMATS = ExtensionTable[Callable[[DataTable], bytes]](
+    "table_formats", {"csv": _csv, "parquet": _parquet, "fits": _fits}
+)
 """Ending of a file of a table -> its contents; raises MissingPackage. A new one is added here."""

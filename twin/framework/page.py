@@ -99,6 +99,7 @@ class RunFacts:
         backend: where it was traced; empty where nothing was.
         seed: of everything that is drawn; None where nothing is.
         command: its subcommand.
+        options: further options of the command that runs it again.
         again: words of the command that runs it again, program first, where it is not the test with the run's own
             config.yaml.
         named: plain data in which files stand that the run read, by their absolute paths.
@@ -113,6 +114,7 @@ class RunFacts:
     backend: str = ""
     seed: int | None = None
     command: str = ""
+    options: tuple[str, ...] = ()
     again: tuple[str, ...] = ()
     named: Any = None
     given: tuple[Path, ...] = ()
@@ -125,7 +127,7 @@ class RunFacts:
             return self.again
         seed = () if self.seed is None else ("--seed", str(self.seed))
         command = (self.command,) if self.command else ()
-        return (self.program, *command, "config.yaml", *seed, "--backend", self.backend)
+        return (self.program, *command, "config.yaml", *self.options, *seed, "--backend", self.backend)
 
     def kept(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """What a manifest says of it: how to make it again, what was read, what it checked of itself.
@@ -223,6 +225,8 @@ def write_test(
     folder.write_text("config.yaml", facts.config)
     folder.write_json(f"{kind}.json", reference_frames.described(kind, numbers))
     write_artefacts(report.artefacts, folder)
+    for name, whole in report.files.items():
+        folder.write_bytes(name, whole)
     for name, frames in report.images.items():
         for file, content in data_files.frame_files(
             name, frames, report.image_facts.get(name, data_files.FrameFacts()), stretch=None

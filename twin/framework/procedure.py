@@ -76,6 +76,20 @@ def performed(
         raise InputError(*error.issues, *(Issue(text) for text in given)) from error
 
 
+def seeded(procedure: Procedure, setup: Any, seed: int | None) -> tuple[Any, int, dict[str, Any]]:
+    """Return a set-up with the seed of its run, this seed, and what a run folder states of both.
+
+    Args:
+        procedure: the test.
+        setup: what its file says.
+        seed: in place of the file's; None for that.
+    """
+    number = setup.seed if seed is None else seed
+    made = setup.with_seed(number)
+    drawn = number if procedure.seeded and made is not setup else None
+    return made, number, {"config": made.to_yaml(), "named": made.plain(), "seed": drawn}
+
+
 @dataclass(frozen=True)
 class Session:
     """A command at work.

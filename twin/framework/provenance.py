@@ -15,6 +15,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from threadpoolctl import threadpool_info
 
 from optics.numerics.backend import LIMIT, cores
+from optics.numerics.extension_table import entries
 from twin.framework.owned_files import digest
 
 PACKAGES = (
@@ -44,10 +46,13 @@ PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Python's and the packages' versions; ``not installed`` where there is none."""
+    """Python's and the packages' versions, ``not installed`` where there is none, and those of other distributions
+    that extend tables of this program.
+    """
     return {
         "python": platform.python_version(),
         **{package: _version(package) or "not installed" for package in PACKAGES},
+        **{entry.distribution: entry.version for entry in entries()},
     }
 
 
@@ -90,10 +95,22 @@ ENDINGS = (".css", ".csv", ".html", ".j2", ".js", ".json", ".py", ".svg", ".tdm"
 
 
 def _program_files(endings: tuple[str, ...]) -> dict[str, str]:
-    """Files of the packages with these endings, by their paths from the root -> SHA-256."""
-    paths = (path for package in SOURCES for path in sorted((ROOT / package).rglob("*")))
-    found = (path for path in paths if path.suffix in endings and path.is_file())
-    return {path.relative_to(ROOT).as_posix(): _checksum(path) for path in found}
+    """Files of the packages with these endings, and of other distributions' that extend tables, by their paths from
+    the folder of the package -> SHA-256.
+    """
+    found = {}
+    for place in (*(ROOT / package for package in SOURCES), *_extensions()):
+        for path in sorted(place.rglob("*")) if place.is_dir() else (place,):
+            if path.suffix in endings and path.is_file():
+                found[path.relative_to(place.parent).as_posix()] = _checksum(path)
+    return found
+
+
+def _extensions() -> Iterator[Path]:
+    """Folder or file of each package of other distributions that has an entry in a table; nothing is imported."""
+    for name in sorted({entry.value.partition(":")[0].partition(".")[0] for entry in entries()}):
+        if (spec := find_spec(name)) is not None:
+            yield from map(Path, spec.submodule_search_locations or filter(None, [spec.origin]))
 
 
 @cache

@@ -9,7 +9,7 @@ times the metres that its source has.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from analysis.arrays import ARCMIN, ARCSEC
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.study import unit_of
-from twin.framework.artefact import Cell, Table, shown_unit
+from twin.framework.artefact import Cell, OwnDecimals, Table, shown_unit
 from twin.framework.data_files import DataColumn, DataTable
 
 S = TypeVar("S")
@@ -209,6 +209,7 @@ class Record(Generic[S]):
         rows: Sequence[Mapping[str, Any]] | Mapping[str, Mapping[str, Any]],
         keys: Sequence[str] = (),
         label: str = "",
+        digits: int = 6,
     ) -> Table:
         """A table of a report.
 
@@ -219,6 +220,7 @@ class Record(Generic[S]):
             rows: as this record gives them, or by name, which then is the first column.
             keys: of the columns, in their order; all if none are given.
             label: head of the column of names.
+            digits: significant ones of numbers without decimals of their own.
         """
 
         def told(row: Mapping[str, Any]) -> list[Cell]:
@@ -231,7 +233,29 @@ class Record(Generic[S]):
             cells: list[list[Cell]] = [[first, *told(row)] for first, row in rows.items()]
         else:
             cells = [told(row) for row in rows]
-        return Table(name, title, caption, heads, cells, decimals)
+        return Table(name, title, caption, heads, cells, decimals, digits)
+
+    def lines(
+        self, numbers: Mapping[str, Any], keys: Sequence[str] = (), truth: Mapping[str, Any] | None = None
+    ) -> list[tuple[Cell, ...]]:
+        """Rows of a report's table with a quantity each: head or meaning, value, sigma where one has a sigma, truth.
+
+        Args:
+            numbers: as this record gives them; a sigma stands beside its value, under the key with ``_sigma``.
+            keys: of the rows, in their order; all if none are given.
+            truth: true values by the same keys, None for a table without them.
+        """
+
+        def cell(one: Quantity[S], value: Any) -> Cell:
+            shown: Cell = one.shown_value(value)
+            return OwnDecimals(shown, one.decimals) if isinstance(shown, float) and one.decimals is not None else shown
+
+        chosen = self._chosen(keys)
+        parts = [numbers, {one.key: numbers.get(f"{one.key}_sigma") for one in chosen}]
+        parts = [*(part for part in parts if any(part.get(one.key) is not None for one in chosen))]
+        parts += [] if truth is None else [truth]
+        heads = (replace(one, head=one.head or one.meaning).shown_head for one in chosen)
+        return [(head, *(cell(one, p.get(one.key)) for p in parts)) for head, one in zip(heads, chosen, strict=True)]
 
     def data_table(
         self, name: str, title: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str] = ()

@@ -41,9 +41,9 @@ def described(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         KeyError: a kind without an entry in `FRAMES` or a test's `frames` of its own.
     """
-    own = {procedure.kind: procedure.frames for procedure in PROCEDURES.values()}
-    frames = dict(FRAMES[kind] if kind in FRAMES else own[kind])
-    return {"schema": f"{kind} {_VERSIONS.get(kind, _FIRST)}", "reference_frames": frames, **data}
+    if (frames := FRAMES.get(kind)) is None:
+        frames = {procedure.kind: procedure.frames for procedure in PROCEDURES.values()}[kind]
+    return {"schema": f"{kind} {_VERSIONS.get(kind, _FIRST)}", "reference_frames": dict(frames), **data}
 
 
 def frames_text(kind: str) -> str:

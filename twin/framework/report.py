@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.artefact import Artefact, Table
 from twin.framework.data_files import FrameFacts
+from twin.framework.provenance import SelfCheck
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +75,8 @@ class Report:
         image_facts: name of images -> what is known of these frames; of some or all.
         code: exit code of the command, of a test whose answer it is.
         conclusions: what follows from the numbers, sentence by sentence, before all tables.
+        files: path in the run folder -> content, of files that no page shows.
+        checks: what the run checked of itself; none for what its numbers say.
     """
 
     title: str
@@ -86,6 +90,8 @@ class Report:
     image_facts: Mapping[str, FrameFacts] = field(default_factory=FrozenMap)
     code: int = 0
     conclusions: tuple[str, ...] = ()
+    files: Mapping[str, bytes] = field(default_factory=FrozenMap)
+    checks: tuple[SelfCheck, ...] = ()
 
     @property
     def artefacts(self) -> tuple[Artefact, ...]:
@@ -141,10 +147,11 @@ def with_warnings(report: Report, given: tuple[str, ...]) -> Report:
     return replace(report, warnings=(*given, *report.warnings))
 
 
-SECTIONS: dict[tuple[str, str], Callable[[Any], Section | None]] = {}
-"""(Kind of run, name of the section) -> the section, of what the run gave; None where it has nothing to say. The kind
-is ``render`` for the main job, and for a test the name of its numbers' file: ``focus``, ``angle``. A section
-stands before the one that says how to reproduce the run; its artefacts are in the run folder. A new one is added here.
+SECTIONS = ExtensionTable[Callable[[Any], Section | None]]("report_sections", {})
+"""Kind of run and name of the section, ``focus skew`` -> the section, of what the run gave; None where it has nothing
+to say. The kind is ``render`` for the main job, and for a test the name of its numbers' file: ``focus``, ``angle``. A
+section stands before the one that says how to reproduce the run; its artefacts are in the run folder. A new one is
+added here.
 """
 
 
@@ -155,5 +162,5 @@ def further_sections(kind: str, run: Any) -> tuple[Section, ...]:
         kind: of the run.
         run: what the run gave.
     """
-    found = (section(run) for (of, _), section in SECTIONS.items() if of == kind)
+    found = (SECTIONS[name](run) for name in SECTIONS if name.partition(" ")[0] == kind)
     return tuple(section for section in found if section is not None)

@@ -31,7 +31,7 @@ from scenes.models.camera_model import ROOT, build_camera_under_test
 from scenes.specs.resolved import DistortionSetup
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.random_streams import stream
-from twin.laboratory.turntable_bench import TurntableModel
+from twin.laboratory.turntable_run import TurntableModel
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_path import TargetPath
 

@@ -5,7 +5,6 @@ truth.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,11 +20,10 @@ from twin.framework.artefact import FAR, Artefact, Cell, OwnDecimals, SvgFigure,
 from twin.framework.data_files import FrameFacts
 from twin.framework.report import Report, Section, answer
 from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
-from twin.laboratory.distortion_numbers import DISTORTION, ESTIMATE, POINTS
-from twin.laboratory.distortion_run import DistortionRun, SimulatedDistortion
-from twin.laboratory.turntable_numbers import DOUBTFUL
-from twin.laboratory.turntable_report import FIT_NAMES
-from twin.laboratory.turntable_run import rms
+from twin.laboratory import distortion_run, turntable_run
+from twin.laboratory.distortion_run import DISTORTION, ESTIMATE, POINTS, TRUTH, DistortionRun, SimulatedDistortion
+from twin.laboratory.turntable_report import FIT_NAMES, rejected_table
+from twin.laboratory.turntable_run import DOUBTFUL, rms
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -214,74 +212,33 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _summary(run: DistortionRun, data: Mapping[str, Any]) -> Table:
-    truth = data.get("truth") or {}
-    # six digits, which tables show of a number, are too few for f
-    rows: list[tuple[Cell, ...]] = [
-        (
-            "balanced principal distance [mm]",
-            f"{data['principal_distance_mm']:.4f}",
-            data["principal_distance_mm_sigma"],
-            f"{truth.get('principal_distance_mm', 0.0):.4f}",
-        ),
-        (
-            "principal point [mm]",
-            f"{data['principal_point_mm']:.3f}",
-            data["principal_point_mm_sigma"],
-            truth.get("principal_point_mm"),
-        ),
-        ("correlation of the two", f"{data['correlation']:.3f}", None, None),
-        ("radial term of the joint model [mm]", f"{data['radial3_mm']:.3f}", data["radial3_mm_sigma"], None),
-        ("residual of smooth model [µm rms]", f"{data['rms_compensated_um']:.3f}", None, None),
-    ]
-    if run.compensation is not None:
-        rows.append(("residual of smooth model, angles as read [µm rms]", f"{data['rms_raw_um']:.3f}", None, None))
-    rows.append(("chi-square of the smooth model", f"{data['chi_square']:.1f}", None, None))
-    rows.append(("degrees of freedom", f"{data['degrees_of_freedom']}", None, None))
-    heads: tuple[str, ...] = ("", "measured", "sigma", "truth")
+    truth = data.get("truth")
+    keys = ["principal_distance_mm", "principal_point_mm", "correlation", "radial3_mm", "rms_compensated_um"]
+    keys += [*(["rms_raw_um"] * (run.compensation is not None)), "chi_square", "degrees_of_freedom"]
+    rows = DISTORTION.lines(data, keys, truth)
     if truth:
-        for name, key in ((RAW, "error_rms_raw_um"), (COMPENSATED, "error_rms_compensated_um")):
-            rows.append((f"error of distortion, {name} [µm rms]", f"{truth[key]:.3f}", None, None))
-    else:
-        heads, rows = heads[:3], [row[:3] for row in rows]
+        rows += [(*row, None, None) for row in TRUTH.lines(truth, ("error_rms_raw_um", "error_rms_compensated_um"))]
     caption = (
         "f and p by least squares with a constant, which is the unknown zero of the angles. Balanced: the f that "
         "leaves the smallest distortion over the points; with the radial term use the joint model."
     )
-    return Table("distortion-result", "Result", caption, heads, rows, (None, 3, 4, 3)[: len(heads)])
+    heads = ("", "measured", "sigma", "truth")[: len(rows[0])]
+    return Table("distortion-result", "Result", caption, heads, rows)
 
 
 def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    text = [
-        "D is what is left of the spots' places after a constant, f tan W and p tan² W. Its sigma holds the scatter of "
-        "the sets, the stated errors of the angles with their covariance, and what the points scatter about a smooth "
-        "curve beyond that. It does not hold what moves every centroid alike at one place of the field, as coma does."
-    ]
-    if run.compensation is not None:
-        text.append(
-            "With angles as read the long waves of the dividing error pass for distortion, and no error bar knows of "
-            "them."
-        )
-    caption = "Means of the sets."
+    text, caption = [], "Means of the sets."
     if isinstance(run, SimulatedDistortion):
         with_it, without = (rms(run.error(one) / one.sigma) for one in (run.compensated, run.raw))
         text.append(
             f"The errors are {with_it:.2f} sigma rms with compensated angles, {without:.2f} with angles as read."
         )
         caption += " Line: by exact chief rays of the as-built camera."
-    shown = (
-        "point",
-        "reading_deg",
-        "field_deg",
-        "position_mm",
-        "distortion_compensated_um",
-        "distortion_compensated_um_sigma",
-    )
-    further = ("residual_compensated_um", "sets_kept")
+    keys = ["point", "reading_deg", "field_deg", "position_mm", "distortion_compensated_um"]
+    keys += ["distortion_compensated_um_sigma", "residual_compensated_um", "sets_kept"]
     artefacts: tuple[Artefact, ...] = (
         SvgFigure("distortion-curve", "Distortion over the field", caption, _curve_svg(run)),
-        POINTS.table(
-            "distortion-points", "Point by point", "Means of the sets kept.", data["points"], (*shown, *further)
-        ),
+        POINTS.table("distortion-points", "Point by point", "Means of the sets kept.", data["points"], keys),
     )
     return Section("Distortion", tuple(text), artefacts, folded=1)
 
@@ -292,17 +249,8 @@ def _compensation(run: DistortionRun) -> Section:
         "distance from the smooth curve": (raw.smooth.residual, own.smooth.residual),
         "RMS of distortion over the sets": (raw.rms_over_sets, own.rms_over_sets),
     }
-    text = (
-        "How much an RMS falls with compensated angles depends on what else is in it. That of the distortion itself "
-        "holds the design's distortion, which a dividing error may even cancel in part, so that it can rise. The "
-        "distance from a smooth curve does not see the long waves of the dividing error."
-    )
     if isinstance(run, SimulatedDistortion):
         pairs["error of the distortion (needs the truth)"] = (run.error(raw), run.error(own))
-        text += (
-            " Only the error against the truth tells what compensation brings. It differs from table to table: the "
-            "constant, f and p take up what is longer than the field."
-        )
     rows: list[tuple[Cell, ...]] = []
     for name, values in pairs.items():
         before, after = (1e6 * rms(one) for one in values)
@@ -316,7 +264,7 @@ def _compensation(run: DistortionRun) -> Section:
         rows,
         (None, 2, 2, 0, 1, 1),
     )
-    return Section("Raw and compensated angles", (text,), (table,))
+    return Section("Raw and compensated angles", (), (table,))
 
 
 ESTIMATES = {
@@ -336,11 +284,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
     Args:
         joint: of distortion.json.
     """
-    text = (
-        "With a radial term f is the slope in the middle of the field; the balanced f, which leaves the smallest "
-        "distortion without such a term, is another. Terms of one table belong together: the f of one with the radial "
-        "term of the other would miss the spots at the edge by more than half of the radial distortion there.",
-    )
+    text = ("Terms of one table belong together: with a radial term f is the slope in the middle of the field.",)
 
     def table(name: str, title: str, caption: str, part: Mapping[str, Any], suffix: str, shown: list[str]) -> Table:
         size, sigma = np.array(part[f"values{suffix}"]), np.array(part[f"values{suffix}_sigma"])
@@ -373,7 +317,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
 
 
 def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    heads, digits = ["estimate", *(one.shown_head for one in ESTIMATE)], [None, *(one.decimals for one in ESTIMATE)]
+    heads, digits = (["estimate", *(one.shown_head for one in ESTIMATE)], [None, *(one.decimals for one in ESTIMATE)])
     rows: list[tuple[Cell, ...]] = [(ESTIMATES[name], *one.values()) for name, one in data["estimates"].items()]
     found = (
         "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W has to count exactly from the "
@@ -385,11 +329,7 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
         off = (run.compensated.zero - run.truth.zero) / ARCSEC
         text = [
             f"{found}, {off:+.3f} arcsec from the truth: the middle was put on the pinhole to "
-            f"{run.truth.zero / ARCSEC:.2f} arcsec, and the compensation at that reading has an error of its own. (2) "
-            "turns such an offset into a principal point, (3) leaves it in the distortion of every point.",
-            "With a radial term f is another quantity, the slope in the middle of the field, and not the slope that "
-            "leaves the smallest distortion: the two differ by definition, and the error is counted against each one's "
-            "own truth.",
+            f"{run.truth.zero / ARCSEC:.2f} arcsec, and the compensation at that reading has an error of its own."
         ]
         caption += " Errors are against the same estimate from exact chief rays at the true angles."
         heads, digits = [*heads, "error of f [mm]", "error of p [mm]", "error of D, rms [µm]"], [*digits, 3, 2, 2]
@@ -440,12 +380,8 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
         text.append(
             f"The table's repeatability, {format_quantity(own, ANGLE)}, makes "
             f"{1e6 * run.compensated.fit.value('principal_distance') * own:.2f} µm of the scatter between the sets; "
-            f"{data['truth']['gross_errors']} exposures had a gross error. What points scatter about a smooth curve is "
-            "the subdivision error, which the calibration's steps cannot see."
-        )
-        text.append(
-            f"Differences of the line's columns move a spot by {noise['centroid_columns_um']:.3f} µm; every row of a "
-            "TDI line sees the same columns."
+            f"{data['truth']['gross_errors']} exposures had a gross error. Differences of the line's columns move a "
+            f"spot by {noise['centroid_columns_um']:.3f} µm."
         )
         artefacts.append(
             SvgFigure(
@@ -456,28 +392,14 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
                 _spot_svg(run),
             )
         )
-    gone = [*data.get("rejected_readings", ()), *data.get("rejected_comparisons", ())]
-    if gone:
-        lines: list[tuple[Cell, ...]] = [
-            (
-                Path(one["file"]).name,
-                one["line"],
-                one["reading_deg"],
-                f"{one['from_mean_um']:+.3f} µm" if "from_mean_um" in one else f"{one['from_mean_arcsec']:+.3f} arcsec",
-            )
-            for one in gone
-        ]
-        artefacts.append(
-            Table(
-                "distortion-rejected",
-                "Readings that Chauvenet's criterion takes out",
-                "Difference from the mean of those that stay.",
-                ("file", "line", "reading [deg]", "from the mean"),
-                lines,
-                (None, None, 6),
-            )
-        )
-    return Section("Noise, and what was rejected", tuple(text), tuple(artefacts), folded=1 if gone else 0)
+    for record, key, what in (
+        (distortion_run.REJECTED, "rejected_readings", "Readings"),
+        (turntable_run.REJECTED, "rejected_comparisons", "Comparisons of the turntable"),
+    ):
+        if gone := data.get(key):
+            artefacts.append(rejected_table(record, f"distortion-{key.replace('_', '-')}", what, gone))
+    folded = len([one for one in artefacts if one.name.startswith("distortion-rejected")])
+    return Section("Noise, and what was rejected", tuple(text), tuple(artefacts), folded)
 
 
 def _curve_svg(run: DistortionRun) -> str:

@@ -1,34 +1,195 @@
 """Report of a focal-plane alignment: what was found, how well, and what limits it; of a simulated bench also beside its
 truth.
+
+Figures of the focal-plane alignment: curves through focus, defocus, MTF curves, edges.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import chi2
 
 from analysis.arrays import ARCMIN, UM_PER_M
+from analysis.arrays import UM_PER_M as UM
+from analysis.focal_plane.through_focus import QUARTIC, FocusVertex
+from analysis.mtf.slanted_edge import measure_edge
 from scenes.specs.camera_tests import MeasuredFocusSpec
 from scenes.yaml.units import LENGTH, format_quantity
+from twin.framework import svg
 from twin.framework.artefact import Artefact, Cell, SvgFigure, Table, fixed
+from twin.framework.quantity import Record
 from twin.framework.report import Report, Section, answer
-from twin.laboratory import focus_plots
-from twin.laboratory.focus_numbers import PLACES, ROW_FAULT, SHIMS, focus_numbers
-from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus
-from twin.laboratory.turntable_numbers import DOUBTFUL
+from twin.laboratory import focus_run
+from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus, SimulatedState
+from twin.laboratory.turntable_run import DOUBTFUL
 from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FIELD_COLOURS = (svg.BLUE, svg.GREEN, svg.ORANGE, svg.VERMILION, svg.PURPLE)
+EDGE_COLOURS = {ALONG: svg.BLUE, TRACK: svg.VERMILION}
+PER_MM = 1e-3
+_COLUMNS, _MOST_BANDS = 5, 10
+
+
+def _shown(run: FocusRun) -> list[tuple[int, FocusState, str]]:
+    """Number, standing and title of the first and the last standing."""
+    states = run.states
+    return (
+        [(0, states[0], "before"), (len(states) - 1, states[-1], "after")] if len(states) > 1 else [(0, states[0], "")]
+    )
+
+
+def through_focus_svg(run: FocusRun) -> str:
+    """Curves through focus of every band, both directions, before the first and after the last shims."""
+    bands, shown = list(dict.fromkeys(run.bands))[:_MOST_BANDS], _shown(run)
+    with svg.look("through-focus"):
+        columns, each = min(len(bands), _COLUMNS), -(-len(bands) // _COLUMNS)
+        figure = svg.new_figure(3.0 * each * len(shown) + 0.3)
+        grid = figure.subplots(each * len(shown), columns, squeeze=False, sharey=True)
+        for (_, state, when), panels in zip(shown, np.split(grid, len(shown)), strict=True):
+            for axes, band in zip(panels.ravel(), bands, strict=False):
+                _curves(axes, run, state, band)
+                axes.set_title(", ".join(part for part in (band, when) if part) or "all places")
+            for axes in panels.ravel()[len(bands) :]:
+                axes.set_visible(False)
+            panels[0, 0].set_ylabel("MTF (○ filled: along the line,\nopen: along the track)")
+        for axes in grid[-1]:
+            axes.set_xlabel("move of the image [µm]")
+        return svg.to_svg(figure)
+
+
+def _curves(axes: Axes, run: FocusRun, state: FocusState, band: str) -> None:
+    own = [scan for scan, name in zip(state.scans, run.bands, strict=True) if name == band]
+    for number, scan in enumerate(own):
+        colour = FIELD_COLOURS[number % len(FIELD_COLOURS)]
+        for edge, vertex in scan.vertex.items():
+            good = np.isfinite(scan.sigma[edge])
+            at, value, sigma = (each[edge][good] for each in (scan.shift, scan.mtf, scan.sigma))
+            fill = colour if edge == ALONG else "white"
+            axes.errorbar(UM * at, value, sigma, fmt="o", ms=2.6, lw=0.7, color=colour, mfc=fill)
+            place = np.linspace(np.min(at), np.max(at), 101)
+            axes.plot(UM * place, _form(vertex, place), color=colour, lw=0.8)
+    axes.axvline(0.0, color=svg.INK, lw=0.8)
+    axes.set_ylim(bottom=0.0)
+    svg.plain_axes(axes)
+
+
+def _form(vertex: FocusVertex, place: np.ndarray) -> np.ndarray:
+    """The fitted curve, where it is above a third of its peak."""
+    u = -0.5 * vertex.curvature / vertex.peak * (place - vertex.position) ** 2
+    value = vertex.peak * (1.0 - u + QUARTIC * u**2)
+    return np.where((value > vertex.peak / 3.0) & (u < 0.5 / QUARTIC), value, np.nan)
+
+
+def defocus_svg(run: FocusRun) -> str:
+    """Defocus of every place before the first and after the last shims, with the fitted plane; of a simulated bench the
+    truth.
+    """
+    shown = _shown(run)
+    with svg.look("defocus"):
+        figure = svg.new_figure(3.4)
+        panels = figure.subplots(1, len(shown), squeeze=False)[0]
+        for axes, (number, state, when) in zip(panels, shown, strict=True):
+            _defocus(axes, run, number, state)
+            axes.set(title=when, xlabel="along the line Y′ [mm]")
+        panels[0].set_ylabel("CCD downstream of focus [µm]")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=max(len(labels), 1))
+        return svg.to_svg(figure)
+
+
+def _defocus(axes: Axes, run: FocusRun, number: int, state: FocusState) -> None:
+    for k, band in enumerate(dict.fromkeys(run.bands)):
+        own = np.array(run.bands) == band
+        colour, places = FIELD_COLOURS[k % len(FIELD_COLOURS)], run.places[own]
+        along, sigma = 1e3 * places[:, 1], UM * state.defocus_sigma[own]
+        style: dict[str, Any] = {"fmt": "o", "ms": 3.5, "lw": 1.0, "color": colour, "label": band or "all places"}
+        axes.errorbar(along, UM * state.defocus[own], sigma, **style)
+        if isinstance(state, SimulatedState):
+            axes.plot(along, UM * state.true_defocus[own], "_", ms=11, color=colour, alpha=0.8)
+        if number < len(run.shimmings):
+            for x in np.unique(places[:, 0]):
+                line = np.array([[x, y] for y in (np.min(places[:, 1]), np.max(places[:, 1]))])
+                plane = run.shimmings[number].plane.plane(line)[0]
+                axes.plot(1e3 * line[:, 1], -UM * plane, color=colour, lw=0.8, alpha=0.7)
+    if isinstance(state, SimulatedState):
+        axes.plot([], [], "_", ms=11, color=svg.GREY, label="truth")
+    axes.axhline(0.0, color=svg.INK, lw=0.7)
+    svg.plain_axes(axes)
+
+
+def _middle(run: SimulatedFocus, band: str) -> int:
+    """Number of the band's site that is nearest to the middle of the field."""
+    sites = run.bench.sites
+    return min((i for i, s in enumerate(sites) if s.band == band), key=lambda i: abs(sites[i].field))
+
+
+def mtf_svg(run: SimulatedFocus) -> str:
+    """MTF curves in the middle of the field after the alignment, measured and true."""
+    with svg.look("mtf-curves"):
+        bench, state = run.bench, run.states[-1]
+        figure = svg.new_figure(3.0)
+        panels = figure.subplots(1, len(bench.ccds), sharey=True, squeeze=False)[0]
+        for axes, band in zip(panels, bench.ccds, strict=True):
+            number = _middle(run, band)
+            site, ccd = bench.sites[number], bench.ccds[band]
+            defocus = state.true_place(number)
+            for edge in DIRECTIONS:
+                frames = state.focus[number].frames[edge]
+                measured = measure_edge(frames.mean(axis=0), noise=ccd.noise, frames=len(frames), even=True)
+                frequency = measured.frequency / ccd.band.pitch
+                true = np.abs(site.imagers[edge].transfer(defocus, frequency))
+                colour = EDGE_COLOURS[edge]
+                axes.fill_between(
+                    PER_MM * frequency,
+                    measured.mtf - 2.0 * measured.sigma,
+                    measured.mtf + 2.0 * measured.sigma,
+                    color=colour,
+                    alpha=0.25,
+                    lw=0,
+                )
+                axes.plot(PER_MM * frequency, measured.mtf, color=colour, lw=1.2, label=DIRECTION_NAMES[edge])
+                axes.plot(
+                    PER_MM * frequency, true, color=svg.INK, lw=0.8, ls="--", label="truth" if edge == TRACK else None
+                )
+            axes.axvline(PER_MM * ccd.band.nyquist, color=svg.GREY, lw=0.8, ls=":")
+            axes.set(title=band, xlabel="cycles/mm", xlim=(0.0, PER_MM / ccd.band.pitch), ylim=(0.0, 1.02))
+            svg.plain_axes(axes)
+        panels[0].set_ylabel("MTF")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=3)
+        return svg.to_svg(figure)
+
+
+def edges_svg(run: SimulatedFocus) -> str:
+    """Recorded edges of the first and the last band."""
+    with svg.look("edges"):
+        bench, state = run.bench, run.states[-1]
+        bands = list(bench.ccds)[:: max(len(bench.ccds) - 1, 1)]
+        figure = svg.new_figure(2.9)
+        panels = figure.subplots(1, 2 * len(bands), squeeze=False)[0]
+        for k, band in enumerate(bands):
+            number = _middle(run, band)
+            for axes, edge in zip(panels[2 * k : 2 * k + 2], DIRECTIONS, strict=True):
+                axes.imshow(state.focus[number].frames[edge][0], cmap="gray", interpolation="none")
+                axes.set_title(f"{band}, measures\n{DIRECTION_NAMES[edge]}")
+                axes.set(xlabel="pixel along the line", ylabel="line" if edge == ALONG and k == 0 else "")
+        return svg.to_svg(figure)
+
 
 MOVED = {"image": "image, along the light", "target": "target, along the light", "focal_plane": "CCD, along the light"}
 
 
 def focus_report(run: FocusRun) -> Report:
     """Report of an alignment."""
-    data = focus_numbers(run)
-    sections = (_shims(run), _plane(run), _curves(run))
+    data = focus_run.focus_numbers(run)
+    sections = (_shims(run), _plane(run), _curve_section(run))
     if isinstance(run, SimulatedFocus):
         return Report(
             f"Focal-plane alignment of {run.bench.setup.camera.name}",
@@ -208,10 +369,7 @@ def _summary(data: Mapping[str, Any]) -> Table:
     plane = data["plane"]
     rows: list[tuple[Cell, ...]] = [
         ("largest distance from best focus [µm]", data["confocal_um_max"], data["confocal_um_sigma"]),
-        ("piston of the plane [µm]", plane["piston_um"], plane["piston_um_sigma"]),
-        ("slope along X′ [arcsec]", plane["slope_x_arcsec"], plane["slope_x_arcsec_sigma"]),
-        ("slope along Y′ [arcsec]", plane["slope_y_arcsec"], plane["slope_y_arcsec_sigma"]),
-        ("CCDs off one plane [µm rms]", plane["chips_um_rms"], None),
+        *focus_run.PLANE.lines(plane, ("piston_um", "slope_x_arcsec", "slope_y_arcsec", "chips_um_rms")),
     ]
     rows += [
         (f"change of shim {name.removeprefix('hole_')} [µm]", one["change_um"], one["change_um_sigma"])
@@ -225,26 +383,18 @@ def _shims(run: FocusRun) -> Section:
     """The shims of every round."""
     tables = []
     for number, done in enumerate(run.shimmings, 1):
-        rows = [
-            (
-                f"{hole}",
-                f"{fixed(one['change_um'], 1)} ± {one['change_um_sigma']:.1f}",
-                *(fixed(one[key], 1) for key in ("ground_um", "shim_um")),
-                fixed(float(np.linalg.norm(one["slide_mm"])), 3),
-            )
-            for hole, one in enumerate(SHIMS.rows(done), 1)
-        ]
+        rows = {
+            f"{hole}": {**one, "slide_mm": float(np.linalg.norm(one["slide_mm"]))}
+            for hole, one in enumerate(focus_run.SHIMS.rows(done), 1)
+        }
         title = "Shims" if len(run.shimmings) == 1 else f"Shims of round {number}"
         caption = (
-            "Changes of thickness under each hole; their sigma holds noise, the error that all vertices share, and "
-            f"that the CCDs do not stand in one plane ({UM_PER_M * done.plane.extra_sigma:.1f} µm rms: chips, "
-            "curvature of field). The turn in the mounting surface of "
+            "Changes of thickness under each hole. The turn in the mounting surface of "
             f"{fixed(done.plan.turn / ARCMIN, 2)} arcmin is set by hand; without it the line would be off its wanted "
             f"level by {fixed(done.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting surface is not parallel "
             "to the focal plane."
         )
-        heads = ("hole", "change [µm]", "ground [µm]", "new shim [µm]", "slide [mm]")
-        tables.append(Table(f"shims-{number}", title, caption, heads, rows))
+        tables.append(focus_run.SHIMS.table(f"shims-{number}", title, caption, rows, label="hole"))
     return Section("Shims", (), tuple(tables))
 
 
@@ -261,8 +411,7 @@ def _plane(run: FocusRun) -> Section:
     text = (
         f"Chi-square of the plane is {plane.chi_square:.1f} for {plane.degrees_of_freedom} degrees of freedom "
         "with the places' own sigmas. What the places scatter beyond them, "
-        f"{UM_PER_M * plane.extra_sigma:.1f} µm rms, is in the weights and in all sigmas of plane and shims: CCDs that "
-        "are not in one plane, curvature of the field, sigmas that are too small.",
+        f"{UM_PER_M * plane.extra_sigma:.1f} µm rms, is in the weights and in all sigmas of plane and shims.",
         f"All vertices share an error of {UM_PER_M * done.vertex_error:.2g} µm by the form of the curve; "
         f"{UM_PER_M * done.vertex_trend:.2g} µm of it change from the middle to the ends; both are in the sigmas.",
     )
@@ -271,57 +420,36 @@ def _plane(run: FocusRun) -> Section:
     if isinstance(run, SimulatedFocus):
         caption += " Dashes: truth from the traced pupils."
     artefacts: tuple[Artefact, ...] = (
-        SvgFigure("defocus", "Where the CCDs stand", caption, focus_plots.defocus_svg(run)),
-        PLACES.table("places", "Places", "Before the last shims.", PLACES.rows(last), keys),
+        SvgFigure("defocus", "Where the CCDs stand", caption, defocus_svg(run)),
+        focus_run.PLACES.table("places", "Places", "Before the last shims.", focus_run.PLACES.rows(last), keys),
     )
     return Section("Plane", text, artefacts, folded=1)
 
 
-def _curves(run: FocusRun) -> Section:
+def _curve_section(run: FocusRun) -> Section:
     """Curves through focus, of the last standing of which a plane was made as a table."""
-    rows: list[tuple[Cell, ...]] = [
-        (
-            one["band"],
-            one["x_mm"],
-            one["y_mm"],
-            DIRECTION_NAMES[edge],
-            curve["vertex_um"],
-            curve["vertex_um_sigma"],
-            f"{curve['peak_mtf']:.4f} ± {curve['peak_mtf_sigma']:.4f}",
-            curve["chi_square"],
-            curve["degrees_of_freedom"],
-            f"{curve['positions_used']} of {curve['positions']}",
-        )
-        for one in PLACES.rows(_last(run))
+    rows = [
+        {**one, "direction": DIRECTION_NAMES[edge], **curve}
+        for one in focus_run.PLACES.rows(_last(run))
         for edge, curve in one["curves"].items()
     ]
-    heads = ("band", "x [mm]", "y [mm]", "direction", "vertex [µm]", "sigma [µm]", "peak", "χ²", "ν", "positions")
-    caption, digits = "Vertices as moves of the image.", (None, 3, 3, None, 2, 2)
+    where = [focus_run.PLACES[key] for key in ("band", "x_mm", "y_mm")]
+    record = Record("A curve.", *where, focus_run.BUDGET["direction"], *focus_run.CURVE)
     drawn = "MTF with one sigma and the fitted curve, by band; black: the CCD."
     artefacts: list[Artefact] = [
-        SvgFigure("through-focus", "Through focus", drawn, focus_plots.through_focus_svg(run)),
-        Table("curves", "Curves through focus", caption, heads, rows, digits),
+        SvgFigure("through-focus", "Through focus", drawn, through_focus_svg(run)),
+        record.table("curves", "Curves through focus", "Vertices as moves of the image.", rows),
     ]
     if run.readings and run.readings.no_edge:
-        gone = [{**ROW_FAULT(one), "file": Path(one.file).name} for one in run.readings.no_edge]
+        gone = [{**focus_run.ROW_FAULT(one), "file": Path(one.file).name} for one in run.readings.no_edge]
         note = "They have no weight."
-        artefacts.insert(1, ROW_FAULT.table("no-edge", "Images without a measurable edge", note, gone))
-    text = [
-        "The main peak of every curve is fitted by v = p (1 − u + 0.3 u²), u = a (z − z₀)², over the positions where "
-        "it is above half of its peak; best focus of a place is midway between its directions, which astigmatism moves "
-        "apart."
-    ]
+        artefacts.insert(1, focus_run.ROW_FAULT.table("no-edge", "Images without a measurable edge", note, gone))
+    text: tuple[str, ...] = ()
     if isinstance(run, SimulatedFocus):
         ratio = run.bench.sites[0].nominal_per_shift
-        text.insert(
-            0,
-            "The target is moved through the collimator's focus; a slanted edge is recorded at every position in both "
-            "directions, and its MTF at the band's Nyquist frequency is fitted. The image moves along the line's "
-            "direction with f² of that direction over the collimator's f², which differ by "
-            f"{100 * abs(ratio[TRACK] / ratio[ALONG] - 1.0):.1f}% in this camera; each direction is reduced with its "
-            "own.",
-        )
-    return Section("Through focus", tuple(text), tuple(artefacts), folded=1)
+        apart = 100 * abs(ratio[TRACK] / ratio[ALONG] - 1.0)
+        text = (f"Per move of the target the image moves by {apart:.1f}% more in one direction than in the other.",)
+    return Section("Through focus", text, tuple(artefacts), folded=1)
 
 
 def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
@@ -345,15 +473,9 @@ def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
         )
         for line in data["mtf_budget"]
     ]
-    text = (
-        "The MTF along the track has everything in it: optics, pixel, charge diffusion and the motion of the image "
-        "over the stages.",
-        "The camera as designed would have the product of diffraction, design and pixel. The others are the "
-        "degradations that camera and test declare.",
-    )
     return Section(
         "MTF at the Nyquist frequency",
-        text,
+        (),
         (
             Table(
                 "mtf",
@@ -376,8 +498,8 @@ def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
                 "MTF curves in the middle of the field, after the alignment",
                 "Measured from the slanted edge, with two sigma; dashed: the traced pupil times the detector's "
                 "factors. Dotted: Nyquist frequency.",
-                focus_plots.mtf_svg(run),
+                mtf_svg(run),
             ),
-            SvgFigure("edges", "Recorded edges", "First frame in the middle of the field.", focus_plots.edges_svg(run)),
+            SvgFigure("edges", "Recorded edges", "First frame in the middle of the field.", edges_svg(run)),
         ),
     )

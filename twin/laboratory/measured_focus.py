@@ -26,7 +26,7 @@ from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.units import LENGTH
 from twin.framework.procedure import Advance, silent
-from twin.laboratory.focus_scan import SiteScan
+from twin.laboratory.focus_bench import SiteScan
 from twin.laboratory.measured_readings import DataFile
 from twin.targets.target_images import ALONG, DIRECTIONS
 

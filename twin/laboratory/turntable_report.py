@@ -4,7 +4,7 @@ truth.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,28 +15,14 @@ from analysis.arrays import ARCSEC
 from analysis.turntable.dividing_error import covered, gaps
 from scenes.specs.turntable import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
-from twin.framework.artefact import Artefact, SvgFigure, Table, fixed
+from twin.framework import svg
+from twin.framework.artefact import Artefact, OwnDecimals, SvgFigure, Table
+from twin.framework.quantity import Record
 from twin.framework.report import Report, Section, answer
-from twin.framework.svg import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    LIGHT,
-    ORANGE,
-    PURPLE,
-    VERMILION,
-    look,
-    new_figure,
-    plain_axes,
-    to_svg,
-)
-from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_numbers import DOUBTFUL, REJECTED, TURNTABLE
-from twin.laboratory.turntable_run import TurntableRun
+from twin.laboratory import turntable_run
+from twin.laboratory.turntable_run import DOUBTFUL, TURNTABLE, TurntableModel, TurntableRun
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FIT_NAMES = {
@@ -48,11 +34,11 @@ FIT_NAMES = {
 }
 """Names of the fits for readers."""
 COLOURS = {
-    "piecewise_linear": ORANGE,
-    "polynomial": PURPLE,
-    "cubic_spline": BLUE,
-    "fourier": GREEN,
-    "network": VERMILION,
+    "piecewise_linear": svg.ORANGE,
+    "polynomial": svg.PURPLE,
+    "cubic_spline": svg.BLUE,
+    "fourier": svg.GREEN,
+    "network": svg.VERMILION,
 }
 _CURVE_POINTS = 801
 
@@ -65,21 +51,24 @@ def comparison_figure(run: TurntableRun) -> Figure:
     spread = np.linspace(-0.12, 0.12, series.repeats) * np.degrees(series.step)
     places = angle[:, None] + spread
     keep = series.keep
-    figure = new_figure(5.2)
+    figure = svg.new_figure(5.2)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
-    top.plot(places[keep], off[keep], ".", color=BLUE, ms=3.5, label=f"kept, {np.sum(keep)}")
+    top.plot(places[keep], off[keep], ".", color=svg.BLUE, ms=3.5, label=f"kept, {np.sum(keep)}")
     gone = series.gone
-    top.plot(places[gone], off[gone], "x", color=VERMILION, ms=5.5, label=f"rejected, {series.rejected}")
+    top.plot(places[gone], off[gone], "x", color=svg.VERMILION, ms=5.5, label=f"rejected, {series.rejected}")
     top.set(title="Comparisons, minus the mean of those kept at their angle", ylabel="arcsec")
     top.margins(y=0.18)
     top.legend(loc="upper right", ncols=2)
-    bottom.plot(angle, series.rms_before / ARCSEC, "o-", color=GREY, ms=3.5, lw=0.9, label="all repeats")
-    bottom.plot(angle, series.rms_after / ARCSEC, "o-", color=BLUE, ms=3.5, lw=0.9, label="after Chauvenet's criterion")
-    bottom.axhline(series.averaging_alone / ARCSEC, color=INK, lw=0.8, ls="--", label="averaging alone, largest")
+    bottom.plot(angle, series.rms_before / ARCSEC, "o-", color=svg.GREY, ms=3.5, lw=0.9, label="all repeats")
+    bottom.plot(
+        angle, series.rms_after / ARCSEC, "o-", color=svg.BLUE, ms=3.5, lw=0.9, label="after Chauvenet's criterion"
+    )
+    bottom.axhline(series.averaging_alone / ARCSEC, color=svg.INK, lw=0.8, ls="--", label="averaging alone, largest")
     bottom.set(title="RMS of single comparisons", ylabel="arcsec", xlabel="reading of the table [deg]")
     bottom.set_ylim(0.0, 1.35 * float(np.max(series.rms_before)) / ARCSEC)
     bottom.legend(loc="upper right", ncols=3)
-    _finish(top, bottom)
+    for axes in (top, bottom):
+        svg.gridded(axes)
     return figure
 
 
@@ -88,13 +77,13 @@ def curve_figure(run: TurntableRun) -> Figure:
     series, held = run.series, run.held_out
     chosen = run.choice.chosen
     at = np.linspace(*run.compensation.region, _CURVE_POINTS)
-    figure = new_figure(3.6)
+    figure = svg.new_figure(3.6)
     axes = figure.subplots()
     if run.model is not None:
-        axes.plot(np.degrees(at), _slow_truth(run.model, at) / ARCSEC, color=INK, lw=2.4, alpha=0.35, label="truth")
+        axes.plot(np.degrees(at), _slow_truth(run.model, at) / ARCSEC, color=svg.INK, lw=2.4, alpha=0.35, label="truth")
     fitted = np.where(covered(series.angle, at), run.fits[chosen](at) / ARCSEC, np.nan)
     axes.plot(np.degrees(at), fitted, color=COLOURS[chosen], lw=1.1, label=f"chosen fit: {FIT_NAMES[chosen]}")
-    for points, mark, colour, label in ((series, "o", INK, "calibrated"), (held, "s", VERMILION, "held out")):
+    for points, mark, colour, label in ((series, "o", svg.INK, "calibrated"), (held, "s", svg.VERMILION, "held out")):
         if points is None:
             continue
         axes.errorbar(
@@ -112,7 +101,7 @@ def curve_figure(run: TurntableRun) -> Figure:
     axes.set(title="Dividing error, reading − true angle", ylabel="arcsec", xlabel="reading of the table [deg]")
     axes.margins(x=0.01, y=0.12)
     axes.legend(loc="best", ncols=2)
-    _finish(axes)
+    svg.gridded(axes)
     return figure
 
 
@@ -123,12 +112,12 @@ def residual_figure(run: TurntableRun) -> Figure:
     assert held is not None
     truth = None if run.model is None else _slow_truth(run.model, at)
     most = 1.15 * max(float(np.max(np.abs(run.held_out_residual(name)))) for name in run.ranking) / ARCSEC
-    figure = new_figure(1.35 * len(run.ranking) + 0.5)
+    figure = svg.new_figure(1.35 * len(run.ranking) + 0.5)
     panels = np.atleast_1d(figure.subplots(len(run.ranking), 1, sharex=True, sharey=True))
     for name, axes in zip(run.ranking, panels, strict=True):
         fit = run.fits[name]
         residual = run.held_out_residual(name)
-        axes.axhline(0.0, color=GREY, lw=0.7)
+        axes.axhline(0.0, color=svg.GREY, lw=0.7)
         if truth is not None:
             axes.plot(np.degrees(at), (truth - fit(at)) / ARCSEC, color=COLOURS[name], lw=1.3)
         axes.errorbar(
@@ -136,7 +125,7 @@ def residual_figure(run: TurntableRun) -> Figure:
             residual / ARCSEC,
             held.sigma / ARCSEC,
             fmt="s",
-            color=INK,
+            color=svg.INK,
             mfc="white",
             ms=3,
             lw=0.7,
@@ -147,27 +136,15 @@ def residual_figure(run: TurntableRun) -> Figure:
         axes.set_ylim(-most, most)
     panels[-1].set_xlabel("reading of the table [deg]")
     panels[-1].margins(x=0.01)
-    _finish(*panels)
+    for axes in panels:
+        svg.gridded(axes)
     return figure
-
-
-def figure_svg(name: str, run: TurntableRun) -> str:
-    """One figure as SVG; name: ``comparisons``, ``curve`` or ``residuals``."""
-    draw = {"comparisons": comparison_figure, "curve": curve_figure, "residuals": residual_figure}[name]
-    with look(f"turntable-{name}"):
-        return to_svg(draw(run))
 
 
 def _slow_truth(model: TurntableModel, at: np.ndarray) -> np.ndarray:
     """True dividing error without the subdivision error, whose period is far below what a figure can show."""
     error = model.error
     return error(at) - error.parts["subdivision"](at)
-
-
-def _finish(*panels: Axes) -> None:
-    for axes in panels:
-        axes.grid(color=LIGHT, lw=0.5)
-        plain_axes(axes)
 
 
 def _readings(run: TurntableRun) -> str:
@@ -185,12 +162,9 @@ def _readings(run: TurntableRun) -> str:
 def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     series = run.series
     text = [
-        f"The dividing error is the table's reading minus its true angle. It is compared with a polygon and an "
-        f"autocollimator from {_readings(run)}.",
         f"Chauvenet's criterion rejects {series.rejected} of {np.sum(series.taken)} comparisons. It would reject "
         f"{result['rejected_expected_of_good']:.0f} on average if all were good: it trims normal noise, and the RMS "
-        f"that remains is that of trimmed readings. All angles together, corrected for this, one comparison has "
-        f"σ = {result['repeatability_arcsec']:.4f} arcsec.",
+        "that remains is that of trimmed readings, for which the σ of one comparison is corrected."
     ]
     if result["suspect_angles"]:
         text.append(
@@ -198,28 +172,13 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
             "gross errors that hide each other. Those angles are given the sigma of their own repeats; "
             "measure them again."
         )
-    names = {
-        "repeat_rms_arcsec": "repeats, as read",
-        "chauvenet_rms_arcsec": "repeats, after Chauvenet's criterion",
-        "averaging_alone_rms_arcsec": "mean of all repeats, nothing rejected",
-        "mean_rms_arcsec": "mean of the kept repeats",
-    }
-    rows = [(said, result[key]) for key, said in names.items()]
-    table = Table(
-        "turntable-repeats",
-        "Repeats: the largest RMS of any angle",
-        "An RMS of the kept repeats is one of single readings, not of their mean.",
-        ("RMS of", "arcsec"),
-        rows,
-        (None, 3),
-    )
     figure = SvgFigure(
         "turntable-comparisons",
         "Comparisons with the reference",
         "Above, all repeats; below, their RMS at each angle, and what the mean of all repeats would have at worst.",
-        figure_svg("comparisons", run),
+        svg.drawn("turntable-comparisons", comparison_figure, run),
     )
-    return Section("Regional comparison of the turntable", tuple(text), (figure, table))
+    return Section("Regional comparison of the turntable", tuple(text), (figure,))
 
 
 def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
@@ -238,10 +197,7 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     text = [
         f"Fits of the means, {judged}. Cross-validation on the calibration points alone chooses the "
         f"{FIT_NAMES[chosen]}{misses}."
-        + ("" if held is None or best == chosen else f" There the {FIT_NAMES[best]} is the best."),
-        "A compensated angle keeps an error, the same whenever its reading comes back: the noise of the calibration "
-        "that the fit passes on, and three misfits beyond it. The repeatability of a reading in use comes "
-        "on top and averages out.",
+        + ("" if held is None or best == chosen else f" There the {FIT_NAMES[best]} is the best.")
     ]
     if model is not None:
         subdivision = model.spec.dividing_error.subdivision
@@ -260,44 +216,49 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
             "turntable-curve",
             "Dividing error",
             f"Means with their sigmas (the scatter of the repeats and the reference), {drawn}.",
-            figure_svg("curve", run),
+            svg.drawn("turntable-curve", curve_figure, run),
         )
     ]
     if held is not None:
         note = "Squares: held-out readings minus the fit, with the sigma of the measurement."
         note += "" if model is None else " Lines: true curve without subdivision error minus the fit."
-        artefacts.append(SvgFigure("turntable-residuals", "What the fits miss", note, figure_svg("residuals", run)))
-    artefacts += [_ranking(result), _left(run, result), _chi_square(run, result)]
+        artefacts.append(
+            SvgFigure(
+                "turntable-residuals",
+                "What the fits miss",
+                note,
+                svg.drawn("turntable-residuals", residual_figure, run),
+            )
+        )
+    artefacts += [_ranking(result), _left(run, result), _chi_square(result)]
     gone = result.get("rejected_readings")
     if gone:
-        note, lines = (
-            "Difference from the mean of those that stay.",
-            [{**one, "file": Path(one["file"]).name} for one in gone],
-        )
-        title = "Comparisons that Chauvenet's criterion takes out"
-        artefacts.append(REJECTED.table("turntable-rejected", title, note, lines))
+        artefacts.append(rejected_table(turntable_run.REJECTED, "turntable-rejected", "Comparisons", gone))
     return Section("Fits of the dividing error", tuple(text), tuple(artefacts), folded=1 if gone else 0)
+
+
+def rejected_table(record: Record[Any], name: str, what: str, rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return what Chauvenet's criterion takes out, by the lines of its files."""
+    note, shown = "Difference from the mean of those that stay.", [{**r, "file": Path(r["file"]).name} for r in rows]
+    return record.table(name, f"{what} that Chauvenet's criterion takes out", note, shown)
 
 
 def _ranking(result: Mapping[str, Any]) -> Table:
     """All fits, the best first; of a simulated table also against the truth."""
     fits, truth = result["fits"], result.get("truth")
-    keys = ("heldout_rms_arcsec", "train_rms_arcsec", "cross_validation_rms_arcsec", "effective_parameters")
-    heads: tuple[str, ...] = ("rank", "fit", "held out", "training points", "cross-validation", "effective parameters")
-    rows = [
-        (rank, FIT_NAMES[name], *(fits[name][key] for key in keys)) for rank, name in enumerate(result["ranking"], 1)
-    ]
-    note = "RMS, arcsec."
-    digits: tuple[int | None, ...] = (None, None, 4, 4, 4, 1)
+    keys = ["heldout_rms_arcsec", "train_rms_arcsec", "cross_validation_rms_arcsec", "effective_parameters"]
+    note = "RMS, the best fit first."
     if truth is not None:
         note += (
             " The last two columns use the true curve, which no test in a laboratory has: over the whole region and "
             "all phases of the signal, and the same without a constant, which differences of angles do not see."
         )
-        heads, digits = (*heads, "truth", "truth, no constant"), (*digits, 4, 4)
-        own = [truth["fits"][name] for name in result["ranking"]]
-        rows = [(*row, one["true_rms_arcsec"], one["true_spread_arcsec"]) for row, one in zip(rows, own, strict=True)]
-    return Table("turntable-fits", "The fits", note, heads, rows, digits)
+        fits = {name: {**fit, **truth["fits"][name]} for name, fit in fits.items()}
+        keys += [one.key for one in turntable_run.TRUE_FIT]
+    rows = {FIT_NAMES[name]: fits[name] for name in result["ranking"]}
+    return Record("A fit.", *turntable_run.FIT, *turntable_run.TRUE_FIT).table(
+        "turntable-fits", "The fits", note, rows, keys, "fit"
+    )
 
 
 def _noise(run: TurntableRun) -> float:
@@ -306,38 +267,20 @@ def _noise(run: TurntableRun) -> float:
 
 
 def _left(run: TurntableRun, result: Mapping[str, Any]) -> Table:
-    parts = result["compensation"]
-    return Table(
-        "turntable-sigma",
-        "What is left of a compensated angle, σ",
-        "Noise: of the calibration, mean over its readings. Common: a constant, which no difference sees. "
-        "Smooth: along the curve over one step. White: new from reading to reading, as the subdivision error is.",
-        ("part", "arcsec"),
-        (
-            ("noise of the calibration", _noise(run)),
-            ("common", parts["common_arcsec"]),
-            ("smooth", parts["smooth_arcsec"]),
-            ("white", parts["white_arcsec"]),
-            ("repeatability of one comparison, not in it", result["repeatability_arcsec"]),
-        ),
-        (None, 4),
-    )
+    noise = "noise of the calibration, mean over its readings [arcsec]", OwnDecimals(_noise(run), 4)
+    lines = [noise, *turntable_run.COMPENSATION.lines(result["compensation"])]
+    title = "What is left of a compensated angle"
+    return Table("turntable-sigma", title, "Without the repeatability of one comparison.", ("part", "σ"), lines)
 
 
-def _chi_square(run: TurntableRun, result: Mapping[str, Any]) -> Table:
-    calibrated = f"chosen fit at {len(run.series.angle)} calibrated readings, sigmas of the means"
-    rows = [(calibrated, result["fit_chi_square"], result["fit_degrees_of_freedom"])]
-    if run.held_out is not None:
-        held = f"at {len(run.held_out.angle)} held-out readings, all that the compensation states"
-        rows.append((held, result["heldout_chi_square"], result["heldout_degrees_of_freedom"]))
-    return Table(
-        "turntable-chi-square",
-        "Chi-square",
-        "Far above the degrees of freedom, the fit misses more than noise; the misfits stand for it.",
-        ("of", "chi-square", "degrees of freedom"),
-        rows,
-        (None, 1, 1),
+def _chi_square(result: Mapping[str, Any]) -> Table:
+    keys = ["fit_chi_square", "fit_degrees_of_freedom", "heldout_chi_square", "heldout_degrees_of_freedom"]
+    lines = TURNTABLE.lines(result, keys if result["heldout_degrees_of_freedom"] else keys[:2])
+    note = (
+        "Of the means against their sigmas, and of held-out readings against all that the compensation states. Far "
+        "above the degrees of freedom, the fit misses more than noise; the misfits stand for it."
     )
+    return Table("turntable-chi-square", "Chi-square of the chosen fit", note, ("", ""), lines)
 
 
 def turntable_report(run: TurntableRun) -> Report:
@@ -362,19 +305,16 @@ def turntable_report(run: TurntableRun) -> Report:
         f"{data['rejected_expected_of_good']:.0f} are expected without gross errors: see what is left of a compensated "
         "angle",
     )
-    rows = [
-        ("repeats, largest RMS of an angle", fixed(data["repeat_rms_arcsec"], 3)),
-        ("the same after Chauvenet's criterion", fixed(data["chauvenet_rms_arcsec"], 3)),
-        ("what averaging alone gives", fixed(data["averaging_alone_rms_arcsec"], 3)),
-        ("one comparison, σ of all angles together", fixed(data["repeatability_arcsec"], 3)),
-        ("compensated angle, σ, mean over the readings", fixed(sigma, 3)),
-    ]
-    key = "cross_validation_rms_arcsec" if run.held_out is None else "heldout_rms_arcsec"
+    judge = "cross_validation_rms_arcsec" if run.held_out is None else "heldout_rms_arcsec"
     by = "by cross-validation" if run.held_out is None else "on held-out angles"
-    rows += [
-        (f"{FIT_NAMES[name]} {by}{', chosen' if name == chosen else ''}", fixed(data["fits"][name][key], 3))
-        for name in data["ranking"]
+    keys = ("repeat_rms_arcsec", "chauvenet_rms_arcsec", "averaging_alone_rms_arcsec", "mean_rms_arcsec")
+    rows = [
+        *TURNTABLE.lines(data, (*keys, "repeatability_arcsec")),
+        ("compensated angle, σ, mean over the readings [arcsec]", OwnDecimals(sigma, 3)),
     ]
+    for name in data["ranking"]:
+        head = f"{FIT_NAMES[name]} {by}{', chosen' if name == chosen else ''} [arcsec]"
+        rows.append((head, OwnDecimals(data["fits"][name][judge], 3)))
     certified = spec.measured.reference if isinstance(spec, MeasuredTurntableSpec) else spec.reference.calibration
     return Report(
         "Dividing error of the turntable",
@@ -386,7 +326,7 @@ def turntable_report(run: TurntableRun) -> Report:
             *(("File", f"{one['file']}, {one['rows']} rows") for one in data.get("files", ())),
             ("Description", spec.description),
         ),
-        Table("dividing-error", "Result", f"Fits in the order of their RMS {by}.", ("RMS", "arcsec"), rows),
+        Table("dividing-error", "Result", f"Fits in the order of their RMS {by}.", ("", "RMS"), rows),
         (_comparison(run, data), _fits(run, data)),
         warnings=_warnings(run, data),
     )

@@ -3,18 +3,30 @@ reference, five fits are made of the comparisons and judged on angles that no fi
 
 The analysis gets the comparisons and the certificate of the reference, of a simulated bench or from files of
 measurements. The true dividing error of a simulated table is only compared with.
+
+A turntable with a dividing error, and its comparison with a reference, simulated.
+
+Dividing error = reading - true angle: the table that reads R stands at phi = R - e(R). e is a sum of harmonics of the
+turn; the subdivision error is a few harmonics of the grating's signal. All coefficients are drawn from the seed, so
+that the turntable test and the distortion test of one seed use the same table.
+
+Radians.
+
+Numbers of a turntable test, as turntable.json has them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
+from analysis.statistics import chance_beyond
 from analysis.turntable.dividing_error import (
     FITS,
     AngleFit,
@@ -24,14 +36,162 @@ from analysis.turntable.dividing_error import (
     angles_left,
     choose,
     compensate,
+    expected_rejections,
     fewest,
 )
 from optics.numerics.backend import Backend, one_blas_thread
+from optics.numerics.number_tree import FrozenMap
 from scenes.specs.resolved import ExperimentSetup
-from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
+from scenes.specs.turntable import DividingErrorSpec, MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from twin.framework.procedure import Advance, silent
-from twin.laboratory.measured_readings import Comparisons, read_turntable
-from twin.laboratory.turntable_bench import TurntableModel
+from twin.framework.quantity import Quantity, Record
+from twin.framework.random_streams import stream
+from twin.laboratory.measured_readings import Comparisons, DataFile, read_turntable
+
+_TABLE, _CALIBRATION, _HELD_OUT, _SPREAD = range(4)
+"""Numbers of the seed's random streams."""
+_FIXED_POINT_STEPS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Harmonics:
+    """sum_k cosine_k cos(k R) + sine_k sin(k R).
+
+    Attributes:
+        order: k, periods in a full turn, (K,).
+        cosine, sine: (K,), radians.
+    """
+
+    order: NDArray[np.int64]
+    cosine: Array
+    sine: Array
+
+    @classmethod
+    def draw(cls, order: ArrayLike, rms: Array, rng: np.random.Generator) -> Harmonics:
+        """Normal coefficients, such that each harmonic's mean square over the circle is expected to be rms^2, (K,)."""
+        k = np.asarray(order, np.int64)
+        cosine, sine = rng.standard_normal((2, len(k))) * rms
+        return cls(k, cosine, sine)
+
+    def __call__(self, reading: ArrayLike) -> Array:
+        """The sum at readings, in their shape."""
+        at = np.asarray(reading, np.float64)
+        phase = at.ravel()[:, None] * self.order
+        return (np.cos(phase) @ self.cosine + np.sin(phase) @ self.sine).reshape(at.shape)
+
+    @property
+    def rms(self) -> float:
+        """Over the full circle, radians."""
+        return float(np.sqrt(0.5 * np.sum(self.cosine**2 + self.sine**2)))
+
+
+@dataclass(frozen=True, eq=False)
+class DividingError:
+    """The true dividing error of one table, reading - true angle, as a function of the reading.
+
+    Attributes:
+        parts: axis, eccentricity, graduation, subdivision.
+    """
+
+    parts: Mapping[str, Harmonics]
+
+    @classmethod
+    def draw(cls, spec: DividingErrorSpec, seed: int) -> DividingError:
+        """A table; spec and seed determine it."""
+        rng = np.random.default_rng(stream(seed, _TABLE))
+        g, sub = spec.graduation, spec.subdivision
+        lines = np.arange(g.first, g.last + 1)
+        fall = lines ** -float(g.slope)
+        waves = sub.lines * np.array(sub.harmonics)
+        return cls(
+            FrozenMap(
+                {
+                    "axis": Harmonics.draw([1, 2], np.full(2, spec.axis / np.sqrt(2.0)), rng),
+                    "eccentricity": Harmonics.draw([1], np.full(1, spec.eccentricity), rng),
+                    "graduation": Harmonics.draw(lines, spec.graduation.rms * fall / np.linalg.norm(fall), rng),
+                    "subdivision": Harmonics.draw(waves, np.full(len(waves), sub.rms / np.sqrt(len(waves))), rng),
+                }
+            )
+        )
+
+    def __call__(self, reading: ArrayLike) -> Array:
+        """Exact dividing error at readings, in their shape, radians."""
+        return np.asarray(sum(part(reading) for part in self.parts.values()), np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class TurntableModel:
+    """A table and the reference it is compared with.
+
+    Attributes:
+        spec: of the test.
+        seed: of everything that is random.
+    """
+
+    spec: TurntableTestSpec
+    seed: int
+
+    @cached_property
+    def error(self) -> DividingError:
+        """True dividing error of this table; the analysis does not get it."""
+        return DividingError.draw(self.spec.dividing_error, self.seed)
+
+    def stand(self, reading: ArrayLike, rng: np.random.Generator | None = None) -> Array:
+        """True angles at which the table stands when it reads this, in the shape of the readings, radians.
+
+        Args:
+            reading: radians.
+            rng: of the repeatability; None for a table that repeats perfectly.
+        """
+        at = np.asarray(reading, np.float64)
+        return at - self.error(at) - self._scatter(at.shape, rng)
+
+    def read(self, true_angle: ArrayLike, rng: np.random.Generator | None = None) -> Array:
+        """Readings of a table that stands at these true angles; the inverse of `stand`.
+
+        R = phi + e(R) by fixed-point steps: |de/dR| is a few times 1e-2 (subdivision), so that eight of them leave less
+        than rounding.
+        """
+        phi = np.asarray(true_angle, np.float64)
+        scatter = self._scatter(phi.shape, rng)
+        reading = phi + scatter
+        for _ in range(_FIXED_POINT_STEPS):
+            reading = phi + scatter + self.error(reading)
+        return reading
+
+    def _scatter(self, shape: tuple[int, ...], rng: np.random.Generator | None) -> Array:
+        if rng is None:
+            return np.zeros(shape)
+        return rng.normal(0.0, self.spec.dividing_error.repeatability, shape)
+
+    def calibrate(self) -> CalibrationSeries:
+        """The regional comparison."""
+        plan = self.spec.calibration
+        return self._compare(self._steps(0.0, plan.count), plan.repeats, _CALIBRATION)
+
+    def held_out(self) -> CalibrationSeries:
+        """The separate series at angles in the middle of the steps, set off by the spread."""
+        plan = self.spec.calibration
+        rng = np.random.default_rng(stream(self.seed, _SPREAD))
+        off = rng.uniform(-plan.held_out.spread, plan.held_out.spread, plan.count - 1)
+        return self._compare(self._steps(0.5, plan.count - 1) + off, plan.held_out.repeats, _HELD_OUT)
+
+    def _steps(self, start: float, count: int) -> Array:
+        """So many readings a step apart, from this many steps after the first, radians."""
+        plan = self.spec.calibration
+        return np.asarray(plan.first + plan.step * (np.arange(count) + start), np.float64)
+
+    def _compare(self, angle: Array, repeats: int, number: int) -> CalibrationSeries:
+        rng = np.random.default_rng(stream(self.seed, number))
+        reference = self.spec.reference
+        shape = len(angle), repeats
+        known = rng.normal(0.0, reference.calibration, len(angle))
+        readings = np.broadcast_to(angle[:, None], shape)
+        seen = self.stand(readings, rng) + known[:, None] + rng.normal(0.0, reference.noise, shape)
+        gross = rng.random(shape) < reference.gross_probability
+        seen = seen + gross * rng.choice([-1.0, 1.0], shape) * reference.gross_error
+        return CalibrationSeries(angle, readings - seen, reference.calibration)
+
 
 TRUTH_READINGS = 4000
 """Readings at which fits are compared with the true curve."""
@@ -211,3 +371,142 @@ def run_turntable_test(
 ) -> TurntableRun:
     """``python -m twin.lab turntable``; nothing is traced, so that the backend is not used. Raises InputError."""
     return run_turntable(setup.test, seed, lambda part: advance(part, 0, 1))
+
+
+DOUBTFUL = 1e-3
+"""Chance below which a chi-square is told as a warning."""
+
+
+def likely(chi_square: float, degrees: int) -> bool | None:
+    """Return whether a chi-square as large has a chance of DOUBTFUL at least; None without degrees of freedom.
+
+    Args:
+        chi_square: of residuals against their sigmas.
+        degrees: of freedom.
+    """
+    return bool(chance_beyond(chi_square, degrees) >= DOUBTFUL) if degrees else None
+
+
+DATA_FILE: Record[DataFile] = Record(
+    "A file of measurements.",
+    Quantity("file", lambda f: f.file, "path as given"),
+    Quantity("rows", lambda f: f.rows, "rows below its heads"),
+    Quantity("sha256", lambda f: f.sha256, "SHA-256 of its contents"),
+    Quantity("copied", lambda f: f.copied, "rows that repeat another one to the last digit"),
+)
+REJECTED: Record[Comparisons] = Record(
+    "A comparison that Chauvenet's criterion takes out, and where it stands.",
+    Quantity("file", lambda c: [c.file.file] * c.series.rejected, "path of its table"),
+    Quantity("line", lambda c: c.lines[c.series.gone], "line in this file"),
+    Quantity("reading_deg", lambda c: c.series.angle[np.nonzero(c.series.gone)[0]], "reading", decimals=6),
+    Quantity("from_mean_arcsec", lambda c: c.series.from_mean[c.series.gone], "minus the mean", "from the mean", 3),
+)
+FIT: Record[tuple[TurntableRun, str]] = Record(
+    "One fit of the dividing error; the source is the run and the fit's name.",
+    Quantity("heldout_rms_arcsec", lambda s: s[0].held_out_rms(s[1]), "RMS residual", "held out", 4),
+    Quantity("train_rms_arcsec", lambda s: rms(s[0].residual(s[1])), "RMS residual", "training points", 4),
+    Quantity("cross_validation_rms_arcsec", lambda s: s[0].choice[s[1]].validation.rms, "RMS", "cross-validation", 4),
+    Quantity("effective_parameters", lambda s: s[0].fits[s[1]].effective_parameters, "trace of smoothing", decimals=1),
+    Quantity("settings", lambda s: s[0].fits[s[1]].settings, "what was selected: order, period, smoothing, trainings"),
+)
+COMPENSATION: Record[DividingCompensation] = Record(
+    "What a compensated angle is wrong by beside the calibration's noise: one sigma of each part.",
+    Quantity("common_arcsec", lambda c: c.common, "a constant, the same at all readings", decimals=4),
+    Quantity("smooth_arcsec", lambda c: c.smooth, "misfit along the curve, correlated over one step", decimals=4),
+    Quantity("white_arcsec", lambda c: c.white, "misfit of each reading by itself", decimals=4),
+)
+TRUE_FIT: Record[Any] = Record(
+    "A fit minus the true curve.",
+    Quantity("true_rms_arcsec", rms, "RMS difference", "truth", 4),
+    Quantity("true_spread_arcsec", np.std, "the same without a constant, which no angle sees", "truth, no constant", 4),
+)
+TRUTH: Record[TurntableRun] = Record(
+    "What no test in a laboratory has.",
+    Quantity("fits", lambda r: {n: r.true_residual(n) for n in r.fits}, "name -> fit minus truth", record=TRUE_FIT),
+    Quantity("dividing_error_spread_arcsec", lambda r: np.std(r.true_error), "RMS of the true curve about its mean"),
+    Quantity("part_rms_full_circle_arcsec", lambda r: _parts(r), "cause -> RMS of its error over the full circle"),
+)
+_Points: TypeAlias = tuple[TurntableRun, CalibrationSeries]
+POINTS: Record[_Points] = Record(
+    "One reading and its comparisons with the reference, reading minus reference.",
+    Quantity("reading_deg", lambda s: s[1].angle, "reading of the table"),
+    Quantity("mean_arcsec", lambda s: s[1].mean, "mean of the comparisons that are kept"),
+    Quantity("mean_arcsec_sigma", lambda s: s[1].sigma, "standard deviation of this mean"),
+    Quantity("rms_before_arcsec", lambda s: s[1].rms_before, "RMS scatter of all comparisons"),
+    Quantity("rms_after_arcsec", lambda s: s[1].rms_after, "RMS scatter of the comparisons that are kept"),
+    Quantity("comparisons_arcsec", lambda s: _each(s[1], s[1].comparisons), "all comparisons"),
+    Quantity("kept", lambda s: _each(s[1], s[1].keep), "whether Chauvenet's criterion keeps each comparison"),
+    Quantity("fitted_arcsec", lambda s: _fitted(*s), "fit -> dividing error by it"),
+)
+
+
+def _each(series: CalibrationSeries, values: Any) -> list[Any]:
+    """Values (N, repeats) of a series, reading by reading, without those of comparisons that were not made."""
+    return [row[taken] for row, taken in zip(values, series.taken, strict=True)]
+
+
+def _fitted(run: TurntableRun, series: CalibrationSeries) -> list[dict[str, float]]:
+    """Fit -> dividing error, at every reading of a series, radians."""
+    values = {name: fit(series.angle) for name, fit in run.fits.items()}
+    return [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
+
+
+def _parts(run: TurntableRun) -> dict[str, float]:
+    return {} if run.model is None else {name: part.rms for name, part in run.model.error.parts.items()}
+
+
+def rejected_rows(tables: tuple[Comparisons, ...]) -> list[dict[str, Any]]:
+    """Rows of `REJECTED` of all tables that were read."""
+    return [row for table in tables for row in REJECTED.rows(table)]
+
+
+TURNTABLE: Record[TurntableRun] = Record(
+    "turntable.json.",
+    Quantity("name", lambda r: r.spec.name, "name of the test"),
+    Quantity("seed", lambda r: r.seed, "seed of all that was drawn"),
+    Quantity(
+        "repeat_rms_arcsec",
+        lambda r: np.max(r.series.rms_before),
+        "largest RMS of the repeats at a reading",
+        decimals=3,
+    ),
+    Quantity(
+        "chauvenet_rms_arcsec", lambda r: np.max(r.series.rms_after), "the largest of those that are kept", decimals=3
+    ),
+    Quantity(
+        "averaging_alone_rms_arcsec", lambda r: r.series.averaging_alone, "largest RMS of a mean of all", decimals=3
+    ),
+    Quantity("mean_rms_arcsec", lambda r: r.series.mean_rms, "largest RMS of a mean of what is kept", decimals=3),
+    Quantity("repeatability_arcsec", lambda r: r.series.repeatability, "one comparison, σ of all together", decimals=3),
+    Quantity("rejected", lambda r: r.series.rejected, "comparisons that Chauvenet's criterion takes out"),
+    Quantity("rejected_expected_of_good", lambda r: expected_rejections(r.series.counts), "average if all were good"),
+    Quantity("suspect_angles", lambda r: np.sum(r.series.suspect), "readings that still scatter after the criterion"),
+    Quantity("heldout_arcsec_sigma", lambda r: r.held_out and rms(r.held_out.sigma), "RMS sigma of the held-out means"),
+    Quantity("fits", lambda r: {n: (r, n) for n in r.fits}, "name -> fit", record=FIT),
+    Quantity("failed", lambda r: r.choice.failed, "name of a fit -> why it failed"),
+    Quantity("chosen", lambda r: r.choice.chosen, "fit that cross-validation chooses"),
+    Quantity("ranking", lambda r: r.ranking, "fits by their RMS at held-out readings or cross-validation, best first"),
+    Quantity("compensation", lambda r: r.compensation, "of the chosen fit", record=COMPENSATION),
+    Quantity("points", lambda r: POINTS.rows((r, r.series)), "calibrated readings"),
+    Quantity("heldout_points", lambda r: POINTS.rows((r, r.held_out)) if r.held_out else [], "held-out readings"),
+    Quantity("fit_chi_square", lambda r: r.chi_square[0], "chi-square against the sigmas of the means", decimals=1),
+    Quantity("fit_degrees_of_freedom", lambda r: r.chi_square[1], "means minus effective parameters", decimals=1),
+    Quantity(
+        "heldout_chi_square",
+        lambda r: r.held_out_chi_square[0],
+        "of held-out readings against the compensation",
+        decimals=1,
+    ),
+    Quantity("heldout_degrees_of_freedom", lambda r: r.held_out_chi_square[1], "number of held-out readings"),
+    Quantity("heldout_agrees", lambda r: r.held_out and likely(*r.held_out_chi_square), "whether that is likely"),
+    Quantity(
+        "rejected_readings", lambda r: rejected_rows(r.tables) if r.tables else None, "in files", where_known=True
+    ),
+    Quantity(
+        "too_few_angles_for", lambda r: r.too_few if r.tables else None, "fits that were left out", where_known=True
+    ),
+    Quantity(
+        "files", lambda r: [t.file for t in r.tables] or None, "that were read", record=DATA_FILE, where_known=True
+    ),
+    Quantity("truth", lambda r: r.model and r, "of a simulated table", record=TRUTH, where_known=True),
+)

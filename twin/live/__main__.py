@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from twin.framework.cli import BackendName, InputErrorText, Quiet, check_backend, explained
+from twin.framework.cli import BackendName, InputErrorText, Quiet, check_backend, explained, program
 
 PORT = 8790
 TOKEN = "TWIN_LIVE_TOKEN"
@@ -23,7 +23,7 @@ EXTRA = (
     "`bash setup.sh --live`"
 )
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = program()
 
 
 @app.command()
@@ -105,9 +105,8 @@ def _serve(
         InputErrorText: the extra is missing, the address is taken, or the instrument cannot be built.
     """
     try:
-        from twin.live.server import LiveServer
-        from twin.serving.guard import BadToken, Guard, new_token
-        from twin.serving.server import addresses, listen
+        from twin.live.guard import BadToken, Guard, new_token
+        from twin.live.server import LiveServer, addresses, listen
     except ImportError as error:
         raise InputErrorText(f"{EXTRA} ({error.name})") from None
     from twin.live.computer import CannotStart, Computer

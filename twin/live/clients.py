@@ -107,16 +107,11 @@ class Client:
 
     def next_wish(self) -> _Wish:
         """What it wants next, which it then no longer wants. It has to want something."""
-        if self.factors is not None:
-            wish, self.factors = _Wish("factors", self.factors), None
-        elif self.state is not None:
-            wish, self.state = _Wish("state", self.state), None
-        elif self.reveal is not None:
-            wish, self.reveal = _Wish("reveal", self.reveal), None
-        elif self.saves:
-            wish = _Wish("save", self.saves.popleft())
-        else:
-            wish, self.view = _Wish("view", self.view), None
+        if self.saves and not (self.factors or self.state or self.reveal):
+            return _Wish("save", self.saves.popleft())
+        kind = next(kind for kind in ("factors", "state", "reveal", "view") if getattr(self, kind) is not None)
+        wish = _Wish(kind, getattr(self, kind))
+        setattr(self, kind, None)
         return wish
 
     def put_back(self, wish: _Wish) -> None:
@@ -378,19 +373,19 @@ class Desk:
 
     async def _serve(self, client: Client, wish: _Wish) -> None:
         asked = wish.asked
-        if isinstance(asked, messages.Factors):
-            await self._build(client, asked)
-        elif wish.kind == "state":
-            key = (asked.noise, asked.frames, asked.seed)
-            client.answer(await self._ask("state", (asked, client.before)), key)
-            client.kept(asked)
-            self.states += 1
-        elif wish.kind == "reveal":
-            client.letter(await self._ask("hidden", asked))
-        elif isinstance(asked, messages.Save):
-            if asked.what == "job":
+        match wish.kind:
+            case "factors":
+                await self._build(client, asked)
+            case "state":
+                key = (asked.noise, asked.frames, asked.seed)
+                client.answer(await self._ask("state", (asked, client.before)), key)
+                client.kept(asked)
+                self.states += 1
+            case "reveal":
+                client.letter(await self._ask("hidden", asked))
+            case "save" if asked.what == "job":
                 client.letter(await self._ask("job", asked.state))
-            else:
+            case "save":
                 client.letter(await self._ask("course", list(client.recorded or ())))
-        else:
-            client.picture(await self._ask("view", asked))
+            case _:
+                client.picture(await self._ask("view", asked))

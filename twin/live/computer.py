@@ -12,11 +12,11 @@ import json
 import multiprocessing
 import os
 import signal
-import tempfile
 import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal
@@ -25,11 +25,11 @@ from optics.numerics.backend import BackendUnavailable, cores, kernel_threads, o
 from optics.numerics.llvm import LibraryMissing
 from scenes.yaml.errors import InputError
 from twin.live.camera_pictures import CameraPictures
-from twin.live.live_bench import LOST, LiveBench
+from twin.live.live_bench import LOST, LiveBench, course_text, job_text
 from twin.live.messages import AskedState, AskedView, BlindState, Opened, packed
-from twin.live.recording import course_text, job_text
 from twin.live.source import read_source
-from twin.pictures.scene_file import write_scene
+from twin.pictures.light_paths import trace_light_paths
+from twin.pictures.scene_file import scene_bytes
 from twin.scripting.instrument_twin import InstrumentTwin
 
 KEPT = 3
@@ -73,14 +73,13 @@ class Answers:
                 "opened": self.source.name,
                 "about": " ".join((f"{self.source.about}.", *(f"{note}." for note in self.source.notes))),
                 "factors": [
-                    {**knob.plain(), "now": factors.get(knob.name, knob.value)} for knob in self.source.factors
+                    {**asdict(knob), "now": factors.get(knob.name, knob.value)} for knob in self.source.factors
                 ],
             }
-            with tempfile.TemporaryDirectory() as folder:
-                place = Path(folder) / "scene.glb"
-                write_scene(bench.twin.experiment, {}, place)
-                scene = place.read_bytes()
-            self._built[key] = bench, CameraPictures(bench.twin.experiment), Opened(greeting, scene)
+            experiment = bench.twin.experiment
+            light = trace_light_paths(experiment.instrument, experiment.backend, {})
+            scene = scene_bytes(experiment.instrument, {}, light)
+            self._built[key] = bench, CameraPictures(experiment), Opened(greeting, scene)
         self._built.move_to_end(key)
         while len(self._built) > KEPT:
             self._built.popitem(last=False)

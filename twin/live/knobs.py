@@ -7,14 +7,14 @@ the knob's unit, and what it does is what a job's file does that writes this num
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.job import JobSpec
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.study import DesignSpec, FactorSpec
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, unknown
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from twin.study.runs.base_job import Tree, with_values
 from twin.study.runs.plan import Plan, number_at
@@ -78,10 +78,6 @@ class Knob:
     reach: float
     limit: float
 
-    def plain(self) -> dict[str, Any]:
-        """Plain data for the page."""
-        return asdict(self)
-
 
 def axes_of(kind: str) -> tuple[str, ...]:
     """What knobs of a kind are called after it."""
@@ -111,7 +107,7 @@ def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
             given = _given(plain.get(node, {}), kind)
             unit = _unit(given.values(), what.unit)
             for axis in dict.fromkeys((*axes_of(kind), *given)):
-                value = _in_unit(given.get(axis), unit)
+                value = _number(given.get(axis), unit, 0.0)
                 size = 1.0 if what.unit == unit else unit_ratio(what.unit, unit)
                 reach = max(what.reach * size, 2.0 * abs(value))
                 name = knob_name(node, kind, axis)
@@ -142,15 +138,6 @@ def _unit(quantities: Iterable[Any], usual: str) -> str:
     return units.pop() if len(units) == 1 else usual
 
 
-def _in_unit(quantity: Any, unit: str) -> float:
-    part = None if quantity is None else split_quantity(quantity)
-    if part is None:
-        return 0.0
-    number, own = part
-    # dividing keeps decimal fractions where a product would not
-    return float(number) if own == unit else float(number) / unit_ratio(unit, own)
-
-
 def perturbation(
     values: Mapping[str, float], pivots: Mapping[str, str], knobs: Mapping[str, Knob], first: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
@@ -170,8 +157,7 @@ def perturbation(
     for name, value in values.items():
         knob = knobs.get(name)
         if knob is None:
-            known = names_text(knobs)
-            raise InputError(Issue("no such knob", found=repr(name), allowed=known, suggestion=nearest(name, knobs)))
+            raise InputError(unknown("no such knob", name, knobs).at())
         if not abs(value) <= knob.limit:
             raise InputError(
                 Issue(
@@ -239,10 +225,6 @@ class FactorKnob:
     whole: bool
     knobs: Mapping[str, float]
 
-    def plain(self) -> dict[str, Any]:
-        """Plain data for the page."""
-        return asdict(self)
-
     def scalar(self, value: float) -> Any:
         """A value as a study's file writes it."""
         number = int(value) if self.whole and value == int(value) else value
@@ -302,13 +284,14 @@ def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | No
 
 
 def _number(value: Any, unit: str, otherwise: float) -> float:
-    """A value of the base in the factor's unit."""
+    """A quantity in a unit."""
     if isinstance(value, int | float):
         return float(value)
     part = split_quantity(value)
     if part is None:
         return otherwise
     number, own = part
+    # dividing keeps decimal fractions where a product would not
     return float(number) if own == unit else float(number) / unit_ratio(unit, own)
 
 

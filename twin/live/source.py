@@ -15,7 +15,7 @@ from scenes.specs.load import CAMERAS, INSTRUMENTS, library_names
 from scenes.specs.monitor_frames import MeasurementSetup
 from scenes.specs.orbit.setup import MonitorSetup
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
-from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
+from scenes.yaml.errors import InputError, Issue, Problem, names_text, unknown
 from scenes.yaml.named import FileKind
 from scenes.yaml.spec import validate
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
@@ -76,10 +76,7 @@ class Source:
         known = {factor.name: factor for factor in self.factors}
         for name in values:
             if name not in known:
-                names = names_text(known)
-                raise InputError(
-                    Issue("no such factor", found=repr(name), allowed=names, suggestion=nearest(name, known))
-                )
+                raise InputError(unknown("no such factor", name, known).at())
         scalars = {**(self.scalars or {}), **{name: known[name].scalar(value) for name, value in values.items()}}
         made: ResolvedJob = validate(ResolvedJob, YamlFile("", base_with(self.study, scalars), {}))
         return made.with_render(made.frames, self.resolved.job.render.seed) if self.own_noise else made

@@ -77,7 +77,7 @@ def _motions(run: RenderRun) -> Table:
     places = list(dict.fromkeys(place for table in run.crosstalk.values() for place in table.coordinates))
     heads = ["camera", "motion", "body", "per", *(f"{place} [µm]" for place in places)]
     readers = ("true", *(estimator.title for estimator in run.estimators.values()))
-    heads += [f"{p.label} {reader}" for reader in readers for p in parameters.CAMERA_PARAMETERS]
+    heads += [f"{p.label} {reader}" for reader in readers for p in parameters.CAMERA_PARAMETERS.values()]
     rows: list[list[Cell]] = []
     for name, table in run.crosstalk.items():
         for k, motion in enumerate(table.motions):
@@ -128,7 +128,7 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
             rows.append(row)
     caption = Markup('All digits: the table of <a href="#motions">motions and spots</a>.')
     heads = ["Motion", "per", *(head for own in columns for head in ("true", *(label for label, _ in own)))]
-    spans = zip(parameters.CAMERA_PARAMETERS, columns, strict=True)
+    spans = zip(parameters.CAMERA_PARAMETERS.values(), columns, strict=True)
     over = [("", 2), *((p.label, 1 + len(own)) for p, own in spans)]
     title = f"Camera {name}"
     return Table(f"crosstalk-{camera}", title, caption, heads, rows, over=over, bands=bands, within=IN_PAGE)
@@ -169,7 +169,7 @@ def formula_section(run: RenderRun) -> Section:
         "for. A factor of 1 is a correct formula."
     )
     every = {name: table.factors for name, table in run.crosstalk.items()}
-    symbols = {p.key: p.symbol for p in parameters.CAMERA_PARAMETERS}
+    symbols = {p.key: p.symbol for p in parameters.CAMERA_PARAMETERS.values()}
     rows: list[list[Cell]] = []
     for same in zip(*every.values(), strict=True):
         row: list[Cell] = [f"{symbols[same[0].parameter]}, {same[0].formula}", same[0].motion]

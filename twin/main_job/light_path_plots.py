@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
@@ -44,33 +45,20 @@ def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
         svg.gridded(axes)
         colours = _colours(instrument)
         kinds = {_fill(solid) for solid in instrument.solids}
-        handles = [
-            Line2D([], [], color=svg.BLUE, lw=1.2, label="imaging beam: chief and marginal rays, field centre"),
-            *(
-                Line2D([], [], color=colours[name], lw=1.2, label=f"monitor beam, {name} channel (out and back)")
-                for name in dict.fromkeys(c.name for c in instrument.channels if c in _seen(instrument, c.camera))
-            ),
-            Line2D([], [], color=svg.INK, lw=3, label="mirrors, clear apertures"),
-            *([Line2D([], [], color=_FACE, lw=1.5, label="faces of lenses")] if _has_lenses(instrument) else []),
-            Line2D(
-                [],
-                [],
-                color=svg.GREEN,
-                lw=3,
-                label="focal plane; return faces" if instrument.channels else "focal plane",
-            ),
-            *([Patch(fc=_GLASS, ec=svg.INK, lw=0.8, label="glass prisms")] if _GLASS in kinds else []),
-            *(
-                [Patch(fc=_FRAME, ec=svg.INK, lw=0.8, label="mirrors and frames of the monitor")]
-                if _FRAME in kinds
-                else []
-            ),
-            *(
-                [Patch(fc=_BLOCK, ec=svg.INK, lw=0.8, label="central prism, common reference")]
-                if _BLOCK in kinds
-                else []
-            ),
+        shown = dict.fromkeys(c.name for c in instrument.channels if c in _seen(instrument, c.camera))
+        mirrors = [mirror for model in instrument.cameras.values() for mirror in model.spec.mirrors.values()]
+        lenses = any(mirror.light == "refracts" for mirror in mirrors)
+        lines = [
+            (svg.BLUE, 1.2, "imaging beam: chief and marginal rays, field centre"),
+            *((colours[name], 1.2, f"monitor beam, {name} channel (out and back)") for name in shown),
+            (svg.INK, 3.0, "mirrors, clear apertures"),
+            *([(_FACE, 1.5, "faces of lenses")] if lenses else []),
+            (svg.GREEN, 3.0, "focal plane; return faces" if instrument.channels else "focal plane"),
         ]
+        handles: list[Artist] = [Line2D([], [], color=colour, lw=lw, label=text) for colour, lw, text in lines]
+        fills = {_GLASS: "glass prisms", _FRAME: "mirrors and frames of the monitor"}
+        fills |= {_BLOCK: "central prism, common reference"}
+        handles += [Patch(fc=fill, ec=svg.INK, lw=0.8, label=text) for fill, text in fills.items() if fill in kinds]
         figure.legend(handles=handles, loc="outside upper center", ncols=3)
         return svg.to_svg(figure)
 
@@ -129,11 +117,6 @@ def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
     text = f"{camera}, look {look_deg:+.4g}°".replace("-", "\N{MINUS SIGN}")
     first = placed.pose(f"{BASE}/{camera}/{model.mirrors[0]}").apply(_section(model, model.mirrors[0]))
     _label(axes, text, np.array([origin.translation[0], first[:, 2].min()]), (-4, -22), "top", bold=True)
-
-
-def _has_lenses(instrument: Instrument) -> bool:
-    mirrors = (mirror for model in instrument.cameras.values() for mirror in model.spec.mirrors.values())
-    return any(mirror.light == "refracts" for mirror in mirrors)
 
 
 def _fill(solid: Solid) -> tuple[float, float, float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -25,13 +25,6 @@ from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
 from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.monitor.truth import Truth
 from twin.uncertainty.monitor_limits import short_text, unseen_texts
-
-CENTROID_NOTES = {
-    "ml": "maximum-likelihood fit of the calibrated spot shape",
-    "gaussian": "fit of a Gaussian",
-    "energy": "windowed energy centroid, as in the paper",
-}
-"""Method of finding spots -> its name for readers."""
 
 
 @shows("cameras", "frames", "centroid", "recovery")
@@ -233,17 +226,14 @@ class MonitorReading:
                 "before": {**_spot(r.before[0, i], r.sigma_before[0, i]), **_fit(fits[0], i)},
                 "after": {**_spot(r.after[0, i], r.sigma_after[0, i]), **_fit(fits[1], i)},
             }
-        out: dict[str, Any] = {"cameras": read.pop("cameras"), "spots": spots, **read}
-        out["disturbances"] = self._stated(self.consistency)
-        if self.from_statement:
-            out["from_statement"] = self.from_statement
-        if r.curvature:
-            out["retraced"] = {name: self._retraced(name) for name in r.curvature}
-        out["sigma_holds"] = self.sigma_holds
-        out["doubts"] = list(self.doubts)
-        out["centroid"] = self.centroid
-        out["frames"] = self.frames
-        return out
+        share, retraced = self.from_statement, {name: self._retraced(name) for name in r.curvature}
+        return {
+            **{"cameras": read.pop("cameras"), "spots": spots, **read, "disturbances": self._stated(self.consistency)},
+            **({"from_statement": share} if share else {}),
+            **({"retraced": retraced} if retraced else {}),
+            **{"sigma_holds": self.sigma_holds, "doubts": list(self.doubts)},
+            **{"centroid": self.centroid, "frames": self.frames},
+        }
 
     def _retraced(self, name: str) -> dict[str, Any]:
         """What the state that an estimator's readings stand for says of them."""
@@ -260,23 +250,12 @@ class MonitorReading:
     def _stated(self, found: Consistency | None) -> dict[str, Any]:
         """What the total sigmas rest on, and whether shifts agree with it; None without a prior or without noise."""
         name = None if self.disturbances is None else self.disturbances.name
-        if found is None:
-            return {"name": name, **dict.fromkeys(_STATED_KEYS), "suspects": []}
-        return {
-            "name": name,
-            "chi_square": _to_digits(found.chi_square),
-            "chi_square_sigma_noise": found.sigma_noise,
-            "degrees_of_freedom": found.degrees,
-            "limit": _to_digits(found.limit),
-            "false_alarm": found.false_alarm,
-            "chance": _to_digits(found.chance),
-            "chance_sigma_noise": found.chance_sigma_noise,
-            "agrees": found.agrees,
-            "suspects": [
-                {"body": one.body, "times_stated": _to_digits(one.times), "log_likelihood_gain": _to_digits(one.gain)}
-                for one in found.suspects
-            ],
-        }
+        numbers = {key: None if found is None else of(found) for key, of in _STATED.items()}
+        suspects = [
+            {"body": one.body, "times_stated": _to_digits(one.times), "log_likelihood_gain": _to_digits(one.gain)}
+            for one in (found.suspects if found is not None else ())
+        ]
+        return {"name": name, **numbers, "suspects": suspects}
 
 
 def contradicted(
@@ -351,16 +330,17 @@ SHARE, OFF = 3, 1
 """Decimals of shares, and of how far linear readings are off in sigmas: noise does not move them but by chance."""
 STATED = 6
 """Decimals of a reading's sigma to which files state the reading."""
-_STATED_KEYS = (
-    "chi_square",
-    "chi_square_sigma_noise",
-    "degrees_of_freedom",
-    "limit",
-    "false_alarm",
-    "chance",
-    "chance_sigma_noise",
-    "agrees",
-)
+_STATED: Mapping[str, Callable[[Consistency], Any]] = {
+    "chi_square": lambda found: _to_digits(found.chi_square),
+    "chi_square_sigma_noise": lambda found: found.sigma_noise,
+    "degrees_of_freedom": lambda found: found.degrees,
+    "limit": lambda found: _to_digits(found.limit),
+    "false_alarm": lambda found: found.false_alarm,
+    "chance": lambda found: _to_digits(found.chance),
+    "chance_sigma_noise": lambda found: found.chance_sigma_noise,
+    "agrees": lambda found: found.agrees,
+}
+"""Key of the agreement with the prior in files -> its number."""
 _STATED_SIGMA = 8
 """Significant digits of a sigma, and of a chi-square."""
 _SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")

@@ -1,4 +1,6 @@
-"""What the report says of image quality, targets and stray light, where a job asks for them."""
+"""What the report says of image quality, targets, stray light, and bodies that tables of nodes deform or warm, where a
+job asks for them.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from analysis.arrays import ARCSEC
 from twin.framework.artefact import (
     FAR,
     Artefact,
     Cell,
     Marked,
+    SvgFigure,
     Table,
     fixed,
     plain,
@@ -20,6 +24,7 @@ from twin.framework.artefact import (
     significant,
 )
 from twin.framework.report import Section
+from twin.main_job.render_files import BENT, WARMED
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.main_job.verdict import sharpness_lost
@@ -340,3 +345,103 @@ def finish_section(run: RenderRun) -> Section | None:
         tables.append(Table("finish_coatings", "Measured coatings", text, columns, coats, (), 4))
     about = "Finishes by tables that somebody measured; all others are built in."
     return Section("Measured finishes", (about,), tuple(tables), 1)
+
+
+NAMED = 1e-10
+"""Terms smaller than this, metres rms, are left out of the report's table."""
+
+
+def _flat(told: Mapping[str, Any], *keys: str) -> list[Cell]:
+    """Return the numbers of some keys, of vectors one for each axis."""
+    found = [told[key] for key in keys]
+    return [number for one in found for number in (one if isinstance(one, list) else [one])]
+
+
+def deformation_section(run: JobRun) -> Section | None:
+    """Numbers, terms and maps of all deformed bodies; None where there are none."""
+    if not run.deformed:
+        return None
+    from twin.main_job.target_plots import deformation_svg  # what draws takes long to import
+
+    motion = "nodes", "nodes_not_used", "spacing_mm", "rotate_arcsec", "shift_um", "growth_ppm"
+    heads = ["body", "nodes", "not used", "spacing [mm]", *(f"rotate {axis} [arcsec]" for axis in "xyz")]
+    heads += [*(f"shift {axis} [µm]" for axis in "xyz"), "growth [ppm]"]
+    sizes = "change_rms_nm", "change_pv_nm", "residual_rms_nm", "residual_pv_nm", "not_carried_rms_nm"
+    left = ["body", "change [nm rms]", "PV [nm]", "after Zernike [nm rms]", "PV [nm]", "after grid [nm rms]"]
+    found = {path: BENT(face) for path, face in run.deformed.items()}
+    terms = [
+        (path, term, size)
+        for path, told in found.items()
+        for term, size in told["figure_nm"].items()
+        if abs(size) >= 1e9 * NAMED
+    ]
+    parts = (
+        Table(
+            "deformation_motion",
+            "Rigid motion and growth",
+            "In the body's own nominal axes, about its origin. Nodes off the optical surface are not used.",
+            heads,
+            [[path, *_flat(told, *motion)] for path, told in found.items()],
+            digits=5,
+        ),
+        Table(
+            "deformation_figure",
+            "Change of sag, and what each step leaves",
+            "Over the clear aperture.",
+            [*left, "nodes left out [nm rms]"],
+            [[path, *_flat(told, *sizes, "between_nodes_rms_nm")] for path, told in found.items()],
+            digits=4,
+        ),
+        SvgFigure(
+            "deformation_maps",
+            "Maps of the change of sag",
+            "At the nodes: beyond the rigid motion, after the Zernike terms, and what the grid does not carry. White "
+            "is zero; every map has its own scale.",
+            deformation_svg(run.deformed),
+        ),
+        Table(
+            "deformation_terms",
+            "Zernike terms",
+            f"Noll's numbering, rms over the disk; those of {plain(1e9 * NAMED)} nm and more.",
+            ("body", "term", "amplitude [nm]"),
+            terms,
+            digits=5,
+        ),
+    )
+    return Section("Deformed mirrors and faces", (), parts, 1)
+
+
+def heat_section(run: JobRun) -> Section | None:
+    """Numbers of all bodies that tables of temperatures warm; None where there are none."""
+    if not run.heated:
+        return None
+    keys = ["nodes", "spacing_mm", "linear_change_k", "linear_gradient_k_per_m"]
+    keys += ["not_linear_rms_k", "not_linear_largest_k", "between_nodes_rms_k"]
+    heads = ["body", "nodes", "spacing [mm]", "change [K]", *(f"gradient {axis} [K/m]" for axis in "xyz")]
+    heads += ["not linear [K rms]", "largest [K]", "nodes left out [K rms]", "outside [%]", "farthest [mm]"]
+    rows: list[list[Cell]] = []
+    for path, told in ((path, WARMED(body)) for path, body in run.heated.items()):
+        share = told["outside_share"]
+        outside: list[Cell] = ["", ""] if share is None else [100.0 * share, told["farthest_mm"]]
+        rows.append([path, *_flat(told, *keys), *outside])
+    faces: list[list[Cell]] = [
+        [
+            *(face, change.motion.rotate[0] / ARCSEC, change.motion.rotate[1] / ARCSEC, 1e9 * change.motion.shift[2]),
+            *(1e9 * change.figure_rms, 1e9 * change.lost, 1e9 * change.unmeshed),
+        ]
+        for body in run.heated.values()
+        for face, change in body.faces.items()
+    ]
+    caption = (
+        "Changes from the instrument's temperature. Outside: share of the body's volume beyond the nodes; farthest "
+        "from any node. Nodes left out: how well every second one is foretold by the others."
+    )
+    title = "Temperatures, and what of them is linear"
+    tables = [Table("temperature_tables", title, caption, heads, rows, digits=4)]
+    if faces:
+        caption = "In the face's own nominal axes. Coarser elements: by how much these would differ."
+        heads = ["face", "rotate x [arcsec]", "rotate y [arcsec]", "shift z [nm]", "figure [nm rms]"]
+        heads += ["not carried [nm rms]", "coarser elements [nm rms]"]
+        title = "What is not linear does to optical faces"
+        tables.append(Table("temperature_faces", title, caption, heads, faces, digits=4))
+    return Section("Bodies warmed by tables", (), tuple(tables), 1)

@@ -18,16 +18,15 @@ from twin.framework.command import Result, print_warnings
 from twin.framework.procedure import Session
 from twin.framework.reference_frames import described
 from twin.framework.second_process import SecondProcess
-from twin.main_job.assumptions import assumed
-from twin.main_job.render_drawings import begin_drawing, load_drawing
-from twin.main_job.render_folder import write_run
+from twin.main_job.render_folder import begin_drawing, load_drawing, write_run
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import JobRun, RenderRun
+from twin.main_job.systematics import assumed
 from twin.main_job.verdict import judge, recovered_numbers
 from twin.monitor.image_quality import AT_FIELDS, PLACES, QUALITY
 from twin.targets.target_images import DIRECTIONS
 from twin.targets.target_images import PLACES as TARGET_PLACES
-from twin.targets.target_measurement import EdgeReading, TargetRun
+from twin.targets.target_measurement import TargetRun
 
 _DASH = "\N{EM DASH}"
 NUMBER = 7
@@ -118,15 +117,12 @@ def _mtf_table(targets: TargetRun) -> Table | None:
             if not pairs:
                 return None
             cells = [
-                f"{_value(before)} -> {_value(after)}\n[dim]{before.true_nyquist:.3f} -> {after.true_nyquist:.3f}[/]"
-                for before, after in pairs
+                f"{' -> '.join('none' if one.nyquist is None else f'{one.nyquist[0]:.3f}' for one in pair)}\n"
+                f"[dim]{' -> '.join(f'{one.true_nyquist:.3f}' for one in pair)}[/]"
+                for pair in pairs
             ]
             table.add_row(f"[bold]{escape(name)}[/] {escape(camera.band)}, {_ALONG[direction]}", *cells)
     return table
-
-
-def _value(edge: EdgeReading) -> str:
-    return "none" if edge.nyquist is None else f"{edge.nyquist[0]:.3f}"
 
 
 def _head(name: str) -> str:

@@ -1,50 +1,54 @@
-"""The run folder of a main job: its data, then what they look like."""
+"""The run folder of a main job: its data, then what they look like. What each drawing needs is imported when it is
+drawn, and by the process that draws it.
+"""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape
 
 import cv2
 from markupsafe import Markup
 
-from twin.framework.artefact import Piece
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend
+from scenes.models.instrument_model import Instrument
+from scenes.yaml.named import Named
+from twin.framework.artefact import Piece, Undrawn
 from twin.framework.page import report_page, write_artefacts
 from twin.framework.procedure import WRITE, Session
 from twin.framework.report import Report, Section, further_sections
 from twin.framework.run_folder import write_manifest
 from twin.framework.second_process import SecondProcess
 from twin.main_job.crosstalk_sections import crosstalk_section, formula_section, motion_section
-from twin.main_job.job_tables import config_text, faces_of, heated_of
-from twin.main_job.part_sections import finish_section, quality_section, stray_section, target_section
-from twin.main_job.render_drawings import (
-    APART,
-    FILES,
-    LIMITS,
-    LOADED,
-    SCENE,
-    begin_drawing,
-    drawings,
-    instrument_drawings,
-    limits_drawing,
-    load_drawing,
-    without_failed,
+from twin.main_job.part_sections import (
+    deformation_section,
+    finish_section,
+    heat_section,
+    quality_section,
+    stray_section,
+    target_section,
 )
-from twin.main_job.render_files import write_results
+from twin.main_job.render_files import config_text, write_results
 from twin.main_job.render_results import PROGRAM, JobRun, RenderRun
 from twin.main_job.result_sections import (
     IN_PAGE,
     course_sections,
+    done_table,
+    facts,
     figure,
     residual_section,
     result_tables,
+    setup_section,
     shown_time,
     spot_section,
 )
-from twin.main_job.setup_sections import done_table, facts, setup_section
 from twin.main_job.verdict import judge
+from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.scene_file import viewer_markup, viewer_programs, viewer_scripts
 
 
@@ -70,17 +74,17 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
     if isinstance(run, RenderRun):
         beside.start(limits_drawing(run.limits))
     write_results(run, folder)
-    tables = tuple(section for section in _tabled(run) if section is not None)
-    further = further_sections("render", run)
+    sections = [section for section in (deformation_section(run), heat_section(run)) if section is not None]
     drawn, missing = without_failed(beside.results())
-    limits: tuple[Section, ...] = ()
     if isinstance(run, RenderRun):
+        from twin.uncertainty.uncertainty_report import limits_section  # what draws takes long to import
+
         finishes = finish_section(run)
-        limits = (*(() if finishes is None else (finishes,)), _limits(run, drawn.get(LIMITS)))
+        sections += [*(() if finishes is None else (finishes,)), limits_section(run.limits, figure=drawn.get(LIMITS))]
+    sections += further_sections("render", run)
     for name, file in FILES.items():
         if name in drawn:
             folder.write_bytes(file, drawn[name])
-    sections = (*tables, *limits, *further)
     write_artefacts((a for section in sections for a in section.artefacts), folder)
     problems = [*missing, _pictures(run, session) if picture else ""]
     pictures = [place for name in _PICTURES if (place := folder.path / name).exists()]
@@ -91,22 +95,6 @@ def write_run(run: JobRun, session: Session, picture: bool = False, beside: Seco
     checks = [check.to_dict() for check in run.checks]
     write_manifest(folder, PROGRAM, session.started, seconds, **entries, again=again, checks=checks)
     return "; ".join(filter(None, problems))
-
-
-def _limits(run: RenderRun, figure: str | None) -> Section:
-    """The section on what limits the readings, with its figure."""
-    from twin.uncertainty.uncertainty_report import limits_section
-
-    return limits_section(run.limits, figure=figure)
-
-
-def _tabled(run: JobRun) -> tuple[Section | None, ...]:
-    """The sections on bodies that tables of nodes deform or warm, if there are any."""
-    if not faces_of(run) and not heated_of(run):
-        return ()
-    from twin.main_job.table_sections import deformation_section, heat_section
-
-    return deformation_section(run), heat_section(run)
 
 
 def _pictures(run: JobRun, session: Session) -> str:
@@ -148,7 +136,7 @@ def render_report(
         sections: beside the report's own.
         scene: contents of scene.glb, for the view that can be turned; None leaves it out.
         pictures: files in PICTURES that were rendered.
-        drawn: name -> <svg> element of every figure of ``twin.main_job.render_drawings``; None draws them.
+        drawn: name -> <svg> element of every figure of ``twin.main_job.render_folder``; None draws them.
     """
     experiment, backend = run.experiment, run.experiment.backend.name
     if drawn is None:
@@ -239,3 +227,131 @@ def _picture(place: Path) -> Markup:
     address = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
     figure = '<figure><img src="{0}" alt="{1}"><figcaption>{2}: <code>{1}</code></figcaption></figure>'
     return Markup(figure).format(address, place.name, _PICTURES[place.name])
+
+
+if TYPE_CHECKING:
+    from twin.uncertainty.monitor_limits import MonitorLimits
+
+LIMITS = "limits"
+"""The figure of what limits the readings."""
+SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
+"""What is no figure of the report: the bytes of summary.png, scene.glb, irradiance.nc."""
+APART = (SUMMARY, SCENE, IRRADIANCE)
+LOADED = (SCENE, IRRADIANCE)
+"""What needs libraries that nothing else of a run needs, trimesh and h5netcdf: drawn after `load_drawing`."""
+FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"}
+"""Where these are written."""
+
+
+def begin_drawing(beside: SecondProcess, instrument: Instrument, backend: Backend, state: State) -> None:
+    """Let the second process draw what is known before anything is measured, if it does not so already.
+
+    Args:
+        beside: the process.
+        instrument: of the run.
+        backend: where to trace its light.
+        state: that is shown.
+    """
+    if SCENE not in beside:
+        beside.start(instrument_drawings(instrument, backend, state), LOADED)
+
+
+def instrument_drawings(instrument: Instrument, backend: Backend, state: State) -> dict[str, Callable[[], Any]]:
+    """Name -> what draws it, the longest first, of an instrument and its light in a state: <svg> elements, and the
+    bytes of scene.glb.
+    """
+    paths = trace_light_paths(instrument, backend, state)
+    return _tried_each(
+        {
+            "footprints": _drawing("light_path_plots:footprints_svg", instrument, paths),
+            "side": _drawing("light_path_plots:side_view_svg", instrument, paths),
+            SCENE: _drawing("twin.pictures.scene_file:scene_bytes", instrument, state, paths),
+        }
+    )
+
+
+def drawings(run: JobRun) -> dict[str, Callable[[], Any]]:
+    """The same of what a run has found; what it works out on demand is taken as it is now."""
+    targets = run.targets
+    out = _of_monitor(run) if isinstance(run, RenderRun) else {}
+    if targets is not None:
+        for name, camera in targets.cameras.items():
+            out[f"targets {name}"] = _drawing("target_plots:images_svg", name, camera)
+            if targets.has_edges:
+                out[f"mtf {name}"] = _drawing("target_plots:curves_svg", name, camera)
+    if run.quality is not None and run.quality.obstruction:
+        out["pupils"] = _drawing("target_plots:pupils_svg", run.quality)
+    return _tried_each(out)
+
+
+def limits_drawing(limits: MonitorLimits | None) -> dict[str, Callable[[], Any]]:
+    """The same of what limits the readings, of which nothing is drawn where no prior is stated."""
+    if limits is None:
+        return {}
+    return _tried_each({LIMITS: _drawing("twin.uncertainty.uncertainty_report:limits_svg", limits)})
+
+
+def _tried_each(drawing: Mapping[str, Callable[[], Any]]) -> dict[str, Callable[[], Any]]:
+    return {name: partial(_tried, name, draw) for name, draw in drawing.items()}
+
+
+def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
+    """Drawings of what the monitor recorded and reads."""
+    out: dict[str, Callable[[], Any]] = {"motions": _drawing("spot_plots:motion_map_svg", run)}
+    out |= {f"spots {name}": _drawing("spot_plots:spots_svg", run, name) for name in run.experiment.instrument.cameras}
+    out[IRRADIANCE] = _drawing("render_files:irradiance_file", run)
+    if (series := run.series) is not None:
+        titles = {name: estimator.title for name, estimator in run.estimators.items()}
+        out["course"] = _drawing("series_plots:parameters_svg", series, titles)
+        out["temperatures"] = _drawing("series_plots:temperatures_svg", series)
+        if series.smoothed is not None:
+            out["smoothed"] = _drawing("series_plots:smoothed_svg", series)
+    out[SUMMARY] = _drawing("spot_plots:summary_png", run)
+    out["residuals"] = _drawing("spot_plots:residuals_svg", run)
+    return out
+
+
+def _drawing(function: str, *given: Any) -> Callable[[], Any]:
+    """A drawing by a function, ``module:name``: what draws takes a second to import, in the process that draws."""
+    return partial(Named(function if "." in function else f"{__package__}.{function}"), *given)
+
+
+def _tried(name: str, draw: Callable[[], Any]) -> Any:
+    """A drawing, or Undrawn: what cannot be drawn must not cost what was computed."""
+    try:
+        return draw()
+    except Exception as error:
+        return Undrawn("undrawn", name, "", f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
+def without_failed(drawn: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Drawings with a note in the place of a figure that could not be made; files that could not are left out. And what
+    is missing, a sentence each.
+    """
+    out, missing = dict(drawn), []
+    for name, made in drawn.items():
+        if isinstance(made, Undrawn):
+            apart = f"the file {FILES[name]} could not be drawn: {made.why}" if name in APART else ""
+            missing.append(apart or made.note)
+            del out[name]
+            if name not in APART:
+                out[name] = (
+                    f'<svg viewBox="0 0 1060 40" role="img"><text x="8" y="25">{escape(missing[-1])}</text></svg>'
+                )
+    return out, tuple(missing)
+
+
+def load_drawing() -> None:
+    """Import what all runs draw with, and let it find its fonts."""
+    import h5netcdf
+
+    from twin.framework.svg import look, new_figure, to_svg
+    from twin.main_job import light_path_plots, spot_plots
+    from twin.pictures import scene_file
+    from twin.uncertainty import uncertainty_report
+
+    _ = h5netcdf, light_path_plots, spot_plots, scene_file, uncertainty_report
+    with look("first"):
+        figure = new_figure(1.0)
+        figure.subplots().set_title("0 \N{MINUS SIGN}", fontweight="bold")
+        to_svg(figure)

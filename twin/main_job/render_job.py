@@ -27,7 +27,7 @@ from scenes.yaml.errors import InputError
 from twin.camera.first_order_data import obscuration, unstated_shadows
 from twin.framework.frame_store import mean_of
 from twin.framework.procedure import Advance, silent
-from twin.main_job.job_tables import deformation_warnings
+from twin.main_job.render_files import deformation_warnings
 from twin.main_job.render_results import JobRun, RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import ImageQuality, image_quality
@@ -36,7 +36,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import require_memory
 from twin.monitor.observation import LOST, Observing, light_of, read
 from twin.monitor.time_series import run_series, series_states, too_large
-from twin.path_tracing.stray_light import NominalPathLost, ghost_warnings, stray_light
+from twin.path_tracing.stray_light import NominalPathLost, StrayLight, ghost_warnings, stray_light
 from twin.sensors.area_detector import coarse_warnings
 from twin.targets.target_images import TargetLostError
 from twin.targets.target_measurement import TargetRun, check_targets, render_targets, target_pixels
@@ -130,14 +130,13 @@ def render_job(
         focus = experiment.nominal_focus
     except LOST as error:
         raise _no_spots(experiment, str(error)) from error
-    which = np.array([shown])
+    which, series = np.array([shown]), None
     with _lost_by_motions(resolved, *LOST):
         stage.begin(3)
         experiment.calibration  # noqa: B018 - before the long parts
         stage.begin(4)
         nominal = experiment.nominal_photons
         light = light_of(experiment, [state], which, single=False) if course is None else None
-    series = None
     if light is None:
         series = run_series(experiment, resolved, states, lambda done: advance(COURSE, done, len(states)))
         # a course is rendered in single precision; the run shows the frames that it measured
@@ -159,14 +158,13 @@ def render_job(
     except SpotError as error:
         raise _unmeasured(experiment, before, error, focus) from error
     assert found is not None
-    photons, after, recovery = light.photons, found.after, found.recovery
+    photons, after = light.photons[0], found.after[0]
     stage.begin(7)
-    tables = crosstalk(experiment, recovery.shift_covariance[0])
+    tables = crosstalk(experiment, found.recovery.shift_covariance[0])
     stage.end()
     targets, quality = _images(experiment, resolved, state, number, advance)
-    instrument = experiment.instrument
     deformed = experiment.deformed(resolved.job)
-    of_glass = {e.body for e in instrument.assembly.elements.values() if e.solid is not None}
+    of_glass = {e.body for e in experiment.instrument.assembly.elements.values() if e.solid is not None}
     return RenderRun(
         resolved=resolved,
         experiment=experiment,
@@ -175,23 +173,21 @@ def render_job(
         seed=number,
         truth=light.truth,
         photons_before=nominal,
-        photons_after=photons[0],
+        photons_after=photons,
         before=before,
-        after=after[0],
-        recovery=recovery,
+        after=after,
+        recovery=found.recovery,
         crosstalk=tables,
         warnings=(
             *blur_warnings(resolved, backend),
             *coarse_warnings(resolved),
             *_blurred(experiment, focus),
-            *_warnings(experiment, nominal, photons[0], before, after[0]),
+            *_warnings(experiment, nominal, photons, before, after),
             *moved_into_beams(experiment.instrument, backend, state),
             *deformation_warnings(deformed, [p for p in deformed if stray is not None and p in of_glass]),
             *(text for path, body in experiment.heated(resolved.job).items() for text in body.warnings(path)),
             *(series.warnings if series is not None else ()),
-            *(_in_the_way(stray) if stray is not None else ()),
-            *(stray.measured.warnings() if stray is not None and stray.measured is not None else ()),
-            *(ghost_warnings(experiment, stray.before) if stray is not None else ()),
+            *(_stray_warnings(experiment, stray) if stray is not None else ()),
             *_image_warnings(experiment, resolved, targets, quality),
         ),
         series=series,
@@ -277,12 +273,14 @@ def _images(
         InputError: the light of the targets is lost.
     """
     render = resolved.job.render
-    targets = _targets(experiment, resolved, state, seed, advance) if render.target_images else None
-    if not resolved.quality:
-        return targets, None
-    advance(QUALITY, 0, 1)
-    with _lost_by_motions(resolved, UnphysicalError):
-        quality = image_quality(experiment.instrument, experiment.backend, [{}, state], obstruction=render.obstructed)
+    instrument, backend, targets = experiment.instrument, experiment.backend, None
+    with _lost_by_motions(resolved, TargetLostError, UnphysicalError):
+        if render.target_images:
+            targets = render_targets(resolved, instrument, backend, state, seed, partial(advance, TARGETS))
+        if not resolved.quality:
+            return targets, None
+        advance(QUALITY, 0, 1)
+        quality = image_quality(instrument, backend, [{}, state], obstruction=render.obstructed)
     advance(QUALITY, 1, 1)
     return targets, quality
 
@@ -331,42 +329,26 @@ def _stray(
     sources = len(experiment.path.channels) * paths
     with _lost_by_motions(resolved, NominalPathLost):
         measured = measured_finishes(resolved)
-        finishes = None if measured is None else measured.finishes
 
-        def first(done: int, _: int) -> None:
-            advance(STRAY, done, 2 * sources)
+        def traced(state: State, first: int) -> StrayLight:
+            finishes = None if measured is None else measured.finishes
+            return stray_light(
+                experiment, state, paths, seed, lambda done, _: advance(STRAY, first + done, 2 * sources), finishes
+            )
 
-        before = stray_light(experiment, {}, paths, seed, first, finishes)
+        before = traced({}, 0)
         taken = find_obstructions(experiment.instrument, experiment.backend)
-        if not state:
-            return StrayPair(before, before, taken, measured)
-        say = partial(_second_half, advance, sources)
-        return StrayPair(before, stray_light(experiment, state, paths, seed, say, finishes), taken, measured)
+        return StrayPair(before, traced(state, sources) if state else before, taken, measured)
 
 
-def _targets(
-    experiment: MonitorExperiment, resolved: ResolvedJob, state: State, seed: int, advance: Advance
-) -> TargetRun:
-    """Test targets before and after the perturbation.
-
-    Raises:
-        InputError: their light is lost.
-    """
-    say = partial(advance, TARGETS)
-    with _lost_by_motions(resolved, TargetLostError):
-        return render_targets(resolved, experiment.instrument, experiment.backend, state, seed, say)
-
-
-def _in_the_way(stray: StrayPair) -> tuple[str, ...]:
-    return tuple(
-        f"{o.body} stands in the beam {o.beam} and takes {100.0 * o.share:.1f}% of it"
-        for o in stray.obstructions
-        if o.used == 0.0 and not (prism_of(o.body) == PRISM_180 and o.beam == f"{o.body.split('/')[1]}/imaging")
-    )
-
-
-def _second_half(advance: Advance, first: int, done: int, _: int) -> None:
-    advance(STRAY, first + done, 2 * first)
+def _stray_warnings(experiment: MonitorExperiment, stray: StrayPair) -> Iterator[str]:
+    for o in stray.obstructions:
+        own = prism_of(o.body) == PRISM_180 and o.beam == f"{o.body.split('/')[1]}/imaging"
+        if o.used == 0.0 and not own:
+            yield f"{o.body} stands in the beam {o.beam} and takes {100.0 * o.share:.1f}% of it"
+    if stray.measured is not None:
+        yield from stray.measured.warnings()
+    yield from ghost_warnings(experiment, stray.before)
 
 
 @contextmanager

@@ -16,6 +16,8 @@ from analysis.monitor.estimators import Estimator
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, Parameter
 from analysis.monitor.recovery import Recovery
 from optics.geometry.tree import State
+from optics.thermal.nodal_deformation import NodalDeformation
+from scenes.models.job_state import HeatedBody
 from scenes.models.obstruction import Obstruction
 from scenes.models.scenery import MeasuredFinishes
 from scenes.specs.resolved import ResolvedJob
@@ -106,6 +108,16 @@ class JobRun:
         return out
 
     @property
+    def deformed(self) -> Mapping[str, NodalDeformation]:
+        """Body -> what the table of displaced nodes is that deforms it."""
+        return self.experiment.deformed(self.resolved.job)
+
+    @property
+    def heated(self) -> Mapping[str, HeatedBody]:
+        """Body -> what the table of temperatures is that warms it."""
+        return self.experiment.heated(self.resolved.job)
+
+    @property
     def checks(self) -> tuple[SelfCheck, ...]:
         """What was checked on the way."""
         return ()
@@ -171,11 +183,6 @@ class RenderRun(JobRun):
     def gains(self) -> dict[str, np.ndarray]:
         """Gain of each estimator of the reading."""
         return self.reading.gains
-
-    @property
-    def consistency(self) -> Consistency | None:
-        """Agreement of the reading's shifts with the prior; None without a prior."""
-        return self.reading.consistency
 
     @property
     def sigma_holds(self) -> bool:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -92,33 +95,8 @@ def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
         series: the course.
         names: estimator -> its name for readers.
     """
-    with svg.look("course"):
-        time, label = _time_axis(series)
-        groups = _by_group(series)
-        cameras = [name for name in groups if name not in (ANGLE_GROUP, GROUND_GROUP)]
-        rows = len(parameters.CAMERA_PARAMETERS) + (ANGLE_GROUP in groups)
-        figure = svg.new_figure(0.7 + 1.5 * rows)
-        grid = figure.add_gridspec(rows, len(cameras))
-        for column, name in enumerate(cameras):
-            for row, same in enumerate(groups[name]):
-                axes = figure.add_subplot(grid[row, column])
-                _panel(axes, series, time, same, names)
-                if column == 0:
-                    axes.set_ylabel(same[0].parameter.label)
-                if row == 0:
-                    axes.set_title(f"Camera {name}", loc="left", fontweight="bold")
-                axes.tick_params(labelbottom=row == rows - 1)
-                if row == rows - 1:
-                    axes.set_xlabel(label)
-        for same in groups.get(ANGLE_GROUP, ()):
-            axes = figure.add_subplot(grid[-1, :])
-            _panel(axes, series, time, same, names)
-            axes.set_ylabel(same[0].parameter.label)
-            axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
-            axes.set_xlabel(label)
-        svg.shared_legend(figure, figure.axes[0])
-        figure.align_ylabels()
-        return svg.to_svg(figure)
+    time, _ = _time_axis(series)
+    return _changes_svg(series, "course", 1.5, lambda axes, same: _panel(axes, series, time, same, names))
 
 
 def smoothed_svg(series: TimeSeries) -> str:
@@ -130,58 +108,62 @@ def smoothed_svg(series: TimeSeries) -> str:
     """
     together = series.smoothed
     assert together is not None
-    with svg.look("smoothed"):
-        size, unit_name = time_unit(series.times)
-        label = f"time [{unit_name}]"
-        every = np.append(series.times, together.times)
-        order = np.argsort(every)
-        groups = _by_group(series)
-        cameras = [name for name in groups if name not in (ANGLE_GROUP, GROUND_GROUP)]
-        rows = len(parameters.CAMERA_PARAMETERS) + (ANGLE_GROUP in groups)
-        figure = svg.new_figure(0.7 + 1.3 * rows)
-        grid = figure.add_gridspec(rows, 2 * len(cameras))
+    size, _ = time_unit(series.times)
+    every = np.append(series.times, together.times)
+    order = np.argsort(every)
 
-        def panel(axes: Axes, name: str, one: Reading, row: int) -> None:
-            at, between = (
-                part.row(one.group, one.parameter.key, "smoothed") for part in (together.changes, together.between)
-            )
-            sigma = np.append(at.sigma, between.sigma)[order]
-            time = every[order] / size
-            _frame(axes, series, series.times / size)
-            axes.fill_between(time, -2.0 * sigma, 2.0 * sigma, color=svg.SKY, alpha=0.25, lw=0, label="2σ, smoothed")
-            axes.fill_between(time, -sigma, sigma, color=svg.SKY, alpha=0.45, lw=0, label="σ, smoothed")
-            axes.plot(series.times / size, at.value - one.true, "o", color=svg.INK, ms=3.0, label="smoothed − true")
-            axes.set_ylabel(name)
-            axes.tick_params(labelbottom=row == rows - 1)
-            if row == rows - 1:
-                axes.set_xlabel(label)
+    def panel(axes: Axes, same: list[Reading]) -> None:
+        one = same[0]
+        at, between = (
+            part.row(one.group, one.parameter.key, "smoothed") for part in (together.changes, together.between)
+        )
+        sigma = np.append(at.sigma, between.sigma)[order]
+        time = every[order] / size
+        _frame(axes, series, series.times / size)
+        axes.fill_between(time, -2.0 * sigma, 2.0 * sigma, color=svg.SKY, alpha=0.25, lw=0, label="2σ, smoothed")
+        axes.fill_between(time, -sigma, sigma, color=svg.SKY, alpha=0.45, lw=0, label="σ, smoothed")
+        axes.plot(series.times / size, at.value - one.true, "o", color=svg.INK, ms=3.0, label="smoothed − true")
 
-        for column, name in enumerate(cameras):
-            for row, same in enumerate(groups[name]):
-                axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
-                panel(axes, same[0].parameter.label if column == 0 else "", same[0], row)
-                if row == 0:
-                    axes.set_title(f"Camera {name}", loc="left", fontweight="bold")
-        half = len(cameras) if GROUND_GROUP in groups else 2 * len(cameras)
+    return _changes_svg(series, "smoothed", 1.3, panel, ground=True)
+
+
+def _changes_svg(
+    series: TimeSeries, name: str, height: float, panel: Callable[[Axes, list[Reading]], None], ground: bool = False
+) -> str:
+    """Draw a panel for each change: cameras side by side, below them the angle between two and, with ``ground``, the
+    height there.
+    """
+    with svg.look(name):
+        groups: dict[str, list[list[Reading]]] = {}
+        for same in series.readings.by_change():
+            groups.setdefault(same[0].group, []).append(same)
+        cameras = [group for group in groups if group not in (ANGLE_GROUP, GROUND_GROUP)]
+        rows, wide = len(parameters.CAMERA_PARAMETERS) + (ANGLE_GROUP in groups), 2 if ground else 1
+        figure = svg.new_figure(0.7 + height * rows)
+        grid = figure.add_gridspec(rows, wide * len(cameras))
+
+        def put(place: Any, same: list[Reading], title: str, label: str, last: bool = True) -> None:
+            axes = figure.add_subplot(place)
+            panel(axes, same)
+            axes.set_ylabel(label)
+            if title:
+                axes.set_title(title, loc="left", fontweight="bold")
+            axes.tick_params(labelbottom=last)
+            if last:
+                axes.set_xlabel(_time_axis(series)[1])
+
+        for column, camera in enumerate(cameras):
+            for row, same in enumerate(groups[camera]):
+                label, title = same[0].parameter.label if column == 0 else "", f"Camera {camera}" if row == 0 else ""
+                put(grid[row, wide * column : wide * (column + 1)], same, title, label, row == rows - 1)
+        half = len(cameras) if GROUND_GROUP in groups else wide * len(cameras)
         for same in groups.get(ANGLE_GROUP, ()):
-            axes = figure.add_subplot(grid[-1, :half])
-            panel(axes, same[0].parameter.label, same[0], rows - 1)
-            axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
-        for same in groups.get(GROUND_GROUP, ())[-1:]:
-            axes = figure.add_subplot(grid[-1, len(cameras) :])
-            panel(axes, f"[{same[0].parameter.unit}]", same[0], rows - 1)
-            axes.set_title("Height on the ground", loc="left", fontweight="bold")
+            put(grid[-1, :half], same, "Angle between the cameras", same[0].parameter.label)
+        for same in groups.get(GROUND_GROUP, ())[-1:] if ground else ():
+            put(grid[-1, len(cameras) :], same, "Height on the ground", f"[{same[0].parameter.unit}]")
         svg.shared_legend(figure, figure.axes[0])
         figure.align_ylabels()
         return svg.to_svg(figure)
-
-
-def _by_group(series: TimeSeries) -> dict[str, list[list[Reading]]]:
-    """Group -> its changes, each with the rows of all estimators."""
-    out: dict[str, list[list[Reading]]] = {}
-    for same in series.readings.by_change():
-        out.setdefault(same[0].group, []).append(same)
-    return out
 
 
 def _panel(axes: Axes, series: TimeSeries, time: np.ndarray, same: list[Reading], names: dict[str, str]) -> None:

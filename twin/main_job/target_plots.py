@@ -1,14 +1,33 @@
-"""Figures of targets, of their MTF and of the pupils with their shadows."""
+"""Figures of targets, of their MTF, of the pupils with their shadows, and of surfaces that tables of nodes deform."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import AsinhNorm, Normalize
+from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
+from scipy.spatial import cKDTree
 
 from optics.targets.target_shapes import TARGETS
-from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
+from optics.thermal.nodal_deformation import NodalDeformation
+from twin.framework.svg import (
+    BLUE,
+    GREY,
+    INK,
+    LIGHT,
+    ORANGE,
+    SKY,
+    VERMILION,
+    look,
+    new_figure,
+    plain_axes,
+    signed_map,
+    to_svg,
+)
 from twin.monitor.image_quality import PLACES, ImageQuality, PupilOutline
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading
@@ -175,3 +194,44 @@ def _draw(axes: Axes, states: list[PupilOutline]) -> None:
             nominal = Polygon(piece, fc=INK, alpha=0.75, lw=0)
             axes.add_patch(nominal if k == 0 else Polygon(piece, fill=False, ec=ORANGE, lw=1.1))
     axes.set(xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
+
+
+_PIXELS = 220
+"""Of a map of a deformed surface along its longer side."""
+
+
+def deformation_svg(faces: Mapping[str, NodalDeformation]) -> str:
+    """Maps of the change of sag at the nodes, a row for each body: change, after Zernike terms, after the grid."""
+    with look("deformation"):
+        figure = new_figure(3.3 * len(faces))
+        rows = figure.subplots(len(faces), 3, squeeze=False)
+        for axes, (path, face) in zip(rows, faces.items(), strict=True):
+            _deformation(figure, axes, path, face)
+        return to_svg(figure)
+
+
+def _deformation(figure: Figure, axes: Any, path: str, face: NodalDeformation) -> None:
+    """Each node colours its own cell of the aperture."""
+    inside = face.weight > 0.0
+    places = face.places[inside]
+    low, high = places.min(axis=0), places.max(axis=0)
+    step = float(np.max(high - low)) / _PIXELS
+    x, y = (np.arange(a, b + step, step) for a, b in zip(low, high, strict=True))
+    distance, nearest = cKDTree(places).query(np.stack(np.meshgrid(x, y), axis=-1))
+    ends = tuple(1e3 * float(v) for v in (low[0], high[0], low[1], high[1]))
+    for one, title, values in (
+        (axes[0], f"{path}: change of sag", face.change),
+        (axes[1], f"after Z{max(face.figure)}", face.residual),
+        (axes[2], "after the grid", face.lost),
+    ):
+        shown = np.where(distance <= 2.0 * face.spacing, 1e9 * values[inside][nearest], np.nan)
+        most = max(float(np.nanmax(np.abs(shown))), 1e-6)
+        picture = signed_map(one, shown, most, extent=ends, origin="lower", interpolation="nearest")
+        one.set_title(
+            f"{title}\n{1e9 * face.rms(values):.3g} nm rms, {1e9 * face.range(values):.3g} nm PV", fontsize=8.5
+        )
+        one.set_xlabel("x, mm")
+        one.tick_params(labelsize=7)
+        bar = figure.colorbar(picture, ax=one, shrink=0.8, pad=0.02)
+        bar.ax.tick_params(labelsize=7)
+    axes[0].set_ylabel("y, mm")

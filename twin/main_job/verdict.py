@@ -18,10 +18,19 @@ from scenes.models.job_state import beyond_statement
 from scenes.specs.course import moment
 from twin.framework.artefact import FAR, SAME, plain, residual_text, significant
 from twin.framework.report import answer
-from twin.main_job.assumptions import NOISE, combination, contradiction, doubted, limits, share_text
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_results import JobRun, RenderRun
-from twin.main_job.systematics import joined, perturbed_unseen, systematics
+from twin.main_job.systematics import (
+    NOISE,
+    combination,
+    contradiction,
+    doubted,
+    joined,
+    limits,
+    perturbed_unseen,
+    share_text,
+    systematics,
+)
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import TimeSeries
@@ -62,13 +71,13 @@ def judge(run: JobRun) -> Judgement:
     off = [r for r in found if r.far]
     if run.series is not None:
         first, *others = _series_verdict(run, run.series, found, off)
-    elif not any(_moves(motion) for motion in run.state.values()):
+    elif not any(map(_moves, run.state.values())):
         first, *others = _nothing(run, found, off)
     elif off:
         first, *others = _misled(run, found, off)
     else:
         first, *others = _recovered(run, found)
-    unseen = _unseen(run)
+    unseen = (*perturbed_unseen(run), *run.reading.unseen)
     given = (*run.warnings, *doubted(run), *contradiction(run), *unseen)
     warnings = (*given, *_unstated(run, found, unseen), *_misreadings(run))
     doubt = "σ does not hold for this measurement: see the warnings" if not run.sigma_holds else ""
@@ -80,20 +89,17 @@ def judge(run: JobRun) -> Judgement:
 
 def _changed(run: JobRun) -> tuple[str, str]:
     """What the perturbation of an instrument without a monitor does, to its geometry and to its images."""
-    moved = any(_moves(motion) for motion in run.state.values())
+    moved = any(map(_moves, run.state.values()))
     cameras = len(run.truth.cameras) > 1
     parts = [
         f"{one.symbol} {'of ' + group + ' ' if cameras and group in run.truth.cameras else ''}"
         f"{significant(value, 3, sign=True)} {one.unit}"
         for group, one, value in run.true_changes()
-        if group not in (GROUND_GROUP,) and abs(value) > 0.5 * 10.0**-one.decimals
+        if group != GROUND_GROUP and abs(value) > 0.5 * 10.0**-one.decimals
     ]
-    if not moved:
-        text = "Nothing is perturbed"
-    elif parts:
-        text = f"The perturbation changes the geometry by {', '.join(parts)}"
-    else:
-        text = "The perturbation does not change the geometry"
+    text = f"The perturbation changes the geometry by {', '.join(parts)}"
+    if not parts or not moved:
+        text = "The perturbation does not change the geometry" if moved else "Nothing is perturbed"
     if run.quality is None:
         return text, ""
     worst: list[str] = []
@@ -116,11 +122,6 @@ def _changed(run: JobRun) -> tuple[str, str]:
     return text, f"{', '.join(worst)}{told}"
 
 
-def _unseen(run: RenderRun) -> tuple[str, ...]:
-    """Warnings of motions that change a camera and that no spot tells."""
-    return (*perturbed_unseen(run), *run.reading.unseen)
-
-
 def recovered_numbers(run: RenderRun) -> dict[str, Any]:
     """Contents of recovered.json: what was read, the verdict and the warnings."""
     told = judge(run)
@@ -134,10 +135,8 @@ def _moves(motion: Motion) -> bool:
 
 def _hidden(run: RenderRun, found: tuple[Reading, ...]) -> str:
     """The least changes that can be told from none, of the parameters of the cameras."""
-    parts = []
-    for p in parameters.CAMERA_PARAMETERS:
-        sigmas = [r.sigma for r in found if r.parameter == p]
-        parts += [f"{p.symbol} {significant(FAR * max(sigmas), 2, floor=0.0)} {p.unit}"] if sigmas else []
+    sigmas = {p: [r.sigma for r in found if r.parameter == p] for p in parameters.CAMERA_PARAMETERS.values()}
+    parts = [f"{p.symbol} {significant(FAR * max(own), 2, floor=0.0)} {p.unit}" for p, own in sigmas.items() if own]
     who = (
         f"with {run.frames} frames the noise of the images hides" if _noise_only(run) else "noise and disturbances hide"
     )
@@ -245,10 +244,13 @@ def limited(run: RenderRun) -> str:
 def _misled(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> tuple[str, ...]:
     own = [r for r in off if r.camera] or _changes(tuple(off)) or off
     worst = max(own, key=lambda r: abs(r.ratio))
+    share = ", larger than the change itself"
+    if abs(worst.error) <= abs(worst.true):
+        share = f" or {significant(100.0 * abs(worst.error / worst.true), 2, floor=0.0)} % of the change"
     return (
         _score(found, off),
         f"the worst is {worst.name}, with a reading of {worst.read} and a true value of {worst.shown(worst.true)}: an "
-        f"error of {residual_text(abs(worst.ratio)).lstrip('+')} σ{_share(worst)}",
+        f"error of {residual_text(abs(worst.ratio)).lstrip('+')} σ{share}",
         _cause(run, worst, len(found)),
     )
 
@@ -259,12 +261,6 @@ def _score(found: tuple[Reading, ...], off: list[Reading], how: str = "") -> str
         return f"None of the {len(found)} changes is recovered within {FAR:g} σ{how}"
     are = "is" if good == 1 else "are"
     return f"{good} of {len(found)} changes {are} recovered within {FAR:g} σ{how}, {len(off)} {_are(off)} not"
-
-
-def _share(worst: Reading) -> str:
-    if abs(worst.error) > abs(worst.true):
-        return ", larger than the change itself"
-    return f" or {significant(100.0 * abs(worst.error / worst.true), 2, floor=0.0)} % of the change"
 
 
 def _unknown(run: RenderRun) -> str:
@@ -306,8 +302,8 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
         return f"{uncovered} contribute, which the crosstalk table does not contain: see Residuals"
     if uncovered:
         return (
-            f"{_ignores(run, uncovered)}, and the crosstalk table does not contain them; more frames do not reduce the "
-            "error: see Residuals"
+            f"the {_told(run)} does not model {uncovered}, and the crosstalk table does not contain them; more frames "
+            "do not reduce the error: see Residuals"
         )
     if parts:
         return f"motions {_unknown(run)} contribute ({_largest(parts)}): see Crosstalk and Residuals"
@@ -323,10 +319,6 @@ def _largest(parts: Mapping[str, float]) -> str:
     return joined(sorted(parts, key=lambda text: -abs(parts[text]))[:NAMED])
 
 
-def _ignores(run: RenderRun, uncovered: str) -> str:
-    return f"the {_told(run)} does not model {uncovered}"
-
-
 def _series_verdict(
     run: RenderRun, series: TimeSeries, found: tuple[Reading, ...], off: list[Reading]
 ) -> tuple[str, ...]:
@@ -336,10 +328,9 @@ def _series_verdict(
     worst = max([r for r in off if r.camera] or off, key=lambda r: abs(r.ratio))
     unit = worst.parameter.unit
     uncovered = joined([name for camera in run.crosstalk for name in systematics(run, camera).uncovered])
-    if run.estimators[run.judged].stated:
-        why = f"motions {_unknown(run)} contribute"
-    else:
-        why = _ignores(run, uncovered) if uncovered else f"motions {_unknown(run)} contribute"
+    why = f"motions {_unknown(run)} contribute"
+    if uncovered and not run.estimators[run.judged].stated:
+        why = f"the {_told(run)} does not model {uncovered}"
     size = "the noise is" if _noise_only(run) else "σ is"
     return (
         f"{_score(found, off, ' (RMS)')}, {span}",

@@ -2,7 +2,7 @@
 
 What an instrument is calibrated to depends on the program, on the numerical packages, on the processor and on what the
 instrument's files say. The SHA-256 of all of these is the name of an entry; whatever changes, the name changes with it.
-What cannot be named so, such as a surface term that a script has registered, is computed in every process.
+What cannot be named so, such as a surface whose class is not of this program, is computed in every process.
 
 An entry holds some forty kinds of objects of the program: bodies, surfaces, aimed rays, matrices. Only ``pickle``
 writes them without a second description of each that could forget one. To read a pickle can run code, so an entry is
@@ -120,7 +120,7 @@ class CacheEntry:
             specs: specifications that it begins with.
             inputs: all else that it depends on.
         """
-        registered = dict(SAG_TERMS), dict(REFLECTORS), dict(NOISE_TERMS), dict(GLASSES), dict(MATERIALS)
+        registered = SAG_TERMS.data, REFLECTORS.data, NOISE_TERMS.data, dict(GLASSES), dict(MATERIALS)
         key = None if backend.name != "llvm" else _digest(_machine(), backend.name, registered, tuple(specs), inputs)
         return cls(key, backend, tuple(specs))
 

@@ -75,7 +75,7 @@ class CameraCrosstalk:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for crosstalk.json."""
-        rows, keys = [], [one.key for one in parameters.CAMERA_PARAMETERS]
+        rows, keys = [], [one.key for one in parameters.CAMERA_PARAMETERS.values()]
         for k, motion in enumerate(self.motions):
             rows.append(
                 {
@@ -113,7 +113,7 @@ class CameraCrosstalk:
             out.append(
                 f"{motion.label}: the principal distance changes by {true:+.3g} um per {motion.unit}, the spots read "
                 f"{seen:+.3g} um: {verdict}. Beside it they show {false[worst]:+.2g} arcsec of "
-                f"{parameters.CAMERA_PARAMETERS[worst].key.removesuffix('_arcsec')} that is not there."
+                f"{[*parameters.CAMERA_PARAMETERS.values()][worst].key.removesuffix('_arcsec')} that is not there."
             )
         return tuple(out)
 
@@ -165,7 +165,7 @@ def crosstalk(experiment: MonitorExperiment, covariance: np.ndarray) -> dict[str
             FormulaFactor(
                 where,
                 e,
-                parameters.CAMERA_PARAMETERS[p].key,
+                [*parameters.CAMERA_PARAMETERS.values()][p].key,
                 motions[p].label,
                 readings[e][p, p] / ideal[p],
                 readings[e][p, p] / true[p, p],

@@ -43,8 +43,7 @@ from optics.waves.pupil_shadow import FEW_SIDES, SMALLEST
 from optics.waves.pupil_stack import CUT_RINGS, DEGREE, WORST_RESIDUAL, PupilStack
 from optics.waves.pupil_terms import WORST_BEND, products, smooth_terms, to_terms
 from scenes.models import shadow
-from scenes.models.camera_axis import LAUNCH_DISTANCE
-from scenes.models.camera_model import coloured, lenses, line_body
+from scenes.models.camera_model import LAUNCH_DISTANCE, coloured, lenses, line_body
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import Shadows
 from scenes.specs.camera import CameraSpec

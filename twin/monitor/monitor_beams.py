@@ -189,11 +189,6 @@ class MonitorBeams:
         return self._with(quadrature.disk(_SCOUT_RINGS))
 
     @cached_property
-    def nominal(self) -> Aimed:
-        """Aimed rays of the unperturbed instrument, the start for all other states."""
-        return self._aim_nominal()
-
-    @cached_property
     def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Series of smooth functions: Zernike terms from values on the nodes (T, N); values, d/dx, d/dy from terms (N,
         T).
@@ -252,8 +247,11 @@ class MonitorBeams:
         """Values of `target` repeated for each state, channel-major, (C*S, N, 2)."""
         return np.repeat(self.target, states, axis=0)
 
-    def _aim_nominal(self) -> Aimed:
-        """Aim rays of the unperturbed instrument: at the middle of the face, then at the nodes around it."""
+    @cached_property
+    def nominal(self) -> Aimed:
+        """Aimed rays of the unperturbed instrument, the start for all other states: at the middle of the face, then at
+        the nodes around it.
+        """
         fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
         middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=_CLOSE_TOLERANCE)
         near = middle + np.einsum("bnij,bpj->bpi", inverse(slope), self.target)
@@ -353,15 +351,11 @@ class MonitorBeams:
         return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its way"
 
     def fields(self, states: Sequence[State]) -> PupilField:
-        """Plane waves at the CCDs for C channels x S states, channel-major, in each chip's own x, y about its centre.
-
-        Raises:
-            BeamMissedError, AimError: as ``rays``.
-        """
+        """Plane waves at the CCDs for C channels x S states. Raises as ``rays``."""
         return self.field_of(self.rays(states))
 
     def field_of(self, rays: CcdRays) -> PupilField:
-        """Plane waves of traced rays."""
+        """Plane waves of traced rays, channel-major, in each chip's own x, y about its centre."""
         direction = rays.direction
         u, v = direction[..., 0], direction[..., 1]
         # sqrt(|d(u, v)/dA| / A) dA of the module docstring of optics.waves.diffraction, with A the face's area

@@ -16,7 +16,7 @@ The states that the monitor's readings stand for, traced again: what they do to 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
@@ -26,6 +26,7 @@ from analysis.monitor import model_fit
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances, TimeLaw
 from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import MotionModel, Retraced
+from optics.geometry.pose import triple
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, Motion, PlacedBodies, State, compose
 from optics.numerics.array_math import PhysicalError, inverse, turned
 from optics.numerics.backend import Backend
@@ -184,13 +185,13 @@ def spot_gradient(
         # system 2c is the row of channel c's spot (y of the CCD), 2c + 1 its column (x)
         share = path.nodes.share[piece, None] * np.array([[[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]])
         weight = np.tile(share, (len(path.channels), 1, 1)) / pitch[:, None, None]
-        there = vjp(path.backend, monitor, place, heading, weight, monitor_steps.names)
+        there = vjp(path.backend, monitor, place, heading, weight, [tuple(own) for own in monitor_steps])
         turn = np.einsum("bnkx,bnx->bnk", across, there.direction)
         back = -np.linalg.solve(np.repeat(np.swapaxes(slope, -1, -2), 2, axis=0), turn[..., None])[..., 0]
         aside = np.concatenate([back, np.zeros_like(back[..., :1])], axis=-1)
-        node = vjp(path.backend, outgoing, place, heading, aside, outgoing_steps.names)
+        node = vjp(path.backend, outgoing, place, heading, aside, [tuple(own) for own in outgoing_steps])
         pinhole = (there.position + node.position).sum(axis=1).reshape(len(path.channels), 2, 3)
-        out += monitor_steps.dot(there.values) + outgoing_steps.dot(node.values)
+        out += _dot(monitor_steps, there.values) + _dot(outgoing_steps, node.values)
         out += np.einsum("ckx,cmx->ckm", pinhole, source)
         # nodes ride on the return face as it grows, and places are counted in pixels, which grow with the chip
         goal = np.repeat(path.target[:, piece], 2, axis=0)
@@ -203,36 +204,18 @@ def spot_gradient(
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _Tangents:
-    """Derivatives of one sequence's numbers by M motions, for C channels: per element, path -> (C, M)."""
+_Tangents = list[dict[Path, np.ndarray]]
+"""Derivatives of one sequence's numbers by M motions, for C channels: per element, path -> (C, M), not all zero."""
 
-    values: tuple[Mapping[Path, np.ndarray], ...]
 
-    @classmethod
-    def of(cls, systems: SystemBatch, channels: int) -> _Tangents:
-        """Those that are not all zero, from a batch of C x M systems with a step each."""
-        assert systems.tangents is not None
-        return cls(
-            tuple(
-                {path: v.reshape(channels, -1) for path, v in leaves(own).items() if np.any(v)}
-                for own in systems.tangents
-            )
-        )
-
-    def dot(self, slopes: Sequence[Mapping[Path, np.ndarray]]) -> np.ndarray:
-        """Sum over numbers of slope (C, 2) times derivative by the motions: (C, 2, M)."""
-        parts = [
-            slope[name].reshape(len(table), 2)[:, :, None] * table[:, None]
-            for own, slope in zip(self.values, slopes, strict=True)
-            for name, table in own.items()
-        ]
-        return np.asarray(sum(parts))
-
-    @property
-    def names(self) -> list[tuple[Path, ...]]:
-        """Paths of the numbers that some motion changes, per element."""
-        return [tuple(own) for own in self.values]
+def _dot(tangents: _Tangents, slopes: Sequence[Mapping[Path, np.ndarray]]) -> np.ndarray:
+    """Sum over numbers of slope (C, 2) times derivative by the motions: (C, 2, M)."""
+    parts = [
+        slope[name].reshape(len(table), 2)[:, :, None] * table[:, None]
+        for own, slope in zip(tangents, slopes, strict=True)
+        for name, table in own.items()
+    ]
+    return np.asarray(sum(parts))
 
 
 def _numbers(
@@ -248,8 +231,10 @@ def _numbers(
     names = [f"{channel.key}/{sequence}" for channel in path.channels]
     systems = assemble(assembly, names, [middle])
     # the union of the states decides the kernel, so that no state of its own adds a figure to another one's mirror
-    tangents = assemble(assembly, names, states, steps, placed)
-    return systems.take(np.repeat(np.arange(systems.count), 2)), _Tangents.of(tangents, len(names))
+    tangents = assemble(assembly, names, states, steps, placed).tangents
+    assert tangents is not None
+    each = [{path: v.reshape(len(names), -1) for path, v in leaves(own).items() if np.any(v)} for own in tangents]
+    return systems.take(np.repeat(np.arange(systems.count), 2)), each
 
 
 def _named(motion: ElementaryMotion, about: State) -> State:
@@ -525,24 +510,15 @@ def _family_amounts(cameras: Mapping[str, CameraCalibration], noise: np.ndarray)
 
 def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> list[State]:
     """The states in which motions of some bodies, all about one pivot of each, have some amounts (S, P), SI."""
-    return [_one_together(motions, row) for row in amounts.tolist()]
-
-
-def _one_together(motions: Sequence[ElementaryMotion], amounts: Sequence[float]) -> State:
-    out: dict[str, Motion] = {}
-    for motion, amount in zip(motions, amounts, strict=True):
-        new, old = motion.motion(amount), out.get(motion.body, Motion(pivot=motion.pivot))
-        out[motion.body] = Motion(
-            rotate=_sum(old.rotate, new.rotate),
-            shift=_sum(old.shift, new.shift),
-            scale=old.scale + new.scale,
-            pivot=motion.pivot,
-        )
-    return out
-
-
-def _sum(one: tuple[float, float, float], two: tuple[float, float, float]) -> tuple[float, float, float]:
-    return one[0] + two[0], one[1] + two[1], one[2] + two[2]
+    states: list[State] = []
+    for row in amounts.tolist():
+        out: dict[str, Motion] = {}
+        for motion, amount in zip(motions, row, strict=True):
+            new, old = motion.motion(amount), out.get(motion.body, Motion(pivot=motion.pivot))
+            rotate, shift = triple(np.add(old.rotate, new.rotate)), triple(np.add(old.shift, new.shift))
+            out[motion.body] = Motion(rotate, shift, motion.pivot, old.scale + new.scale)
+        states.append(out)
+    return states
 
 
 def _traced(path: MonitorPath, sight: LineSight, states: Sequence[State]) -> Retraced:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import center_of_mass
 
 from analysis.arrays import shows
 from analysis.monitor.disturbances import Disturbances
@@ -27,8 +28,15 @@ from optics.waves.diffraction import UnsampledImageError
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
-from scenes.models.job_state import job_state, motions_of, on_deformed
-from scenes.models.nodal_bodies import HeatedBody, deformed_face, heated_body, with_heat
+from scenes.models.job_state import (
+    HeatedBody,
+    deformed_face,
+    heated_body,
+    job_state,
+    motions_of,
+    on_deformed,
+    with_heat,
+)
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.course import NO_MOTION
 from scenes.specs.instrument import SIDES
@@ -365,10 +373,8 @@ class MonitorExperiment:
 
     def _template(self, image: np.ndarray) -> SpotTemplate:
         """Calibrated shape of one spot; its centre is the energy centroid of the core (above 5% of the peak)."""
-        core = np.where(image > 0.05 * image.max(), image, 0.0)
-        row = float(core.sum(axis=1) @ np.arange(image.shape[0]) / core.sum())
-        column = float(core.sum(axis=0) @ np.arange(image.shape[1]) / core.sum())
-        return SpotTemplate.from_image(image, row, column, self.path.shape)
+        row, column = center_of_mass(np.where(image > 0.05 * image.max(), image, 0.0))
+        return SpotTemplate.from_image(image, float(row), float(column), self.path.shape)
 
     def pattern(self, seed: int | Sequence[int]) -> FixedPattern:
         """PRNU and DSNU of all area CCDs, (C, rows, columns); the same before and after. Those of several seeds one

@@ -18,7 +18,7 @@ from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.system import touched_bodies
-from optics.waves.diffraction import PixelResponse, PupilField, UnsampledImageError, image
+from optics.waves.diffraction import PixelResponse, UnsampledImageError, image
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE, Channel
 from twin.monitor.image_sampling import (
@@ -68,7 +68,10 @@ class MonitorPath(MonitorBeams):
         self._sized = nodes is None
         self.checked = ImageChecks()
         self._class_beams: dict[int, MonitorBeams] = {}
+        self._second: dict[int, MonitorBeams] = {}
         self._responses: dict[int, PixelResponse] = {}
+        self._parts: dict[tuple[str, ...], MonitorPath] = {}
+        self._rested: dict[bool, tuple[np.ndarray, int]] = {}
 
     @cached_property
     def node_classes(self) -> NodeClasses:
@@ -101,11 +104,6 @@ class MonitorPath(MonitorBeams):
         if number not in self._class_beams:
             self._class_beams[number] = self._with(self.node_classes.nodes(number))
         return self._class_beams[number]
-
-    @cached_property
-    def _second(self) -> dict[int, MonitorBeams]:
-        """Class -> beams with the nodes that check its images."""
-        return {}
 
     def class_of(self, known: CoarseTrace, margin: int = 0) -> np.ndarray:
         """Number of the class of nodes that is right for all spots of each state, (S,), as far as a few rays can tell.
@@ -190,7 +188,7 @@ class MonitorPath(MonitorBeams):
         for start in range(0, len(states), chunk):
             some = states[start : start + chunk]
             with one_blas_thread():
-                photons = self._render(some, margin, single)
+                photons, _ = self._render(some, margin, single)
             yield slice(start, start + len(some)), photons
 
     def photons_of(self, state: State, placed: PlacedBodies | None = None, single: bool = False) -> np.ndarray:
@@ -217,12 +215,12 @@ class MonitorPath(MonitorBeams):
                 photons, usual = self._at_rest(single)
                 # spots far off or blurred need more nodes, and then all channels get them
                 if part.class_of(coarse)[0] <= usual:
-                    own, number = part._render_classed([state], 0, single, coarse)
+                    own, number = part._render([state], 0, single, coarse)
                     if number[0] == usual:
                         out = photons.copy()
                         out[[c.camera in moved for c in self.channels]] = own[0]
                         return out
-            return np.asarray(self._render([state], 0, single, self.coarse_trace([state], placed))[0])
+            return self._render([state], 0, single, self.coarse_trace([state], placed))[0][0]
 
     def moved_cameras(self, state: State, placed: PlacedBodies | None = None) -> tuple[str, ...]:
         """Cameras of whose channels' light some body is moved or otherwise changed.
@@ -257,44 +255,32 @@ class MonitorPath(MonitorBeams):
             self._parts[names].checked = self.checked
         return self._parts[names]
 
-    @cached_property
-    def _parts(self) -> dict[tuple[str, ...], MonitorPath]:
-        return {}
-
     def _at_rest(self, single: bool) -> tuple[np.ndarray, int]:
         """Photons of the unperturbed instrument (C, rows, columns), and the number of their class."""
         if single not in self._rested:
-            photons, number = self._render_classed([{}], 0, single)
+            photons, number = self._render([{}], 0, single)
             self._rested[single] = photons[0], int(number[0])
         return self._rested[single]
 
-    @cached_property
-    def _rested(self) -> dict[bool, tuple[np.ndarray, int]]:
-        return {}
-
     def _render(
         self, states: Sequence[State], margin: int, single: bool, coarse: CoarseTrace | None = None
-    ) -> np.ndarray:
-        """Expected photons (S, C, rows + 2 margin, columns + 2 margin), each state with the nodes of its class.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Expected photons (S, C, rows + 2 margin, columns + 2 margin), each state with the nodes of its class, and
+        these classes, (S,).
 
         Raises:
             UncertainImageError: an image is not right whatever the nodes.
         """
-        return self._render_classed(states, margin, single, coarse)[0]
-
-    def _render_classed(
-        self, states: Sequence[State], margin: int, single: bool, coarse: CoarseTrace | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """What ``_render`` gives, and the class of each state, (S,)."""
         coarse = self.coarse_trace(states) if coarse is None else coarse
         for channel, place, aperture in zip(self.channels, coarse.place, coarse.aperture, strict=True):
             self._require_on_ccd(channel, place[aperture > 0.0])
         chosen = self.class_of(coarse, margin)
         out = np.empty((len(states), len(self.channels), *(n + 2 * margin for n in self.shape)))
-        number = 0
+        number, last = 0, len(self.node_classes.reached) - 1
         while number <= np.max(chosen):
             own = np.flatnonzero(chosen == number)
-            for piece in np.array_split(own, -(-len(own) * self._rays_of(number) // _MOST_RAYS) or 1):
+            rays = self.class_beams(min(number, last)).nodes.count * len(self.channels)
+            for piece in np.array_split(own, -(-len(own) * rays // _MOST_RAYS) or 1):
                 if len(piece):
                     self._require_class(number, coarse, int(piece[0]))
                     known = coarse.take(piece, self.backend)
@@ -303,11 +289,6 @@ class MonitorPath(MonitorBeams):
                     out[piece], chosen[piece] = self._images(some, known, number, margin, single)
             number += 1
         return out, chosen
-
-    def _rays_of(self, number: int) -> int:
-        """Rays of a state with the nodes of a class."""
-        last = len(self.node_classes.reached) - 1
-        return self.class_beams(min(number, last)).nodes.count * len(self.channels)
 
     def _images(
         self, states: Sequence[State], known: CoarseTrace, number: int, margin: int, single: bool
@@ -327,7 +308,10 @@ class MonitorPath(MonitorBeams):
         wanted, last = np.full(len(states), number), len(self.node_classes.reached) - 1
         difference = np.zeros((len(self.channels), len(states)))
         if self._sized:
-            difference = disagreement(waves, self._second_field(states, known, number), x, y)
+            if number not in self._second:
+                self._second[number] = self._with(self.node_classes.second_nodes(number))
+            second = self._second[number]
+            difference = disagreement(waves, second.field_of(second.rays(states, known)), x, y)
             difference = difference.reshape(-1, len(states))
             if number + 2 <= last:
                 wanted[np.any(difference > GOOD, axis=0)] += 2
@@ -340,13 +324,6 @@ class MonitorPath(MonitorBeams):
         photons = photons.reshape(len(self.channels), len(states), *photons.shape[1:])
         photons *= self.light_per_pixel[:, None, None, None]
         return np.swapaxes(photons, 0, 1), wanted
-
-    def _second_field(self, states: Sequence[State], known: CoarseTrace, number: int) -> PupilField:
-        """Field of the states' beams at the nodes that check a class."""
-        if number not in self._second:
-            self._second[number] = self._with(self.node_classes.second_nodes(number))
-        second = self._second[number]
-        return second.field_of(second.rays(states, known))
 
     def _require_alike(self, difference: np.ndarray, rays: CcdRays) -> None:
         """Raise UncertainImageError where two rules differ too much (C, S), of the peaks."""

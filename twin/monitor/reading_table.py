@@ -7,7 +7,7 @@ live page are views of it. What is read is declared in `analysis.monitor.paramet
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -250,7 +250,7 @@ def reading_table(
     fixed_changes = frozenset() if prior is None else unmoved(prior, cameras, ground)
 
     def add(
-        group: str, which: Sequence[Parameter], true: np.ndarray | None, read: Mapping[str, Sequence[np.ndarray]]
+        group: str, which: Iterable[Parameter], true: np.ndarray | None, read: Mapping[str, Sequence[np.ndarray]]
     ) -> None:
         """Rows of numbers (S, P)."""
         for k, parameter in enumerate(which):
@@ -264,7 +264,7 @@ def reading_table(
                     value = sigma = noise = np.full_like(value, np.nan)
                 rows.append(Reading(group, parameter, estimator, own, value, value - own, sigma, noise))
 
-    units = np.array([one.per_si for one in parameters.CAMERA_PARAMETERS])
+    units = np.array([one.per_si for one in parameters.CAMERA_PARAMETERS.values()])
     for name, estimators in found.parameters.items():
         made_of = parameters.rows_of(cameras[name]) / units[:, None]
         told: dict[str, Sequence[np.ndarray]] = {
@@ -279,7 +279,7 @@ def reading_table(
             for estimator, one in estimators.items()
         }
         true = None if truth is None else units * (truth.vector(name) @ made_of.T)
-        add(name, parameters.CAMERA_PARAMETERS, true, told)
+        add(name, parameters.CAMERA_PARAMETERS.values(), true, told)
     if found.angle:
         told = {
             e: tuple(v[:, None] / ARCSEC for v in (a.change_rad, a.sigma_rad, a.noise_rad))

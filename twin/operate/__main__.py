@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from scenes.yaml.errors import InputError, nearest
+from scenes.yaml.errors import InputError
 from scenes.yaml.standard_output import BAD_INPUT, print_error
-from twin.framework import durable
-from twin.framework.cli import INTERRUPTED, AsJson, InputErrorText, Quiet, Strict, end_strictly, print_verdict
+from twin.framework import cli, durable
+from twin.framework.cli import InputErrorText, print_verdict
 from twin.operate.estimate_commands import (
     alarms,
     exclude,
@@ -37,6 +37,7 @@ from twin.operate.terminal import (
     NewFolder,
     Place,
     PlanFile,
+    json_and_quiet,
     line,
     moment_said,
     on_record,
@@ -53,9 +54,7 @@ if TYPE_CHECKING:
 POLL = 10.0
 """Seconds between two looks at what is watched."""
 
-app = typer.Typer(
-    add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True
-)
+app = cli.program(no_args_is_help=True)
 
 
 @app.callback()
@@ -74,8 +73,10 @@ def main() -> None:
 
 
 @app.command()
+@json_and_quiet
 def init(
     record: Place,
+    options: cli.Options,
     instrument: Annotated[str, typer.Argument(help="Name of an instrument in the library, or path of its file.")],
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Readings are simulated: their times may be still to come.")
@@ -84,8 +85,6 @@ def init(
         Path | None,
         typer.Option(readable=False, help="Plan of operation that counts from now on; `status` and `forecast` use it."),
     ] = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Make the record of an instrument, or bring one that an earlier program made up to this one.
 
@@ -115,7 +114,7 @@ def init(
             text = f"record of {history.name} ({history.sha256[:12]}) in {history.url}: {what}"
             data = {"record": history.url, "instrument": history.name, "instrument_sha256": history.sha256}
             made = {"versions": list(passed), "plan": None if plan is None else str(plan.absolute()), "new_plan": kept}
-        tell(errors, as_json, quiet, data | made, lambda console: line(console, text))
+        tell(errors, options, data | made, lambda console: line(console, text))
 
 
 @app.command()
@@ -171,7 +170,7 @@ def ingest(
     """
     from twin.operate.record.telemetry import Sources
 
-    listed = call.as_json and not watch
+    listed = call.options.as_json and not watch
     with durable.exit_on_terminate():
         start = None if moment is None else moment_said("--time", moment)
         if page is not None:
@@ -202,11 +201,11 @@ def ingest(
         except KeyboardInterrupt:
             if not watch:  # a watching command has no other end
                 print_error(call.errors, "interrupted: the files that were told are in the record, the others are not")
-                raise typer.Exit(INTERRUPTED) from None
+                raise typer.Exit(cli.INTERRUPTED) from None
         done = {**totals, "files": files_told, "alarms": raised}
         call.tell(done, partial(print_verdict, verdict=_counted(totals)))
         if refused := totals["refused"] + totals["refused_before"]:
-            if call.quiet or call.as_json:
+            if call.options.silent:
                 print_error(call.errors, f"{refused} refused, the first in {first}")
             raise typer.Exit(BAD_INPUT)
 
@@ -271,7 +270,7 @@ def status(
     check_all: Annotated[
         bool, typer.Option("--check-all", help="Compare every entry with its digest, not the newest 500 alone.")
     ] = False,
-    strict: Strict = False,
+    strict: cli.Strict = False,
 ) -> None:
     """Tell what a record holds, what was refused and why; and, under its plan of operation or another one, how the
     instrument stands: every quantity with its sigma, requirements, jumps, sensors, whether predictions came true.
@@ -302,7 +301,7 @@ def status(
 
     call.tell(data, show)
     if strict:
-        end_strictly(call.errors, data)
+        cli.end_strictly(call.errors, data)
 
 
 def _record_warnings(held: dict[str, Any]) -> list[str]:
@@ -346,10 +345,7 @@ def export(
     from twin.framework.data_files import TABLE_FORMATS, MissingPackage
     from twin.operate.record.record_tables import tables as all_tables
 
-    if tables not in TABLE_FORMATS:
-        near = nearest(tables, TABLE_FORMATS)
-        meant = f"; did you mean {near!r}?" if near else ";"
-        raise InputErrorText(f"--tables: no such format, {tables!r}{meant} allowed: {', '.join(TABLE_FORMATS)}")
+    cli.require_one_of("--tables", tables, TABLE_FORMATS)
     require_new(out)
     try:
         made = [(f"{one.name}.{tables}", TABLE_FORMATS[tables](one), one.rows) for one in all_tables(call.history)]

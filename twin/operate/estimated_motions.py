@@ -18,9 +18,8 @@ from analysis.monitor.disturbances import Disturbances
 from optics.geometry.tree import Body, Motion
 from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
-from scenes.models.disturbances import HEAT, Component, state_of, usual_pivot
+from scenes.models.disturbances import HEAT, Component, joint_disturbances, joint_files, state_of, usual_pivot
 from scenes.models.instrument_model import Instrument
-from scenes.models.joint_disturbances import joint_disturbances, joint_files
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import MOST_JOINT
 from scenes.specs.job import JobSpec, PerturbationSpec

@@ -10,17 +10,7 @@ import typer
 from scenes.yaml.input_file import read_json
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.framework import durable
-from twin.framework.cli import (
-    LARGEST_SEED,
-    AsJson,
-    BackendName,
-    Force,
-    InputErrorText,
-    Options,
-    Out,
-    Quiet,
-    check_backend,
-)
+from twin.framework.cli import LARGEST_SEED, InputErrorText, Options, check_backend, with_options
 from twin.framework.command import Result, finished, progress_shown, run_command
 from twin.framework.procedure import Session
 from twin.operate.terminal import line, tell, told
@@ -29,11 +19,13 @@ if TYPE_CHECKING:
     from scenes.specs.operation import OperationSetup
 
 
+@with_options("out", "seed", "export", "strict")
 def simulate(
     plan: Annotated[
         Path,
         typer.Argument(metavar="PLAN.yaml", readable=False, help="Plan of the operation, or a life's config.yaml."),
     ],
+    options: Options,
     start: Annotated[str, typer.Option("--from", help="UTC of the first reading; laws of time count from it.")],
     days: Annotated[float, typer.Option(help="How long the life takes, in days.")],
     every: Annotated[str, typer.Option(help="Time from one reading to the next, with its unit: 6d, 12h.")],
@@ -69,10 +61,6 @@ def simulate(
         Path | None,
         typer.Option(readable=False, help="File for the truth, or none. Default: life.json among the files."),
     ] = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Simulate the life of an instrument into a new record: motions are drawn by the plan's laws of time, every reading
     of the monitor is traced, rendered with noise and recovered, sensors read temperatures, and events come.
@@ -86,31 +74,29 @@ def simulate(
     Exit codes: 0 success, 2 bad input, 1 anything else.
     """
     with told() as errors, durable.exit_on_terminate():
-        check_backend(backend)
+        check_backend(options.backend)
         from optics.numerics.backend import load_backend
         from twin.operate.simulation_run import simulate_into, simulation
 
-        options = {"--from": start, "--days": f"{days:.17g}", "--every": every, "--frames": str(frames)}
-        options |= {"--coefficient-error": coefficient_error, "--sensor-sigma": sensor_sigma}
+        stated = {"--from": start, "--days": f"{days:.17g}", "--every": every, "--frames": str(frames)}
+        stated |= {"--coefficient-error": coefficient_error, "--sensor-sigma": sensor_sigma}
         several = {"--sensor": sensor or [], "--dead": dead or [], "--stuck": stuck or [], "--event": event or []}
-        what = simulation(options, several, seed)
-        with progress_shown(errors, as_json or quiet) as advance:
-            done = simulate_into(plan, record, out, truth, force, what, load_backend(backend), advance)
+        what = simulation(stated, several, seed)
+        with progress_shown(errors, options.silent) as advance:
+            done = simulate_into(plan, record, out, truth, options.force, what, load_backend(options.backend), advance)
         place = done["record"] or done["files"]
         text = f"{done['readings']} readings of the monitor in {place}"
         lost = "".join(f"\nwarning: {one}" for one in done["lost"])
-        tell(errors, as_json, quiet, done, lambda console: line(console, f"{text}; truth: {done['truth']}{lost}"))
+        tell(errors, options, done, lambda console: line(console, f"{text}; truth: {done['truth']}{lost}"))
 
 
+@with_options("seed", "export", "backend", "strict")
 def judge(
     life: Annotated[Path, typer.Argument(metavar="RECORD", readable=False, help="Record made by `simulate`.")],
+    options: Options,
     truth: Annotated[
         Path | None, typer.Option(readable=False, help="File of the truth. Default: life.json among its files.")
     ] = None,
-    out: Out = None,
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Follow a simulated life reading by reading, as it would have been, and hold what was said against the truth: by
     the calibration on the ground, by each reading itself, and by the operation with the readings so far and with all of
@@ -147,7 +133,7 @@ def judge(
         report = judged_report(done, plan.model.instrument.name)
         return finished(session, "judged", report, judged_numbers(done), program="twin.operate", **facts)
 
-    run_command("judged", Options(out, None, "llvm", force, as_json, quiet), resolve, work)
+    run_command("judged", options, resolve, work)
 
 
 def _truth(file: Path) -> dict[str, Any]:

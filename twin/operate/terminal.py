@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
-from inspect import Parameter, Signature, signature
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,8 +15,8 @@ from rich.console import Console
 
 from scenes.yaml.errors import Problem
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.framework import durable
-from twin.framework.cli import AsJson, InputErrorText, Quiet, Standing, explained, heartbeat, print_whole, result_table
+from twin.framework import cli, durable
+from twin.framework.cli import InputErrorText
 from twin.operate.record import NotARecord, RecordFailed, file_of, require_file
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ PlanFile = Annotated[
     Path | None,
     typer.Argument(metavar="[PLAN.yaml]", readable=False, help="Plan of operation. Default: that of the record."),
 ]
+json_and_quiet = cli.with_options("out", "seed", "export", "backend", "force", "strict")
+"""What gives a command the options ``--json`` and ``--quiet``."""
 NewFolder = Annotated[Path, typer.Option(readable=False, help="Folder for them; it must not be there yet.")]
 
 
@@ -43,7 +45,7 @@ NewFolder = Annotated[Path, typer.Option(readable=False, help="Folder for them; 
 def told() -> Iterator[Console]:
     """Errors as one sentence and an exit code."""
     errors = Console(stderr=True)
-    with explained(errors):
+    with cli.explained(errors):
         try:
             yield errors
         except NotARecord as error:
@@ -79,20 +81,19 @@ def moment_said(option: str, text: str) -> int:
         return micros(text)
 
 
-def tell(errors: Console, as_json: bool, quiet: bool, data: Any, show: Callable[[Console], None]) -> None:
+def tell(errors: Console, options: cli.Options, data: Any, show: Callable[[Console], None]) -> None:
     """Print a result, as JSON or as a reader wants it.
 
     Args:
         errors: where it is told that standard output is gone.
-        as_json: print ``data``.
-        quiet: print nothing else.
+        options: whether ``data`` are printed, or nothing is.
         data: plain data.
         show: prints it for a reader.
     """
     with to_stdout(errors, "the record is as it was told"):
-        if as_json:
+        if options.as_json:
             print_json(data)
-        elif not quiet:
+        elif not options.quiet:
             show(Terminal())
 
 
@@ -103,12 +104,12 @@ def line(console: Console, text: str) -> None:
 
 def show_table(console: Console, heads: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[int]) -> None:
     """Print a table, the columns of these numbers flush right."""
-    table = result_table()
+    table = cli.result_table()
     for k, head in enumerate(heads):
         table.add_column(head, justify="right" if k in right else "left")
     for row in rows:
         table.add_row(*row)
-    print_whole(console, table)
+    cli.print_whole(console, table)
 
 
 @dataclass(frozen=True)
@@ -119,18 +120,17 @@ class Call:
         place: folder or address of the record.
         history: the record.
         errors: where errors and the progress are told.
-        as_json, quiet: as the options ask for.
+        options: ``as_json`` and ``quiet``.
     """
 
     place: str
     history: History
     errors: Console
-    as_json: bool
-    quiet: bool
+    options: cli.Options
 
     def tell(self, data: Any, show: Callable[[Console], None]) -> None:
         """Print a result; arguments as of `tell`."""
-        tell(self.errors, self.as_json, self.quiet, data, show)
+        tell(self.errors, self.options, data, show)
 
     def planned(self, plan: Path | None) -> OperationSetup:
         """Return the plan in a file, or that of the record. Raises InputError; InputErrorText: the record has none."""
@@ -156,8 +156,8 @@ class Call:
         """
         from twin.operate.estimate.operation import Operation
 
-        standing, history = Standing("follow the record"), history or self.history
-        with problems_of(history.url), heartbeat(self.errors, standing.__str__, self.quiet or self.as_json):
+        standing, history = cli.Standing("follow the record"), history or self.history
+        with problems_of(history.url), cli.heartbeat(self.errors, standing.__str__, self.options.silent):
             made = Operation(history, setup, lambda done, of: standing.advance("readings", done, of))
             made.follow()
         return made
@@ -209,21 +209,15 @@ def on_record(work: Callable[..., None]) -> Callable[..., None]:
             ``--quiet`` after them.
     """
 
-    @wraps(work)
-    def command(record: str, as_json: bool, quiet: bool, **options: Any) -> None:
+    def command(record: str, options: cli.Options, **given: Any) -> None:
         with told() as errors:
             if (file := file_of(record)) is not None:
                 require_file(file)  # before what reads a database is imported
             from twin.operate.record.history import History
 
             with History(record) as history:
-                work(Call(record, history, errors, as_json, quiet), **options)
+                work(Call(record, history, errors, options), **given)
 
-    # Typer makes arguments and options from the signature
-    own = list(signature(work, eval_str=True).parameters.values())[1:]
-    kind = Parameter.POSITIONAL_OR_KEYWORD
-    common = [Parameter(name, kind, default=False, annotation=a) for name, a in (("as_json", AsJson), ("quiet", Quiet))]
-    every = [Parameter("record", kind, annotation=Place), *own, *common]
-    command.__signature__ = Signature(every)  # type: ignore[attr-defined]
-    command.__annotations__ = {one.name: one.annotation for one in every}
-    return command
+    _, *own = signature(work, eval_str=True).parameters.values()
+    place = Parameter("record", Parameter.POSITIONAL_OR_KEYWORD, annotation=Place)
+    return json_and_quiet(cli.with_parameters(wraps(work)(command), [place, *own]))

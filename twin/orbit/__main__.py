@@ -8,7 +8,6 @@ if __name__ == "__main__":
     end_quietly()
 
 import os
-from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,10 +15,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from scenes.specs.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES, SENSORS
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import ANGLE, DISTANCE, parse_quantity
-from twin.framework.cli import AsJson, BackendName, File, Force, InputErrorText, Options, Out, Quiet, Seed, Strict
+from twin.framework import cli
+from twin.framework.cli import InputErrorText
 from twin.framework.command import Result, add_tests, finished, print_warnings, run_command, run_test
 from twin.framework.procedure import Advance, Session
 
@@ -42,9 +43,7 @@ class Correction(StrEnum):
     affine = "affine"
 
 
-app = typer.Typer(
-    add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True
-)
+app = cli.program(no_args_is_help=True)
 
 
 @app.callback()
@@ -64,8 +63,10 @@ add_tests(app, "orbit", apart=("adjust",))
 
 
 @app.command("adjust", help=PROCEDURES["orbit adjust"].about)
+@cli.with_options("export")
 def adjust(
-    file: File,
+    file: cli.File,
+    options: cli.Options,
     without: Annotated[
         list[str] | None,
         typer.Option("--without", metavar="SENSOR", help=f"A sensor that is not used: {', '.join(SENSORS)}."),
@@ -76,38 +77,28 @@ def adjust(
             min=1, max=1024, help="Number of worker processes that reduce the points. Default: this process alone."
         ),
     ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Use a running Dask cluster, as of `python -m twin.study --scheduler`.")
-    ] = None,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-    strict: Strict = False,
+    scheduler: cli.Scheduler = None,
 ) -> None:
     """Adjust a block of scenes; its help is that of the test."""
     procedure = PROCEDURES["orbit adjust"]
 
-    def reduced(setup: AnyAdjust) -> AnyAdjust:
+    def reduced() -> AnyAdjust:
         from scenes.specs.orbit.setup import without_sensors
 
-        return without_sensors(setup, without or ())
-
-    options = Options(out, seed, backend, force, as_json, quiet, strict=strict)
+        return without_sensors(read_for(f"{PROGRAM} adjust", file, procedure.resolve), without or ())
 
     def run(setup: AnyAdjust, backend: Backend, seed: int, advance: Advance) -> Any:
-        from twin.orbit.block.point_workers import point_workers
+        from twin.orbit.block.block_run import point_workers
 
         with point_workers(workers, scheduler, lambda text: print_warnings(errors, (text,))) as pool:
             return procedure.run(setup, backend, seed, advance, pool)
 
     errors = Console(stderr=True)
-    run_test(PROGRAM, "adjust", replace(procedure, run=run), file, options, changed=reduced)
+    run_test("orbit adjust", file, options, read=reduced, run=run)
 
 
 @app.command("export")
+@cli.with_options("export", "strict")
 def export(
     source: Annotated[
         Path,
@@ -117,6 +108,7 @@ def export(
             "the DIMAP file of a scene, DIM_NAME.XML, or a file of rational polynomials.",
         ),
     ],
+    options: cli.Options,
     lowest: Annotated[
         str | None,
         typer.Option(
@@ -158,12 +150,6 @@ def export(
     height_sigma: Annotated[
         str | None, typer.Option("--height-sigma", help="Of the heights that points of one line have, '3 m'.")
     ] = None,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Line cameras for other photogrammetric software: image support data (ISD) of the community sensor model for Ames
     Stereo Pipeline and ISIS, and rational polynomials (RPC00B).
@@ -203,7 +189,7 @@ def export(
         stated = {name: _sigma(name, one) for name, one in sigmas.items() if one is not None}
         uncertainty = CameraUncertainty.of(**stated) if stated else None
         points = None if control is None else read_control(control, correction.value)
-        read = read_polynomial_source(source, band) or read_exportable(source, seed, band)
+        read = read_polynomial_source(source, band) or read_exportable(source, options.seed, band)
         return read, _ground(lowest, highest), uncertainty, points
 
     def work(given: tuple[Any, ...], session: Session) -> Result:
@@ -233,14 +219,14 @@ def export(
             session.folder.write_bytes(name, content)
         ends = () if heights is None else ("--lowest", f"{heights[0]!r} m", "--highest", f"{heights[1]!r} m")
         name = session.backend.name
-        options = (*ends, *(["--truth"] if truth else []), *asked, "--seed", str(drawn))
-        again = (PROGRAM, "export", str(source), *options, *(() if name == "llvm" else ("--backend", name)))
+        words = (*ends, *(["--truth"] if truth else []), *asked, "--seed", str(drawn))
+        again = (PROGRAM, "export", str(source), *words, *(() if name == "llvm" else ("--backend", name)))
         inputs = (source,) if control is None else (source, control)
         facts = {"config": read.config, "seed": drawn, "again": again, "given": inputs}
         return finished(session, "export", shown, numbers, program=PROGRAM, **facts)
 
     stem = source.resolve().name if os.path.isdir(source) else source.stem
-    run_command(f"{stem}-export", Options(out, seed, backend, force, as_json, quiet), resolve, work)
+    run_command(f"{stem}-export", options, resolve, work)
 
 
 def _sigma(name: str, given: str | float) -> float:

@@ -18,8 +18,7 @@ from scipy.spatial import ConvexHull
 
 from optics.geometry.aperture import Aperture, Rectangle
 from optics.geometry.pose import Pose
-from scenes.models.scenery import Scenery
-from scenes.models.scenery_parts import LEAST_CLEARANCE, SceneSurface
+from scenes.models.scenery import LEAST_CLEARANCE, Scenery, SceneSurface
 from twin.path_tracing.families import decode
 
 FACING = 0.05

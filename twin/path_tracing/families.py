@@ -99,11 +99,7 @@ def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[
 def touches(scenery: Scenery, codes: tuple[int, ...]) -> tuple[Touch, ...]:
     """Events in words."""
     parts = scenery.parts
-    out = []
-    for number in codes:
-        part, event, outside = decode(number)
-        out.append(Touch(parts[part], event, outside))
-    return tuple(out)
+    return tuple(Touch(parts[part], event, outside) for part, event, outside in map(decode, codes))
 
 
 _COUNTS = {1: "single", 2: "double", 3: "triple"}

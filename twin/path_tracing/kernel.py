@@ -21,7 +21,7 @@ from twin.path_tracing import tables as layout
 from twin.path_tracing.families import BITS, FACTOR, OUTSIDE, START, Event
 from twin.path_tracing.importance_sampling import Leaving, TableDraw, spread
 from twin.path_tracing.meeting import Flight, Place, locate, next_surface
-from twin.path_tracing.sinks import Arrival, Sinks, record
+from twin.path_tracing.path_result import Arrival, Sinks, record
 
 STEP_BACK = 1e-5
 """How far behind a triangle that is passed over the search goes on, metres."""

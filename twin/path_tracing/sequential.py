@@ -26,7 +26,7 @@ from twin.path_tracing.families import Event, code, decode, signature
 from twin.path_tracing.importance_sampling import Thinning, divide
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, choose, shares
 from twin.path_tracing.meeting import Flight, Place, locate
-from twin.path_tracing.sinks import Arrival, Sinks, record
+from twin.path_tracing.path_result import Arrival, Sinks, record
 
 GROUP = 4
 """Surfaces in a row that a packet passes without asking whether any of its paths is still there."""

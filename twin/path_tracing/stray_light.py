@@ -21,8 +21,7 @@ from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
 from optics.waves.diffraction import Grid, image
 from scenes.models.instrument_model import Instrument
-from scenes.models.scenery import Scenery, build_scenery
-from scenes.models.scenery_parts import Finishes
+from scenes.models.scenery import Finishes, Scenery, build_scenery
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import Channel, prism_of
 from twin.framework.quantity import Quantity, Record
@@ -30,8 +29,7 @@ from twin.monitor.monitor_beams import Aimed
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.families import Event, Touch, family_name, nominal_codes
-from twin.path_tracing.path_result import Balance, Family, PathResult
-from twin.path_tracing.sinks import NOMINAL
+from twin.path_tracing.path_result import NOMINAL, Balance, Family, PathResult
 from twin.path_tracing.source import DiskSource
 from twin.path_tracing.tracer import CHUNK, FAINT, PathTracer, Progress, Sampling
 
@@ -231,7 +229,11 @@ class StrayLight:
 
     def to_dict(self) -> dict[str, Any]:
         """Contents of stray.json: by source, the families at any detector and where the light went."""
-        return {"paths_per_source": self.paths, "sources": {name: _source(self, name) for name in self.traced.runs}}
+        sources = {
+            name: {"families": [*map(FAMILY, self.traced.relative(name)[:FAMILIES])], "balance": _BALANCE(run.balance)}
+            for name, run in self.traced.runs.items()
+        }
+        return {"paths_per_source": self.paths, "sources": sources}
 
 
 FAMILY: Record[ListedFamily] = Record(
@@ -257,12 +259,6 @@ _BALANCE: Record[Balance] = Record(
     Quantity("under_way", lambda balance: balance.under_way, "light of paths that were cut at the step limit"),
     Quantity("relative_error", lambda balance: balance.error, "what is missing in the sum"),
 )
-
-
-def _source(light: StrayLight, channel: str) -> dict[str, Any]:
-    """The strongest families of a source, and its balance."""
-    families = [FAMILY(one) for one in light.traced.relative(channel)[:FAMILIES]]
-    return {"families": families, "balance": _BALANCE(light.traced.runs[channel].balance)}
 
 
 def stray_light(

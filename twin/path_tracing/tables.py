@@ -17,8 +17,7 @@ from optics.materials import scatter
 from optics.materials.scatter import DrawnScatter, Finish
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import leaves
-from scenes.models.scenery import Scenery
-from scenes.models.scenery_parts import SceneSurface
+from scenes.models.scenery import Scenery, SceneSurface
 from twin.path_tracing.clear_ways import PLACES, Way
 
 _HEADER = 8

@@ -1,10 +1,9 @@
-"""A scene made ready for path tracing, run piece by piece, and Mitsuba's integrator that does it."""
+"""A scene made ready for path tracing, and run piece by piece."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from functools import cache
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +14,8 @@ from twin.path_tracing.clear_ways import ClearWays
 from twin.path_tracing.families import Touch, signature, touches
 from twin.path_tracing.importance_sampling import Followed, Thinning, learn
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, follow
-from twin.path_tracing.path_result import Collector, Key, PathResult, event_lists
+from twin.path_tracing.path_result import NOMINAL, Collector, Key, PathResult, Sinks, make_sinks
 from twin.path_tracing.sequential import Left, Step, go_on, pass_along, steps_of
-from twin.path_tracing.sinks import NOMINAL, Sinks, make_sinks
 from twin.path_tracing.source import DiskSource, Source, pieces, start
 from twin.path_tracing.tables import ROWS_PER_SURFACE, SurfaceForm, upload, way_table
 
@@ -74,10 +72,6 @@ def build_scene(mi: Any, scenery: Scenery) -> Any:
     if [shape.id() for shape in scene.shapes()] != names:
         raise AssertionError("mitsuba has put the shapes of a scene in another order")
     return scene
-
-
-NAME = "float64_light_tracer"
-"""Under which the integrator is registered with Mitsuba."""
 
 
 @dataclass(frozen=True)
@@ -155,77 +149,46 @@ class Along:
     thinning: Thinning | None = None
 
 
-@cache
-def _register(variant: str) -> Callable[..., Any]:
-    """Register the integrator for the variant that is set, once; returns how to make one."""
-    import mitsuba as mi
+def launch(
+    scene: PreparedScene,
+    sampling: Sampling,
+    features: Features,
+    start: Launch,
+    mean_weight: float,
+    sinks: Sinks,
+    along: Along | None = None,
+) -> Followed | None:
+    """Trace paths in float64 to their end and write what they meet to the sinks.
 
-    base: Any = mi.SamplingIntegrator
+    Returns:
+        What the paths have done along the nominal way and after it, None without one.
+    """
+    import drjit as dr
 
-    class Float64LightTracer(base):
-        """Follows light from its sources in float64 (``launch``); it has no camera's view to render."""
-
-        def __init__(self, props: Any) -> None:
-            super().__init__(props)
-            self.sampling = Sampling(**{f.name: props[f.name] for f in fields(Sampling) if f.name in props})
-
-        def sample(self, *arguments: Any, **options: Any) -> Any:
-            raise NotImplementedError(f"{NAME} follows light from its sources; call launch")
-
-        def launch(
-            self,
-            scene: PreparedScene,
-            features: Features,
-            start: Launch,
-            mean_weight: float,
-            sinks: Sinks,
-            along: Along | None = None,
-        ) -> Followed | None:
-            """Trace paths to their end and write what they meet to the sinks.
-
-            Returns:
-                What the paths have done along the nominal way and after it, None without one.
-            """
-            import drjit as dr
-
-            backend = scene.backend
-            s = self.sampling
-            limits = Limits(
-                dr.opaque(backend.UInt, s.steps),
-                dr.opaque(backend.UInt, sinks.room),
-                [backend.opaque(floor) for floor in s.floors],
-                [backend.opaque(floor) for floor in s.scatter_floors],
-                backend.opaque(s.near),
-                backend.opaque(s.roulette * mean_weight),
-            )
-            with dr.suspend_grad():
-                dr.scatter_add(sinks.left, start.weight, backend.UInt(2))
-                if along is None:
-                    follow(scene, features, limits, start, sinks)
-                    dr.eval(sinks.arrays)
-                    return None
-                stretch = pass_along(scene, features, limits, start, sinks, along.steps)
-                dr.eval(sinks.arrays, stretch.arrays)
-                left = Left.of(along.steps, stretch, along.numbers, along.thinning, features.log)
-                steps = np.zeros(len(along.numbers))
-                if len(left.chosen):
-                    taken = follow(scene, features, limits, go_on(backend, along.steps, stretch, left), sinks)
-                    dr.eval(sinks.arrays, taken)
-                    steps[left.chosen] = taken.numpy() - left.passed[left.chosen]
-            return Followed(left.passed, left.turned, steps)
-
-        def to_string(self) -> str:
-            return f"{NAME}[{self.sampling}]"
-
-    mi.register_integrator(NAME, Float64LightTracer)
-    return Float64LightTracer
-
-
-def make_integrator(backend: Backend, sampling: Sampling) -> Any:
-    """The integrator as Mitsuba's plugin."""
-    mi = load_mitsuba(backend)
-    _register(mi.variant())
-    return mi.load_dict({"type": NAME, **{name: n for name, n in asdict(sampling).items() if n is not None}})
+    backend = scene.backend
+    limits = Limits(
+        dr.opaque(backend.UInt, sampling.steps),
+        dr.opaque(backend.UInt, sinks.room),
+        [backend.opaque(floor) for floor in sampling.floors],
+        [backend.opaque(floor) for floor in sampling.scatter_floors],
+        backend.opaque(sampling.near),
+        backend.opaque(sampling.roulette * mean_weight),
+    )
+    with dr.suspend_grad():
+        dr.scatter_add(sinks.left, start.weight, backend.UInt(2))
+        if along is None:
+            follow(scene, features, limits, start, sinks)
+            dr.eval(sinks.arrays)
+            return None
+        stretch = pass_along(scene, features, limits, start, sinks, along.steps)
+        dr.eval(sinks.arrays, stretch.arrays)
+        left = Left.of(along.steps, stretch, along.numbers, along.thinning, features.log)
+        steps = np.zeros(len(along.numbers))
+        if len(left.chosen):
+            taken = follow(scene, features, limits, go_on(backend, along.steps, stretch, left), sinks)
+            dr.eval(sinks.arrays, taken)
+            steps[left.chosen] = taken.numpy() - left.passed[left.chosen]
+    return Followed(left.passed, left.turned, steps)
 
 
 CHUNK = 1 << 19
@@ -272,7 +235,6 @@ class PathTracer:
             there = ", ".join(known)
             raise ValueError(f"families of unknown detectors: {', '.join(unknown)}; detectors of the scene: {there}")
         self.sampling = sampling
-        self.integrator = make_integrator(backend, sampling)
         mi = load_mitsuba(backend)
         signatures = {name: signature(codes) for name, codes in self.nominal.items()}
         self._clear = ClearWays(scenery, self.nominal if ways else {})
@@ -334,7 +296,7 @@ class PathTracer:
                 numbers = np.arange(first, first + count)
                 light = replace(start(self.backend, source, numbers, total, seed), way=way)
                 along = Along(steps, numbers, thinning) if steps else None
-                done = self.integrator.launch(prepared, features, light, 1.0 / total, sinks, along)
+                done = launch(prepared, self.sampling, features, light, 1.0 / total, sinks, along)
                 wanted = int(sinks.counter.numpy()[0])
                 if wanted <= sinks.room:
                     break
@@ -432,9 +394,10 @@ class PathTracer:
         light = replace(start(self.backend, source, numbers, total, seed), path=own, way=way)
         sinks = self._sinks(LEAST_ROOM, count * most)
         along = Along(steps, numbers, thinning) if steps else None
-        done = self.integrator.launch(prepared, self.features(log=True), light, 1.0 / total, sinks, along)
-        logged = event_lists(sinks.log.numpy(), count)
+        done = launch(prepared, self.sampling, self.features(log=True), light, 1.0 / total, sinks, along)
+        # steps that passed over something are left out
+        logged = [tuple(int(c) for c in row if c) for row in sinks.log.numpy().reshape(count, -1)]
         if done is None:
-            return list(logged)
+            return logged
         codes = tuple(step.code for step in steps)
         return [codes[:passed] + after for passed, after in zip(done.passed, logged, strict=True)]

@@ -18,7 +18,6 @@ import base64
 import gzip
 from collections.abc import Sequence
 from importlib.resources import files
-from pathlib import Path
 from typing import Any, assert_never
 
 import numpy as np
@@ -34,8 +33,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE, Channel
-from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.pictures.light_paths import RIM, Beam, LightPaths, trace_light_paths
+from twin.pictures.light_paths import RIM, Beam, LightPaths
 
 LINE_WIDTH = 0.002
 RETICLE = 0.0005
@@ -75,20 +73,8 @@ IMAGING = (_metal(0, 114, 178, 0.0, 0.8), _metal(86, 180, 233, 0.0, 0.8))
 MONITOR = (_metal(213, 94, 0, 0.0, 0.8), _metal(230, 159, 0, 0.0, 0.8))
 
 
-def write_scene(experiment: MonitorExperiment, state: State, place: Path) -> None:
-    """Write the instrument in a perturbed state as binary glTF.
-
-    Args:
-        experiment: the instrument and where to trace.
-        state: what is perturbed.
-        place: the file, ``scene.glb``.
-    """
-    paths = trace_light_paths(experiment.instrument, experiment.backend, state)
-    place.write_bytes(scene_bytes(experiment.instrument, state, paths))
-
-
 def scene_bytes(instrument: Instrument, state: State, paths: LightPaths) -> bytes:
-    """The file's content.
+    """The content of ``scene.glb``: the instrument in a perturbed state as binary glTF.
 
     Args:
         instrument: the instrument.
@@ -292,7 +278,7 @@ def viewer_scripts(scene: bytes) -> Markup:
     """What makes the view: the library and the scene, both packed, and the program. They stand at the end of a page.
 
     Args:
-        scene: binary glTF, as ``scene_file.write_scene`` writes it.
+        scene: binary glTF, as `scene_bytes` gives it.
     """
     program, library = viewer_programs()
     # names of tags cannot stand in base64, and the program is ours

@@ -8,35 +8,23 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from scenes.specs.file_kinds import read_for
-from scenes.yaml.named import Named
-from twin.framework.cli import AsJson, BackendName, Force, Options, Out, Quiet, Strict
-from twin.framework.command import Result, finished, run_command
-from twin.framework.procedure import Session
+from twin.framework import cli
+from twin.framework.command import run_test
 
-if TYPE_CHECKING:
-    from scenes.specs.monitor_frames import MeasurementSetup
-
-PROGRAM = "twin.recover"
-
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = cli.program()
 
 
 @app.command()
+@cli.with_options("seed", "export")
 def main(
     measurement: Annotated[
         Path, typer.Argument(readable=False, help="YAML file of the measurement, or the config.yaml of a run.")
     ],
-    out: Out = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-    strict: Strict = False,
+    options: cli.Options,
 ) -> None:
     """Recover what moved from measured frames of a monitor's area CCDs, before and after: the centroids and estimators
     of `python -m twin.render`, with total sigmas and without a truth.
@@ -63,24 +51,7 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-
-    def work(setup: MeasurementSetup, session: Session) -> Result:
-        from twin.recover.recover_run import run_recover
-
-        run = run_recover(setup, session.backend, session.advance)
-        # frames that cannot be measured are told before anything that draws is loaded
-        from twin.main_job.monitor_reading import worst_checks
-        from twin.recover.recover_report import KIND, recover_numbers, recover_report
-
-        facts = {"config": setup.to_yaml(), "named": setup.plain(), "checks": worst_checks(run.readings)}
-        return finished(session, KIND, recover_report(run), recover_numbers(run), program=PROGRAM, **facts)
-
-    run_command(
-        measurement.stem,
-        Options(out, None, backend, force, as_json, quiet, strict=strict),
-        lambda: read_for(PROGRAM, measurement, Named("scenes.specs.monitor_frames:MeasurementSetup.read")),
-        work,
-    )
+    run_test("recover", measurement, options)
 
 
 if __name__ == "__main__":

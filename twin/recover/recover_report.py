@@ -2,61 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from analysis.monitor import parameters
-from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
+from analysis.spots import CENTROIDS
 from scenes.specs.course import moment
 from twin.framework.artefact import FAR, Cell, SvgFigure, Table, decimals_for, fixed, plain, significant
 from twin.framework.report import Report, Section, answer
-from twin.main_job.assumptions import NOISE, assumed, course_agrees, limits, share_text
-from twin.main_job.monitor_reading import CENTROID_NOTES, contradicted, stated
+from twin.main_job.monitor_reading import worst_checks
+from twin.main_job.systematics import NOISE, assumed, course_agrees, limits, share_text
 from twin.recover.channel_measurement import ChannelResult, SpotResult
 from twin.recover.recover_plots import Line, changes_svg, residuals_svg, spots_svg
 from twin.recover.recover_run import RecoverRun, state_name
 
-KIND = "recovered"
 _IN_NO_SIGMA = (
     "σ contains no charge that a CCD leaves behind when it is read out (tails away from the read-out), no reflection "
     "so near the spot that it is not told from it, and no error of the stated geometry."
 )
-
-
-def recover_numbers(run: RecoverRun) -> dict[str, Any]:
-    """Contents of recovered.json: as the main job's, of the last state; then what was found in the frames, and of a
-    series all states.
-    """
-    out: dict[str, Any] = {**stated(run.last.recovered_dict())}
-    out["warnings"] = list(_warnings(run))
-    out["channels"] = {
-        result.channel.name: {name.replace(" ", "_"): _spot_numbers(spot) for name, spot in result.states()}
-        for result in run.channels
-    }
-    transfers = {r.channel.name: r.channel.transfer for r in run.channels if r.channel.transfer is not None}
-    if transfers:
-        out["photon_transfer"] = {name: vars(one) for name, one in transfers.items()}
-    if run.times is not None:
-        out["times_s"] = list(run.times)
-        out["series"] = [stated(reading.recovered_dict()) for reading in run.readings]
-    if run.smoothed is not None:
-        between = run.smoothed.between_dict()
-        out["smoothed"] = {**run.smoothed.changes.groups(), "disturbances": run.smoothed.to_dict(), "between": between}
-    return out
-
-
-def _spot_numbers(spot: SpotResult) -> dict[str, Any]:
-    return {
-        "frames": len(spot.frames.frames),
-        "first_pixel": list(spot.frames.offset),
-        "pixels_left_out": int(np.count_nonzero(~spot.used)),
-        "found": [
-            {"kind": finding.kind, "text": finding.text, "corrected": finding.corrects} for finding in spot.findings
-        ],
-        "sigma_cost": round(spot.cost, 6),
-    }
 
 
 def _name(run: RecoverRun) -> str:
@@ -92,7 +55,7 @@ def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
         second = f"the clearest change is {clearest.name}, {clearest.read}"
     else:
         parts = []
-        for p in parameters.CAMERA_PARAMETERS:
+        for p in parameters.CAMERA_PARAMETERS.values():
             sigmas = [one.sigma for one in found if one.parameter == p]
             parts += [f"{p.symbol} {significant(FAR * max(sigmas), 2, floor=0.0)} {p.unit}"] if sigmas else []
         first = (
@@ -127,7 +90,7 @@ def recover_report(run: RecoverRun) -> Report:
     facts = [
         ("instrument", _name(run) if run.setup.model is not None else f"geometry of {_name(run)}"),
         ("spot's shape", "from the model" if run.setup.test.template == "twin" else "learnt from the frames before"),
-        ("centroid", CENTROID_NOTES[reading.centroid]),
+        ("centroid", CENTROIDS[reading.centroid].title),
         ("area CCD", f"{run.setup.detector.name}, pixels of {plain(1e6 * run.pitch)} µm"),
         ("frames", _frames_text(run)),
     ]
@@ -144,21 +107,9 @@ def recover_report(run: RecoverRun) -> Report:
         facts=tuple(facts),
         summary=_summary(run),
         sections=tuple(sections),
-        warnings=_warnings(run),
+        warnings=run.all_warnings,
+        checks=worst_checks(run.readings),
     )
-
-
-def _warnings(run: RecoverRun) -> tuple[str, ...]:
-    worst, when, rate = run.worst, "", f"{FALSE_ALARM:g}"
-    if worst is None:
-        return run.warnings
-    if run.times is not None and len(run.times) > 1:
-        when = f" at {moment(run.times[worst[0]])}, the worst of {len(run.times)} times"
-        rate += " for the series"
-    found = (*run.warnings, *contradicted(run.last.disturbances, worst[1], when, rate))
-    if run.smoothed is not None:
-        found += run.smoothed.jump_texts()
-    return (*found, *(() if run.smoothed is None else run.smoothed.contradiction))
 
 
 def _frames_text(run: RecoverRun) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from analysis.arrays import shows
-from analysis.monitor.disturbances import Consistency, Disturbances
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
 from analysis.monitor.monitoring import MonitorGeometry, coefficients
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.monitor.recovery import MotionModel, Recovery, judged_spots, recover, recovery_of
@@ -26,7 +26,7 @@ from scenes.specs.monitor_frames import MeasurementSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.framework.frame_store import mean_of
 from twin.framework.procedure import Advance, silent
-from twin.main_job.monitor_reading import MonitorReading
+from twin.main_job.monitor_reading import MonitorReading, contradicted, stated
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import pieces
@@ -86,6 +86,20 @@ class RecoverRun:
             np.concatenate([one.shift for one in found]), np.concatenate([one.shift_covariance for one in found])
         )
 
+    @property
+    def all_warnings(self) -> tuple[str, ...]:
+        """Warnings of the measurement, and what contradicts the prior."""
+        worst, when, rate = self.worst, "", f"{FALSE_ALARM:g}"
+        if worst is None:
+            return self.warnings
+        if self.times is not None and len(self.times) > 1:
+            when = f" at {moment(self.times[worst[0]])}, the worst of {len(self.times)} times"
+            rate += " for the series"
+        found = (*self.warnings, *contradicted(self.last.disturbances, worst[1], when, rate))
+        if self.smoothed is not None:
+            found += self.smoothed.jump_texts()
+        return (*found, *(() if self.smoothed is None else self.smoothed.contradiction))
+
 
 @dataclass(frozen=True, eq=False)
 class _Bench:
@@ -112,13 +126,18 @@ class _Bench:
 
 
 def run_recover(
-    setup: MeasurementSetup, backend: Backend, advance: Advance = silent, experiment: MonitorExperiment | None = None
+    setup: MeasurementSetup,
+    backend: Backend,
+    seed: int = 0,
+    advance: Advance = silent,
+    experiment: MonitorExperiment | None = None,
 ) -> RecoverRun:
     """Measure the spots and read what they say.
 
     Args:
         setup: the measurement.
         backend: where the instrument is traced.
+        seed: of nothing; nothing is drawn.
         advance: told what is being done.
         experiment: the instrument where it has been built already; results are the same.
 
@@ -411,3 +430,37 @@ def _noisy(
         " `detector`, or measure it with dark and flat frames and `photon_transfer: measured`"
         for where, (_, ratio) in _worst(results, times, apart, first)
     )
+
+
+def recover_numbers(run: RecoverRun) -> dict[str, Any]:
+    """Contents of recovered.json: as the main job's, of the last state; then what was found in the frames, and of a
+    series all states.
+    """
+    out: dict[str, Any] = {**stated(run.last.recovered_dict())}
+    out["warnings"] = list(run.all_warnings)
+    out["channels"] = {
+        result.channel.name: {name.replace(" ", "_"): _spot_numbers(spot) for name, spot in result.states()}
+        for result in run.channels
+    }
+    transfers = {r.channel.name: r.channel.transfer for r in run.channels if r.channel.transfer is not None}
+    if transfers:
+        out["photon_transfer"] = {name: vars(one) for name, one in transfers.items()}
+    if run.times is not None:
+        out["times_s"] = list(run.times)
+        out["series"] = [stated(reading.recovered_dict()) for reading in run.readings]
+    if run.smoothed is not None:
+        between = run.smoothed.between_dict()
+        out["smoothed"] = {**run.smoothed.changes.groups(), "disturbances": run.smoothed.to_dict(), "between": between}
+    return out
+
+
+def _spot_numbers(spot: SpotResult) -> dict[str, Any]:
+    return {
+        "frames": len(spot.frames.frames),
+        "first_pixel": list(spot.frames.offset),
+        "pixels_left_out": int(np.count_nonzero(~spot.used)),
+        "found": [
+            {"kind": finding.kind, "text": finding.text, "corrected": finding.corrects} for finding in spot.findings
+        ],
+        "sigma_cost": round(spot.cost, 6),
+    }

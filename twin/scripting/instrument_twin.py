@@ -18,7 +18,6 @@ import xarray as xr
 
 from analysis.monitor import parameters
 from analysis.monitor.recovery import recover
-from analysis.spots.centroid import CENTROIDS
 from optics.geometry.tree import ORIGIN, State
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.camera_sharpness import blur_warnings
@@ -29,7 +28,7 @@ from scenes.specs.load import load_camera as read_camera
 from scenes.specs.motion_text import AXES, meant, motion_of, node_named, perturbation_in_words
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
-from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
+from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, unknown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.camera.camera_view import CameraView
@@ -267,15 +266,13 @@ class InstrumentTwin:
             before: frames of the unperturbed instrument, grey values, (channel, frame, row, column) in the order of
                 ``shot.before.channel``; a DataArray or an array.
             after: of the perturbed one.
-            centroid: ``ml`` (the calibrated shape of the spot), ``gaussian`` or ``energy``; the job's if not given.
+            centroid: name of a method of `analysis.spots.CENTROIDS`; the job's if not given.
 
         Raises:
             ValueError: frames of another shape, or no such centroid.
             SpotError: a spot cannot be measured.
         """
         method = self.resolved.job.analysis.centroid if centroid is None else centroid
-        if method not in CENTROIDS:
-            raise ValueError(f"no centroid {method!r}; there are {', '.join(CENTROIDS)}")
         experiment = self._bench.experiment
         path = experiment.path
         keys = [channel.key for channel in path.channels]
@@ -339,7 +336,7 @@ class InstrumentTwin:
                 "channel": keys,
                 "axis": ["row", "column"],
                 "camera": names,
-                "parameter": [one.key for one in parameters.CAMERA_PARAMETERS],
+                "parameter": [one.key for one in parameters.CAMERA_PARAMETERS.values()],
                 "estimator": list(gains),
             },
             attrs={"reference_frames": frames_text("crosstalk")},
@@ -359,10 +356,7 @@ class InstrumentTwin:
 
         name = name or (self.cameras[0] if len(self.cameras) == 1 else "")
         if name not in self.cameras:
-            known = names_text(self.cameras)
-            raise InputError(
-                Issue("no such camera", found=repr(name), allowed=known, suggestion=nearest(name, self.cameras))
-            )
+            raise InputError(unknown("no such camera", name, self.cameras).at())
         return CameraTwin.of(self, name, obstruction)
 
     def to_yaml(self) -> str:

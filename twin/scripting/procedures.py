@@ -1,4 +1,4 @@
-"""Tests of the laboratory and of the orbit in a script: the same runs as the commands', with their numbers at hand."""
+"""Commands in a script: the same runs with their numbers at hand."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ import pandas as pd
 from analysis.arrays import shows
 from optics.numerics.backend import load_backend
 from scenes.specs.procedures import PROCEDURES
-from scenes.specs.resolved import ExperimentSetup
-from scenes.yaml.errors import InputError, Issue, names_text, nearest
-from scenes.yaml.spec import Source, annotation_at, validate
+from scenes.yaml.errors import InputError, unknown
+from scenes.yaml.spec import Source, Spec, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.framework.artefact import cell_text
 from twin.framework.page import RunFacts, write_test
-from twin.framework.procedure import performed
+from twin.framework.procedure import performed, seeded
 from twin.framework.report import Report, with_warnings
 from twin.framework.run_folder import RunFolder
 
@@ -41,7 +40,7 @@ class TestResult:
     name: str
     numbers: Mapping[str, Any] = field(repr=False)
     report: Report = field(repr=False)
-    setup: ExperimentSetup[Any] = field(repr=False)
+    setup: Spec = field(repr=False)
     run: Any = field(repr=False)
     _facts: RunFacts = field(repr=False)
     _kind: str = field(repr=False)
@@ -77,47 +76,46 @@ class TestResult:
 def perform(
     name: str, file: str | Path, *, seed: int | None = None, backend: str = "llvm", **changes: Any
 ) -> TestResult:
-    """Run a test of the laboratory or of the orbit.
+    """Run what a command runs on its file.
 
     Args:
-        name: ``lab focus``, ``lab distortion``, ``lab turntable``, ``orbit angle``, ``orbit calibrate``,
-            ``orbit monitor`` or ``orbit simulate``.
-        file: of the test, or its name in scenes/lab or scenes/orbit.
+        name: ``camera``, ``recover``, ``tolerance``, ``uncertainty``; or any of ``lab``, ``orbit`` (but export),
+            ``design`` and ``asbuilt`` with its subcommand, such as ``lab focus``.
+        file: of the test, or its name in the library.
         seed: of all that is drawn; the file's own if not given.
         backend: where to trace, ``llvm`` or ``cuda``.
-        changes: keys of the test's file with other values; a mapping replaces single keys of a mapping.
+        changes: keys of the test's file with other values, of ``camera`` and ``uncertainty`` those of the run's
+            config.yaml; a mapping replaces single keys of a mapping.
 
     Raises:
         InputError: no such test, file or key; or the test failed on its bench, with the key to be changed.
     """
     if name not in PROCEDURES:
-        meant = nearest(name, PROCEDURES)
-        raise InputError(Issue("no such test", found=repr(name), allowed=names_text(PROCEDURES), suggestion=meant))
+        raise InputError(unknown("no such test", name, PROCEDURES).at())
     procedure = PROCEDURES[name]
     setup = procedure.resolve(file)
     if changes:
-        tree = setup.plain()
-        tree["test"] = _merged(tree["test"], changes, type(setup.test))
-        source = setup.test.source
-        setup = validate(procedure.model, YamlFile("", tree, {}))
-        setup = setup.model_copy(update={"test": setup.test.with_source(Source(source.file))})
-    number = setup.test.seed if seed is None else seed
+        tree, test = setup.plain(), getattr(setup, "test", None)
+        tree = _merged(tree, changes if test is None else {"test": changes})
+        setup = validate(type(setup), YamlFile("", tree, {}))
+        if test is not None:
+            setup = setup.model_copy(update={"test": setup.test.with_source(Source(test.source.file))})
+    setup, number, stated = seeded(procedure, setup, seed)
     started, clock = time.time(), time.monotonic()
     run, given = performed(procedure, setup, load_backend(backend), number)
-    program, command = name.split()
-    seeded, seconds = setup.with_seed(number), time.monotonic() - clock
-    told = (seeded.to_yaml(), f"twin.{program}", started, seconds, backend, number, command)
-    facts = RunFacts(*told, named=seeded.plain())
+    seconds = time.monotonic() - clock
     shown = with_warnings(procedure.report(run), given)
+    program, _, command = name.partition(" ")
+    called = (f"twin.{program}", started, seconds, backend)
+    facts = RunFacts(stated.pop("config"), *called, command=command, checks=shown.checks, **stated)
     numbers = shown.told(procedure.numbers(run))
     return TestResult(name, numbers, shown, setup, run, facts, procedure.kind)
 
 
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any], model: Any) -> dict[str, Any]:
-    """Plain data of a model with other values."""
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain data with other values."""
     out = dict(base)
     for key, value in changes.items():
         inner = out.get(key)
-        both = isinstance(value, Mapping) and isinstance(inner, Mapping)
-        out[key] = _merged(inner, value, annotation_at(model, (key,))) if both and isinstance(inner, Mapping) else value
+        out[key] = _merged(inner, value) if isinstance(value, Mapping) and isinstance(inner, Mapping) else value
     return out

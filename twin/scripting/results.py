@@ -234,7 +234,7 @@ def _reading_frame(found: Found) -> pd.DataFrame:
 
 def _truth_frame(truth: xr.Dataset) -> pd.DataFrame:
     """True parameters, a row for each camera."""
-    return truth[[one.key for one in parameters.CAMERA_PARAMETERS]].to_dataframe()
+    return truth[[one.key for one in parameters.CAMERA_PARAMETERS.values()]].to_dataframe()
 
 
 def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
@@ -293,7 +293,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     if shares:
         from_statement.index = pd.MultiIndex.from_tuples(shares, names=["camera", "parameter"])
     estimators = list(recovery.parameters[cameras[0]])
-    table, keys = reading.table, [one.key for one in parameters.CAMERA_PARAMETERS]
+    table, keys = reading.table, [one.key for one in parameters.CAMERA_PARAMETERS.values()]
     values = [[[table.row(camera, key, name).value for key in keys] for name in estimators] for camera in cameras]
     coords = {"camera": list(cameras), "estimator": estimators, "parameter": keys}
     dims = ("camera", "estimator", "parameter")

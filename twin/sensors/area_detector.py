@@ -29,9 +29,10 @@ from pydantic import ValidationError
 from analysis.spots.noise import COARSE, FEW, WHOLE, FurtherNoise, NoiseModel
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import cores
+from optics.numerics.extension_table import ExtensionTable
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec
-from scenes.yaml.errors import Problem, names_text, nearest
+from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.spec import Spec
 from twin.framework.frame_store import frame_room, largest_of, let_go
 from twin.framework.random_streams import stream
@@ -117,7 +118,7 @@ class FixedOffsets:
         return
 
 
-NOISE_TERMS: dict[str, Callable[[float], NoiseTerm]] = {"read": ReadNoise, "offset": FixedOffsets}
+NOISE_TERMS = ExtensionTable[Callable[[float], NoiseTerm]]("noise_terms", {"read": ReadNoise, "offset": FixedOffsets})
 """Name that a data sheet may write under ``noise`` -> the term of the number that stands there, electrons rms where the
 term does not say otherwise. A new one is added here.
 """
@@ -221,10 +222,7 @@ class EmvaDetector:
         sheet.check_exposure(exposure)
         for name in sheet.noise or {}:
             if name not in NOISE_TERMS:
-                key, known = ("noise", name), names_text(NOISE_TERMS)
-                raise sheet.error(
-                    "no such noise", key, found=name, allowed=known, suggestion=nearest(name, NOISE_TERMS)
-                )
+                raise sheet.error(unknown("no such noise", name, NOISE_TERMS, ("noise", name)))
         terms = tuple(NOISE_TERMS[name](value) for name, value in (sheet.noise or {}).items())
         return cls(**{name: getattr(sheet, name) for name in cls._sheet_names()}, noise=terms)
 

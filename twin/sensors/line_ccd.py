@@ -1,19 +1,48 @@
-"""A TDI line CCD: what its pixels, its charge and its clocking do to the image, and the frames it records."""
+"""A TDI line CCD: what its pixels, its charge and its clocking do to the image, and the frames it records.
+
+What an oscillation of the image does while a TDI line collects light: exact, for any frequency.
+
+The charge of a pixel is collected in M = stages x phases steps, one every D = line time / phases, of which light falls
+in for a share o. A motion of the image by x(t), against the charge that follows the image's mean motion, multiplies the
+image's spectrum at nu cycles per pixel by
+
+    T(nu) = mean over the light of exp(-2 pi i nu x(t)).
+
+For x = A sin(2 pi f t + p) the expansion of Jacobi and Anger makes each of its terms an integral over the steps that
+has a closed form,
+
+    T(nu) = sum over n of J_n(2 pi nu A) exp(-i n p) W(n f),    W(f) = sinc(o D f) sin(pi M D f) / (M sin(pi D f)),
+
+t counting from the middle of the collection. Its limits, with the length T = M D of the collection:
+
+- slow, f T << 1: the image moves on by A cos(p) 2 pi f T while light is collected, and |T| is the sinc of a linear
+  smear of that length. The displacement A sin(p) is in the phase of T and does not blur.
+- fast, f T >> 1: only n = 0 is left, and T = J_0(2 pi nu A) whatever the phase.
+
+The mean of |T|^2 over the phases needs no sum: two moments of the collection that lie s apart move by
+2 A sin(pi f s) cos(q) against each other with q as random as p, so that
+
+    E |T|^2 = mean over pairs of moments of J_0(4 pi nu A |sin(pi f s)|) for each line,
+              times exp(-4 pi^2 nu^2 (R(0) - R(s))) for noise of a band with the autocovariance R.
+
+This holds for any number of independent lines and bands at once.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import j0, jv
 
 from analysis.spots.noise import NoiseModel
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
 if TYPE_CHECKING:
-    from scenes.specs.camera import BandSpec
+    from scenes.specs.camera import BandSpec, TdiSpec
     from scenes.specs.detector import DetectorSpec
-
 
 WIDEST_STEP = 100e-9
 """Mean distance of the wavelengths of a band, metres: mean transfer functions are then right to 1e-4."""
@@ -125,3 +154,196 @@ class LineCcd:
             raise ValueError(f"columns {column} to {last - 1} are not all on a line of {self.band.pixels} pixels")
         own = FixedPattern(pattern.gain[:, column:last], pattern.offset_e[:, column:last])
         return self.detector.expose(photons, own, frames, self.exposure, seed, threads=1)
+
+
+_BEYOND = 30
+"""Terms of the expansion beyond the size of its argument; they fall off faster than (e z / 2 n)^n."""
+_PER_STEP = 8
+"""Moments by which a quadrature knows the light of a step, where the light of a step is not all."""
+_PER_CYCLE = 6
+"""Gauss' points for each cycle of what is meant over a step."""
+
+
+@dataclass(frozen=True)
+class Collection:
+    """When the charge of a pixel is collected, about the middle of it.
+
+    Attributes:
+        steps: how often the charge stands still, stages x phases.
+        step: from one to the next, seconds.
+        open_share: share of each step in which light falls in, in its middle.
+    """
+
+    steps: int
+    step: float
+    open_share: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or not self.step > 0.0 or not 0.0 < self.open_share <= 1.0:
+            raise ValueError("a collection has a step or more, of a length above zero, open for a share within 0 to 1")
+
+    @classmethod
+    def of(cls, tdi: TdiSpec, line_time: float | None = None) -> Collection:
+        """Of a line CCD as its file says it; line_time: seconds, in place of the file's."""
+        time = tdi.line_time if line_time is None else line_time
+        return cls(tdi.stages * tdi.phases, time / tdi.phases, tdi.open_share)
+
+    @property
+    def length(self) -> float:
+        """From its begin to its end, seconds."""
+        return self.steps * self.step
+
+    def mean(self, frequency: np.ndarray | float) -> np.ndarray:
+        """W: what is left of an oscillation in the mean over the collection, at frequencies (...), hertz."""
+        cycles = self.step * np.asarray(frequency, np.float64)
+        near = np.sinc(cycles)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.sinc(self.steps * cycles) / near
+        # a whole number of cycles in a step: all steps see the same
+        whole = np.round(cycles)
+        aligned = np.where((self.steps - 1) * whole % 2 == 0, 1.0, -1.0)
+        return np.asarray(np.sinc(self.open_share * cycles) * np.where(np.abs(near) < 1e-9, aligned, ratio))
+
+    def moments(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss' rule for means over the collection: moments (K,), seconds from its middle, and weights that sum to 1.
+
+        Polynomials up to 2 K - 1 in time are meant exactly; K is ``count``, or what the collection has moments of.
+        """
+        if self.open_share == 1.0:
+            x, w = np.polynomial.legendre.leggauss(count)
+            return 0.5 * self.length * x, 0.5 * w
+        within, weight = np.polynomial.legendre.leggauss(_PER_STEP)
+        at = np.arange(self.steps) - 0.5 * (self.steps - 1)
+        place = ((at[:, None] + 0.5 * self.open_share * within) / self.steps).ravel()
+        mass = np.tile(0.5 * weight / self.steps, self.steps)
+        return _gauss(place, mass, min(count, len(place)), self.length)
+
+    def transfer(self, nu: np.ndarray | float, frequency: float, amplitude: float, phase: float) -> np.ndarray:
+        """T of one oscillation, complex, (...).
+
+        Args:
+            nu: cycles per pixel, (...).
+            frequency: hertz.
+            amplitude: pixels.
+            phase: in the middle of the collection, radians.
+        """
+        z = 2.0 * np.pi * amplitude * np.asarray(nu, np.float64)
+        most = int(np.ceil(np.max(np.abs(z), initial=0.0))) + _BEYOND
+        order = np.arange(-most, most + 1)
+        weight = np.exp(-1j * order * phase) * self.mean(order * frequency)
+        return np.asarray(np.tensordot(jv(order, z[..., None]), weight, axes=(-1, 0)))
+
+    def mean_square(self, nu: np.ndarray | float, motion: Motion) -> np.ndarray:
+        """E |T|^2 over random phases, (...), of independent oscillations and bands at ``nu`` (...) cycles per pixel."""
+        at = np.asarray(nu, np.float64)
+        lag, weight = self._lags(motion.highest + 2.0 * motion.speed * float(np.max(np.abs(at), initial=0.0)))
+        return np.asarray(np.tensordot(motion.agreement(at[..., None], lag), weight, axes=(-1, 0)))
+
+    def mtf(self, nu: np.ndarray | float, motion: Motion) -> np.ndarray:
+        """Root mean square of the modulation transfer over random phases, (...)."""
+        return np.sqrt(np.maximum(self.mean_square(nu, motion), 0.0))
+
+    def smear(self, motion: Motion) -> float:
+        """Rms of the image's motion about its mean over the collection, pixels."""
+        lag, weight = self._lags(motion.highest)
+        # the variance about a mean is half of the mean square of all differences
+        return float(np.sqrt(max(float(weight @ (motion.variance - motion.covariance(lag))), 0.0)))
+
+    def _lags(self, highest: float) -> tuple[np.ndarray, np.ndarray]:
+        """Quadrature over the time between two moments of the collection, for what changes up to a frequency."""
+        if self.open_share == 1.0:
+            # the whole collection is one step: its density falls linearly
+            points = 16 + int(np.ceil(_PER_CYCLE * highest * self.length))
+            x, w = np.polynomial.legendre.leggauss(points)
+            share = 0.5 * (x + 1.0)
+            return self.length * share, w * (1.0 - share)
+        points = 16 + int(np.ceil(_PER_CYCLE * highest * self.open_share * self.step))
+        x, w = np.polynomial.legendre.leggauss(points)
+        share = 0.5 * (x + 1.0)
+        part = np.concatenate([-share[::-1], share]) * self.open_share * self.step
+        within = 0.5 * np.concatenate([(w * (1.0 - share))[::-1], w * (1.0 - share)])
+        apart = np.arange(self.steps)
+        often = np.where(apart == 0, 1.0, 2.0) * (self.steps - apart) / self.steps**2
+        lag = self.step * apart[:, None] + part
+        return np.abs(lag).ravel(), (often[:, None] * within).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A random motion of the image in one direction: oscillations of random phase and bands of noise, independent.
+
+    Attributes:
+        frequency, amplitude: (K,) hertz and pixels, of the oscillations.
+        first, last, level: (B,) hertz and pixels^2/Hz, of the bands, one-sided.
+    """
+
+    frequency: np.ndarray
+    amplitude: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+    level: np.ndarray
+
+    @classmethod
+    def of(cls, lines: Sequence[tuple[float, float]] = (), bands: Sequence[tuple[float, float, float]] = ()) -> Motion:
+        """From (frequency, amplitude) of lines and (first, last, level) of bands.
+
+        Raises:
+            ValueError: a frequency that is not above zero, an amplitude or level below zero, an empty band.
+        """
+        line, band = np.array(lines, np.float64).reshape(-1, 2), np.array(bands, np.float64).reshape(-1, 3)
+        if not (np.all(line[:, 0] > 0.0) and np.all(line[:, 1] >= 0.0)):
+            raise ValueError("oscillations have frequencies above zero and amplitudes of zero or more")
+        if not (np.all(band[:, 0] >= 0.0) and np.all(band[:, 1] > band[:, 0]) and np.all(band[:, 2] >= 0.0)):
+            raise ValueError("bands reach from a frequency to a higher one, with a level of zero or more")
+        return cls(*line.T, *band.T)
+
+    @property
+    def highest(self) -> float:
+        """Highest frequency of it, hertz; 0 without any motion."""
+        return float(np.max(np.concatenate([self.frequency, self.last]), initial=0.0))
+
+    @property
+    def speed(self) -> float:
+        """What it hardly exceeds, pixels per second."""
+        square = self.level @ (self.last**3 - self.first**3) / 3.0
+        return float(2.0 * np.pi * (self.frequency @ self.amplitude + 4.0 * np.sqrt(square)))
+
+    @property
+    def variance(self) -> float:
+        """Of the motion, pixels^2."""
+        return float(0.5 * self.amplitude @ self.amplitude + self.level @ (self.last - self.first))
+
+    def covariance(self, lag: np.ndarray) -> np.ndarray:
+        """Of the motion at two times that lie so far apart, seconds; (...) -> (...), pixels^2."""
+        s = np.asarray(lag, np.float64)[..., None]
+        lines = np.cos(2.0 * np.pi * self.frequency * s) @ (0.5 * self.amplitude**2)
+        return np.asarray(lines + self._of_bands(s))
+
+    def _of_bands(self, s: np.ndarray) -> np.ndarray:
+        """Covariance of the bands' noise at lags (..., 1) -> (...): the integral of level cos(2 pi f s)."""
+        ends = self.last * np.sinc(2.0 * self.last * s) - self.first * np.sinc(2.0 * self.first * s)
+        return np.asarray(ends @ self.level)
+
+    def agreement(self, nu: np.ndarray, lag: np.ndarray) -> np.ndarray:
+        """E exp(-2 pi i nu (x(t) - x(t + lag))) over all phases and draws: shapes that broadcast."""
+        nu, lag = np.broadcast_arrays(np.asarray(nu, np.float64), np.asarray(lag, np.float64))
+        out: np.ndarray = np.ones(nu.shape)
+        for frequency, amplitude in zip(self.frequency, self.amplitude, strict=True):
+            out = out * j0(4.0 * np.pi * nu * amplitude * np.sin(np.pi * frequency * lag))
+        if len(self.level):
+            still = float(self.level @ (self.last - self.first))
+            out = out * np.exp(-4.0 * np.pi**2 * nu**2 * (still - self._of_bands(lag[..., None])))
+        return out
+
+
+def _gauss(place: np.ndarray, mass: np.ndarray, count: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss' rule of a discrete even measure (Stieltjes' procedure, Golub and Welsch)."""
+    before, now = np.zeros_like(place), np.full_like(place, 1.0 / np.sqrt(mass.sum()))
+    off, last = [], 0.0
+    for _ in range(count - 1):
+        after = place * now - last * before
+        last = float(np.sqrt(mass @ after**2))
+        before, now = now, after / last
+        off.append(last)
+    nodes, vectors = np.linalg.eigh(np.diag(off, 1) + np.diag(off, -1))
+    return scale * nodes, vectors[0] ** 2

@@ -8,6 +8,7 @@ if __name__ == "__main__":
     end_quietly()
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from os.path import isfile
 from pathlib import Path
@@ -25,18 +26,18 @@ if TYPE_CHECKING:  # help waits for nothing that computes
     from twin.framework.procedure import Session
     from twin.study.runs.setup import StudySetup
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = cli.program()
 
 
 @app.command()
+@cli.with_options("out", "seed", "export", "quiet")
 def main(
     file: Annotated[Path, typer.Argument(readable=False, help="YAML file of the study, or the config.yaml of one.")],
+    options: cli.Options,
     out: Annotated[
         Path | None, typer.Option(readable=False, help="Folder of the study. Default: runs/STUDY-001, -002, ...")
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Number of worker processes. Default: one for each core.")
-    ] = None,
+    workers: cli.Workers = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
@@ -47,16 +48,12 @@ def main(
         ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the folder --out.")] = False,
-    force: cli.Force = False,
     gradient: Annotated[
         bool,
         typer.Option("--gradient", help="Differentiate the responses by the factors at the base, instead of the runs."),
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Run more runs than the study's limit.")] = False,
-    backend: cli.BackendName = "llvm",
-    as_json: cli.AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and warnings.")] = False,
-    strict: cli.Strict = False,
     progress_fd: Annotated[int | None, typer.Option("--progress-fd", hidden=True, min=3)] = None,
 ) -> None:
     """Run a job many times with varied values and keep the numbers that matter.
@@ -81,6 +78,7 @@ def main(
     the program did, or a figure could not be drawn.
     """
     errors = Console(stderr=True)
+    options = replace(options, out=out, quiet=quiet)
     if gradient:
         _refuse_with_gradient(
             errors, {"--workers": workers, "--scheduler": scheduler, "--resume": resume or None, "--yes": yes or None}
@@ -88,7 +86,7 @@ def main(
         # drawing libraries are not needed before
         from twin.study.gradient.gradient_report import run_gradient
 
-        run_gradient(file, cli.Options(out, None, backend, force, as_json, quiet, strict=strict))
+        run_gradient(file, options)
         return
     from twin.framework.cluster import refuse_both
     from twin.framework.run_folder import KeptWork, read_manifest
@@ -106,7 +104,7 @@ def main(
         place, chosen = kept.begin(), (workers, scheduler)
         if out is not None and finished and not (place / BLOCKS).exists():
             copyfile(out / BLOCKS, place / BLOCKS)
-        said = errors if not (quiet or as_json) else Console(quiet=True)
+        said = Console(quiet=True) if options.silent else errors
         say = partial(said.print, markup=False, highlight=False, soft_wrap=True)
         if progress_fd is None:
             return study_command.run_study(setup, session, place, chosen, say)
@@ -116,10 +114,9 @@ def main(
 
     # --resume of a finished study makes its report anew
     finished = resume and out is not None and isfile(out / BLOCKS) and read_manifest(out) is not None
-    again = f"python -m twin.study {file}{'' if out is None else f' --out {out}'}{' --force' if force else ''}"
-    kept = KeptWork(out, file.stem, "blocks", resume, force, again)
-    options = cli.Options(out, None, backend, force or finished, as_json, quiet, strict=strict)
-    run_command(file.stem, options, resolve, work, kept)
+    again = f"python -m twin.study {file}{'' if out is None else f' --out {out}'}{' --force' if options.force else ''}"
+    kept = KeptWork(out, file.stem, "blocks", resume, options.force, again)
+    run_command(file.stem, replace(options, force=options.force or finished), resolve, work, kept)
 
 
 def _refuse_with_gradient(errors: Console, options: Mapping[str, object]) -> None:

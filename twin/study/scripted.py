@@ -271,7 +271,7 @@ def _responses(resolved: ResolvedJob) -> Tree:
         return out
     own = "model" if resolved.disturbances is None else "posterior"
     for camera in resolved.instrument.cameras:
-        for key in (one.key for one in parameters.CAMERA_PARAMETERS):
+        for key in (one.key for one in parameters.CAMERA_PARAMETERS.values()):
             short = key.rpartition("_")[0]
             read = ["recovered", "cameras", camera, own, key]
             out[f"{camera}_{short}"] = _with_sigmas(read)

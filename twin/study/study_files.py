@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from optics.numerics.extension_table import ExtensionTable
 from scenes.specs.study import NOISE
 from twin.framework import data_files, reference_frames
 from twin.framework.run_folder import RunFolder
@@ -96,10 +97,11 @@ def _as_table(ending: str, data: xr.Dataset) -> bytes | None:
         return None
 
 
-FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {
+_FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {
     "nc": data_files.netcdf,
     **{ending: partial(_as_table, ending) for ending in ("csv", "parquet")},
 }
+FORMATS = ExtensionTable("study_formats", _FORMATS)
 """Ending of a file of the data set, study.ENDING -> its contents, None where what it needs is not installed. A new one
 is added here.
 """

@@ -33,8 +33,7 @@ from optics.waves.line_transfer import LINE_SIDES, CutPupil, cut_pupils, lit_at
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import CUT_RESIDUAL, CUT_RINGS, DEGREE, PupilFunction, fit_pupils
 from optics.waves.transfer import with_nodes_enough
-from scenes.models.camera_axis import LAUNCH_DISTANCE
-from scenes.models.camera_model import CameraModel, coloured, line_body
+from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
 from scenes.models.shadow import ImagingShadows, SeenEdges, TracedBeams
 
 RINGS = 14

@@ -8,43 +8,29 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
 from scenes.specs.file_kinds import read_for
-from scenes.yaml.named import Named
-from twin.framework.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
-from twin.framework.command import Result, finished, run_command
-from twin.framework.procedure import Session
+from scenes.specs.procedures import PROCEDURES
+from twin.framework import cli
+from twin.framework.command import run_test
 
-if TYPE_CHECKING:
-    from scenes.specs.tolerance import ToleranceSetup
-
-PROGRAM = "twin.tolerance"
-
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = cli.program()
 
 
 @app.command()
+@cli.with_options("export", "strict")
 def main(
     file: Annotated[Path, typer.Argument(readable=False, help="YAML file of the budget, or the config.yaml of a run.")],
-    out: Out = None,
+    options: cli.Options,
     samples: Annotated[
         int | None, typer.Option(min=20, help="Number of cameras to draw; overrides the file's.")
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Number of worker processes. Default: one for each core.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Use a running Dask cluster, as of `python -m twin.study --scheduler`.")
-    ] = None,
+    workers: cli.Workers = None,
+    scheduler: cli.Scheduler = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
 ) -> None:
     """Find out how well a camera has to be made: what each tolerance does after all adjustments, which share of the
     cameras meets the requirements, and which limits reach a yield at the least cost.
@@ -72,24 +58,19 @@ def main(
     """
     from twin.framework.run_folder import KeptWork
 
-    def resolve() -> ToleranceSetup:
-        setup: ToleranceSetup = read_for(PROGRAM, file, Named("scenes.specs.tolerance:ToleranceSetup.read"))
-        changed = {name: value for name, value in (("samples", samples), ("seed", seed)) if value is not None}
-        return setup.model_copy(update={"test": setup.test.model_copy(update=changed)}) if changed else setup
+    procedure = PROCEDURES["tolerance"]
 
-    def work(setup: ToleranceSetup, session: Session) -> Result:
+    def read() -> Any:
+        setup = read_for("twin.tolerance", file, procedure.resolve)
+        return setup if samples is None else setup.with_test(samples=samples)
+
+    def run(*given: Any) -> Any:
         from twin.tolerance.samples import Workforce
-        from twin.tolerance.tolerance_run import TOLERANCE, run_tolerance
 
-        force = Workforce(workers, scheduler, kept.begin())
-        run = run_tolerance(setup, session.backend, setup.test.seed, session.advance, force)
-        from twin.tolerance.tolerance_report import tolerance_report
+        return procedure.run(*given, Workforce(workers, scheduler, kept.begin()))
 
-        facts = {"config": setup.to_yaml(), "named": setup.plain(), "seed": setup.test.seed}
-        return finished(session, "tolerance", tolerance_report(run), TOLERANCE(run), program=PROGRAM, **facts)
-
-    kept = KeptWork(out, file.stem, "samples", resume)
-    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work, kept)
+    kept = KeptWork(options.out, file.stem, "samples", resume)
+    run_test("tolerance", file, options, kept, read, run=run)
 
 
 if __name__ == "__main__":

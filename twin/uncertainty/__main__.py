@@ -7,25 +7,23 @@ if __name__ == "__main__":
 
     end_quietly()
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from twin.framework.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed, Strict
-from twin.framework.command import Result, finished, run_command
-from twin.framework.procedure import Session
+from scenes.specs.procedures import PROCEDURES
+from twin.framework import cli
+from twin.framework.command import run_test
 
-if TYPE_CHECKING:
-    from scenes.specs.resolved import ResolvedJob
-
-PROGRAM, KIND = "twin.uncertainty", "uncertainty"
 _MOST_STATES = 100_000
 
-app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = cli.program()
 
 
 @app.command()
+@cli.with_options("export")
 def main(
     file: Annotated[
         Path,
@@ -35,6 +33,7 @@ def main(
             "of a run.",
         ),
     ],
+    options: cli.Options,
     disturbances: Annotated[
         str | None,
         typer.Option(
@@ -48,13 +47,6 @@ def main(
             "--states", min=0, max=_MOST_STATES, help="Random states to render and recover: do the sigmas hold?"
         ),
     ] = 0,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-    strict: Strict = False,
 ) -> None:
     """Say what limits the readings of an instrument's monitor under its stated disturbances: standard deviations of
     every parameter, the intersection angle and points on the ground before and after a measurement, by every estimator;
@@ -74,29 +66,10 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-
-    def resolve() -> ResolvedJob:
-        from scenes.specs.resolved import resolve_with
-
-        resolved = resolve_with(file, disturbances)
-        chosen = resolved.job.render.seed if seed is None else seed
-        return resolved.with_render(resolved.frames, chosen)
-
-    def work(resolved: ResolvedJob, session: Session) -> Result:
-        from twin.framework.provenance import checks_in
-        from twin.uncertainty.coverage import run_uncertainty
-        from twin.uncertainty.uncertainty_numbers import uncertainty_numbers
-        from twin.uncertainty.uncertainty_report import uncertainty_report
-
-        run = run_uncertainty(resolved, session.backend, states, session.advance)
-        numbers = uncertainty_numbers(run)
-        options = ("--states", str(states), "--seed", str(run.seed)) if states else ()
-        again = (PROGRAM, "config.yaml", *options, "--backend", session.backend.name)
-        facts: dict[str, Any] = {"config": resolved.to_yaml(), "named": resolved.plain(), "again": again}
-        facts |= {"seed": run.seed if states else None, "checks": (*run.images.told(), *checks_in(numbers))}
-        return finished(session, KIND, uncertainty_report(run), numbers, program=PROGRAM, **facts)
-
-    run_command(file.stem, Options(out, seed, backend, force, as_json, quiet, strict=strict), resolve, work)
+    procedure = PROCEDURES["uncertainty"]
+    read, run = partial(procedure.resolve, file, disturbances), partial(procedure.run, states=states)
+    words = ("--states", str(states)) if states else ()
+    run_test("uncertainty", file, options, read=read, words=words, run=run, seeded=states > 0)
 
 
 if __name__ == "__main__":

@@ -285,15 +285,16 @@ class UncertaintyRun:
 
 
 def run_uncertainty(
-    resolved: ResolvedJob, backend: Backend, states: int = 0, advance: Advance = silent
+    resolved: ResolvedJob, backend: Backend, seed: int = 0, advance: Advance = silent, states: int = 0
 ) -> UncertaintyRun:
     """Work out what limits the readings of a job's instrument; what the job does to it is not looked at.
 
     Args:
-        resolved: the job, with its seed and its number of frames.
+        resolved: the job.
         backend: where to trace.
-        states: how many random states are drawn, rendered and recovered.
+        seed: of the random states.
         advance: told what is being done.
+        states: how many random states are drawn, rendered and recovered.
 
     Raises:
         InputError: nothing is stated to move, or what is stated cannot be.
@@ -318,7 +319,7 @@ def run_uncertainty(
             )
         )
     advance(_SPREAD, 1, 1)
-    seed, coverage = resolved.job.render.seed, None
+    coverage = None
     if states:
         coverage = run_states(experiment, limits.quantities, states, resolved.frames, seed, advance)
     hidden = unseen_texts(limits.stated, noise, limits.quantities, limits.gain)

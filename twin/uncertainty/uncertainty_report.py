@@ -13,6 +13,7 @@ from analysis.monitor.limits import Split
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from twin.framework import svg
 from twin.framework.artefact import Cell, SvgFigure, Table, shown_unit, significant
+from twin.framework.provenance import checks_in
 from twin.framework.report import Report, Section, answer, sentence
 from twin.uncertainty.coverage import FALSE, HALF_WIDTHS, LEVELS, Coverage, UncertaintyRun
 from twin.uncertainty.monitor_limits import (
@@ -27,6 +28,7 @@ from twin.uncertainty.monitor_limits import (
     short_text,
     unit_text,
 )
+from twin.uncertainty.uncertainty_numbers import uncertainty_numbers
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -112,6 +114,7 @@ def uncertainty_report(run: UncertaintyRun) -> Report:
         _sigmas(limits),
         tuple(sections),
         warnings=tuple(warnings),
+        checks=(*run.images.told(), *checks_in(uncertainty_numbers(run))),
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from optics.numerics.extension_table import ExtensionTable, entries
 from scenes.yaml.errors import nearest
 from scenes.yaml.named import Named
 from twin.validation.row_names import matches, names_in_files
@@ -43,7 +44,10 @@ GROUPS: tuple[CheckGroup, ...]
 def __getattr__(name: str) -> Any:
     if name != "GROUPS":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = globals()[name] = tuple(named.get() for named in _GROUPS)
+    from twin.validation.group import CheckGroup
+
+    others = ExtensionTable[CheckGroup]("check_groups", {}, CheckGroup)
+    found = globals()[name] = (*(named.get() for named in _GROUPS), *others.values())
     return found
 
 
@@ -101,7 +105,8 @@ def require_known(only: str | None) -> None:
     Raises:
         UnknownCheck: there is nothing under one of the prefixes.
     """
-    if only is not None and "GROUPS" not in globals():
+    # other distributions' groups are in no file of ours
+    if only is not None and not entries() and "GROUPS" not in globals():
         _known(only, names_in_files())
 
 

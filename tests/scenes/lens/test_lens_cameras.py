@@ -76,6 +76,7 @@ def read_back(lens: Prescription, path: Path) -> Prescription:
     return read_zemax(path) if path.suffix == ".zmx" else read_batoid(path, 650e-9)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", [".zmx", ".yaml"])
 @pytest.mark.parametrize("name", quick(1, ["gf7_conic", "gf7", "monitor"]))
 def test_out_and_in_again(tmp_path: Path, backend, camera, name: str, kind: str) -> None:
@@ -98,6 +99,7 @@ def test_out_and_in_again(tmp_path: Path, backend, camera, name: str, kind: str)
         assert (spec.stop, spec.field_bias) == (model.spec.stop, pytest.approx(model.spec.field_bias, rel=1e-12))
 
 
+@pytest.mark.second
 def test_the_camera_file_is_read_and_traces_the_same(tmp_path: Path, backend) -> None:
     path = tmp_path / "tma.zmx"
     path.write_text(TMA, "utf-16")
@@ -137,6 +139,7 @@ def test_a_lens_is_a_lens_either_way(tmp_path: Path, backend) -> None:
     np.testing.assert_allclose(again, -direction, rtol=0, atol=ROUNDING)
 
 
+@pytest.mark.second
 def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> None:
     """By name or by the catalogue's formula; a glass whose dispersion nobody knows keeps its index."""
     agf = tmp_path / "own.agf"
@@ -287,6 +290,7 @@ def run(*arguments: object) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
+@pytest.mark.second
 def test_the_example_of_a_zemax_file_is_what_is_read_of_it(tmp_path: Path, backend) -> None:
     """The camera beside it, which a tolerance budget names."""
     out = tmp_path / "cassegrain_zmx.yaml"

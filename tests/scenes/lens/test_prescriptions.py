@@ -312,6 +312,7 @@ def paraboloid(field: str, distance: str = "INFINITY", image: str = "CURV 0") ->
     )  # fmt: skip
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", [2, 3])
 def test_fields_as_heights_on_the_image(tmp_path: Path, backend, kind: int) -> None:
     """Of a paraboloid that is its own stop the chief ray of tan w meets the focal plane at f tan w, to all orders."""
@@ -320,6 +321,7 @@ def test_fields_as_heights_on_the_image(tmp_path: Path, backend, kind: int) -> N
     assert (camera.field.x, camera.field.y) == pytest.approx((np.arctan(0.01), np.arctan(0.02)), rel=1e-12)
 
 
+@pytest.mark.second
 def test_a_height_with_distortion(tmp_path: Path, backend) -> None:
     """The chief ray of the camera's largest direction meets the height that the file has for it."""
     text = SINGLET.replace("FTYP 0", "FTYP 3").replace("YFLN 0 2", "YFLN 0 3")

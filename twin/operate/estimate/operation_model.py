@@ -152,7 +152,7 @@ def read_plan(path: Path, history: History) -> OperationSetup:
 def quantity_names(instrument: InstrumentSpec) -> tuple[str, ...]:
     """Group and key of all that is read of an instrument, as `analysis.monitor.limits.quantities` has them."""
     cameras = tuple(instrument.cameras)
-    names = [f"{camera} {one.key}" for camera in cameras for one in CAMERA_PARAMETERS]
+    names = [f"{camera} {one.key}" for camera in cameras for one in CAMERA_PARAMETERS.values()]
     if len(cameras) == 2:
         names.append(f"{ANGLE_GROUP} {ANGLE.key}")
         names += [f"{GROUND_GROUP} {one.key}" for one in GROUND] if instrument.altitude is not None else []

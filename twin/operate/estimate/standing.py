@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, cast
@@ -31,7 +32,7 @@ from twin.operate.record.entries import MICRO
 
 _FILTER = (Aside, BadReading, Belief, Disturbances, HeatInputs, Innovation, Jump, Observed, Quantity)
 _CLASSES = (*_FILTER, SeriesFilter, TimeLaw, Track)
-_PARAMETERS = {one.key: one for one in (*CAMERA_PARAMETERS, ANGLE, *GROUND)}
+_PARAMETERS = ChainMap(CAMERA_PARAMETERS, {one.key: one for one in (ANGLE, *GROUND)})
 
 
 def packed(value: Any) -> bytes:

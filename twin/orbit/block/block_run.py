@@ -1,10 +1,14 @@
-"""Adjust a block, and adjust it again without each of its sensors: ``python -m twin.orbit adjust``."""
+"""Adjust a block, and adjust it again without each of its sensors: ``python -m twin.orbit adjust``.
+
+Worker processes of this machine or of a cluster that reduce the points of a block.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -19,11 +23,11 @@ from analysis.orbit.forward_intersection import Accuracy, level_axes, predicted,
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.setup import AnyAdjust, MeasuredAdjustSetup
+from twin.framework.cluster import ClusterError, Workers, chosen_workers
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.block.drawn_block import DrawnBlock, draw_block
-from twin.orbit.block.measured_block import measured_block
-from twin.orbit.block.pass_knowledge import MonitorSource
+from twin.orbit.block.measured_block import MonitorSource, measured_block
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -167,7 +171,7 @@ def run_adjustment(
         datum, block, rejected = _datum(block, spec.robust, pool)
         robust = spec.robust and rejected is None
         found = adjust_block(
-            block, robust="reject" if robust else None, variance_components=_components(spec.components), pool=pool
+            block, robust="reject" if robust else None, variance_components=spec.components or False, pool=pool
         )
         advance("block", 2, 2)
         worth = _worth(kept_block(found), found, known, advance, pool)
@@ -219,10 +223,6 @@ def _datum(block: Block, robust: bool, pool: Pool | None) -> tuple[DatumTest | N
     return test, block, None
 
 
-def _components(names: tuple[str, ...]) -> bool | tuple[str, ...]:
-    return names or False
-
-
 def _check(found: BlockAdjustment, known: _Known) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Check points (k,) that were adjusted, their errors (k, 3), ITRS, metres, and covariances (k, 3, 3) of these."""
     block = found.assembly.block
@@ -236,8 +236,10 @@ def _worth(
 ) -> FrozenMap[str, Worth]:
     """Check points by all sensors, without each, and by none but ties."""
     sensors = [name for name in kept.sensors if name != "ties"]
+    # without ties the check points are all that is left to judge by
+    enough = int(np.sum(kept.points.role == "check")) >= _LEAST_CHECK
     cases: dict[str, tuple[str, ...]] = {ALL: ()}
-    cases |= {f"without {name.replace('_', ' ')}": (name,) for name in kept.sensors if _leaves_points(kept, name)}
+    cases |= {f"without {name.replace('_', ' ')}": (name,) for name in kept.sensors if name != "ties" or enough}
     if len(sensors) > 1:
         cases[NOTHING] = tuple(sensors)
     rows = {}
@@ -252,11 +254,6 @@ def _worth(
         rows[case] = _accuracy(left_out, one, known)
     advance("sensors", len(cases), len(cases))
     return FrozenMap(rows)
-
-
-def _leaves_points(block: Block, sensor: str) -> bool:
-    """Whether points are left to be judged by."""
-    return sensor != "ties" or int(np.sum(block.points.role == "check")) >= _LEAST_CHECK
 
 
 def _accuracy(left_out: tuple[str, ...], one: BlockAdjustment, known: _Known) -> Worth:
@@ -286,3 +283,78 @@ def _cameras(found: BlockAdjustment, known: _Known) -> FrozenMap[str, CameraChan
         before = np.sqrt(np.diag(law)[own])
         rows[scene.name] = CameraChange(value, np.sqrt(np.diag(spread)), before, known.change.get(scene.name))
     return FrozenMap(rows)
+
+
+_LOST = "a worker was lost with its share of the points; adjust the block again"
+
+
+@dataclass(frozen=True, eq=False)
+class PointWorkers:
+    """Workers as `analysis.block.point_reduction` uses them: one share for each of those that there are at the start.
+
+    Attributes:
+        workers: the processes.
+        count: of them.
+    """
+
+    workers: Workers
+    count: int
+
+    def hold(self, things: Sequence[Any]) -> Sequence[Any]:
+        """Give each thing to a worker, in turn."""
+        client = self.workers.client
+        addresses = sorted(client.scheduler_info(n_workers=-1)["workers"])
+        return [
+            client.scatter(one, workers=[addresses[k % len(addresses)]], hash=False) for k, one in enumerate(things)
+        ]
+
+    def results(self, work: Callable[[tuple[Any, ...]], Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Work done with each of the arguments, in their order.
+
+        Raises:
+            MeasurementError: a share that cannot be reduced.
+            ClusterError: a worker or the scheduler is gone.
+        """
+        futures = [self.workers.submit(_on_one_thread, (work, *one)) for one in arguments]
+
+        def look() -> None:
+            if any(one.status in ("lost", "cancelled") for one in futures):
+                raise ClusterError(_LOST)
+
+        for _ in futures:
+            done = self.workers.next_finished(look)
+            if done.status == "finished":
+                continue
+            error = done.exception()
+            if isinstance(error, MeasurementError):
+                raise error
+            raise ClusterError(f"{_LOST} ({type(error).__name__}: {error})")
+        return [one.result() for one in futures]
+
+
+def _on_one_thread(given: tuple[Any, ...]) -> Any:
+    work, *rest = given
+    with one_blas_thread():
+        return work(tuple(rest))
+
+
+@contextmanager
+def point_workers(
+    count: int | None, scheduler: str | None, warn: Callable[[str], None]
+) -> Iterator[PointWorkers | None]:
+    """Workers inside the block; none where neither a number nor a scheduler is given.
+
+    Args:
+        count: of processes of this machine.
+        scheduler: address of a running cluster.
+        warn: told what the user should know.
+
+    Raises:
+        InputErrorText: both are given, or a cluster that cannot be used.
+        ClusterError: a cluster without workers.
+    """
+    if scheduler is None and (count is None or count < 2):
+        yield None
+        return
+    with chosen_workers(count, scheduler, warn) as workers:
+        yield PointWorkers(workers, workers.count)

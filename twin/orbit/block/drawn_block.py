@@ -19,22 +19,27 @@ from analysis.block.processes import STEPPED, Law
 from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
 from optics.numerics.array_math import covariance_root
-from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.adjust import BlockPassSpec, OrbitAdjustSpec, ReadingLawsSpec
-from scenes.specs.orbit.flight import AttitudeSpec, OrbitSpec, PassingSpec
+from scenes.specs.orbit.flight import AttitudeSpec
 from scenes.specs.orbit.setup import AdjustSetup
 from twin.framework.procedure import BenchError
 from twin.framework.random_streams import stream
-from twin.orbit.block.pass_knowledge import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
-from twin.orbit.calibration.campaign import line_model
-from twin.orbit.calibration.observations import PassData
-from twin.orbit.flight.earth import Earth, east_north_up, tai_of
+from twin.orbit.block.measured_block import (
+    MonitorSource,
+    camera_sigmas,
+    change_covariance,
+    law_of,
+    monitored_camera,
+    seconds_after_the_first,
+)
+from twin.orbit.calibration.campaign import PassData, line_model, pass_data, passing_orbit
+from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineTimes, drifted_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Platform, Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
-from twin.orbit.measured.pass_measurements import ImagePoints
+from twin.orbit.measured.pass_measurements import ImagePoints, point_names
 
 Course = Callable[[np.ndarray], np.ndarray]
 Monitored = dict[str, known.CameraKnowledge] | known.CamerasKnowledge
@@ -204,16 +209,9 @@ def _cameras(
 
 
 def _trajectory(spec: OrbitAdjustSpec, name: str, one: BlockPassSpec, earth: Earth) -> Trajectory:
-    passing = PassingSpec.model_construct(
-        longitude=spec.area.longitude if one.longitude is None else one.longitude,
-        latitude=spec.area.latitude if one.latitude is None else one.latitude,
-        altitude=spec.altitude,
-        direction=one.direction,
-        inclination=None,
-    )
-    orbit = OrbitSpec.model_construct(
-        epoch=one.epoch, before=spec.span, after=spec.span, passing=passing, elements=None, state=None
-    )
+    longitude = spec.area.longitude if one.longitude is None else one.longitude
+    latitude = spec.area.latitude if one.latitude is None else one.latitude
+    orbit = passing_orbit(one.epoch, spec.span, spec.altitude, longitude, latitude, one.direction)
     roll, pitch, yaw = spec.attitude.offset
     held = AttitudeSpec(nadir=spec.attitude.nadir, steering=spec.attitude.steering)
     attitude = Attitude.from_spec(held.model_copy(update={"offset": (roll + one.roll, pitch, yaw)}))
@@ -237,14 +235,11 @@ def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence, monitor: Monito
     spec, payload = setup.test, setup.camera
     earth = Earth.from_spec(spec.earth)
     readings = {name: _trajectory(spec, name, one, earth) for name, one in spec.passes.items()}
-    moments = {name: tai_of(one.epoch) for name, one in spec.passes.items()}
-    zero = min(moments.values())
-    begin = {
-        name: float(round((day - zero[0]) * _DAY + (part - zero[1]) * _DAY, 6)) for name, (day, part) in moments.items()
-    }
+    epochs = {name: one.epoch for name, one in spec.passes.items()}
+    begin = seconds_after_the_first(epochs)
     turns, shifts, constants = _courses(spec, spec.truth or spec.errors, begin, stream(seed, _COURSES))
     days = np.array(list(begin.values())) / _DAY
-    recorded = monitor({name: one.epoch for name, one in spec.passes.items()}, spec.lines) if monitor else None
+    recorded = monitor(epochs, spec.lines) if monitor else None
     true, expected, monitored = _cameras(spec, days, np.random.default_rng(stream(seed, _CAMERAS)), recorded)
     platforms = {
         name: TruePlatform(
@@ -254,19 +249,14 @@ def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence, monitor: Monito
     }
     lines = int((2.0 * spec.span - spec.line_time) / spec.line_time) - 1
     times = LineTimes.even(-spec.span + 0.5 * spec.line_time, spec.line_time, lines)
-    laboratory = line_cameras(payload)
     sensors, data, change = {}, {}, {}
     for k, name in enumerate(spec.passes):
         changed = line_cameras(drifted_payload(payload, {line: true[line][k] for line in spec.lines}))
         for line in spec.lines:
             sensors[f"{name}/{line}"] = Sensor.of_lines(changed[line], platforms[name], earth, times, NO_EFFECTS)
             change[f"{name}/{line}"] = true[line][k]
-        known_sensors = {
-            line: Sensor.of_lines(laboratory[line], readings[name], earth, times, NO_EFFECTS) for line in spec.lines
-        }
-        models = FrozenMap({line: line_model(payload, line) for line in spec.lines})
-        pitch = FrozenMap({line: payload.pitch_of(line) for line in spec.lines})
-        data[name] = PassData(name, known_sensors, models, pitch, spec.area.height, 1.0, payload.lines)
+        at = dict.fromkeys(spec.lines, times)
+        data[name] = pass_data(name, payload, readings[name], at, spec.area.height, 1.0)
     ground, role, seen = _points(setup, sensors, earth, np.random.default_rng(stream(seed, _PLACES)))
     shots = _shots(spec, platforms, earth, stream(seed, _LASER))
     first = len(ground)
@@ -428,8 +418,7 @@ def _known_points(
     # where the mean height is: what a first intersection gives as well
     rough = earth.ecef(lon, lat, np.full(len(lon), spec.area.height))
     start = np.where((role == "control")[:, None], ground + noise + shift, rough)
-    letter = {"control": "c", "tie": "t", "check": "k"}
-    ids = np.array([f"{letter[r]}{k}" for k, r in enumerate(role.tolist())], object)
+    ids = np.array(point_names(role), object)
     return known.Points(ids, start, role, covariance)
 
 

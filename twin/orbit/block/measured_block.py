@@ -1,31 +1,80 @@
-"""A block of measured passes, from the tables that a calibration reads."""
+"""A block of measured passes, from the tables that a calibration reads.
+
+What is known of the passes of a block, as the analysis has it: laws, cameras before and after their readings.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from analysis.block import block as known
+from analysis.block.block import CameraKnowledge, CamerasKnowledge, Term
+from analysis.block.processes import Law
 from analysis.orbit.calibration_parameters import CalibrationError, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays
 from optics.numerics.number_tree import FrozenMap
+from scenes.specs.orbit.adjust import CameraChangeSpec, LawSpec
+from scenes.specs.orbit.calibration import CameraDriftSpec, MonitorReadingSpec
 from scenes.specs.orbit.setup import MeasuredAdjustSetup
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.orbit.block.pass_knowledge import MonitorSource, camera_sigmas, change_covariance, law_of, monitored_camera
-from twin.orbit.calibration.campaign import line_model
-from twin.orbit.calibration.observations import PassData, light_effects
+from twin.orbit.calibration.campaign import light_effects, line_model, pass_data
 from twin.orbit.flight.earth import Earth, tai_of
 from twin.orbit.flight.light_effects import NO_EFFECTS
-from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.measurement_tables import read_measurements
 from twin.orbit.measured.pass_measurements import PassMeasurements
 
+MonitorSource = Callable[[Mapping[str, str], Sequence[str]], CamerasKnowledge]
+"""Epochs of passes, UTC, and lines -> what a record of the monitor says of the lines' cameras in these passes."""
+
+
+def law_of(name: str, spec: LawSpec) -> Term:
+    """A stated law as the analysis has it."""
+    sigma: tuple[float, float, float] = spec.sigma  # type: ignore[attr-defined]
+    return Term(Law(name, spec.law, sigma, spec.interval, spec.time or 0.0, spec.frequency or 0.0), spec.shared_by)
+
+
+def camera_sigmas(spec: CameraDriftSpec | MonitorReadingSpec) -> np.ndarray:
+    """(4,) of d_alpha, d_beta, d_gamma, radians, and d_f, metres."""
+    return np.array([*spec.angles, spec.principal_distance])
+
+
+def change_covariance(spec: CameraChangeSpec, days: np.ndarray) -> np.ndarray:
+    """(4 T, 4 T) of a camera's changes in passes at so many days (T,) from the first."""
+    lasting, each, walk = (np.diag(camera_sigmas(s) ** 2) for s in (spec.lasting, spec.each_pass, spec.walk))
+    one = np.ones((len(days), len(days)))
+    earlier = np.minimum(days[:, None], days)
+    return np.asarray(np.kron(one, lasting) + np.kron(np.eye(len(days)), each) + np.kron(earlier, walk))
+
+
+def monitored_camera(law: np.ndarray, reading: np.ndarray, sigma: np.ndarray) -> CameraKnowledge:
+    """A camera's changes after the monitor's readings.
+
+    Args:
+        law: covariance before them, (4 T, 4 T).
+        reading: of the changes, (4 T,), radians and metres.
+        sigma: of the readings, (4 T,); infinite where there is none.
+    """
+    use = np.flatnonzero(np.isfinite(sigma))
+    gain = law[:, use] @ np.linalg.inv(law[np.ix_(use, use)] + np.diag(sigma[use] ** 2))
+    rest = law - gain @ law[use]
+    return CameraKnowledge((gain @ reading[use]).reshape(-1, 4), 0.5 * (rest + rest.T))
+
+
 _DAY = 86400.0
+
+
+def seconds_after_the_first(epochs: Mapping[str, str]) -> dict[str, float]:
+    """Return the time of each epoch since the earliest, seconds of TAI, to a microsecond."""
+    moments = {name: tai_of(epoch) for name, epoch in epochs.items()}
+    zero = min(moments.values())
+    return {
+        name: float(round((day - zero[0]) * _DAY + (part - zero[1]) * _DAY, 6)) for name, (day, part) in moments.items()
+    }
 
 
 def measured_block(
@@ -44,12 +93,15 @@ def measured_block(
         if line not in spec.changes:
             raise BenchError(f"it is not said how {line} may have changed", ("changes",), f"`{line}:`")
     epochs = {one.name: one.platform.epoch for one in passes}
-    moments = {one.name: tai_of(one.platform.epoch) for one in passes}
-    zero = min(moments.values())
-    begin = {name: round((day - zero[0]) * _DAY + (part - zero[1]) * _DAY, 6) for name, (day, part) in moments.items()}
+    begin = seconds_after_the_first(epochs)
     points, number = _points(passes, spec.names == "shared")
     models = {line: line_model(payload, line) for line in lines}
-    data = {one.name: _pass_data(one, setup) for one in passes}
+    data = {}
+    for one in passes:
+        known_places = one.ground.itrs[one.ground.role != "tie"]
+        mean = float(np.mean(Earth().geodetic(known_places)[2])) if len(known_places) else 0.0
+        times = {line: one.line_times[line] for line in one.images}
+        data[one.name] = pass_data(one.name, payload, TabulatedTrajectory(one.platform), times, mean, 1.0)
     raw = {}
     for one in passes:
         for line, rays in data[one.name].rays(one.images).items():
@@ -89,20 +141,6 @@ def measured_block(
 def _middle(scenes: Sequence[known.Scene], name: str) -> float | None:
     times = [s.rays.time for s in scenes if s.of == name and s.rays.time is not None and len(s.rays.time)]
     return 0.5 * float(np.concatenate(times).min() + np.concatenate(times).max()) if times else None
-
-
-def _pass_data(one: PassMeasurements, setup: MeasuredAdjustSetup) -> PassData:
-    cameras, path, earth = line_cameras(setup.camera), TabulatedTrajectory(one.platform), Earth()
-    sensors = {
-        name: Sensor.of_lines(cameras[name], path, earth, one.line_times[name], NO_EFFECTS) for name in one.images
-    }
-    known_places = one.ground.role != "tie"
-    height = 0.0
-    if np.any(known_places):
-        height = float(np.mean(earth.geodetic(one.ground.itrs[known_places])[2]))
-    models = FrozenMap({name: line_model(setup.camera, name) for name in one.images})
-    pitch = FrozenMap({name: setup.camera.pitch_of(name) for name in one.images})
-    return PassData(one.name, FrozenMap(sensors), models, pitch, height, 1.0, setup.camera.lines)
 
 
 def _points(passes: Sequence[PassMeasurements], shared: bool) -> tuple[known.Points, dict[str, np.ndarray]]:

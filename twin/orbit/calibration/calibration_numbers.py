@@ -15,15 +15,23 @@ from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS
 from twin.framework.quantity import Quantity, Record
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
-from twin.orbit.calibration.camera_drift import DriftSize, Monitoring, Treatment
-from twin.orbit.calibration.campaign import Campaign, FieldPass, interior_names
-from twin.orbit.calibration.field_images import FieldImages, Screening
+from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Screening, interior_names
+from twin.orbit.calibration.campaign_adjustment import LatitudeFit
 from twin.orbit.calibration.influences import AttitudeDrift, ChipStep, DatumRow, LightRow, Surprise
-from twin.orbit.calibration.latitude import LatitudeFit
-from twin.orbit.calibration.schemes import FieldErrors, Repeatability, Repeats, SchemeMeans, meets
+from twin.orbit.calibration.schemes import (
+    DriftSize,
+    FieldErrors,
+    Monitoring,
+    Repeatability,
+    Repeats,
+    SchemeMeans,
+    Strips,
+    Treatment,
+    meets,
+)
 from twin.orbit.calibration.screening import ground_sample, meeting_of
-from twin.orbit.calibration.strip import Strips
-from twin.orbit.images.point_judgement import LineJudgement
+from twin.orbit.images.patch import LineJudgement
+from twin.orbit.images.simulate_run import MATCH_COUNTS
 
 # --- errors at check points, by scheme -------------------------------------------------------------------
 
@@ -125,15 +133,6 @@ MAP_LIMITS: Record[CalibrationRun] = Record(
 # --- points measured in images ---------------------------------------------------------------------------
 
 
-_MATCHES = {
-    "found": "places that were found, before any is rejected",
-    "matched": "places that the thresholds of matching let pass",
-    "accepted": "places that consensus lets pass, too",
-    "wrong_found": "wrong places among those that were found",
-    "wrong_matched": "wrong places among those that matching let pass",
-    "wrong_accepted": "wrong places among those that consensus let pass",
-    "right_rejected_by_consensus": "right matches that consensus rejected",
-}
 _SCREENED = {
     "entered": "image points of control and tie points that enter the adjustment",
     "left": "image points that the adjustment keeps",
@@ -159,6 +158,9 @@ def _sums(meanings: Mapping[str, str], parts: Callable[[Any], Any] = lambda part
     return [Quantity(name, total(name), said) for name, said in meanings.items()]
 
 
+SCREENED: Record[Screening] = Record("Image points of a field in the adjustment.", *_sums(_SCREENED, lambda one: [one]))
+
+
 def _degrees(parts: Sequence[LineJudgement]) -> Array:
     return np.array([j.degrees_of_freedom for j in parts], float)
 
@@ -172,13 +174,14 @@ def _rms(parts: Sequence[LineJudgement]) -> Array:
 
 MATCHING: Record[Sequence[LineJudgement]] = Record(
     "Points of one sort in the images of one line, over the patches of a field.",
-    *_sums(_MATCHES),
-    Quantity("rms_lines_px", lambda parts: _rms(parts)[0], "RMS error along the track of places that are not wrong"),
-    Quantity("rms_pixels_px", lambda parts: _rms(parts)[1], "RMS error along the line of places that are not wrong"),
+    *_sums(MATCH_COUNTS),
+    Quantity("rms_lines_px", lambda parts: _rms(parts)[0], "RMS error along track of right places", "RMS track"),
+    Quantity("rms_pixels_px", lambda parts: _rms(parts)[1], "RMS error along line of right places", "RMS line"),
     Quantity(
         "chi_square_ratio",
         lambda parts: sum(j.chi_square for j in parts) / max(_degrees(parts).sum(), 1.0),
         "chi-square of the errors of these places over its degrees of freedom",
+        "χ²/dof",
     ),
 )
 
@@ -204,7 +207,7 @@ def _screenings(campaign: Campaign) -> list[Screening]:
 
 TOTAL: Record[Campaign] = Record(
     "Points in images, over all fields and lines; what is wrong is known from the truth.",
-    *_sums(_MATCHES, _judgements),
+    *_sums(MATCH_COUNTS, _judgements),
     *_sums(_SCREENED, _screenings),
     Quantity(
         "right_rejected_by_adjustment",
@@ -230,9 +233,7 @@ UNKNOWN: Record[Unknown] = Record(
     Quantity("value", lambda one: one.value, "estimated"),
     Quantity("sigma", lambda one: one.sigma, "standard deviation with the gauge's held unknowns exact"),
     Quantity(
-        "sigma_with_gauge",
-        lambda one: one.sigma_with_gauge,
-        "standard deviation with what launch leaves to expect of the held unknowns",
+        "sigma_with_gauge", lambda one: one.sigma_with_gauge, "with what launch leaves to expect of the held unknowns"
     ),
     Quantity(
         "share_from_launch",
@@ -335,10 +336,10 @@ CHIP_STEP: Record[ChipStep] = Record(
     "A step of x (along the track) or y within a line, at a joint between chips.",
     Quantity("line", lambda step: step.line, "camera"),
     Quantity("axis", lambda step: step.axis, "x or y"),
-    Quantity("place_m", lambda step: step.place, "y of the joint in the focal plane"),
-    Quantity("step_m", lambda step: step.step, "what the residuals say of it"),
-    Quantity("sigma_m", lambda step: step.sigma, "its standard deviation, all steps together"),
-    Quantity("seen_from_m", lambda step: step.seen_from, "step that is told in half of all cases"),
+    Quantity("place_m", lambda step: step.place, "y of the joint in the focal plane", shown="mm"),
+    Quantity("step_m", lambda step: step.step, "what the residuals say of it", shown="um"),
+    Quantity("sigma_m", lambda step: step.sigma, "its standard deviation, all steps together", shown="um"),
+    Quantity("seen_from_m", lambda step: step.seen_from, "step that is told in half of all cases", shown="um"),
     Quantity("found", lambda step: step.found, "whether this one is told, false alarm 1e-4 for all together"),
 )
 STEPWISE: Record[CalibrationRun] = Record(
@@ -399,9 +400,7 @@ MEASURED: Record[tuple[Campaign, FieldPass, Adjustment]] = Record(
     Quantity("tie_points", lambda m: m[1].tie_count, "that calibrate or tie the strip"),
     Quantity("check_points", lambda m: len(m[1].check_ground), "that test"),
     Quantity(
-        "image_points",
-        lambda m: {name: len(row.point) for name, row in m[1].measurements.images.items()},
-        "by line camera",
+        "image_points", lambda m: {name: len(row.point) for name, row in m[1].measurements.images.items()}, "by line"
     ),
     Quantity(
         "gsd_m",
@@ -410,11 +409,7 @@ MEASURED: Record[tuple[Campaign, FieldPass, Adjustment]] = Record(
     ),
     Quantity("rejected", lambda m: _rejected(m, "points", []), "points with a rejected image point, and its line"),
     Quantity("rejected_check_points", lambda m: _rejected(m, "check_points", []), "whose rays do not meet"),
-    Quantity(
-        "sigma_factor",
-        lambda m: _rejected(m, "factors"),
-        "by line, on the sigmas of its image points, by the residuals",
-    ),
+    Quantity("sigma_factor", lambda m: _rejected(m, "factors"), "by line, on the sigmas of its image points"),
     Quantity("check_chi_square", lambda m: meeting_of(*m).chi_square, "of the rays of the check points"),
     Quantity("check_degrees_of_freedom", lambda m: meeting_of(*m).degrees_of_freedom, "of this chi-square"),
 )
@@ -428,12 +423,12 @@ def _rejected(measured: tuple[Campaign, FieldPass, Adjustment], what: str, none:
 
 LATITUDE: Record[LatitudeFit] = Record(
     "Amplitude x sin(latitude - reference) + constant, of one axis of the biases.",
-    Quantity("amplitude_rad", lambda fit: fit.amplitude, "of the drift with latitude"),
-    Quantity("amplitude_rad_sigma", lambda fit: fit.amplitude_sigma, "its standard deviation, with what remains"),
-    Quantity("constant_rad", lambda fit: fit.constant, "bias at the reference"),
-    Quantity("constant_rad_sigma", lambda fit: fit.constant_sigma, "its standard deviation, with what remains"),
+    Quantity("amplitude_rad", lambda fit: fit.amplitude, "of the drift with latitude", shown="arcsec"),
+    Quantity("amplitude_rad_sigma", lambda fit: fit.amplitude_sigma, "with what remains", "σ", shown="arcsec"),
+    Quantity("constant_rad", lambda fit: fit.constant, "bias at the reference", shown="arcsec"),
+    Quantity("constant_rad_sigma", lambda fit: fit.constant_sigma, "with what remains", "σ", shown="arcsec"),
     Quantity("reference_rad", lambda fit: fit.reference, "latitude in the middle of the fields"),
-    Quantity("remainder_rad", lambda fit: fit.remainder, "standard deviation of what remains: the season"),
+    Quantity("remainder_rad", lambda fit: fit.remainder, "what remains, 1 sigma: the season", shown="arcsec"),
     Quantity("chi_square", lambda fit: fit.chi_square, "by the biases' own covariance"),
     Quantity("degrees_of_freedom", lambda fit: fit.degrees_of_freedom, "of this chi-square"),
     Quantity("p_value", lambda fit: fit.p_value, "chance of a chi-square as large if latitude is all that matters"),

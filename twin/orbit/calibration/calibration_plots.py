@@ -6,18 +6,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from analysis.arrays import ARCSEC
+from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS, misclosure
 from twin.framework import svg
 from twin.orbit.calibration.calibration_run import CalibrationRun
-from twin.orbit.calibration.camera_drift import Monitoring
 from twin.orbit.calibration.flown_campaign import true_bias
-from twin.orbit.calibration.schemes import RMS, FieldErrors, values_of
-
-
-def drift_svg(run: CalibrationRun, found: Monitoring) -> str:
-    """The figure as SVG."""
-    with svg.look("calibration-monitor-heights"):
-        return svg.to_svg(_figure(run, found))
+from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, values_of
 
 
 def _expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray) -> np.ndarray:
@@ -31,7 +25,9 @@ def _expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray)
     return np.asarray(np.hypot(found.at(0.0).without.together.height_rms, factor * metres))
 
 
-def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
+def _drift_figure(run: CalibrationRun) -> Figure:
+    found = run.monitoring
+    assert found is not None
     figure = svg.new_figure(4.3)
     left, right = figure.subplots(1, 2)
     angle = found.angle / ARCSEC or 1.0
@@ -89,11 +85,15 @@ def _schemes_figure(run: CalibrationRun) -> Figure:
     """RMS of every field over the schemes, plan and height."""
     figure = svg.new_figure(4.3)
     panels = figure.subplots(1, 2)
-    names, limits = list(run.schemes), run.campaign.spec.limits
+    names, spec = list(run.schemes), run.campaign.spec
     place = np.arange(len(names))
-    labels = [f"{k}\n{_count(len(s))}" for k, s in zip(names, run.campaign.spec.schemes, strict=False)]
+    labels = [
+        f"{k}\n{len(s)} field{'s' * (len(s) > 1)}" for k, s in zip(names, run.campaign.spec.schemes, strict=False)
+    ]
     labels.append(f"{names[-1]}\neach its own")
-    for axes, what, title, limit in zip(panels, RMS, ("plan", "height"), (limits.plan, limits.height), strict=True):
+    for axes, what, title, limit in zip(
+        panels, RMS, ("plan", "height"), (spec.limits.plan, spec.limits.height), strict=True
+    ):
         table = np.array([values_of(errors, what) for errors in run.schemes.values()])
         for k, field in enumerate(run.before):
             style = MARKERS[k // len(COLOURS) % len(MARKERS)]
@@ -169,7 +169,7 @@ def _residual_figure(run: CalibrationRun) -> Figure:
     """Residuals of one field's control points in the images of the lines, in pixels."""
     one = run.campaign.passes[0]
     found = run.together
-    offset = [found.value(n) if n in found.names else 0.0 for n in _offsets(one.name)]
+    offset = [found.value(n) if n in found.names else 0.0 for n in (f"{one.name} offset {axis}" for axis in OFFSET)]
     figure = svg.new_figure(3.9)
     shown = tuple(one.control.rays)
     panels = figure.subplots(1, len(shown), sharex=True, squeeze=False)[0]
@@ -239,17 +239,10 @@ def _check_figure(run: CalibrationRun) -> Figure:
 
 
 FIGURES = {
+    "monitor-heights": _drift_figure,
     "schemes-of-fields": _schemes_figure,
     "bias-latitude": _latitude_figure,
     "correlation-matrix": _correlation_figure,
     "residuals": _residual_figure,
     "check-points": _check_figure,
 }
-
-
-def _offsets(name: str) -> list[str]:
-    return [f"{name} offset {axis}" for axis in ("along", "across", "down")]
-
-
-def _count(fields: int) -> str:
-    return "1 field" if fields == 1 else f"{fields} fields"

@@ -9,20 +9,19 @@ import numpy as np
 from analysis.arrays import ARCSEC
 from scenes.specs.orbit.setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.framework.artefact import Cell, Table
 from twin.framework.report import Report, answer
 from twin.orbit.calibration import calibration_sections
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import CalibrationRun, unit
+from twin.orbit.calibration.campaign import any_effect, light_effects
 from twin.orbit.calibration.influences import SURPRISE, drift_warnings, step_warnings
-from twin.orbit.calibration.observations import any_effect, light_effects
-from twin.orbit.calibration.schemes import meets, values_of
+from twin.orbit.calibration.schemes import values_of
 from twin.orbit.calibration.screening import meeting_of
+from twin.orbit.images.simulate_report import changes_text
 from twin.orbit.measured.pass_measurements import duplicates, listed
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
-
 
 _FEW = 30
 """Image points of which a chance is hardly worth a warning."""
@@ -52,52 +51,27 @@ def calibration_report(run: CalibrationRun) -> Report:
     lead = (
         *more,
         calibration_sections.scheme_summary(run.scheme_means),
-        *(() if run.monitoring is None else (calibration_sections.monitor_gain(run.monitoring),)),
-        *(() if run.strips is None else (calibration_sections.strip_gain(run.schemes, run.strips),)),
+        *(() if run.monitoring is None else (calibration_sections.monitor_gain(run),)),
+        *(() if run.strips is None else (calibration_sections.strip_gain(run),)),
     )
     return Report(
         "Calibration in orbit over test fields",
         verdict,
         lead,
         _measured_facts(setup, run) if isinstance(setup, MeasuredCalibrationSetup) else _facts(setup),
-        _summary(run),
-        calibration_sections.sections(run),
+        calibration_sections.summary(run),
+        calibration_sections.sections(run, CALIBRATION(run)),
         warnings=_warnings(run),
-    )
-
-
-def _summary(run: CalibrationRun) -> Table:
-    limits = run.campaign.spec.limits
-    rows: list[tuple[Cell, ...]] = []
-    for name, errors in zip(
-        ["laboratory", *calibration_sections.scheme_names(run)], (run.before, *run.schemes.values()), strict=True
-    ):
-        plan, height = (values_of(errors, what) for what in ("plan_rms", "height_rms"))
-        numbers = (plan.mean(), plan.std(), plan.max(), height.mean(), height.std(), height.max())
-        meets_limits = "yes" if meets(errors, limits) else "no"
-        rows.append((name, *(float(v) for v in numbers), meets_limits))
-    return Table(
-        "schemes",
-        "Schemes of parameters, tested on all fields without ground control",
-        "RMS at check points, metres: mean, standard deviation and largest of the fields.",
-        ("parameters", "plan [m]", "spread", "largest", "height [m]", "spread", "largest", "1:50 000"),
-        rows,
-        (None, 2, 2, 2, 2, 2, 2, None),
     )
 
 
 def _facts(setup: CalibrationSetup) -> tuple[tuple[str, str], ...]:
     test, camera, errors = setup.test, setup.camera, setup.test.errors
-    changes = "; ".join(
-        f"{name} f {format_quantity(c.principal_distance, LENGTH)}, "
-        f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"
-        for name, c in test.perturb.items()
-    )
     bias = ", ".join(format_quantity(v, ANGLE) for v in errors.star_tracker.bias)
     noise = f"image {errors.image:g} px, control {format_quantity(errors.control, LENGTH)}"
     return (
         ("Camera", f"{camera.name}, {camera.description}"),
-        ("Changed since the laboratory", changes or "nothing"),
+        ("Changed since the laboratory", changes_text(test.perturb)),
         ("Bias of the star trackers", f"[{bias}]"),
         ("Passes", f"descending, {test.altitude / 1e3:g} km, one over each of {len(test.fields)} fields"),
         ("Points", _points(setup)),

@@ -1,12 +1,14 @@
 """Calibration over fields by simultaneous adjustment, and each field by itself as in paper 003; all that is computed
 from the measurements of a campaign. Truth enters only where an estimate is compared with it.
+
+What a calibration was made from, as a folder of tables with a test file that reads them back.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,11 +21,19 @@ from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.calibration import LEAST_TIES
 from scenes.specs.orbit.setup import MeasuredCalibrationSetup
+from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, BenchError, silent
-from twin.orbit.calibration.camera_drift import Monitoring, monitored
 from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
-from twin.orbit.calibration.campaign_adjustment import calibrated_alone, drift_looked_for, gauge_of, simultaneous
+from twin.orbit.calibration.campaign_adjustment import (
+    LatitudeFit,
+    calibrated_alone,
+    drift_looked_for,
+    gauge_of,
+    latitude_fits,
+    rate_priors,
+    simultaneous,
+)
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import (
     AttitudeDrift,
@@ -35,20 +45,22 @@ from twin.orbit.calibration.influences import (
     light_rows,
     surprises,
 )
-from twin.orbit.calibration.latitude import LatitudeFit, latitude_fits, rate_priors
 from twin.orbit.calibration.schemes import (
+    Monitoring,
     Repeatability,
     Repeats,
     SchemeMeans,
+    Strips,
     meets,
+    monitored,
     repeatability,
     repeated,
     schemes_tested,
+    strips_adjusted,
     tested_before,
 )
 from twin.orbit.calibration.screening import require_labelled, screened
-from twin.orbit.calibration.strip import Strips, strips_adjusted
-from twin.orbit.measured.measurement_tables import read_measurements
+from twin.orbit.measured.measurement_tables import CAMERA_FILE, TEST_FILE, campaign_files, read_measurements
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -355,3 +367,48 @@ def _even(time: np.ndarray) -> np.ndarray:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], even, [False]]).astype(int)))
     begin, end = max(edges.reshape(-1, 2).tolist(), key=lambda run: run[1] - run[0])
     return np.asarray(time[begin : end + 1])
+
+
+def exported(run: CalibrationRun) -> dict[str, str]:
+    """Path -> text of the files. Points that screening left out are in them, as they were measured."""
+    return files_of(run.setup, run.campaign)
+
+
+def files_of(setup: AnyCalibration, campaign: Campaign) -> dict[str, str]:
+    """Path -> text of the files of a campaign, which need not be calibrated."""
+    files = campaign_files([one.measurements for one in campaign.passes], setup.camera.plain())
+    return files | {TEST_FILE: dump_yaml(_test(setup))}
+
+
+def _test(setup: AnyCalibration) -> dict[str, Any]:
+    """The test file: the same schemes, sigmas of readings, effects and limits."""
+    spec = setup.test
+    plain: Mapping[str, Any] = spec.plain()
+    given = plain["errors"]
+    common = {
+        "name": spec.name,
+        "description": spec.description,
+        "camera": f"./{CAMERA_FILE}",
+        "data": ".",
+        "schemes": plain["schemes"],
+        **{key: plain[key] for key in ("effects", "launch", "limits")},
+        "strip": bool(spec.strip),
+    }
+    if isinstance(setup, MeasuredCalibrationSetup):
+        return common | {"errors": given, "screening": setup.test.screening, "ties": setup.test.ties}
+    gps, tracker = given["gps"], given["star_tracker"]
+    errors = {
+        "gps": {key: gps[key] for key in ("noise", "drift", "interval")},
+        "star_tracker": {key: tracker[key] for key in ("noise", "slow", "interval")},
+        "season": given["season"],
+    }
+    if not setup.test.errors.switched_on:
+        nothing = {"noise": ["0 m"] * 3, "interval": gps["interval"]}
+        errors = {"gps": nothing, "star_tracker": {"noise": ["0 arcsec"] * 3, "interval": tracker["interval"]}}
+    drawn = setup.test.images is None
+    # drawn points have the errors that their sigmas say, and no gross ones
+    return common | {
+        "errors": errors,
+        "screening": "none" if drawn else "robust",
+        "ties": "apart" if drawn else "with_control",
+    }

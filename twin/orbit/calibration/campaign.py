@@ -2,15 +2,25 @@
 
 Each pass is what was measured (`twin.orbit.measured.pass_measurements`): readings of orbit and attitude, line times,
 ground and image points. The camera is that of the laboratory, and the effects on the light are taken out of the image
-points by it (`twin.orbit.calibration.observations`). The truth is there where a simulation knows it, for comparisons
+points by it (`twin.orbit.calibration.campaign`). The truth is there where a simulation knows it, for comparisons
 alone.
+
+From image points of a pass to what a calibration takes, with the effects on the light taken out.
+
+The adjustment's rays are straight lines in Earth-fixed axes. A pixel's look is where the light seems to come from; the
+straight line to the place on the ground that this look really sees, through the measured station, is where the place
+is. The image point is moved from the one to the other. Camera and trajectory are those that the analysis has: the
+laboratory's and the measured one. The camera's error of 100 m on the ground, 2e-4 rad, changes an aberration of 4
+pixels by a thousandth of a pixel.
+
+Image points may be drawn, as `twin.orbit.calibration.campaign` does, or measured in images: nothing here knows which.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,22 +29,269 @@ from analysis.orbit.calibration_parameters import CalibrationField, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import INTERIOR, LineModel, Rays
 from optics.geometry.pose import about_axis, rotation_matrix
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.number_tree import FrozenMap
+from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
-from twin.orbit.calibration.observations import PassData, image_sigma, light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.line_camera import LineTimes, line_cameras, pixel_places
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import Sensor
+from twin.orbit.flight.sensor import Platform, Sensor
 from twin.orbit.flight.trajectory import MeasurementErrors, Trajectory
 from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 
 if TYPE_CHECKING:
+    from scenes.specs.orbit.angle import EffectsSpec
     from scenes.specs.orbit.calibration import OrbitCalibrationSpec
     from scenes.specs.orbit.flight import ErrorsSpec
     from scenes.specs.orbit.measurements import MeasuredCalibrationSpec, ReadingErrorsSpec
-    from twin.orbit.calibration.field_images import FieldImages
+    from scenes.specs.orbit.three_line_camera import LineCameraSpec
+    from twin.orbit.images.image_points import PatchPoints
+    from twin.orbit.images.patch import LineJudgement, Patch
+
+EFFECTS = ("light_time", "aberration", "refraction")
+_DISTORTION_STEPS = 8
+"""Fixed-point steps; each makes the error smaller by the distortion, 1e-3 of the image or less."""
+
+
+def light_effects(spec: EffectsSpec) -> LightEffects:
+    """Effects on the light that a file switches on."""
+    return LightEffects(spec.light_time, spec.aberration, spec.refraction, spec.wavelength)
+
+
+def any_effect(effects: LightEffects) -> bool:
+    """Whether one of them is on."""
+    return any(getattr(effects, name) for name in EFFECTS)
+
+
+def light_shift(
+    sensor: Sensor, model: LineModel, line: np.ndarray, pixel: np.ndarray, height: np.ndarray
+) -> np.ndarray:
+    """From image points as they are measured to where they would lie if nothing happened to the light.
+
+    Args:
+        sensor: the laboratory's line on the measured trajectory, with the effects that are to be taken out.
+        model: the same line as the adjustment has it.
+        line: of the image points, (n,).
+        pixel: likewise.
+        height: of the ground that they show, above the ellipsoid, metres, (n,).
+
+    Returns:
+        (n, 2) x and y in the focal plane, metres, to be added.
+
+    Raises:
+        ValueError: a point outside the image, or a look that misses the Earth.
+    """
+    if sensor.effects == NO_EFFECTS or not any_effect(sensor.effects):
+        return np.zeros((len(line), 2))
+    ground = sensor.ground(line, pixel, height)
+    if not np.all(np.isfinite(ground)):
+        raise UnphysicalError("a look misses the Earth")
+    seconds = sensor.time(line)
+    arm = ground - sensor.trajectory.position(seconds)
+    geometric = np.einsum("nji,nj->ni", sensor.trajectory.body_to_itrs(seconds), arm) - model.position
+    return _place(geometric, model) - _place(sensor.camera.look(pixel), model)
+
+
+def _place(direction: np.ndarray, model: LineModel) -> np.ndarray:
+    """Image (n, 2) of directions (n, 3) in the body frame, from the principal point, metres."""
+    a, b, c = (direction @ model.to_body).T
+    ideal = -model.interior[0] * np.stack([a / c, b / c], axis=-1)
+    found = ideal
+    for _ in range(_DISTORTION_STEPS):
+        square = np.sum(found**2, axis=1, keepdims=True)
+        found = ideal / (1.0 + square * (model.k1 + model.k2 * square))
+    return np.asarray(found)
+
+
+_SAME_PHASE = 1e-6
+"""Phase that counts as zero, as a share of the interval between readings: times of readings are rounded."""
+_HEIGHTS = (-500.0, 9000.0)
+"""Metres: of land. A control point outside of them is refused by the calibration, not here."""
+
+
+@dataclass(frozen=True, eq=False)
+class PassData:
+    """What is known of a pass beside its image points; nothing of it is the truth.
+
+    Attributes:
+        name: of the field.
+        sensors: line -> the laboratory's camera on the measured trajectory. Its effects do not matter.
+        models: line -> the same camera as the adjustment has it.
+        pitch: line -> of its pixels, metres.
+        height: mean of the ground above the ellipsoid, metres.
+        lines: line -> what the payload's file says of it.
+        unit: metres in the focal plane; every ray carries the covariance of its own image point in units of it
+            squared. None: rays carry none.
+    """
+
+    name: str
+    sensors: Mapping[str, Sensor]
+    models: Mapping[str, LineModel]
+    pitch: Mapping[str, float]
+    height: float
+    lines: Mapping[str, LineCameraSpec]
+    unit: float | None = None
+
+    def places(self, name: str, pixel: np.ndarray) -> np.ndarray:
+        """Where pixels (n,) of a line lie in its focal plane, (n, 2), metres."""
+        return pixel_places(self.lines[name], pixel, self.sensors[name].camera.pixels, self.pitch[name])
+
+    @property
+    def phase(self) -> float:
+        """Time of a reading of the attitude from the next whole multiple of their interval, seconds.
+
+        Readings of the orbit are as far from their multiples at most, half of their interval, which shared noise does
+        not know: its variance then is that of another place between two readings.
+        """
+        path = next(iter(self.sensors.values())).trajectory
+        if not isinstance(path, TabulatedTrajectory):
+            return 0.0
+        time, step = path.table.attitude_time, path.attitude_interval
+        # a table may begin with an odd end
+        reading = float(time[1 + int(np.argmin(np.abs(np.diff(time[1:]) - step)))]) if len(time) > 2 else float(time[0])
+        phase = reading - step * round(reading / step)
+        return phase if abs(phase) > _SAME_PHASE * step else 0.0
+
+    @property
+    def earth(self) -> Earth:
+        """The ellipsoid."""
+        return next(iter(self.sensors.values())).earth
+
+    def pixels_per_line(self, name: str) -> float:
+        """What one image line of the middle of a line's image is in x of the focal plane, pixels.
+
+        It is where the ground that the next line sees, at the pass' mean height, lies in the focal plane at one moment.
+        Where lines are spaced as pixels are, 1 at nadir and about cos^2 of the look angle in a line that looks ahead.
+        """
+        sensor, model = self.sensors[name], self.models[name]
+        middle = np.full(2, 0.5 * (sensor.lines - 1))
+        ground = sensor.ground(
+            middle + np.array([-0.5, 0.5]), np.full(2, 0.5 * (sensor.camera.pixels - 1)), self.height
+        )
+        seconds = sensor.time(middle)
+        to_body = np.swapaxes(sensor.trajectory.body_to_itrs(seconds), 1, 2)
+        arm = np.einsum("nij,nj->ni", to_body, ground - sensor.trajectory.position(seconds))
+        a, _, c = ((arm - model.position) @ model.to_body).T
+        x = -float(model.interior[0]) * a / c
+        return abs(float(x[1] - x[0])) / self.pitch[name]
+
+    def rays(self, images: Mapping[str, ImagePoints]) -> dict[str, Rays]:
+        """Rays of image points with what happened to the light left in.
+
+        Raises:
+            ValueError: a line outside the image.
+        """
+        found = {}
+        for name, row in images.items():
+            sensor = self.sensors[name]
+            seconds = sensor.time(row.line)
+            image = self.places(name, row.pixel)
+            station, attitude = sensor.trajectory.position(seconds), sensor.trajectory.body_to_itrs(seconds)
+            # the noise of readings is shared by its own clock, which ticks at the readings
+            rays = Rays.of(row.point, image, station, attitude, seconds - self.phase)
+            found[name] = rays if self.unit is None else replace(rays, spread=self.spread(name, row) / self.unit**2)
+        return found
+
+    def spread(self, name: str, row: ImagePoints) -> np.ndarray:
+        """(n, 2, 2) of image points in the focal plane, metres^2. A later line acts as a smaller x."""
+        scale = self.pitch[name] * np.array([-self.pixels_per_line(name), 1.0])
+        return row.covariance * scale[:, None] * scale
+
+    def control_field(
+        self,
+        images: Mapping[str, ImagePoints],
+        ground: np.ndarray,
+        covariance: float | tuple[float, float] | np.ndarray,
+        removed: LightEffects,
+        control: np.ndarray | None = None,
+    ) -> CalibrationField:
+        """Control points for the calibration.
+
+        Args:
+            images: line -> their image points.
+            ground: (m, 3) given coordinates, ITRS, metres.
+            covariance: (m, 3, 3) of the coordinates, m^2, of ties not used; or a sigma of each coordinate, or of each
+                axis in plan and of the height, metres.
+            removed: effects on the light that are taken out.
+            control: (m,) which of them are control, the others are ties; None for all.
+
+        Raises:
+            CalibrationError: coordinates that cannot be used, such as geodetic ones.
+            ValueError: a point outside the image.
+        """
+        # the calibration's own check comes first: a place without a height has no refraction
+        field = CalibrationField.of(self.name, self.rays(images), ground, covariance, control)
+        return replace(field, rays=self.corrected(field.rays, images, removed, self._heights(ground)))
+
+    def check_rays(self, images: Mapping[str, ImagePoints], removed: LightEffects, noise: Noise) -> dict[str, Rays]:
+        """Rays of points without ground control.
+
+        Refraction depends on the height of the ground, 8% of it on 700 m. It is taken from a first intersection by the
+        laboratory's camera, 100 m wrong, of the rays as they are.
+
+        Raises:
+            CalibrationError: the rays cannot be intersected.
+            ValueError: a point outside the image.
+        """
+        rays = self.rays(images)
+        return self.corrected(rays, images, removed, self._heights(intersect(rays, self.models, noise).ground))
+
+    def corrected(
+        self, rays: Mapping[str, Rays], images: Mapping[str, ImagePoints], removed: LightEffects, height: np.ndarray
+    ) -> dict[str, Rays]:
+        """The rays without these effects.
+
+        Args:
+            rays: line -> rays of the image points.
+            images: line -> the image points.
+            removed: effects on the light that are taken out.
+            height: of the ground points, (m,), NaN where not known, metres.
+
+        Raises:
+            ValueError: a point outside the image.
+        """
+        known = np.clip(np.where(np.isfinite(height), height, self.height), *_HEIGHTS)
+        found = {}
+        for name, row in images.items():
+            sensor = replace(self.sensors[name], effects=removed)
+            shift = light_shift(sensor, self.models[name], row.line, row.pixel, known[row.point])
+            found[name] = replace(rays[name], image=rays[name].image + shift)
+        return found
+
+    def _heights(self, ground: np.ndarray) -> np.ndarray:
+        found = np.full(len(ground), np.nan)
+        good = np.all(np.isfinite(ground), axis=1)
+        found[good] = self.earth.geodetic(ground[good])[2]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class FieldPoints:
+    """What was measured of a field's points.
+
+    Attributes:
+        control_images: line -> image points of the control points, and of the tie points after them.
+        control_ground: (n, 3) given coordinates of control points, first guesses of ties, ITRS, metres.
+        control: (n,) bool: which are control.
+        sigma: of given coordinates, of each axis in plan and of the height, metres.
+        check_images: line -> image points of the check points.
+        check_ground: (m, 3) true coordinates of the check points, ITRS, metres.
+    """
+
+    control_images: Mapping[str, ImagePoints]
+    control_ground: np.ndarray
+    control: np.ndarray
+    sigma: tuple[float, float]
+    check_images: Mapping[str, ImagePoints]
+    check_ground: np.ndarray
+
+
+def image_sigma(images: Mapping[str, ImagePoints], data: PassData) -> float:
+    """One standard deviation of x and y in the focal plane for all image points, root mean square, metres."""
+    variances = [np.diagonal(data.spread(name, row), axis1=1, axis2=2) for name, row in images.items()]
+    return float(np.sqrt(np.mean(np.concatenate(variances))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +319,62 @@ class PassTruth:
             self.errors.bias + np.sin(latitude - self.errors.reference) * self.errors.thermal + time * self.errors.rate
         )
         return np.asarray(Rotation.from_rotvec(turn).inv().as_euler("XYZ"))
+
+
+@dataclass(frozen=True, eq=False)
+class PatchRecord:
+    """One patch and how its points were matched.
+
+    Attributes:
+        points: measured.
+        judgements: ``control`` (with the check points) or ``tie`` -> line -> against the truth.
+    """
+
+    points: PatchPoints
+    judgements: Mapping[str, Mapping[str, LineJudgement]]
+
+
+@dataclass(frozen=True, eq=False)
+class FieldImages:
+    """What became of a field's points.
+
+    Attributes:
+        name: of the field.
+        patches: one by one.
+        shown: the first patch itself, for a figure.
+        wrong: line -> (n,) whether the place of a control or tie point is wrong, by number of the point.
+        wrong_check: line -> (m,) likewise for check points.
+        screening: what the adjustment has left out; None before it.
+    """
+
+    name: str
+    patches: tuple[PatchRecord, ...]
+    shown: Patch
+    wrong: Mapping[str, np.ndarray]
+    wrong_check: Mapping[str, np.ndarray]
+    screening: Screening | None = None
+
+
+@dataclass(frozen=True)
+class Screening:
+    """What the adjustment has left out of a field; counts are of image points, by truth where wrong or right.
+
+    Attributes:
+        entered, left: image points of control and tie points before and after.
+        wrong_entered, wrong_left: wrong ones among them.
+        right_lost: right ones that were left out.
+        check_entered, check_left: check points before and after the test of their intersection.
+        wrong_check_left: of these, with a wrong place in a line.
+    """
+
+    entered: int
+    left: int
+    wrong_entered: int
+    wrong_left: int
+    right_lost: int
+    check_entered: int
+    check_left: int
+    wrong_check_left: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,6 +663,46 @@ def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:
     )
 
 
+def passing_orbit(
+    epoch: str,
+    span: float,
+    altitude: float,
+    longitude: float,
+    latitude: float,
+    direction: Literal["descending", "ascending"] = "descending",
+) -> OrbitSpec:
+    """Return the orbit that passes a place at its epoch, followed for a span before and after; SI units."""
+    passing = PassingSpec.model_construct(
+        longitude=longitude, latitude=latitude, altitude=altitude, direction=direction, inclination=None
+    )
+    return OrbitSpec.model_construct(epoch=epoch, before=span, after=span, passing=passing, elements=None, state=None)
+
+
+def pass_data(
+    name: str,
+    payload: ThreeLineCameraSpec,
+    platform: Platform,
+    times: Mapping[str, LineTimes],
+    height: float,
+    unit: float | None = None,
+) -> PassData:
+    """Return what is known of a pass: its lines by the laboratory's camera and the readings of the platform.
+
+    Args:
+        name: of the pass.
+        payload: camera as the laboratory measured it.
+        platform: orbit and attitude as they were read.
+        times: line camera -> when its lines were exposed.
+        height: of the ground above the ellipsoid, metres.
+        unit: sigma of an image point of weight 1, metres; None for points that weigh alike.
+    """
+    cameras, earth = line_cameras(payload), Earth()
+    sensors = {line: Sensor.of_lines(cameras[line], platform, earth, at, NO_EFFECTS) for line, at in times.items()}
+    models = {line: line_model(payload, line) for line in times}
+    pitch = {line: payload.pitch_of(line) for line in times}
+    return PassData(name, FrozenMap(sensors), FrozenMap(models), FrozenMap(pitch), height, payload.lines, unit)
+
+
 def campaign_of(
     spec: OrbitCalibrationSpec | MeasuredCalibrationSpec,
     payload: ThreeLineCameraSpec,
@@ -369,7 +722,7 @@ def campaign_of(
     """
     seen = {name for one in measured for name in one.images}
     laboratory = FrozenMap({name: line_model(payload, name) for name in payload.lines if name in seen})
-    passes = [_field_pass(one, payload, laboratory, ties_apart) for one in measured]
+    passes = [_field_pass(one, payload, ties_apart) for one in measured]
     unit = image_sigma(passes[0].control_images, passes[0].data)
     noise = _noise_of(spec.errors, unit, [one.measured for one in passes])
     weighed = tuple(replace(p, data=replace(p.data, unit=unit)) for p in passes)
@@ -399,23 +752,15 @@ def _noise_of(errors: ErrorsSpec | ReadingErrorsSpec, image: float, paths: Seque
     return Noise(image, attitude, station, *between, slow, tracker.slow.interval, walk, between[0])
 
 
-def _field_pass(
-    one: PassMeasurements, payload: ThreeLineCameraSpec, models: Mapping[str, LineModel], ties_apart: bool
-) -> FieldPass:
-    """Sort the points of a pass; rays are made later, when the effects on the light are taken out."""
-    earth, cameras, path = Earth(), line_cameras(payload), TabulatedTrajectory(one.platform)
-    sensors = {
-        name: Sensor.of_lines(cameras[name], path, earth, one.line_times[name], NO_EFFECTS) for name in one.images
-    }
+def _field_pass(one: PassMeasurements, payload: ThreeLineCameraSpec, ties_apart: bool) -> FieldPass:
     role = one.ground.role
     rays = np.zeros(len(role), int)
     for row in one.images.values():
         np.add.at(rays, row.point, 1)
     known = (role == "control") & (rays > 0)
-    _, latitude, height = earth.geodetic(one.ground.itrs[known])
-    pitch = {name: payload.pitch_of(name) for name in one.images}
-    own = FrozenMap({name: models[name] for name in one.images})
-    data = PassData(one.name, FrozenMap(sensors), own, FrozenMap(pitch), float(np.mean(height)), lines=payload.lines)
+    _, latitude, height = Earth().geodetic(one.ground.itrs[known])
+    times = {name: one.line_times[name] for name in one.images}
+    data = pass_data(one.name, payload, TabulatedTrajectory(one.platform), times, float(np.mean(height)))
     check = (role == "check") & (rays > 1)
     tie = (role == "tie") & (rays > 1)
     # control points first, ties after them

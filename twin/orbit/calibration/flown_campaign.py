@@ -3,13 +3,18 @@
 Ground points come from the nadir line's image and terrain of given relief; every line sees them through the rigorous
 sensor of `twin.orbit.flight.sensor`, from the true orbit and attitude, with light time, aberration and refraction. The
 analysis gets image points, control coordinates and the measured orbit and attitude, and takes the effects on the light
-out of the image points by the laboratory's camera (`twin.orbit.calibration.observations`).
+out of the image points by the laboratory's camera (`twin.orbit.calibration.campaign`).
+
+Image points of a field that are measured in rendered images of some patches of its ground, instead of drawn.
+
+Every patch is rendered through the true sensors and measured with what the user has (`twin.orbit.images.image_points`).
+The truth enters the record of wrong matches and the true places of check points, which only test.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,66 +24,284 @@ from analysis.orbit.calibration_parameters import level_covariance
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
-from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
+from scenes.yaml.errors import KeyPath
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.random_streams import stream
-from twin.orbit.calibration.campaign import Campaign, PassTruth, campaign_of, line_model
-from twin.orbit.calibration.field_images import FieldImages, Imager
-from twin.orbit.calibration.observations import FieldPoints, PassData, light_effects
+from twin.orbit.calibration.campaign import (
+    Campaign,
+    FieldImages,
+    FieldPoints,
+    PassData,
+    PassTruth,
+    PatchRecord,
+    campaign_of,
+    light_effects,
+    line_model,
+    pass_data,
+    passing_orbit,
+)
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import NO_EFFECTS
+from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineTimes, changed_payload, drifted_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import TERMS, Trajectory
-from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
+from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PointsError, measure_points
+from twin.orbit.images.line_optics import LineOptics, optics_of
+from twin.orbit.images.patch import LineJudgement, Patch, PatchError, fly_patch, imaged_lines, judged, true_ground
+from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.calibration import FieldSpec, OrbitCalibrationSpec, PointsSpec
+    from scenes.specs.orbit.calibration import (
+        CalibrationImagesSpec,
+        FieldSpec,
+        OrbitCalibrationSpec,
+        PatchPlaceSpec,
+        PointsSpec,
+    )
+    from scenes.specs.orbit.scene import GroundSpec
     from scenes.specs.orbit.setup import CalibrationSetup
+
+_OFFSET = 9000.0
+"""Metres. As far from the middle of the real terrain model, east and north, a patch may lie; 30 km x 32 km are real."""
+_LEAST_CONTROL = 6
+"""Control points of a field that must be left; twelve unknowns take three."""
+_REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
+    {
+        "span": (("span",), "a longer pass, or patches nearer to the field's middle"),
+        "place": (("images", "patches"), "a patch inside the swath of every line"),
+        "size": (("images", "patches"), "a smaller patch, or one farther from the ends of the lines"),
+        "terrain": (("images", "ground", "terrain"), "less relief, a larger exponent or larger posts"),
+    }
+)
+
+
+@dataclass(eq=False)
+class Imager:
+    """Renders and measures fields, and says how far it is.
+
+    Attributes:
+        setup: test and camera.
+        spec: of the images.
+        optics: line -> lens and CCD.
+        pattern: seed of the pixels' differences, the same over all fields.
+        advance: told of each patch.
+        done: patches so far.
+    """
+
+    setup: CalibrationSetup
+    spec: CalibrationImagesSpec
+    optics: Mapping[str, LineOptics]
+    pattern: np.random.SeedSequence
+    advance: Advance
+    done: int = field(default=0)
+
+    @classmethod
+    def of(cls, setup: CalibrationSetup, pattern: np.random.SeedSequence, advance: Advance) -> Imager:
+        """For a test with a section `images`."""
+        spec = setup.test.images
+        assert spec is not None
+        optics = optics_of(setup.camera, tuple(setup.camera.lines), setup.test.line_time, setup.detectors)
+        return cls(setup, spec, optics, pattern, advance)
+
+    def measured(
+        self,
+        place: FieldSpec,
+        sensors: Mapping[str, Sensor],
+        data: PassData,
+        effects: LightEffects,
+        seed: np.random.SeedSequence,
+    ) -> tuple[FieldPoints, FieldImages]:
+        """Points of one field.
+
+        Args:
+            place: the field.
+            sensors: the true ones.
+            data: what is known of the pass.
+            effects: on the light, which the user knows as well.
+            seed: of the ground, of the control's errors and of the frames' noise.
+
+        Raises:
+            BenchError: a patch that cannot be imaged, points that cannot be measured, too few of them.
+        """
+        users = {name: replace(sensor, effects=effects) for name, sensor in data.sensors.items()}
+        lines = imaged_lines(sensors, users, {name: self.optics[name] for name in sensors}, self.pattern)
+        total = len(self.setup.test.fields) * len(self.spec.patches)
+        self.advance("patches", self.done, total)
+        patches, records = [], []
+        for k, one in enumerate(self.spec.patches):
+            own = stream(seed, k)
+            try:
+                patch = fly_patch(
+                    lines,
+                    _middle(one, sensors["nadir"], place.height),
+                    (self.spec.lines, self.spec.pixels),
+                    self._ground(place, stream(own, 1)),
+                    self.spec.control,
+                    stream(own, 0),
+                    self.spec.oversampling,
+                )
+                points = measure_points(patch, self.spec.points)
+            except PatchError as error:
+                key, remedy = _REMEDIES[error.part]
+                raise BenchError(f"{data.name}, patch {k + 1}: {error}", key, remedy) from error
+            except PointsError as error:
+                problem = f"{data.name}, patch {k + 1}: {error}"
+                raise BenchError(problem, ("images", "points"), POINTS_REMEDY) from error
+            patches.append(patch)
+            judgements = {sort: judged(patch, some) for sort, some in points.sorts.items()}
+            records.append(PatchRecord(points, FrozenMap(judgements)))
+            self.done += 1
+            self.advance("patches", self.done, total)
+        return self._collected(data, patches, records)
+
+    def _ground(self, place: FieldSpec, seed: np.random.SeedSequence) -> GroundSpec:
+        terrain = self.spec.ground.terrain
+        offset = np.random.default_rng(seed).uniform(-_OFFSET, _OFFSET, 2) + terrain.offset
+        terrain = terrain.model_copy(update={"height": place.height, "offset": tuple(offset.tolist())})
+        return self.spec.ground.model_copy(update={"terrain": terrain})
+
+    def _collected(
+        self, data: PassData, patches: list[Patch], records: list[PatchRecord]
+    ) -> tuple[FieldPoints, FieldImages]:
+        control, check, ties, truth = [], [], [], []
+        for patch, record in zip(patches, records, strict=True):
+            maps = record.points.control
+            assert maps is not None
+            control.append(_Chosen.of(maps, maps.in_all & ~maps.check, record.judgements["control"]))
+            check.append(_Chosen.of(maps, maps.in_all & maps.check, record.judgements["control"]))
+            truth.append(true_ground(patch, maps)[maps.in_all & maps.check])
+            if record.points.ties is not None:
+                tied = record.points.ties
+                ties.append(_Chosen.of(tied, tied.in_all, record.judgements["tie"]))
+        known, held_back, tie = (_joined(parts, data) for parts in (control, check, ties))
+        if known.count < _LEAST_CONTROL or held_back.count < 2:
+            raise BenchError(
+                f"{data.name}: only {known.count} control and {held_back.count} check points were matched in every "
+                f"line; {_lost(records)}",
+                ("images", "points"),
+                f"{_LEAST_CONTROL} control and 2 check points or more: {POINTS_REMEDY}",
+            )
+        # one error in plan moves all points of a patch: each of n weighs as if it had n times the variance
+        share = np.sqrt(known.count / len(patches))
+        sigma = self.spec.control.sigma * share, self.spec.points.height_sigma
+        both = known.followed_by(tie)
+        points = FieldPoints(
+            both.images,
+            both.ground,
+            np.arange(both.count) < known.count,
+            sigma if min(sigma) > 0.0 else (max(sigma[0], _EXACT), max(sigma[1], _EXACT)),
+            held_back.images,
+            np.concatenate(truth),
+        )
+        return points, FieldImages(data.name, tuple(records), patches[0], both.wrong, held_back.wrong)
+
+
+_EXACT = 1e-3
+"""Metres; of control without errors."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Chosen:
+    """Points of a patch or a field, seen by every line: image points, given ground, which places are wrong."""
+
+    images: Mapping[str, ImagePoints]
+    ground: np.ndarray
+    wrong: Mapping[str, np.ndarray]
+
+    @property
+    def count(self) -> int:
+        return len(self.ground)
+
+    @classmethod
+    def of(cls, points: MatchedPoints, chosen: np.ndarray, judgements: Mapping[str, LineJudgement]) -> _Chosen:
+        images, wrong = {}, {}
+        number = np.arange(int(chosen.sum()))
+        for name, line in points.lines.items():
+            images[name] = line.measured(chosen, number)
+            wrong[name] = judgements[name].wrong[chosen] if name in judgements else np.zeros(len(number), bool)
+        return cls(images, points.ground[chosen], wrong)
+
+    def followed_by(self, other: _Chosen) -> _Chosen:
+        images = {
+            name: ImagePoints.joined([row, other.images[name].numbered(-self.count)])
+            for name, row in self.images.items()
+        }
+        wrong = {name: np.concatenate([w, other.wrong[name]]) for name, w in self.wrong.items()}
+        return _Chosen(images, np.concatenate([self.ground, other.ground]), wrong)
+
+
+def _joined(parts: list[_Chosen], data: PassData) -> _Chosen:
+    none = {name: ImagePoints.of(np.zeros(0, int), [], [], np.zeros((0, 2, 2))) for name in data.sensors}
+    whole = _Chosen(none, np.zeros((0, 3)), {name: np.zeros(0, bool) for name in data.sensors})
+    for part in parts:
+        whole = whole.followed_by(part)
+    return whole
+
+
+def _lost(records: list[PatchRecord]) -> str:
+    """Numbers of points that were sought, matched and agreed with by their neighbours, in words."""
+    words = []
+    for name in records[0].judgements["control"]:
+        lines = [r.points.control.lines[name] for r in records if r.points.control is not None]
+        sought, matched, accepted = (
+            sum(int(np.sum(v)) for v in values)
+            for values in zip(*((np.ones(len(x.status)), x.matched, x.accepted) for x in lines), strict=True)
+        )
+        words.append(f"{name}: {sought} sought, {matched} matched, {accepted} agree with their neighbours")
+    return "; ".join(words)
+
+
+def _middle(place: PatchPlaceSpec, nadir: Sensor, height: float) -> tuple[float, float]:
+    """Longitude and latitude of a patch's middle, radians."""
+    at = (0.0 - nadir.first_line_time) / nadir.line_time
+    step = nadir.ground(np.array([at, at + 1.0]), np.array([place.pixel]), height)
+    line = at + place.track / float(np.linalg.norm(step[1] - step[0]))
+    if not 0.0 <= line <= nadir.lines - 1.0:
+        problem = f"the patch at {place.track / 1e3:g} km along the track lies beyond the pass"
+        raise PatchError(problem, "span")
+    point = nadir.ground(np.array([line]), np.array([place.pixel]), height)
+    longitude, latitude, _ = nadir.earth.geodetic(point[0])
+    return float(longitude), float(latitude)
 
 
 _DRIFT, _READING = 6, 7
 """Streams of a field's seed. What else is drawn of a field does not change with them."""
 
 
-def _sample_drift(
-    spec: OrbitCalibrationSpec, lines: Sequence[str], seed: np.random.SeedSequence
-) -> FrozenMap[str, np.ndarray]:
+def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) true d_alpha, d_beta, d_gamma (radians) and d_f (metres) during one field; empty for no drift.
 
     The draws of a line are the same whatever their sigmas are.
 
     Args:
         spec: the test.
-        lines: names of the three lines.
         seed: of the field.
     """
     if not spec.drift:
         return FrozenMap({})
-    unit = np.random.default_rng(stream(seed, _DRIFT)).standard_normal((len(lines), 4))
+    unit = np.random.default_rng(stream(seed, _DRIFT)).standard_normal((len(LINES), 4))
     sigma = {name: np.array([*one.angles, one.principal_distance]) for name, one in spec.drift.items()}
-    return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(lines, unit, strict=True)})
+    return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(LINES, unit, strict=True)})
 
 
 def _sample_readings(
-    spec: OrbitCalibrationSpec, lines: Sequence[str], drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
+    spec: OrbitCalibrationSpec, drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
 ) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) what the monitor reads, in the same units; empty for no monitor.
 
     Args:
         spec: the test.
-        lines: names of the three lines.
         drift: the true one.
         seed: of the field.
     """
     if spec.monitor is None:
         return FrozenMap({})
-    noise = np.random.default_rng(stream(seed, _READING)).standard_normal((len(lines), 4))
+    noise = np.random.default_rng(stream(seed, _READING)).standard_normal((len(LINES), 4))
     sigma = reading_sigma(spec) * spec.errors.switched_on
-    return FrozenMap({name: drift[name] + sigma * row for name, row in zip(lines, noise, strict=True)})
+    return FrozenMap({name: drift[name] + sigma * row for name, row in zip(LINES, noise, strict=True)})
 
 
 def reading_sigma(spec: OrbitCalibrationSpec) -> np.ndarray:
@@ -114,23 +337,15 @@ def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: A
         _pass(name, field, spec, payload, changed, earth, own, imager)
         for (name, field), own in zip(spec.fields.items(), seed.spawn(len(spec.fields)), strict=True)
     ]
-    campaign = campaign_of(spec, payload, [one.measurements for one in flown], spec.images is None)
+    measured, readings, pictures, truths = zip(*flown, strict=True)
+    campaign = campaign_of(spec, payload, measured, spec.images is None)
     passes = tuple(
-        replace(p, known_truth=one.truth, readings=one.readings) for p, one in zip(campaign.passes, flown, strict=True)
+        replace(one, known_truth=truth, readings=told)
+        for one, truth, told in zip(campaign.passes, truths, readings, strict=True)
     )
-    images = tuple(one.images for one in flown if one.images is not None)
+    images = tuple(one for one in pictures if one is not None)
     truth = FrozenMap({k: line_model(changed, k) for k in LINES})
     return replace(campaign, passes=passes, images=images or None, known_truth=truth)
-
-
-@dataclass(frozen=True, eq=False)
-class _Flown:
-    """A pass: what was measured of it, what a monitor reads, what became of points in images, and the truth."""
-
-    measurements: PassMeasurements
-    readings: Mapping[str, np.ndarray]
-    images: FieldImages | None
-    truth: PassTruth
 
 
 def true_bias(spec: OrbitCalibrationSpec, latitude: np.ndarray) -> np.ndarray:
@@ -150,10 +365,10 @@ def _pass(
     earth: Earth,
     seed: np.random.SeedSequence,
     imager: Imager | None,
-) -> _Flown:
-    """Fly and measure."""
-    pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, LINES, seed)
-    readings = _sample_readings(spec, LINES, drift, seed)
+) -> tuple[PassMeasurements, Mapping[str, np.ndarray], FieldImages | None, PassTruth]:
+    """Return what was measured of a pass, what a monitor reads, what became of points in images, and the truth."""
+    pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, seed)
+    readings = _sample_readings(spec, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
     place, image, ground, season, data = (np.random.default_rng(s) for s in seed.spawn(5))
     trajectory = _trajectory(name, field, spec, earth, seed)
@@ -169,17 +384,14 @@ def _pass(
     lines = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
     times = LineTimes.even(trajectory.first + 0.5 * spec.line_time, spec.line_time, lines)
     sensors = {k: Sensor.of_lines(cameras[k], trajectory, earth, times, effects) for k in LINES}
-    known, path = line_cameras(payload), TabulatedTrajectory(platform)
-    laboratory = {k: Sensor.of_lines(known[k], path, earth, times, NO_EFFECTS) for k in LINES}
-    models = FrozenMap({k: line_model(payload, k) for k in LINES})
-    pitch = FrozenMap({k: payload.pitch_of(k) for k in LINES})
-    pass_data = PassData(name, FrozenMap(laboratory), models, pitch, field.height)
+    path, at = TabulatedTrajectory(platform), dict.fromkeys(LINES, times)
+    known = pass_data(name, payload, path, at, field.height)
     images = None
     if imager is None:
         assert spec.points is not None
-        points = _simulated_points(field, spec, spec.points, sensors, pass_data, (place, image, ground))
+        points = _simulated_points(field, spec, spec.points, sensors, known, (place, image, ground))
     else:
-        points, images = imager.measured(field, sensors, pass_data, effects, pictures)
+        points, images = imager.measured(field, sensors, known, effects, pictures)
     ties: Mapping[str, ImagePoints] = {}
     if spec.strip is not None and spec.points is not None:
         tie_points = spec.points.model_copy(
@@ -188,7 +400,7 @@ def _pass(
         own = stream(seed, _TIES)
         a, b, c = (np.random.default_rng(s) for s in own.spawn(3))
         try:
-            ties = _simulated_points(field, spec, tie_points, sensors, pass_data, (a, b, c)).check_images
+            ties = _simulated_points(field, spec, tie_points, sensors, known, (a, b, c)).check_images
         except BenchError as error:
             remedy = "a shorter strip, or a longer pass (`span`)"
             raise BenchError(f"tie points: {error}", ("strip", "length"), remedy) from error
@@ -205,24 +417,24 @@ def _pass(
         drift,
     )
     datum = errors.datum if errors.switched_on else (0.0, 0.0, 0.0)
-    told = _measurements_of(name, platform, FrozenMap(dict.fromkeys(LINES, times)), points, ties, datum)
-    return _Flown(told, readings, images, truth)
+    told = _measurements_of(name, platform, times, points, ties, datum)
+    return told, readings, images, truth
 
 
 def _measurements_of(
     name: str,
     platform: PlatformTable,
-    times: Mapping[str, LineTimes],
+    times: LineTimes,
     points: FieldPoints,
     ties: Mapping[str, ImagePoints],
-    datum: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    datum: tuple[float, float, float],
 ) -> PassMeasurements:
     """What was measured of a simulated pass, as files would have it.
 
     Args:
         name: of the pass.
         platform: readings.
-        times: line -> line times.
+        times: of every line.
         points: control, tie and check points.
         ties: line -> image points of further tie points, counted from 0.
         datum: by which control points are given too far east, north and up, metres.
@@ -233,24 +445,18 @@ def _measurements_of(
         given = given + np.array(datum) @ east_north_up(lon, lat)
     count, checks = len(given), len(points.check_ground)
     more = 1 + max((int(r.point.max()) for r in ties.values() if len(r.point)), default=-1)
-    plan, tall = points.sigma if isinstance(points.sigma, tuple) else (points.sigma, points.sigma)
-    empty = np.full((count, 3), np.nan)
-    itrs = np.concatenate(
-        [np.where(is_control[:, None], given, empty), points.check_ground, np.full((more, 3), np.nan)]
-    )
+    known = np.where(is_control[:, None], given, np.nan)
+    itrs = np.concatenate([known, points.check_ground, np.full((more, 3), np.nan)])
     role = np.array(["control" if c else "tie" for c in is_control] + ["check"] * checks + ["tie"] * more, object)
     covariance = np.zeros((len(role), 3, 3))
-    covariance[:count][is_control] = level_covariance(given[is_control], plan, tall)
-    letter = {"control": "c", "check": "k", "tie": "t"}
-    ids = [f"{letter[r]}{k}" for k, r in enumerate(role.tolist())]
+    covariance[:count][is_control] = level_covariance(given[is_control], *points.sigma)
     images = {}
     for line, row in points.control_images.items():
-        rows = [(row, 0), (points.check_images[line], count)]
-        rows += [(ties[line], count + checks)] if line in ties else []
-        columns = (np.concatenate([getattr(r, k) for r, _ in rows]) for k in ("line", "pixel", "covariance"))
-        images[line] = ImagePoints(np.concatenate([r.point + first for r, first in rows]), *columns)
-    ground = GroundPoints.of(ids, itrs, covariance, role)
-    return PassMeasurements(name, platform, FrozenMap(dict(times)), ground, FrozenMap(images))
+        parts = [row, points.check_images[line].numbered(-count)]
+        parts += [ties[line].numbered(-count - checks)] if line in ties else []
+        images[line] = ImagePoints.joined(parts)
+    ground = GroundPoints.of(point_names(role), itrs, covariance, role)
+    return PassMeasurements(name, platform, FrozenMap(dict.fromkeys(LINES, times)), ground, FrozenMap(images))
 
 
 def _simulated_points(
@@ -277,23 +483,15 @@ def _simulated_points(
     given = points[:count] + control * ground.standard_normal((count, 3))
     control_images = {k: row.taken(np.arange(count)) for k, row in images.items()}
     check_images = {k: row.taken(np.arange(count, len(points))).numbered(count) for k, row in images.items()}
-    return FieldPoints(data, control_images, given, np.ones(count, bool), control, check_images, points[count:])
+    known = np.ones(count, bool)
+    return FieldPoints(control_images, given, known, (control, control), check_images, points[count:])
 
 
 def _trajectory(
     name: str, field: FieldSpec, spec: OrbitCalibrationSpec, earth: Earth, seed: np.random.SeedSequence
 ) -> Trajectory:
     """The true orbit, which passes the field's middle at its epoch, and the true attitude."""
-    passing = PassingSpec.model_construct(
-        longitude=field.longitude,
-        latitude=field.latitude,
-        altitude=spec.altitude,
-        direction="descending",
-        inclination=None,
-    )
-    orbit = OrbitSpec.model_construct(
-        epoch=field.epoch, before=spec.span, after=spec.span, passing=passing, elements=None, state=None
-    )
+    orbit = passing_orbit(field.epoch, spec.span, spec.altitude, field.longitude, field.latitude)
     try:
         return Trajectory.flown(propagate(orbit, earth), spec.attitude, seed)
     except ValueError as error:

@@ -22,11 +22,8 @@ from analysis.calibration.adjustment import FALSE_ALARM, Adjustment, Rates, Step
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
 from scenes.specs.orbit.measurements import MeasuredCalibrationSpec
-from twin.framework.artefact import Table
-from twin.framework.quantity import in_unit
-from twin.orbit.calibration.campaign import Campaign, FoundDrift
+from twin.orbit.calibration.campaign import EFFECTS, Campaign, FoundDrift
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
-from twin.orbit.calibration.observations import EFFECTS
 from twin.orbit.calibration.schemes import FieldErrors, schemes_tested, tested_before
 from twin.orbit.flight.light_effects import NO_EFFECTS
 
@@ -370,25 +367,11 @@ def _joints(campaign: Campaign) -> tuple[tuple[str, float], ...]:
     data = campaign.passes[0].data
     found = []
     for name in campaign.lines:
-        ccds = () if data.lines is None else data.lines[name].ccds or ()
+        ccds = data.lines[name].ccds or ()
         pixels = [0.5 * (a.last + b.first) for a, b in pairwise(ccds)]
         pixels = pixels or [0.5 * (data.sensors[name].camera.pixels - 1)]
         found += [(name, float(y)) for y in data.places(name, np.array(pixels))[:, 1]]
     return tuple(found)
-
-
-def steps_table(numbers: tuple[ChipStep, ...]) -> Table:
-    """What the points say, joint by joint, in micrometres."""
-    rows = [(n.line, n.axis, in_unit(n.place, "mm"), *in_unit((n.step, n.sigma, n.seen_from), "um")) for n in numbers]
-    return Table(
-        "chip-steps",
-        "Steps between chips that these points would show",
-        "Steps are no unknowns: what the residuals say of one at each joint of the camera's file, at the middle of a "
-        "line of one chip, micrometres. Seen from: told in half of all cases, one false alarm in 10 000 runs.",
-        ("line", "axis", "at y [mm]", "step", "σ", "seen from"),
-        rows,
-        (None, None, 2, 2, 2, 2),
-    )
 
 
 def step_warnings(numbers: tuple[ChipStep, ...]) -> list[str]:

@@ -21,9 +21,8 @@ from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import Rays, misclosure
 from analysis.statistics import robust_variance
 from optics.numerics.number_tree import FrozenMap
-from twin.orbit.calibration.campaign import Campaign, FieldPass, Rejected
+from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Rejected, Screening
 from twin.orbit.calibration.campaign_adjustment import simultaneous
-from twin.orbit.calibration.field_images import FieldImages, Screening
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints, listed
 

@@ -14,8 +14,20 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue
 from twin.framework.procedure import Advance, silent
 from twin.orbit.conventions import pass_readings
-from twin.orbit.conventions.pass_readings import QUESTIONS, Changes, PassConventions, PassReadings, changed
-from twin.orbit.conventions.reading_fit import Fit, ImpossibleError, PassBench, line_of, line_times, pixel_of, spread
+from twin.orbit.conventions.pass_readings import (
+    QUESTIONS,
+    Changes,
+    Fit,
+    ImpossibleError,
+    PassBench,
+    PassConventions,
+    PassReadings,
+    changed,
+    line_of,
+    line_times,
+    pixel_of,
+    spread,
+)
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineTimes, line_cameras
 from twin.orbit.measured.clock import epoch_before

@@ -40,8 +40,8 @@ from twin.orbit.flight.line_camera import LineCamera, calibrated_lines, correcte
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.images.simulate_run import fly_simulation
-from twin.orbit.measured.dimap_sensor import DimapScene, read_scene
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
+from twin.orbit.measured.platform_files import DimapScene, read_scene
 from twin.orbit.measured.xml_file import text_lines
 
 if TYPE_CHECKING:

@@ -39,7 +39,7 @@ from twin.orbit.export.rational_polynomial import (
     read_rpc,
 )
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.measured.dimap_sensor import DimapScene
+from twin.orbit.measured.platform_files import DimapScene
 
 _COMPARED = (15, 15, 3)
 """Lines, pixels and heights at which polynomials are compared."""

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from optics.numerics.array_math import UnphysicalError, in_span
+from optics.numerics.extension_table import ExtensionTable
 from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, FLATTENING, Earth, EarthRotation, ut1_of
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def _gravity(_: float, position: np.ndarray, velocity: np.ndarray) -> np.ndarray
     return acceleration(position)
 
 
-FORCES: dict[str, Force] = {"gravity": _gravity}
+FORCES = ExtensionTable[Force]("forces", {"gravity": _gravity})
 """Every force on every satellite, by its name; the accelerations add. A new one is added here. Orbits that are called
 sun-synchronous follow the mean Sun by J2 alone.
 """

@@ -31,7 +31,7 @@ from optics.geometry.pose import rotation_matrix
 from twin.framework.random_streams import stream
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
 from twin.orbit.flight.orbit import Orbit
-from twin.sensors.charge_transfer import Collection
+from twin.sensors.line_ccd import Collection
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec, JitterSpec

@@ -34,6 +34,7 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Map, Maps
 from twin.orbit.images.pushbroom import Window
+from twin.orbit.measured.pass_measurements import ImagePoints
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.scene import ImagePointsSpec
@@ -280,6 +281,16 @@ class MatchedLine:
     def usual_sigma(self) -> np.ndarray:
         """(2,) of lines and pixels, median of the accepted."""
         return np.asarray(np.median(np.sqrt(np.diagonal(self.covariance[self.accepted], axis1=1, axis2=2)), axis=0))
+
+    def measured(self, rows: np.ndarray, point: np.ndarray) -> ImagePoints:
+        """Return image points of some places, by mask or index, with `BEYOND` in their covariances.
+
+        Args:
+            rows: which places.
+            point: the ground point of each.
+        """
+        image, spread = self.image[rows], self.covariance[rows] + BEYOND**2 * np.eye(2)
+        return ImagePoints.of(point, image[:, 0], image[:, 1], spread)
 
     @property
     def lost(self) -> Mapping[str, int]:

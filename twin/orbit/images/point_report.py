@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,8 +18,8 @@ from twin.framework.data_files import csv_table
 from twin.framework.report import Section
 from twin.framework.svg import SKY, VERMILION, YELLOW, look, new_figure, to_png
 from twin.orbit.images.image_points import CONSENSUS, ImagedGround, LineFrame, MatchedPoints, PatchPoints, status_text
-from twin.orbit.images.patch import Patch
-from twin.orbit.images.point_judgement import WRONG, judged
+from twin.orbit.images.patch import WRONG, Patch, judged
+from twin.orbit.images.simulate_run import JUDGED, MATCHED
 
 
 def pixel_axes(axes: Axes) -> None:
@@ -90,105 +90,75 @@ def listing(patch: ImagedGround, points: PatchPoints) -> list[list[Any]]:
     return rows
 
 
+T = TypeVar("T")
 _DPI = 110
-_NAMES = {"control": "orthophoto", "tie": "tie"}
+SORTS = {"control": "orthophoto", "tie": "tie"}
+
+
+def how_measured(spec: ImagePointsSpec, known: str) -> str:
+    """Return how points are measured in images, in sentences.
+
+    Args:
+        spec: of the points.
+        known: what brings them into each line's geometry.
+    """
+    return (
+        "Distinct places of the orthophoto, with heights of the elevation model, and distinct places of one line's "
+        f"image are brought into each line's geometry by {known}, templates of {spec.template} pixels, sought "
+        f"{spec.reach} pixels to each side, and fitted by least squares. Rejected is what fails a threshold of the "
+        "matching, and what does not follow the smooth displacement of its neighbours."
+    )
 
 
 def points_section(patch: Patch, points: PatchPoints, spec: ImagePointsSpec) -> Section:
     """Numbers, figure and listing of a patch's points."""
-    text = [
-        f"Distinct places of the orthophoto, with heights of the elevation model, and distinct places of one line's "
-        f"image are brought into each line's geometry by the measured sensor, templates of {spec.template} pixels, "
-        f"sought {spec.reach} pixels to each side of where it expects them, and fitted by least squares. Rejected is "
-        "what fails a threshold of the matching, and what does not follow the smooth displacement of its neighbours. "
-        "Where orthophoto points have lain is taken into the prediction of tie points."
-    ]
-    if points.control is not None:
-        text.append(
-            "The covariances come from the residuals of each fit. They do not hold what another season's light and "
-            "changed parcels move a match by; chi-square per degree of freedom says by how much they are too small. "
-            "The error that orthophoto and heights have in common in the whole patch is in none of these numbers: "
-            "matches are judged against the place of what the orthophoto shows."
-        )
-    shown = point_artefacts(patch, points, _NAMES, ("predicted", " as given", ""), _true(patch, points))
-    return Section("Measured points", tuple(text), shown)
+    shown = point_artefacts(patch, points, found_table(points), _true(patch, points))
+    return Section("Measured points", (how_measured(spec, "the measured sensor"),), shown)
 
 
-def point_artefacts(
-    patch: ImagedGround, points: PatchPoints, names: Mapping[str, str], words: tuple[str, str, str], *tables: Table
-) -> tuple[Artefact, ...]:
-    """What was matched, figures, what was lost, and the listing.
-
-    Args:
-        patch: images and what is known of the ground.
-        points: measured in them.
-        names: sort of points -> its name for readers.
-        words: what points are before they are found, and what else is said of ground coordinates and of sigmas.
-        tables: to stand after the table of what was matched.
-    """
-    before, ground, sigmas = words
+def point_artefacts(patch: ImagedGround, points: PatchPoints, *tables: Table) -> tuple[Artefact, ...]:
+    """Return tables, figures, what was lost, and the listing of points that were measured in images of ground."""
     figures = [
         PngFigure(
             f"points-{sort}",
-            f"From {before} to found, {names[sort]} points",
+            f"From predicted to found, {SORTS[sort]} points",
             "Arrows as long as they are in the image, after the median displacement in the title was taken off, "
             "enlarged as the title says; crosses: rejected by the neighbours; points: not matched.",
             points_png(patch, one),
         )
         for sort, one in points.sorts.items()
     ]
-    caption = f"Every point in every line: ground coordinates{ground}, image coordinates, sigmas{sigmas}, verdict."
+    caption = "Every point in every line: ground coordinates, image coordinates, sigmas of the fit, verdict."
     listed = PointListing("points", "Points", caption, listing(patch, points))
-    return _found_table(points), *tables, *figures, _lost_table(points), listed
+    return *tables, *figures, _lost_table(points), listed
 
 
-def _found_table(points: PatchPoints) -> Table:
-    """How many points were matched, and what by."""
-    rows: list[tuple[Cell, ...]] = []
-    for sort, one in points.sorts.items():
-        for name, line in one.sought_in.items():
-            counts = len(line.status), int(line.matched.sum()), int(line.accepted.sum())
-            rows.append((_NAMES[sort], name, *counts, *line.moved.tolist(), *line.usual_sigma.tolist()))
-    return Table(
-        "points-found",
-        "Matching",
-        "Displacement from predicted to found and sigma: medians of the accepted, px along the track (lines) and along "
-        "the line (pixels).",
-        ("points", "line", "sought", "matched", "accepted", "moved, track", "moved, line", "σ track", "σ line"),
-        rows,
-        (None, None, None, None, None, 2, 2, 3, 3),
+def flat(points: PatchPoints, below: Callable[[MatchedPoints], Mapping[str, T]]) -> dict[str, T]:
+    """Return what points have by line, under sort and line together."""
+    found = ((sort, below(one)) for sort, one in points.sorts.items())
+    return {f"{SORTS[sort]}, {name}": line for sort, lines in found for name, line in lines.items()}
+
+
+def found_table(points: PatchPoints) -> Table:
+    """Return the table of the points that were matched, by sort and line."""
+    found = flat(points, lambda one: one.sought_in)
+    rows = {name: MATCHED(line) for name, line in found.items() if line.accepted.any()}
+    caption = (
+        "Displacement from predicted to found and sigma: medians of the accepted, px along the track and the line."
     )
+    moved = ("displacement_lines_px", "displacement_pixels_px")
+    keys = ("found", "matched", "accepted", *moved, *(f"{key}_sigma" for key in moved))
+    return MATCHED.table("points-found", "Matching", caption, rows, keys, "points, line", digits=4)
 
 
 def _true(patch: Patch, points: PatchPoints) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for sort, one in points.sorts.items():
-        for name, j in judged(patch, one).items():
-            ratio = j.chi_square / max(j.degrees_of_freedom, 1)
-            numbers = (*j.rms.tolist(), *j.mean.tolist(), ratio)
-            rows.append((_NAMES[sort], name, *j.wrong_shares, j.right_rejected_by_consensus, *numbers))
-    return Table(
-        "points-truth",
-        "Against the truth",
-        f"Wrong: {WRONG}; of "
-        "all places that a fit gave, of those that matching let pass, of those that the neighbours agree with. RMS and "
-        "mean error, px, and chi-square over degrees of freedom, of right places.",
-        (
-            "points",
-            "line",
-            "wrong before",
-            "after matching",
-            "after consensus",
-            "right lost",
-            "RMS track",
-            "RMS line",
-            "mean track",
-            "mean line",
-            "χ²/dof",
-        ),
-        rows,
-        (None, None, None, None, None, None, 3, 3, 3, 3, 2),
+    rows = {name: JUDGED(line) for name, line in flat(points, lambda one: judged(patch, one)).items()}
+    caption = (
+        f"Wrong: {WRONG}; of all places that a fit gave, of those that matching let pass, of those that the neighbours "
+        "agree with. RMS and mean error, px, and chi-square, of right places."
     )
+    keys = [one.key for one in JUDGED][:-1]
+    return JUDGED.table("points-truth", "Against the truth", caption, rows, keys, "points, line", digits=4)
 
 
 def _lost_table(points: PatchPoints) -> Table:
@@ -200,7 +170,7 @@ def _lost_table(points: PatchPoints) -> Table:
         for found in count.values():
             total.update(found)
         for text, _ in total.most_common():
-            rows.append((_NAMES[sort], text, ", ".join(f"{n} {c.get(text, 0)}" for n, c in count.items())))
+            rows.append((SORTS[sort], text, ", ".join(f"{n} {c.get(text, 0)}" for n, c in count.items())))
     return Table("points-lost", "Why points were not accepted", "", ("points", "reason", "how many"), rows)
 
 

@@ -11,9 +11,9 @@ it runs in strips of lines, and the result does not depend on how it is cut.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -24,8 +24,7 @@ from optics.numerics.backend import cores, one_blas_thread
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.orthophoto import Extent
-from twin.orbit.images.jitter_exposure import exposures, steady
-from twin.orbit.images.line_optics import ImageMotion, LineOptics
+from twin.orbit.images.line_optics import ImageMotion, LineOptics, exposures, steady
 
 TOLERANCE = 2e-4
 """Metres: largest interpolation error of the look's place at given heights."""
@@ -211,11 +210,8 @@ _SAMPLES_AT_ONCE = 4_000_000
 _CHECKS = 400
 
 
-class GroundImage(Protocol):
-    """What the ground looks like from above: apparent reflectance at east and north, metres, any equal shapes."""
-
-    def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """Values, of the places' shape."""
+GroundImage = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Apparent reflectance of places of the ground, east and north of the frame's middle in metres, of one shape."""
 
 
 @dataclass(frozen=True, eq=False)

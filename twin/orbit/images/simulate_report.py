@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.framework.artefact import Cell, Data, PngFigure, SvgFigure, Table
+from twin.framework.artefact import Data, PngFigure, SvgFigure, Table
 from twin.framework.data_files import FrameFacts, MapPlace
 from twin.framework.reference_frames import described
 from twin.framework.report import Report, Section, answer
@@ -29,12 +30,20 @@ from twin.framework.svg import (
     to_svg,
 )
 from twin.orbit.ground.orthophoto import Raster
-from twin.orbit.images import simulate_numbers
 from twin.orbit.images.patch import LineImage
 from twin.orbit.images.point_report import pixel_axes, points_section
-from twin.orbit.images.simulate_run import Simulation
+from twin.orbit.images.simulate_run import (
+    GEOREFERENCE,
+    LINE,
+    TRUTH,
+    Simulation,
+    camera_data,
+    georeference_data,
+    trajectory_data,
+)
 
 if TYPE_CHECKING:
+    from scenes.specs.orbit.scene import InteriorChangeSpec
     from scenes.specs.orbit.setup import SimulateSetup
 
 
@@ -69,12 +78,6 @@ def _control_png(run: Simulation) -> bytes:
         heights.set(title="Elevation model, m above the ellipsoid")
         figure.colorbar(shown, ax=heights, fraction=0.045, pad=0.02)
         return to_png(figure, _DPI)
-
-
-def _transfer_svg(run: Simulation) -> str:
-    """MTF along the line and along the track, all lines and the parts of the first that looks obliquely."""
-    with look("simulate-transfer"):
-        return to_svg(_transfer_figure(run))
 
 
 def _modulus(values: np.ndarray) -> np.ndarray:
@@ -146,32 +149,23 @@ def sections(run: Simulation) -> tuple[Section, ...]:
 
 
 def _images(run: Simulation) -> Section:
-    rows: list[tuple[Cell, ...]] = []
-    for name, image in run.patch.images.items():
-        window, frame = image.window, image.frame
-        levels = float(frame.mean()), int(frame.min()), int(frame.max())
-        rows.append((name, str(window.first_line), str(window.first_pixel), *levels, image.saturated))
     worst = max(image.error for image in run.patch.images.values())
     text = (
-        "Each line's window of the same size has the patch in its middle. Every sample of the ground is looked at by "
-        "the rigorous sensor with light time, aberration and refraction as the file says, met with the terrain, and "
-        "taken to the pixels by the transfer function of lens, pixels and motion; the detector makes grey values "
-        f"of the photons. Places that are interpolated between rigorous ones are off by {worst:.1g} pixels at most.",
-        "Slopes are lit by Lambert's law and the sky; they throw no shadows. A line's pixels differ by the detector's "
-        "fixed pattern, and no radiometric correction has been made.",
+        "Each line's window of the same size has the patch in its middle. Places that are interpolated between "
+        f"rigorous ones are off by {worst:.1g} pixels at most. A line's pixels differ by the detector's fixed pattern, "
+        "and no radiometric correction has been made.",
     )
     figure = PngFigure(
         "lines", "What the lines recorded", "Grey values between 0.5% and 99.5% of each image.", _images_png(run)
     )
-    table = Table(
-        "windows",
-        "Windows and grey values",
-        "Lines count from the begin of the orbit data, pixels from the first of the line.",
-        ("line", "first line", "first pixel", "mean [DN]", "smallest", "largest", "saturated"),
-        rows,
-        (None, None, None, 1, None, None, None),
-    )
-    return Section("Images", text, (figure, table))
+    caption = "Lines count from the begin of the orbit data, pixels from the first of the line."
+    keys = ("first_line", "first_pixel", "mean_dn", "smallest_dn", "largest_dn", "saturated_pixels")
+    return Section("Images", text, (figure, _lines(run, "windows", "Windows and grey values", caption, keys)))
+
+
+def _lines(run: Simulation, name: str, title: str, caption: str, keys: Sequence[str]) -> Table:
+    rows = {line: LINE(image) for line, image in run.patch.images.items()}
+    return LINE.table(name, title, caption, rows, keys, "line", digits=4)
 
 
 def _control(run: Simulation) -> Section:
@@ -189,22 +183,17 @@ def _control(run: Simulation) -> Section:
 
 
 def _sharpness(run: Simulation) -> Section:
-    text = (
-        "An oblique line sees the ground under a larger pixel than it advances by in a line's time: along the track "
-        "its pixels overlap, which blurs at half a cycle per line but hides nothing. Motion during a line blurs by one "
-        "line.",
-    )
-    figure = SvgFigure(
-        "transfer", "Modulation transfer", "Up to half a cycle per sample; before any noise.", _transfer_svg(run)
-    )
-    return Section("Sharpness", text, (figure,))
+    with look("simulate-transfer"):
+        drawing = to_svg(_transfer_figure(run))
+    caption = "Up to half a cycle per sample; before any noise."
+    return Section("Sharpness", (), (SvgFigure("transfer", "Modulation transfer", caption, drawing),))
 
 
 def _data(run: Simulation) -> Section:
-    camera = described("camera", simulate_numbers.camera_data(run.laboratory))
-    path = described("trajectory", simulate_numbers.trajectory_data(run, run.measured))
-    rasters = described("georeference", simulate_numbers.georeference_data(run))
-    truth = described("simulate-truth", simulate_numbers.TRUTH(run))
+    camera = described("camera", camera_data(run.laboratory))
+    path = described("trajectory", trajectory_data(run, run.measured))
+    rasters = described("georeference", georeference_data(run))
+    truth = described("simulate-truth", TRUTH(run))
     parts = (
         Data("camera", "Camera", "As the laboratory measured it.", camera),
         Data("trajectory", "Orbit and attitude", "As measured.", path),
@@ -253,23 +242,24 @@ def simulation_report(run: Simulation) -> Report:
 
 def map_facts(raster: Raster, note: str, heights: bool = False) -> FrameFacts:
     """What the TIFF of a map says of itself: a GeoTIFF."""
-    longitude, latitude, *steps = list(simulate_numbers.GEOREFERENCE(raster).values())[3:]
+    longitude, latitude, *steps = list(GEOREFERENCE(raster).values())[3:]
     return FrameFacts(note=note, place=MapPlace(longitude, latitude, steps[0], steps[1], heights))
 
 
 def _summary(run: Simulation) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for name, image in run.patch.images.items():
-        contrast = 100.0 * float(image.frame.std() / image.frame.mean())
-        rows.append((name, *image.sample, *image.nyquist, float(image.frame.mean()), contrast))
-    return Table(
-        "images",
-        "Images",
-        "Distance of samples on the ground and modulation transfer at half a cycle per sample, in the patch's middle.",
-        ("line", "along line [m]", "along track [m]", "MTF line", "MTF track", "mean [DN]", "contrast [%]"),
-        rows,
-        (None, 3, 3, 3, 3, 1, 1),
+    caption = "Distance of samples on the ground and modulation transfer at half a cycle per sample, in the middle."
+    keys = ("sample_along_line_m", "sample_along_track_m", "mtf_nyquist_along_line", "mtf_nyquist_along_track")
+    return _lines(run, "images", "Images", caption, (*keys, "mean_dn", "rms_contrast"))
+
+
+def changes_text(perturb: Mapping[str, InteriorChangeSpec]) -> str:
+    """Return in words what has changed in the lines of a camera since the laboratory."""
+    changes = (
+        f"{name} f {format_quantity(c.principal_distance, LENGTH)}, "
+        f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"
+        for name, c in perturb.items()
     )
+    return "; ".join(changes) or "nothing"
 
 
 def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
@@ -280,15 +270,10 @@ def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
         "Jacksboro fault, 3 arc seconds, moved" if terrain.kind == "real" else f"fractal, exponent {terrain.exponent:g}"
     )
     sun = f"{format_quantity(light.elevation, ANGLE)} high in {format_quantity(light.azimuth, ANGLE)}"
-    changes = "; ".join(
-        f"{name} f {format_quantity(c.principal_distance, LENGTH)}, "
-        f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"
-        for name, c in test.perturb.items()
-    )
     bias = ", ".join(format_quantity(v, ANGLE) for v in test.errors.star_tracker.bias)
     return (
         ("Camera", f"{camera.name}, {camera.description}"),
-        ("Changed since the laboratory", changes or "nothing"),
+        ("Changed since the laboratory", changes_text(test.perturb)),
         ("Bias of the star trackers", f"[{bias}]"),
         ("Terrain", f"{kind}; {format_quantity(terrain.height, LENGTH)} high, {relief}"),
         ("Ground", f"cells of {test.ground.texture.spacing:g} m, reflectance {test.ground.texture.mean:g}"),

@@ -1,28 +1,67 @@
-"""A pass over a patch of ground from what its file says: orbit, the camera as it is and as it was known, images."""
+"""A pass over a patch of ground from what its file says: orbit, the camera as it is and as it was known, images.
+
+The quantities of a simulated pass: simulate.json, and what artefacts/NAME.json hold for other software and as truth.
+
+simulate.json has what the user of the images may know. The camera, orbit and attitude, and the georeference are files
+of their own; the camera and the trajectory as they truly are stand in truth.json alone.
+
+The simulated measurements as a folder of tables with a test file that reads them back.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from analysis.arrays import Array
+from analysis.orbit.calibration_parameters import level_covariance
+from optics.geometry.pose import about_axis, rotation_matrix
+from optics.numerics.array_math import in_span
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.scene import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
+from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance, BenchError, silent
+from twin.framework.quantity import Quantity, Record, plain_data
 from twin.framework.random_streams import stream
+from twin.framework.reference_frames import described
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
-from twin.orbit.flight.line_camera import LineCamera, changed_payload, line_cameras
+from twin.orbit.flight.line_camera import LineCamera, LineTimes, changed_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
+from twin.orbit.flight.platform_table import PlatformTable, joined_quaternions
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.flight.trajectory import Trajectory
-from twin.orbit.images.image_points import POINTS_REMEDY, PatchPoints, PointsError, measure_points
+from twin.orbit.flight.trajectory import Trajectory, readings
+from twin.orbit.ground.orthophoto import Raster
+from twin.orbit.images.image_points import (
+    CONSENSUS,
+    POINTS_REMEDY,
+    MatchedLine,
+    MatchedPoints,
+    PatchPoints,
+    PointsError,
+    measure_points,
+)
 from twin.orbit.images.line_optics import optics_of
-from twin.orbit.images.patch import ImagedLine, Patch, PatchError, fly_patch, imaged_lines
+from twin.orbit.images.patch import (
+    ImagedLine,
+    LineImage,
+    LineJudgement,
+    Patch,
+    PatchError,
+    fly_patch,
+    imaged_lines,
+    judged,
+    true_ground,
+)
+from twin.orbit.measured.measurement_tables import CAMERA_FILE, TEST_FILE, campaign_files
+from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -164,3 +203,268 @@ def _place(sensor: Sensor, spec: OrbitSimulateSpec) -> tuple[float, float]:
     point = sensor.ground(np.array([line]), np.array([spec.patch.pixel]), spec.ground.terrain.height)
     longitude, latitude, _ = sensor.earth.geodetic(point[0])
     return float(longitude), float(latitude)
+
+
+_TRUE_POINTS = 21
+"""Along each side of the grid of true ground points."""
+_LOOK = (
+    "y = (pixel - (pixels - 1)/2) pitch, r^2 = x0^2 + (y - y0)^2, d = k1 r^2 + k2 r^4; the look in camera axes "
+    "is along (x0 (1 + d), -(y - y0)(1 + d), f); pixel 0 is the middle of the first"
+)
+
+
+def _line_time(image: LineImage, row: int) -> float:
+    return float(image.measured.time(np.array([image.window.first_line + row]))[0])
+
+
+LINE: Record[LineImage] = Record(
+    "One line's image.",
+    Quantity("first_line", lambda image: image.window.first_line, "of the window in the line's whole image"),
+    Quantity("first_pixel", lambda image: image.window.first_pixel, "of the window on the line"),
+    Quantity("lines", lambda image: image.window.lines, "how many"),
+    Quantity("pixels", lambda image: image.window.pixels, "how many"),
+    Quantity("first_line_time_s", lambda image: _line_time(image, 0), "middle of its exposure, from the epoch"),
+    Quantity("last_line_time_s", lambda image: _line_time(image, image.window.lines - 1), "the same of the last line"),
+    Quantity("line_time_s", lambda image: image.measured.line_time, "from one line to the next"),
+    Quantity("mean_dn", lambda image: image.frame.mean(), "mean grey value", "mean [DN]"),
+    Quantity("smallest_dn", lambda image: image.frame.min(), "smallest grey value", "smallest [DN]"),
+    Quantity("largest_dn", lambda image: image.frame.max(), "largest grey value", "largest [DN]"),
+    Quantity("rms_contrast", lambda i: i.frame.std() / i.frame.mean(), "standard deviation over mean", shown="percent"),
+    Quantity("saturated_pixels", lambda image: image.saturated, "at the end of the detector's range"),
+    Quantity("sample_along_line_m", lambda image: image.sample[0], "distance of two pixels on the ground"),
+    Quantity("sample_along_track_m", lambda image: image.sample[1], "distance of two lines on the ground"),
+    Quantity("mtf_nyquist_along_line", lambda image: image.nyquist[0], "at half a cycle per pixel", "MTF line"),
+    Quantity("mtf_nyquist_along_track", lambda image: image.nyquist[1], "at half a cycle per line", "MTF track"),
+    Quantity("advance_px_per_line", lambda image: image.motion.advance, "motion of the image across the line"),
+    Quantity("drift_px_per_line", lambda image: image.motion.drift, "motion of the image along the line"),
+    Quantity("geometry_error_px", lambda image: image.error, "largest of places that the renderer interpolates"),
+)
+
+
+def _per_pixel(raster: Raster) -> Array:
+    """Radians of longitude per column and of latitude per row, which go to the south."""
+    return raster.spacing / np.array(raster.frame.scale) * np.array([1.0, -1.0])
+
+
+GEOREFERENCE: Record[Raster] = Record(
+    "Where a raster's pixels lie, exactly: longitude and latitude are linear in column and row.",
+    Quantity("rows", lambda raster: raster.values.shape[0], "how many"),
+    Quantity("columns", lambda raster: raster.values.shape[1], "how many"),
+    Quantity("spacing_m", lambda raster: raster.spacing, "of rows and columns on the ground"),
+    Quantity(
+        "first_longitude_deg",
+        lambda raster: raster.frame.longitude + raster.west / raster.frame.scale[0],
+        "of the middle of the first column",
+    ),
+    Quantity(
+        "first_latitude_deg",
+        lambda raster: raster.frame.latitude + raster.north / raster.frame.scale[1],
+        "of the middle of the first row",
+    ),
+    Quantity("longitude_per_column_deg", lambda raster: _per_pixel(raster)[0], "from one column to the next"),
+    Quantity("latitude_per_row_deg", lambda raster: _per_pixel(raster)[1], "from one row to the next, negative"),
+)
+MATCHED: Record[MatchedLine] = Record(
+    "Points of one sort in one line. Displacements from where the line is known to have the points, and sigmas of the "
+    "fit, are medians of the accepted.",
+    Quantity("found", lambda line: np.isfinite(line.place[:, 0]).sum(), "places that a fit gave"),
+    Quantity("matched", lambda line: line.matched.sum(), "of these, places that matching let pass"),
+    Quantity("accepted", lambda line: line.accepted.sum(), "of these, places that the neighbours agree with"),
+    Quantity("rejected_by_consensus", lambda line: (line.status == CONSENSUS).sum(), "that the neighbours contradict"),
+    Quantity("not_accepted", lambda line: line.lost, "reason -> number of points, the most frequent first"),
+    Quantity("displacement_lines_px", lambda line: line.moved[0], "found minus predicted along track", "moved, track"),
+    Quantity("displacement_pixels_px", lambda line: line.moved[1], "found minus predicted along line", "moved, line"),
+    Quantity("displacement_lines_px_sigma", lambda line: line.usual_sigma[0], "1 sigma along track", "σ track"),
+    Quantity("displacement_pixels_px_sigma", lambda line: line.usual_sigma[1], "1 sigma along line", "σ line"),
+    Quantity("consensus_scatter_px", lambda line: line.scatter, "of the displacements beyond their covariances"),
+)
+POINTS: Record[MatchedPoints] = Record(
+    "Points of one sort; ties are chosen in one line, which is left out.",
+    Quantity("sought", lambda points: len(points.ground), "how many"),
+    Quantity("in_all_lines", lambda points: points.in_all.sum(), "accepted in every line"),
+    Quantity("lines", lambda points: points.sought_in, "every line that was searched", record=MATCHED),
+)
+SIMULATE: Record[Simulation] = Record(
+    "simulate.json. What the user of the images may know.",
+    Quantity("seed", lambda run: run.seed, "of all random numbers"),
+    Quantity("epoch_utc", lambda run: str(run.spec.orbit.epoch), "from which times count"),
+    Quantity("longitude_deg", lambda run: run.place[0], "of the patch's middle"),
+    Quantity("latitude_deg", lambda run: run.place[1], "of the patch's middle"),
+    Quantity("lines", lambda run: run.patch.images, "every line's image", record=LINE),
+    Quantity("orthophoto", lambda run: run.patch.control.orthophoto, "grey values of the map", record=GEOREFERENCE),
+    Quantity("dem", lambda run: run.patch.control.dem, "the elevation model", record=GEOREFERENCE),
+    Quantity(
+        "points", lambda run: run.points and run.points.sorts, "sort -> points measured in the images", record=POINTS
+    ),
+)
+
+
+def camera_data(camera: ThreeLineCameraSpec) -> dict[str, Any]:
+    """Interior orientation and mounting of every line, and how they make a look."""
+    lines = {
+        name: {
+            "pixels": camera.pixels_of(name),
+            "pitch_m": camera.pitch_of(name),
+            "principal_distance_m": line.principal_distance,
+            "principal_point_m": line.principal_point,
+            "k1_per_m2": line.k1,
+            "k2_per_m4": line.k2,
+            "camera_to_body": about_axis(1, line.look) @ rotation_matrix(np.array(line.rotate)),
+            "position_m": line.position,
+        }
+        for name, line in camera.lines.items()
+    }
+    return {"name": camera.name, "look": _LOOK, "lines": plain_data(lines)}
+
+
+def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
+    """Orbit and attitude at the times of the pass's readings; between them the errors of a measured trajectory are the
+    cubic spline that `twin.orbit.flight.trajectory` describes.
+
+    Quaternions are (x, y, z, w); neighbours lie on one side, so that they can be joined.
+    """
+    errors = run.spec.errors
+    fixes, looks = (
+        times[in_span(times, path.first, path.last)]
+        for times in (readings(path.first, path.last, one.interval) for one in (errors.gps, errors.star_tracker))
+    )
+    quaternion = Rotation.from_matrix(path.body_to_itrs(looks)).as_quat(canonical=False)
+    found = {
+        "epoch_utc": str(path.orbit.epoch),
+        "orbit_s": fixes,
+        "position_m": path.position(fixes),
+        "velocity_m_per_s": path.velocity(fixes),
+        "inertial_velocity_m_per_s": path.inertial_velocity(fixes),
+        "attitude_s": looks,
+        "quaternion": joined_quaternions(quaternion),
+    }
+    return {key: plain_data(value) for key, value in found.items()}
+
+
+def georeference_data(run: Simulation) -> dict[str, Any]:
+    """Where the pixels of orthophoto and elevation model lie."""
+    control = run.patch.control
+    return {"orthophoto": GEOREFERENCE(control.orthophoto), "dem": GEOREFERENCE(control.dem)}
+
+
+def _errors(one: LineJudgement) -> list[list[float | None]]:
+    return [[float(v) if np.isfinite(v) else None for v in row] for row in one.error]
+
+
+MATCH_COUNTS = {
+    "found": "places that were found, before any is rejected",
+    "matched": "places that the thresholds of matching let pass",
+    "accepted": "places that consensus lets pass, too",
+    "wrong_found": "wrong places among those that were found",
+    "wrong_matched": "wrong places among those that matching let pass",
+    "wrong_accepted": "wrong places among those that consensus let pass",
+    "right_rejected_by_consensus": "right matches that consensus rejected",
+}
+"""Count of places in one line -> what it is."""
+
+JUDGED: Record[LineJudgement] = Record(
+    "Points of one sort in one line against the truth; RMS and mean of those that are not wrong.",
+    *(Quantity(key, attrgetter(key), meaning) for key, meaning in MATCH_COUNTS.items()),
+    Quantity("rms_lines_px", lambda one: one.rms[0], "root mean square error along the track", "RMS track"),
+    Quantity("rms_pixels_px", lambda one: one.rms[1], "root mean square error along the line", "RMS line"),
+    Quantity("mean_lines_px", lambda one: one.mean[0], "mean error along the track", "mean track"),
+    Quantity("mean_pixels_px", lambda one: one.mean[1], "mean error along the line", "mean line"),
+    Quantity("chi_square", lambda one: one.chi_square, "of their errors over their covariances", "χ²"),
+    Quantity("degrees_of_freedom", lambda one: one.degrees_of_freedom, "two for each place"),
+    Quantity("error_px", _errors, "found minus true, lines and pixels, of every point"),
+)
+TRUE_POINTS: Record[tuple[Patch, MatchedPoints]] = Record(
+    "True places of what the points of one sort show, in the order of points.csv.",
+    Quantity("itrs_m", lambda of: true_ground(*of), "ITRS"),
+    Quantity("lines", lambda of: judged(*of), "every line that was searched", record=JUDGED),
+)
+
+
+def _grid(shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Rows and columns of a grid over an image."""
+    row, column = np.meshgrid(*(np.linspace(0.0, n - 1.0, _TRUE_POINTS) for n in shape), indexing="ij")
+    return row.ravel(), column.ravel()
+
+
+def _true_grid(patch: Patch, name: str) -> dict[str, Any]:
+    """True places of a grid of a line's image."""
+    row, column = _grid(patch.images[name].frame.shape)
+    line, pixel = patch.images[name].image_point(row, column)
+    return {"line": line, "pixel": pixel, "itrs_m": patch.true_point(name, row, column)}
+
+
+def _control_error(patch: Patch) -> dict[str, Any]:
+    """Error in plan of the control at a grid of the orthophoto."""
+    photo = patch.control.orthophoto
+    row, column = _grid(photo.values.shape)
+    east, north = patch.control.error(*photo.east_north(row, column))
+    return {"row": row, "column": column, "east_m": east, "north_m": north}
+
+
+TRUTH: Record[Simulation] = Record(
+    "What only the truth of a pass knows.",
+    Quantity(
+        "points",
+        lambda run: run.points and {sort: (run.patch, one) for sort, one in run.points.sorts.items()},
+        "sort -> true places, and the measured ones against them",
+        record=TRUE_POINTS,
+    ),
+    Quantity("camera", lambda run: described("camera", camera_data(run.truth)), "as it is"),
+    Quantity("trajectory", lambda run: described("trajectory", trajectory_data(run, run.trajectory)), "the true one"),
+    Quantity(
+        "ground_points",
+        lambda run: {name: _true_grid(run.patch, name) for name in run.patch.images},
+        "line -> true places of a grid of its image",
+    ),
+    Quantity("control_error", lambda run: _control_error(run.patch), "error in plan at a grid of the orthophoto"),
+)
+
+
+_EXACT = 1e-3
+"""Metres; of control without errors."""
+
+
+def simulation_exported(run: Simulation) -> dict[str, str]:
+    """Path -> text of the files of one pass over a patch, whose points were measured in its images.
+
+    Raises:
+        InputError: the test measures no points.
+    """
+    spec = run.spec
+    if run.points is None or run.points.control is None or spec.points is None:
+        raise spec.error("images alone give no tables", ("points",), allowed="`points:` with control and check points")
+    errors = spec.errors
+    plain = spec.plain()
+    platform = PlatformTable.sampled(run.measured, errors.gps.interval, errors.star_tracker.interval)
+    lines = max(int((run.measured.last - run.measured.first) / spec.line_time) - 1, 1)
+    times = LineTimes.even(run.measured.first + 0.5 * spec.line_time, spec.line_time, lines)
+    known = run.points.control
+    sorts = [known] if run.points.ties is None else [known, run.points.ties]
+    role = np.concatenate([np.where(known.check, "check", "control"), *(["tie"] * len(s.ground) for s in sorts[1:])])
+    ground = np.concatenate([known.ground, *(np.full((len(s.ground), 3), np.nan) for s in sorts[1:])])
+    covariance = np.zeros((len(role), 3, 3))
+    # one error in plan moves all points of a patch: each of n weighs as if it had n times the variance
+    share = float(np.sqrt(max(int(np.sum(known.in_all & ~known.check)), 1)))
+    plan, tall = max(spec.control.sigma * share, _EXACT), max(spec.points.height_sigma, _EXACT)
+    covariance[: len(known.ground)] = level_covariance(known.ground, plan, tall)
+    images = {}
+    for name in known.lines:
+        good = [np.flatnonzero(sort.lines[name].accepted) for sort in sorts]
+        parts = [sort.lines[name].measured(rows, rows) for sort, rows in zip(sorts, good, strict=True)]
+        images[name] = ImagePoints.joined([parts[0], *(part.numbered(-len(known.ground)) for part in parts[1:])])
+    points = GroundPoints.of(point_names(role), ground, covariance, role.astype(object))
+    one = PassMeasurements(spec.name, platform, dict.fromkeys(known.lines, times), points, images)
+    gps, tracker = plain["errors"]["gps"], plain["errors"]["star_tracker"]
+    test = {
+        "name": spec.name,
+        "description": spec.description,
+        "camera": f"./{CAMERA_FILE}",
+        "data": ".",
+        "schemes": [[spec.name]],
+        "effects": {**plain["effects"], "corrected": True},
+        "errors": {
+            "gps": {key: gps[key] for key in ("noise", "drift", "interval")},
+            "star_tracker": {key: tracker[key] for key in ("noise", "slow", "interval")},
+        },
+    }
+    return campaign_files([one], run.laboratory.plain()) | {TEST_FILE: dump_yaml(test)}

@@ -30,7 +30,7 @@ from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.jitter.sights import Sights, SightsError, sights_of
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
-from twin.sensors.charge_transfer import Collection, Motion
+from twin.sensors.line_ccd import Collection, Motion
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.framework.artefact import Cell, Table
 from twin.framework.report import Report, Section, answer
-from twin.orbit.images.point_report import point_artefacts
-from twin.orbit.matching.match_run import Match
+from twin.orbit.images.point_report import found_table, how_measured, point_artefacts
+from twin.orbit.matching.match_run import IMAGE, Match
 
 _FAR = 0.5
 """Share of the reach: matches that lie farther from where they were expected leave the search little room."""
@@ -19,7 +18,7 @@ def match_report(run: Match) -> Report:
         "Points measured in images",
         *_verdict(run),
         _facts(run),
-        _summary(run),
+        found_table(run.points),
         (_measured(run), _images(run)),
         warnings=_warnings(run),
     )
@@ -49,23 +48,6 @@ def _verdict(run: Match) -> tuple[str, tuple[str, ...]]:
     )
 
 
-def _summary(run: Match) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for sort, one in run.points.sorts.items():
-        for name, line in one.sought_in.items():
-            if line.accepted.any():
-                counts = len(line.status), int(line.accepted.sum())
-                rows.append((sort, name, *counts, *line.moved.tolist(), *line.usual_sigma.tolist()))
-    return Table(
-        "matched",
-        "Points",
-        "Displacement from where camera and platform expect them, and sigma of the fit: medians of the accepted [px].",
-        ("points", "line", "sought", "accepted", "lines", "pixels", "σ lines", "σ pixels"),
-        rows,
-        (None, None, None, None, 2, 2, 3, 3),
-    )
-
-
 def _facts(run: Match) -> tuple[tuple[str, str], ...]:
     maps, spec = run.ground.control, run.setup.test
     plan, height = spec.control_sigma
@@ -79,34 +61,14 @@ def _facts(run: Match) -> tuple[tuple[str, str], ...]:
 
 
 def _measured(run: Match) -> Section:
-    spec = run.setup.test.points
-    text = (
-        "Distinct places of the orthophoto, with heights of the elevation model, and distinct places of one line's "
-        f"image are brought into each line's geometry by camera and platform as they are known, templates of "
-        f"{spec.template} pixels, sought {spec.reach} pixels to each side, and fitted by least squares. "
-        f"Rejected is what fails a "
-        "threshold of the matching, and what does not follow the smooth displacement of its neighbours.",
-    )
-    names = {sort: sort for sort in run.points.sorts}
-    shown = point_artefacts(run.ground, run.points, names, ("expected", "", " of the fit"))
-    return Section("Measured points", text, shown)
+    text = how_measured(run.setup.test.points, "camera and platform as they are known")
+    return Section("Measured points", (text,), point_artefacts(run.ground, run.points))
 
 
 def _images(run: Match) -> Section:
-    rows: list[tuple[Cell, ...]] = []
-    for name, image in run.ground.images.items():
-        window = image.window
-        size = (window.lines, window.pixels)
-        rows.append((name, window.first_line, window.first_pixel, *size, *image.sample, float(image.frame.mean())))
-    table = Table(
-        "windows",
-        "Images",
-        "Lines count from the first of the table of times, pixels from the one that sees farthest to the right.",
-        ("line", "first line", "first pixel", "lines", "pixels", "along line [m]", "along track [m]", "mean"),
-        rows,
-        (None, None, None, None, None, 3, 3, 1),
-    )
-    return Section("Images", (), (table,))
+    rows = {name: IMAGE(image) for name, image in run.ground.images.items()}
+    caption = "Lines count from the first of the table of times, pixels from the one that sees farthest to the right."
+    return Section("Images", (), (IMAGE.table("windows", "Images", caption, rows, label="line", digits=4),))
 
 
 def _warnings(run: Match) -> tuple[str, ...]:

@@ -19,8 +19,13 @@ from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from twin.framework.memory import Lowered, require_memory
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.framework.quantity import Quantity, Record
-from twin.orbit.conventions.pass_readings import LineClock, PassConventions, read_line_clocks
-from twin.orbit.conventions.reading_fit import ImpossibleError, line_times
+from twin.orbit.conventions.pass_readings import (
+    ImpossibleError,
+    LineClock,
+    PassConventions,
+    line_times,
+    read_line_clocks,
+)
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, LineTimes, line_cameras
@@ -29,7 +34,6 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Maps
 from twin.orbit.images.image_points import (
-    BEYOND,
     POINTS_REMEDY,
     ImagedGround,
     LineFrame,
@@ -39,9 +43,8 @@ from twin.orbit.images.image_points import (
     measure_points,
 )
 from twin.orbit.images.pushbroom import Window
-from twin.orbit.images.simulate_numbers import POINTS
-from twin.orbit.measured.geotiff import LARGEST_PART
-from twin.orbit.measured.map_part import MapPart, UserMap
+from twin.orbit.images.simulate_run import POINTS
+from twin.orbit.measured.maps import LARGEST_PART, MapPart, UserMap
 from twin.orbit.measured.measurement_tables import campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_files import platform_table, read_platform
@@ -173,38 +176,34 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
         allowed = (
             f"{sensor.camera.pixels} pixels of {name}; `first_pixel` of the image's first column, and its `window`"
         )
-        raise InputError(spec.issue("an image wider than its line", ("first_pixel",), found=found, allowed=allowed))
+        raise spec.error("an image wider than its line", ("first_pixel",), found=found, allowed=allowed)
     if first_line + rows > sensor.lines + 1:
         found = f"lines to {first_line + rows - 1}"
         allowed = f"lines to {sensor.lines - 1}, of which the table has times; or a `window`"
-        raise InputError(
-            spec.issue("an image longer than its line times", ("first_line",), found=found, allowed=allowed)
-        )
+        raise spec.error("an image longer than its line times", ("first_line",), found=found, allowed=allowed)
     return LineFrame(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
 
 
 def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
     """Grey values (rows, columns) of the image, or of its window; so many alike have to fit into the memory."""
-    from twin.orbit.measured.geotiff import opened
+    from twin.orbit.measured.maps import opened
 
     file, part = str(path), spec.window
     with opened(file) as source:
         from rasterio.windows import Window as Part
 
         if not 1 <= spec.band <= source.count:
-            raise InputError(spec.issue("no such band", ("band",), found=spec.band, allowed=f"1 to {source.count}"))
+            raise spec.error("no such band", ("band",), found=spec.band, allowed=f"1 to {source.count}")
         shape = (source.height, source.width)
         row, column, rows, columns = (
             (0, 0, *shape) if part is None else (part.row, part.column, part.rows, part.columns)
         )
         if row + rows > shape[0] or column + columns > shape[1]:
             allowed = f"within {shape[0]} rows and {shape[1]} columns"
-            raise InputError(spec.issue("a window outside of the image", ("window",), allowed=allowed))
+            raise spec.error("a window outside of the image", ("window",), allowed=allowed)
         if rows * columns > LARGEST_PART:
             found, allowed = f"{rows} x {columns} pixels", f"a `window:` of at most {LARGEST_PART:.0e} pixels"
-            raise InputError(
-                spec.issue("too large an image to be matched at once", ("window",), found=found, allowed=allowed)
-            )
+            raise spec.error("too large an image to be matched at once", ("window",), found=found, allowed=allowed)
         key = ("file",) if part is None else ("window", "rows")
         unit = "rows in a `window`" if part is None else "rows"
         require_memory(Lowered(spec, key, rows, unit, lambda n: n * columns * count * _PIXEL, 32))
@@ -256,9 +255,7 @@ def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, 
         roles += ["tie" if sort == "tie" else "check" if one.check[k] else "control" for k in number]
         for name, line in one.lines.items():
             good = np.flatnonzero(line.accepted & keep)
-            image, spread = line.image[good], line.covariance[good] + BEYOND**2 * np.eye(2)
-            which = [number[int(k)] for k in good]
-            rows[name].append(ImagePoints.of(which, image[:, 0], image[:, 1], spread))
+            rows[name].append(line.measured(good, np.array([number[int(k)] for k in good], np.intp)))
     itrs, role = np.concatenate(places), np.array(roles, object)
     covariance = np.zeros((len(ids), 3, 3))
     given = role != "tie"

@@ -33,9 +33,15 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, shown
 from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.flight.platform_table import joined_quaternions
-from twin.orbit.measured import platform_readings
 from twin.orbit.measured.clock import Readings
-from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
+from twin.orbit.measured.orbit_files import (
+    SPEED_TOLERANCE,
+    AttitudeReadings,
+    OrbitReadings,
+    require_orbit,
+    require_unit,
+    velocity_misfit,
+)
 from twin.orbit.measured.xml_file import Element, read_xml, readings, require_rising
 
 PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
@@ -96,11 +102,9 @@ class DimapPass:
         attitude: its samples, or polynomials.
         forward, right: coefficients (K,) of the tangents of a pixel's look, ascending powers of the pixel from 0.
         pitch: of the detector's pixels, metres; None where the file does not say.
-        settings: what the file says was done to it, by key.
         refracted: whether its geometry knows refraction.
         inertial_velocity: whether its velocities were those against the stars.
         light_speed: whether it says that the speed of light was taken into account, of which nothing is known here.
-        accuracy: ACCURACY_STDV, metres; None where there is none.
         rpc: names of files with its rational polynomials.
     """
 
@@ -117,11 +121,9 @@ class DimapPass:
     forward: Array
     right: Array
     pitch: float | None
-    settings: Mapping[str, str]
     refracted: bool
     inertial_velocity: bool
     light_speed: bool
-    accuracy: float | None
     rpc: tuple[str, ...]
 
     @property
@@ -241,8 +243,6 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
     title = root.maybe("Dataset_Identification", "DATASET_NAME")
     pitch = model.maybe("Instrument_Configuration", "DETECTOR_SIZE_COL")
     said = root.maybe("Processing_Information", "Product_Settings", "Geometric_Settings")
-    settings = {} if said is None else {one.tag: one.text for one in said.children if one.text}
-    accuracy = root.maybe("Quality_Assessment", "Planimetric_Accuracy_Measurement", "Quality_Values", "ACCURACY_STDV")
     named = root.all("Geoposition", "Geoposition_Models", "Rational_Function_Model", "Component", "COMPONENT_PATH")
     return DimapPass(
         str(path),
@@ -258,11 +258,9 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
         forward,
         right,
         None if pitch is None else pitch.number(least=1e-7, most=1e-3, unit=_LENGTH),
-        FrozenMap(settings),
         _switch(said, "ATMOSPHERIC_REFRACTION_SETTING"),
         inertial,
         _switch(said, "LIGHT_SPEED_SETTING"),
-        None if accuracy is None else accuracy.number(least=0.0, most=1e5),
         tuple(one.attributes["href"] for one in named if one.attributes.get("href")),
     )
 
@@ -338,12 +336,10 @@ def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
     position = np.stack([one.one("LOCATION_XYZ").floats(3) for one in points])
     velocity = np.stack([one.one("VELOCITY_XYZ").floats(3) for one in points])
     require_orbit(file, position, lines)
-    share, inertial = platform_readings.velocity_misfit(
-        (clock.day - clock.day[0]) * _DAY + clock.second, position, velocity
-    )
+    share, inertial = velocity_misfit((clock.day - clock.day[0]) * _DAY + clock.second, position, velocity)
     if inertial:
         velocity = velocity - carried_with_earth(position)
-    elif np.median(share) > platform_readings.SPEED_TOLERANCE:
+    elif np.median(share) > SPEED_TOLERANCE:
         found = f"they differ by {100.0 * np.median(share):.3g} % in the median"
         points[0].one("VELOCITY_XYZ").wrong("not the velocity of these positions", found, "Earth-fixed, m/s")
     return OrbitReadings(file, clock, position, velocity, "ITRS", "UTC"), inertial

@@ -236,8 +236,7 @@ def _checked(
         problem = "days that do not rise, or a gap of more than ten"
         raise InputError(Issue(problem, file, lines[row], (), f"MJD {mjd[row]:g}", "days in order"))
     far = (np.abs(ut1_utc) > 1.0) | np.any(np.abs(pole) > 1e-5, axis=1) | (mjd < FIRST_DAY) | (mjd > LAST_DAY)
-    if np.any(far):
-        row = int(np.argmax(far))
+    for row in np.flatnonzero(far)[:1]:
         found = f"MJD {mjd[row]:g}, UT1 - UTC {ut1_utc[row]:g} s"
         raise InputError(Issue("not Earth orientation", file, lines[row], (), found, "UT1 - UTC within 1 s, a pole "
                                "within 2 arcsec, days of 1972 to 2099"))  # fmt: skip

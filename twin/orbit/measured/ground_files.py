@@ -15,7 +15,7 @@ from scenes.yaml.errors import InputError, Issue, Problem, names_text, shown
 from scenes.yaml.input_file import parse_json
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.measured.datum import Datum, Geoid
+from twin.orbit.measured.maps import Datum, Geoid
 from twin.orbit.measured.pass_measurements import ROLES, GroundPoints
 from twin.orbit.measured.xml_file import numbers, text_lines
 
@@ -88,16 +88,14 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
         geoid = None if spec.geoid is None else Geoid.read(folder / spec.geoid)
         datum = Datum.of(system, heights, geoid)
     except Problem as problem:
-        raise spec.error(problem.problem, ("crs",), found=problem.found, allowed=problem.allowed) from None
+        raise spec.error(problem, ("crs",)) from None
     try:
         itrs = datum.itrs(*rows.places.T)
     except Problem as problem:
         line = rows.lines[int(problem.within[0])] if problem.within else None
         raise InputError(Issue(problem.problem, file, line, (), problem.found, problem.allowed)) from None
     height = Earth().geodetic(itrs)[2]
-    high = ~((height > -1000.0) & (height < 10000.0))
-    if np.any(high):
-        row = int(np.argmax(high))
+    for row in np.flatnonzero(~((height > -1000.0) & (height < 10000.0)))[:1]:
         found = f"{height[row]:.6g} m above the ellipsoid"
         raise InputError(
             Issue("no place on the ground", file, rows.lines[row], (), found, "-1000 m to 10 000 m; units?")
@@ -117,9 +115,8 @@ def _covariance(spec: GroundFileSpec, file: str, rows: _Rows, itrs: np.ndarray, 
     """(n, 3, 3) in axes of the ITRS, m^2."""
     sigma = rows.sigmas.copy()
     missing = np.isnan(sigma).any(axis=1)
-    if np.any(missing):
+    for row in np.flatnonzero(missing)[:1]:
         if spec.sigma is None:
-            row = int(np.argmax(missing))
             problem, allowed = "a point without sigmas", f"{names_text(_SIGMAS)} in the file, or `sigma:` for all"
             raise InputError(Issue(problem, file, rows.lines[row], (), shown(rows.ids[row]), allowed))
         sigma[missing] = (spec.sigma[0], spec.sigma[0], spec.sigma[1])
@@ -286,9 +283,7 @@ def _gcp(path: Path) -> tuple[_Rows, dict[str, np.ndarray], str | None]:
     if not rows:
         raise InputError(Issue("no points", file, None, (), None, "one a line"))
     found = numbers(file, [row[1:7] for row in rows], lines, _GCP)
-    bad = (found[:, 3:] <= 0.0) | (found[:, 3:] > 1e4)
-    if np.any(bad):
-        row, column = (int(v) for v in np.argwhere(bad)[0])
+    for row, column in np.argwhere((found[:, 3:] <= 0.0) | (found[:, 3:] > 1e4))[:1].tolist():
         value = shown(rows[row][4 + column])
         raise InputError(Issue("not a sigma", file, lines[row], (_GCP[3 + column],), value, "0 m to 10 km"))
     ids = [row[0] for row in rows]

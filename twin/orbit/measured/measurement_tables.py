@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from analysis.arrays import Array
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.numerics.array_math import in_span
-from scenes.specs.orbit.measurements import ConventionsSpec, OrbitDataSpec, PassFilesSpec, PlatformFilesSpec
+from scenes.specs.orbit.measurements import (
+    ConventionsSpec,
+    OrbitDataSpec,
+    PassFilesSpec,
+    PlatformFilesSpec,
+    body_axes_matrix,
+)
 from scenes.specs.orbit.setup import DATA_FILE
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.csv_table import Column, Table, read_table
@@ -27,9 +33,9 @@ from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance, silent
 from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
-from twin.orbit.measured.map_part import MOST_HEIGHT
+from twin.orbit.measured.maps import MOST_HEIGHT
+from twin.orbit.measured.orbit_files import AGAINST_EARTH, INERTIAL, SPEED_TOLERANCE, velocity_misfit
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
-from twin.orbit.measured.platform_readings import platform_of
 
 _FAR, _FAST, _LATE, _MANY = 1e9, 1e5, 1e10, 1e9
 """Metres, m/s, seconds and lines beyond which nothing is meant; below them sums of squares do not overflow."""
@@ -185,15 +191,11 @@ def _line_times_of(
         line, time = table["line"][rows], table["time"][rows]
         if len(rows) < 2:
             raise table.error(int(rows[0]), "line", f"one line of {name} tells no line time", allowed="two or more")
-        twice = np.flatnonzero(np.diff(line) == 0.0)
-        if len(twice):
-            raise table.error(
-                int(rows[twice[0] + 1]), "line", f"this line of {name} stands twice", f"{line[twice[0]]:g}"
-            )
-        falls = np.flatnonzero(np.diff(time) <= 0.0)
-        if len(falls):
+        for row in rows[1:][np.diff(line) == 0.0][:1]:
+            raise table.error(int(row), "line", f"this line of {name} stands twice", f"{table['line'][row]:g}")
+        for row in rows[1:][np.diff(time) <= 0.0][:1]:
             allowed = "a later time than that of the line before; number the lines as they were exposed"
-            raise table.error(int(rows[falls[0] + 1]), "time", "times do not rise with the lines", allowed=allowed)
+            raise table.error(int(row), "time", "times do not rise with the lines", allowed=allowed)
         step = np.gradient(time, line)
         time = time + {"start": 0.5, "middle": 0.0, "end": -0.5}[conventions.line_moment] * step
         at = LineTimes.of(line - line[0], time)
@@ -222,11 +224,10 @@ def ground_of(table: Table) -> GroundPoints:
     radius = np.linalg.norm(place, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         height = radius - radius / np.linalg.norm(place / _EARTH_AXES, axis=1)
-    far = np.flatnonzero(~(np.abs(height) < MOST_HEIGHT))
-    if len(far):
-        found = f"{height[far[0]] / 1e3:.6g} km above the ellipsoid"
+    for row in np.flatnonzero(~(np.abs(height) < MOST_HEIGHT))[:1]:
+        found = f"{height[row] / 1e3:.6g} km above the ellipsoid"
         allowed = "Earth-centred, Earth-fixed coordinates of the ground, not geodetic ones; and is the unit right?"
-        raise table.error(int(far[0]), "x", "no place on the ground", found, allowed)
+        raise table.error(int(row), "x", "no place on the ground", found, allowed)
     return GroundPoints.of(table["point"], place, _covariance(table, place), table["role"])
 
 
@@ -245,9 +246,9 @@ def _covariance(table: Table, place: Array) -> Array:
         text = "correlations go with x_sigma, y_sigma and z_sigma"
         raise InputError(Issue(text, table.file, int(table.lines[0]) - 1, (table.heads[correlated[0]],)))
     for name in ways[0]:
-        bad = np.flatnonzero((table[name] == 0.0) & (table["role"] == "control"))
-        if len(bad) and np.any(table[name] > 0.0):
-            raise table.error(int(bad[0]), name, "some sigmas are zero", "0", "all positive, or all zero for exact")
+        zero = (table[name] == 0.0) & (table["role"] == "control") & np.any(table[name] > 0.0)
+        for row in np.flatnonzero(zero)[:1]:
+            raise table.error(int(row), name, "some sigmas are zero", "0", "all positive, or all zero for exact")
     if ways[0] == ("sigma",):
         return np.asarray(table["sigma"][:, None, None] ** 2 * np.eye(3))
     if ways[0] == _SIGMAS[1]:
@@ -257,10 +258,9 @@ def _covariance(table: Table, place: Array) -> Array:
     for name, (i, j) in zip(_CORRELATIONS, ((0, 1), (0, 2), (1, 2)), strict=True):
         if name in table:
             like[:, i, j] = like[:, j, i] = table[name]
-    bad = np.flatnonzero(np.linalg.eigvalsh(like)[:, 0] < -1e-9)
-    if len(bad):
+    for row in np.flatnonzero(np.linalg.eigvalsh(like)[:, 0] < -1e-9)[:1]:
         allowed = "correlations that a covariance can have"
-        raise table.error(int(bad[0]), correlated[0], "these correlations contradict each other", allowed=allowed)
+        raise table.error(int(row), correlated[0], "these correlations contradict each other", allowed=allowed)
     return np.asarray(sigma[:, :, None] * like * sigma[:, None, :])
 
 
@@ -290,21 +290,18 @@ def _image_points_of(
     """
     require_known(table, "camera", tuple(times))
     number = np.array([names.get(name, -1) for name in table["point"].tolist()])
-    if np.any(number < 0):
-        row = int(np.argmax(number < 0))
-        meant = nearest(str(table["point"][row]), names)
-        problem = "this point has no coordinates"
+    for row in np.flatnonzero(number < 0)[:1]:
+        name, problem = str(table["point"][row]), "this point has no coordinates"
         allowed = "a point of the ground table; points without coordinates belong into `tie_points`"
-        raise table.error(row, "point", problem, shown(str(table["point"][row])), allowed, meant)
+        raise table.error(int(row), "point", problem, shown(name), allowed, nearest(name, names))
     found = {}
     half = 0.5 if conventions.centre == "half" else 0.0
     for name in times:
         rows = np.flatnonzero(table["camera"] == name)
         order = rows[np.argsort(number[rows], kind="stable")]
-        twice = np.flatnonzero(np.diff(number[order]) == 0)
-        if len(twice):
-            row = int(order[twice[0] + 1])
-            raise table.error(row, "point", f"this point stands twice in {name}", shown(str(table["point"][row])))
+        for row in order[1:][np.diff(number[order]) == 0][:1]:
+            point = str(table["point"][row])
+            raise table.error(int(row), "point", f"this point stands twice in {name}", shown(point))
         pixels, last = camera.pixels_of(name), times[name].line[-1]
         line = table["line"][order] - half - origins[name]
         pixel = table["pixel"][order] - half - conventions.first_pixel
@@ -312,17 +309,13 @@ def _image_points_of(
             ("line", line, last, origins[name]),
             ("pixel", pixel, pixels - 1, conventions.first_pixel),
         ):
-            out = np.flatnonzero(~in_span(value, -0.5, most + 0.5))
-            if len(out):
+            for row in order[~in_span(value, -0.5, most + 0.5)][:1]:
                 low, high = (v + half + first for v in (-0.5, most + 0.5))
-                row = int(order[out[0]])
                 where = f"{low:.10g} to {high:.10g}, the {what}s of {name}"
-                raise table.error(row, what, "outside the image", f"{table[what][row]:.10g}", where)
-        known = trajectory.known(times[name].at(line))
-        if not np.all(known):
-            row = int(order[np.argmin(known)])
+                raise table.error(int(row), what, "outside the image", f"{table[what][row]:.10g}", where)
+        for row in order[~trajectory.known(times[name].at(line))][:1]:
             problem = "exposed in a gap of the readings of orbit or attitude"
-            raise table.error(row, "line", problem, allowed="points where readings are at most 5 intervals apart")
+            raise table.error(int(row), "line", problem, allowed="points where readings are at most 5 intervals apart")
         spread = image_covariance(table, order)
         if conventions.first_pixel_sees == "left":
             # a mirrored axis turns the sign of the correlation
@@ -367,6 +360,7 @@ CONVENTIONS: Mapping[str, Any] = {
 }
 """Conventions of the files that are written: the project's own."""
 CAMERA_FILE = "camera.yaml"
+TEST_FILE = "calibrate.yaml"
 
 
 def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]) -> dict[str, str]:
@@ -458,3 +452,116 @@ def _csv(columns: Mapping[str, Any]) -> str:
     cells = [[str(v) for v in np.asarray(c, dtype=object).tolist()] for c in columns.values()]
     rows = [", ".join(columns), *map(",".join, zip(*cells, strict=True))]
     return "\n".join(rows) + "\n"
+
+
+_LEAST_RADIUS, _MOST_RADIUS = 6.45e6, 5.0e7
+"""Metres from the Earth's centre: of satellites that map the Earth."""
+_UNIT_TOLERANCE = 1e-3
+_FALL, _JUMP = 12.0, 0.05
+"""Largest acceleration, m/s^2, and share of the speed by which readings one interval apart may change it by noise."""
+_LEAST_TURN, _FASTEST_TURN = np.radians(2.0), np.radians(10.0)
+"""Between two readings, radians, and radians for each second: more than agile satellites turn."""
+
+
+def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: ConventionsSpec) -> PlatformTable:
+    """Orbit and attitude.
+
+    Args:
+        epoch: UTC.
+        orbit: its table.
+        attitude: its table, which may be the same.
+        conventions: of both.
+
+    Raises:
+        InputError: a time twice, a place where no satellite is, a velocity that is not that of the places, a
+            quaternion that is not of unit length.
+    """
+    order, looks = _rising(orbit), _rising(attitude)
+    time, place = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
+    radius = np.linalg.norm(place, axis=1)
+    for k in np.flatnonzero((radius < _LEAST_RADIUS) | (radius > _MOST_RADIUS))[:1]:
+        found = f"{radius[k] / 1e3:.6g} km from the Earth's centre"
+        allowed = f"{_LEAST_RADIUS / 1e3:g} to {_MOST_RADIUS / 1e3:g} km; is the unit in the head right?"
+        raise orbit.error(int(order[k]), "x", "no place of a satellite", found, allowed)
+    _check_jumps(orbit, order, time, place)
+    speed = None
+    given = [name for name in ("vx", "vy", "vz") if name in orbit]
+    if given:
+        missing = [name for name in ("vx", "vy", "vz") if name not in orbit]
+        if missing:
+            raise InputError(
+                Issue(f"no column {missing[0]!r}", orbit.file, found=names_text(given), allowed="all three or none")
+            )
+        speed = orbit.stacked("vx", "vy", "vz")[order]
+        _check_velocity(orbit, order, time, place, speed)
+    numbers = attitude.stacked("q1", "q2", "q3", "q4")[looks]
+    norm = np.linalg.norm(numbers, axis=1)
+    for k in np.flatnonzero(np.abs(norm - 1.0) > _UNIT_TOLERANCE)[:1]:
+        raise attitude.error(
+            int(looks[k]), "q1", "no unit quaternion", f"a norm of {norm[k]:.6g}", "four numbers of norm 1"
+        )
+    quaternion = _quaternions_of(numbers, conventions)
+    _check_turns(attitude, looks, quaternion)
+    return PlatformTable.of(epoch, time, place, speed, attitude["time"][looks], quaternion)
+
+
+def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
+    """Quaternions x, y, z, w that turn the project's body axes into those of the frame.
+
+    Args:
+        numbers: (n, 4) q1 to q4 as the file has them.
+        conventions: what they mean.
+    """
+    said = conventions.quaternion
+    assert said is not None
+    assert conventions.body_axes is not None
+    xyzw = numbers if said.scalar == "last" else np.roll(numbers, -1, axis=1)
+    if said.turns == "frame_to_body":
+        xyzw = xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
+    axes = np.array(body_axes_matrix(conventions.body_axes), np.float64)
+    if np.array_equal(axes, np.eye(3)):
+        return np.asarray(xyzw, np.float64)
+    from scipy.spatial.transform import Rotation
+
+    # v_frame = R(q) v_file, v_file = axes @ v_project
+    return np.asarray((Rotation.from_quat(xyzw) * Rotation.from_matrix(axes)).as_quat(canonical=False))
+
+
+def _rising(table: Table) -> NDArray[np.intp]:
+    """Rows in the order of time. InputError for a time twice."""
+    order = np.argsort(table["time"], kind="stable")
+    for row in order[1:][np.diff(table["time"][order]) == 0.0][:1]:
+        raise table.error(int(row), "time", "this time stands twice", f"{table['time'][row]:.9g} s", "each time once")
+    return np.asarray(order, np.intp)
+
+
+def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Array) -> None:
+    """InputError for a place that no orbit passes between its neighbours."""
+    step = np.diff(time)
+    with np.errstate(over="ignore", invalid="ignore"):  # of times that all but coincide
+        rate = np.diff(place, axis=0) / step[:, None]
+        change = np.linalg.norm(np.diff(rate, axis=0), axis=1)
+        speed = np.median(np.linalg.norm(rate, axis=1))
+        jump = ~(change <= _FALL * (step[1:] + step[:-1]) + _JUMP * speed)
+    for k in np.flatnonzero(jump)[:1]:
+        found, allowed = f"the velocity changes by {change[k]:.4g} m/s", "one pass without manoeuvre"
+        raise table.error(int(order[k + 1]), "x", "a jump of the orbit", found, f"{allowed}; leave out wrong readings")
+
+
+def _check_turns(table: Table, order: NDArray[np.intp], quaternion: Array) -> None:
+    """InputError for a turn from one reading to the next that no satellite makes."""
+    step = np.diff(table["time"][order])
+    turn = 2.0 * np.arccos(np.clip(np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=1)), 0.0, 1.0))
+    for k in np.flatnonzero(turn > _LEAST_TURN + _FASTEST_TURN * step)[:1]:
+        found = f"{np.degrees(turn[k]):.4g} deg in {step[k]:.4g} s"
+        raise table.error(int(order[k + 1]), "q1", "a jump of the attitude", found, "leave out wrong readings")
+
+
+def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, place: Array, speed: Array) -> None:
+    """InputError unless the velocity is the rate of change of the places."""
+    far, inertial = velocity_misfit(time, place, speed)
+    if np.median(far) > SPEED_TOLERANCE:
+        row = int(order[int(np.argsort(far)[len(far) // 2])])
+        found = f"they differ by {100.0 * np.median(far):.3g} % in the median"
+        problem = INERTIAL if inertial else "not the velocity of these positions"
+        raise table.error(row, "vx", problem, found, AGAINST_EARTH)

@@ -12,14 +12,173 @@ is a missing one. A file without its last line EOF is whole where it has as many
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal, get_args
 
+import numpy as np
+
+from analysis.arrays import Array
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
-from twin.orbit.measured import platform_readings
+from twin.orbit.flight.light_effects import carried_with_earth
 from twin.orbit.measured.clock import Readings, known_scale
-from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, Segment, known_frame
 from twin.orbit.measured.xml_file import numbers, parsed_xml, readings, require_rising, text_lines
+
+Frame = Literal["ITRS", "GCRS", "EME2000", "TEME"]
+Scalar = Literal["last", "first"]
+Turns = Literal["body_to_frame", "frame_to_body"]
+FRAMES: tuple[str, ...] = get_args(Frame)
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """Part of an orbit that is joined by itself, as between two manoeuvres.
+
+    Attributes:
+        first, last: of its readings, counted from 0.
+        usable: two clock readings between which the file says that it may be used; None for all of it.
+    """
+
+    first: int
+    last: int
+    usable: Readings | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class OrbitReadings:
+    """An orbit as a file holds it.
+
+    Attributes:
+        file: where it is from.
+        clock: N readings, rising.
+        position: (N, 3) metres.
+        velocity: (N, 3) m/s in axes and against axes of the same frame; None where the file has none.
+        frame: in which; None where the file does not say.
+        scale: of the clock; None where the file does not say.
+        segments: parts that no interpolation may join; empty for one.
+    """
+
+    file: str
+    clock: Readings
+    position: np.ndarray
+    velocity: np.ndarray | None
+    frame: str | None = None
+    scale: str | None = None
+    segments: tuple[Segment, ...] = ()
+
+    def taken(self, part: slice) -> OrbitReadings:
+        """Return some of the readings, with what is among them of the segments."""
+        begin, end, _ = part.indices(len(self.clock))
+        here = (one for one in self.segments if one.first < end and one.last >= begin)
+        segments = (replace(one, first=max(one.first - begin, 0), last=min(one.last, end - 1) - begin) for one in here)
+        velocity, clock = None if self.velocity is None else self.velocity[part], self.clock.taken(part)
+        return replace(self, clock=clock, position=self.position[part], velocity=velocity, segments=tuple(segments))
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeReadings:
+    """An attitude as a file holds it.
+
+    Attributes:
+        file: where it is from.
+        clock: M readings, rising.
+        quaternion: (M, 4) components as they stand in the file; None for angles.
+        angles: (M, 3) roll, pitch, yaw, radians; None for quaternions.
+        frame: that the body is turned against; None where the file does not say.
+        scale: of the clock; None where the file does not say.
+        scalar: where the scalar part stands; None where the file does not say.
+        turns: what the quaternion turns into what; None where the file does not say.
+    """
+
+    file: str
+    clock: Readings
+    quaternion: np.ndarray | None
+    angles: np.ndarray | None = None
+    frame: str | None = None
+    scale: str | None = None
+    scalar: Scalar | None = None
+    turns: Turns | None = None
+
+    def taken(self, part: slice) -> AttitudeReadings:
+        """Return some of the readings."""
+        turns, angles = (None if values is None else values[part] for values in (self.quaternion, self.angles))
+        return replace(self, clock=self.clock.taken(part), quaternion=turns, angles=angles)
+
+
+def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_FRAME") -> str:
+    """The frame of this name as files of others spell it.
+
+    Every ITRF and WGS 84 counts as ITRS: realisations since 1992 agree to some centimetres. GCRF and ICRF are GCRS, and
+    J2000 is EME2000, which is turned against it by 0.02 arcsec.
+
+    Raises:
+        InputError: another one.
+    """
+    word = name.strip().upper().replace("-", "").replace("_", "")
+    # SP3 has five letters: ITR97, IER97 of the IERS, IGS14, IGb08, and ECF where a realisation is not said
+    if word.startswith(("ITRF", "ITRS", "ITR", "IER", "IGS", "IGB", "IGC", "WGS84", "WGS", "SLR", "ECEF", "ECF")):
+        return "ITRS"
+    found = {"GCRF": "GCRS", "ICRF": "GCRS", "GCRS": "GCRS", "J2000": "EME2000", "EME2000": "EME2000", "TEME": "TEME"}
+    if word not in found:
+        allowed = f"{names_text(FRAMES)}, or names of them as ITRF2014, ICRF, J2000"
+        raise InputError(Issue("a frame that cannot be read", file, line, (key,), shown(name), allowed))
+    return found[word]
+
+
+def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
+    """InputError unless positions (N, 3), metres, on these lines lie between the Earth's surface and 100 000 km: what
+    fails has the wrong unit.
+    """
+    radius = np.linalg.norm(position, axis=1)
+    for row in np.flatnonzero((radius < 6.3e6) | (radius > 1e8))[:1]:
+        found = f"{radius[row] / 1e3:.6g} km from the Earth's centre"
+        raise InputError(Issue("no place of a satellite", file, lines[row], (), found, "6300 km to 100 000 km; units?"))
+
+
+def require_unit(file: str, quaternion: np.ndarray, lines: list[int]) -> None:
+    """InputError unless quaternions (M, 4) on these lines have length 1 to a thousandth."""
+    length = np.linalg.norm(quaternion, axis=1)
+    for row in np.flatnonzero(np.abs(length - 1.0) > 1e-3)[:1]:
+        found = f"length {length[row]:.6g}"
+        raise InputError(Issue("not a quaternion of a rotation", file, lines[row], (), found, "length 1"))
+
+
+SPEED_TOLERANCE = 0.02
+"""Relative tolerance of a velocity. Positions of 1 m noise 1 s apart differ by less, and the velocity against the stars
+differs by 6 % and more."""
+
+
+def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, bool]:
+    """Return by how much velocities differ from the change of Earth-fixed places, and whether they are recognised as
+    those against the stars, which are larger by omega x P.
+
+    Args:
+        time: (N,), seconds.
+        place: (N, 3), ITRS, metres.
+        speed: (N, 3), in axes of the ITRS, m/s.
+
+    Returns:
+        Relative differences (N - 1,), and whether the velocities less omega x P fit while they themselves do not.
+    """
+    rate = np.diff(place, axis=0) / np.diff(time)[:, None]
+    # across a long step the chord is shorter than the arc, and lies to its side; that is no error of the velocity
+    own, turning = (
+        np.linalg.norm(rate - 0.5 * (v[1:] + v[:-1]), axis=1) / np.linalg.norm(rate, axis=1).clip(1.0)
+        for v in (speed, speed - carried_with_earth(place))
+    )
+    return own, bool(np.median(own) > SPEED_TOLERANCE >= np.median(turning))
+
+
+def require_own_velocity(orbit: OrbitReadings) -> None:
+    """InputError if velocities of Earth-fixed positions are those against the stars."""
+    time = (orbit.clock.day - orbit.clock.day[0]) * 86400.0 + orbit.clock.second
+    if orbit.velocity is not None and velocity_misfit(time, orbit.position, orbit.velocity)[1]:
+        raise InputError(Issue(INERTIAL, orbit.file, None, (), None, AGAINST_EARTH))
+
+
+INERTIAL = "the velocities are against the stars, larger than those of the Earth-fixed positions by omega x P"
+AGAINST_EARTH = "velocities against the same axes as the positions, or none"
+
 
 _COVARIANCE = ("COVARIANCE_START", "COVARIANCE_STOP")
 
@@ -59,12 +218,12 @@ def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
         if centre.upper() != "EARTH":
             raise InputError(Issue("an orbit about another body", file, line, ("CENTER_NAME",), shown(centre), "EARTH"))
     frame, line = _same(file, segments, "REF_FRAME")
-    rows, lines = _all_rows(segments)
+    rows, lines = [row for s in segments for row in s.rows], [line for s in segments for line in s.lines]
     widths = {len(row) for row in rows}
     cells = [row[1:7] for row in rows] if widths <= {7, 10} else [row[1:] for row in rows]
     found = 1e3 * numbers(file, cells, lines, ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT"))
     clock = readings(file, [row[0] for row in rows], lines)
-    platform_readings.require_orbit(file, found[:, :3], lines)
+    require_orbit(file, found[:, :3], lines)
     parts = _parts(file, segments)
     for part, segment in zip(parts, segments, strict=True):
         own = slice(part.first, part.last + 1)
@@ -93,16 +252,16 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
     if direction.upper() not in ("A2B", "B2A"):
         raise InputError(Issue("no such direction", file, turn_line, ("ATTITUDE_DIR",), shown(direction), "A2B, B2A"))
     to_body = (direction.upper() == "A2B") == (body[0] == "REF_FRAME_B")
-    turns: platform_readings.Turns = "body_to_frame" if to_body else "frame_to_body"
+    turns: Turns = "body_to_frame" if to_body else "frame_to_body"
     first, type_line = _same(file, segments, "QUATERNION_TYPE", "LAST")
     if first.upper() not in ("FIRST", "LAST"):
         raise InputError(Issue("no such type", file, type_line, ("QUATERNION_TYPE",), shown(first), "FIRST, LAST"))
-    scalar: platform_readings.Scalar = "first" if first.upper() == "FIRST" else "last"
+    scalar: Scalar = "first" if first.upper() == "FIRST" else "last"
     rows, lines = _joined(segments)
     cells = [row[1:5] if len(row) >= 5 else row[1:] for row in rows]
     heads = ("QC", "Q1", "Q2", "Q3") if scalar == "first" else ("Q1", "Q2", "Q3", "QC")
     quaternion = numbers(file, cells, lines, heads)
-    platform_readings.require_unit(file, quaternion, lines)
+    require_unit(file, quaternion, lines)
     clock = readings(file, [row[0] for row in rows], lines)
     require_rising(file, clock, lines)
     frame = known_frame(reference, file, at, "REF_FRAME_A")
@@ -218,13 +377,7 @@ def _scale(file: str, segments: list[_Segment]) -> str:
     try:
         return known_scale(name)
     except Problem as problem:
-        key = ("TIME_SYSTEM",)
-        raise InputError(Issue(problem.problem, file, line, key, problem.found, problem.allowed)) from None
-
-
-def _all_rows(segments: list[_Segment]) -> tuple[list[list[str]], list[int]]:
-    """Rows of all segments one after the other, with their lines."""
-    return [row for s in segments for row in s.rows], [line for s in segments for line in s.lines]
+        raise InputError(problem.at(file, line, ("TIME_SYSTEM",))) from None
 
 
 def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
@@ -277,51 +430,44 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     file, lines = str(path), text_lines(path, WHAT)
     head = lines[0]
     old = head[:2] in ("#a", "#b")
-    which = _name(satellite, lines, old) if satellite else _only_satellite(file, lines)
+    which = _satellite(file, lines, satellite, old)
     scale = _sp3_scale(file, lines, old)
     system = head[46:51].strip()
     frame = known_frame(system, file, 1, "coordinate system") if system not in ("", "UNDEF") else None
-    texts, where, places, rows, speeds, speed_rows = [], [], [], [], [], []
+    texts, places, rows, speeds, speed_rows = [], [], [], [], []
     epoch: str | None = None
-    ended = last_used = False
+    ended = used = False
     epochs = 0
     for k, line in enumerate(lines):
-        mark = line[:1]
+        mark, cells = line[:1], [line[4:18], line[18:32], line[32:46]]
         if mark == "*":
-            epoch, last_used, epochs = _epoch(file, k + 1, line), False, epochs + 1
+            epoch, used, epochs = _epoch(file, k + 1, line), False, epochs + 1
         elif mark in "PV" and line[1:4].strip() == which:
             if epoch is None:
                 raise InputError(Issue("a record before the first epoch", file, k + 1, (), shown(line[:20]), WHAT))
-            cells = [line[4:18], line[18:32], line[32:46]]
             if mark == "P":
-                if not any(c.strip(" 0.-") for c in cells) and all(c.strip() for c in cells):
-                    epoch_used = False
-                else:
-                    epoch_used = True
-                    texts.append(epoch)
-                    where.append(k + 1)
-                    places.append(cells)
-                    rows.append(k + 1)
-                last_used = epoch_used
-            elif rows and last_used:
+                used = any(c.strip(" 0.-") for c in cells) or not all(c.strip() for c in cells)
+            if mark == "P" and used:
+                texts.append(epoch)
+                places.append(cells)
+                rows.append(k + 1)
+            elif mark == "V" and used:
                 speeds.append(cells)
                 speed_rows.append(k + 1)
         elif line.startswith("EOF"):
             ended = True
             break
     stated = head[32:39].strip()
-    if not ended and not (stated.isdigit() and int(stated) == epochs and last_used):
+    if not ended and not (stated.isdigit() and int(stated) == epochs and used):
         found = f"{epochs} of {stated} epochs" if stated.isdigit() else None
         allowed = "EOF as the last line, or all epochs of the header"
         raise InputError(Issue("the file ends early", file, len(lines), (), found, allowed))
-    if not rows and satellite is not None:
-        raise _unknown(file, lines, satellite)
     if len(rows) < 2:
         raise InputError(Issue(f"fewer than two places of {which}", file, None, (), str(len(rows)), "two or more"))
-    clock = readings(file, texts, where)
-    require_rising(file, clock, where)
+    clock = readings(file, texts, rows)
+    require_rising(file, clock, rows)
     position = 1e3 * numbers(file, places, rows, ("x", "y", "z"))
-    platform_readings.require_orbit(file, position, rows)
+    require_orbit(file, position, rows)
     velocity = None
     if speeds:
         if len(speeds) != len(rows):
@@ -331,30 +477,19 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     return OrbitReadings(file, clock, position, velocity, frame, scale)
 
 
-def _only_satellite(file: str, lines: list[str]) -> str:
+def _satellite(file: str, lines: list[str], wanted: str | None, old: bool) -> str:
+    """Return the name of a satellite in the file; in files of versions a and b a number may stand for it."""
     names = list(dict.fromkeys(line[1:4].strip() for line in lines if line[:1] == "P"))
-    if len(names) != 1:
-        found = names_text(names[:20]) or "none"
-        raise InputError(Issue("which satellite is not said", file, None, ("satellite",), found, "the name of one"))
-    return names[0]
-
-
-def _name(wanted: str, lines: list[str], old: bool) -> str:
-    """A satellite's name as the file spells it: in the old versions 5, 05 and G05 are one."""
-    names = {line[1:4].strip() for line in lines if line[:1] == "P"}
-    if wanted in names or not old:
-        return wanted
-    number = wanted.lstrip("Gg").lstrip("0")
-    return next((n for n in sorted(names) if n.lstrip("Gg").strip().lstrip("0") == number), wanted)
-
-
-def _unknown(file: str, lines: list[str], wanted: str) -> InputError:
-    """What to say of a satellite that a file does not have."""
-    names = list(dict.fromkeys(line[1:4].strip() for line in lines if line[:1] == "P"))
-    issue = Issue(
-        "no such satellite", file, None, ("satellite",), wanted, names_text(names[:20]), nearest(wanted, names)
-    )
-    return InputError(issue)
+    key, found = ("satellite",), names_text(names[:20]) or "none"
+    if wanted is None:
+        if len(names) != 1:
+            raise InputError(Issue("which satellite is not said", file, None, key, found, "the name of one"))
+        return names[0]
+    alike = [n for n in sorted(names) if n.lstrip("Gg").strip().lstrip("0") == wanted.lstrip("Gg").lstrip("0")]
+    name = wanted if wanted in names or not (old and alike) else alike[0]
+    if name not in names:
+        raise InputError(Issue("no such satellite", file, None, key, wanted, found, nearest(wanted, names)))
+    return name
 
 
 def _sp3_scale(file: str, lines: list[str], old: bool) -> str:
@@ -365,8 +500,7 @@ def _sp3_scale(file: str, lines: list[str], old: bool) -> str:
             try:
                 return known_scale(line[9:12])
             except Problem as problem:
-                key = ("time system",)
-                raise InputError(Issue(problem.problem, file, k + 1, key, problem.found, problem.allowed)) from None
+                raise InputError(problem.at(file, k + 1, ("time system",))) from None
     if old:
         return known_scale("GPS")
     raise InputError(Issue("no line %c with the time system", file, None, (), None, WHAT))

@@ -133,6 +133,12 @@ class ImagePoints:
         return replace(self, point=self.point - first)
 
 
+def point_names(roles: NDArray[np.object_]) -> list[str]:
+    """Return names for points of these roles: c, k or t, and their number."""
+    letter = {"control": "c", "check": "k", "tie": "t"}
+    return [f"{letter[role]}{k}" for k, role in enumerate(roles.tolist())]
+
+
 _APART = 0.01
 """Metres: two targets that images from orbit show apart lie farther from each other."""
 

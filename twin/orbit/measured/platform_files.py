@@ -2,6 +2,8 @@
 
 Reading and understanding are two steps: `PlatformReadings` holds what the files say, `Conventions` what it means, and
 `platform_table` makes the table of both, so that the same readings can be understood another way.
+
+The scene of a DIMAP file as a sensor like all others.
 """
 
 from __future__ import annotations
@@ -19,13 +21,23 @@ from scenes.specs.orbit.measurements import body_axes_matrix
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
+from twin.orbit.flight.earth import Earth
+from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.flight.line_camera import polynomial_line
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
+from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Attitude
-from twin.orbit.measured import earth_orientation, orbit_files, platform_readings
+from twin.orbit.measured import earth_orientation, orbit_files
 from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
-from twin.orbit.measured.dimap_file import is_dimap, read_dimap
+from twin.orbit.measured.dimap_file import DimapPass, is_dimap, read_dimap
 from twin.orbit.measured.earth_orientation import EarthOrientation, TableRotation
-from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
+from twin.orbit.measured.orbit_files import (
+    AttitudeReadings,
+    OrbitReadings,
+    require_orbit,
+    require_own_velocity,
+    require_unit,
+)
 from twin.orbit.measured.xml_file import first_lines, require_rising
 
 if TYPE_CHECKING:
@@ -120,7 +132,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         Attitude(spec_of.nadir != "geocentric", spec_of.steering == "yaw"),
     )
     if found.orbit_frame == "ITRS":
-        platform_readings.require_own_velocity(orbit)
+        require_own_velocity(orbit)
     return PlatformReadings(orbit, attitude, _earth(spec, folder, orbit, found)), found
 
 
@@ -200,10 +212,7 @@ def _one_segment(readings: PlatformReadings, meant: Conventions) -> tuple[OrbitR
         count = int(np.sum(in_span(turn_time, first, last)))
         if count > best_count:
             best, best_count, best_usable = one, count, usable
-    own = slice(best.first, best.last + 1)
-    clock = Readings(orbit.clock.day[own], orbit.clock.second[own])
-    velocity = None if orbit.velocity is None else orbit.velocity[own]
-    return replace(orbit, clock=clock, position=orbit.position[own], velocity=velocity, segments=()), best_usable
+    return replace(orbit.taken(slice(best.first, best.last + 1)), segments=()), best_usable
 
 
 def _in_itrs(
@@ -247,7 +256,7 @@ def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants
     try:
         return clock.instants(scale).later(offset)
     except Problem as problem:
-        raise InputError(Issue(problem.problem, file, None, (), problem.found, problem.allowed)) from None
+        raise InputError(problem.at(file)) from None
 
 
 def _stated(spec: Any, key: str, said: str | None, found: str | None, what: str) -> str:
@@ -361,9 +370,60 @@ def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: Readings) -> Reading
         start = tai_minus_utc(calendar_reading(str(spec.epoch))[0])
         since = np.array([tai_minus_utc(int(day)) for day in days]) - start
     except Problem as problem:
-        raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
+        raise spec.error(problem, ("epoch",)) from None
     between = float(np.max(np.abs(since)))
     if between and spec.leap_seconds is None:
         count = f"{between:g} leap seconds lie between the epoch and the times"
         raise spec.error(count, ("leap_seconds",), allowed="counted or skipped")
     return Readings(clock.day, clock.second - since[where]) if spec.leap_seconds == "counted" else clock
+
+
+_ITRS = Conventions("ITRS", "UTC", "ITRS", "UTC", scalar="first", turns="body_to_frame")
+
+
+@dataclass(frozen=True, eq=False)
+class DimapScene:
+    """A scene.
+
+    Attributes:
+        read: what its file says.
+        sensor: the rigorous model; line 0 and pixel 0 are the format's row 1 and column 1.
+        epoch: UTC from which the sensor's times count.
+    """
+
+    read: DimapPass
+    sensor: Sensor
+    epoch: str
+
+
+def read_scene(path: str | Path, band: str | None = None, effects: LightEffects | None = None) -> DimapScene:
+    """The scene of a DIMAP file.
+
+    Args:
+        path: of its file DIM_*.XML.
+        band: whose looks are taken; may be left out where all bands have the same.
+        effects: what happens to the light; None for refraction where the file says so, and nothing else.
+
+    Raises:
+        InputError: it cannot be read, or its orbit or attitude do not reach over the image.
+    """
+    read = read_dimap(path, band)
+    readings = PlatformReadings(read.spanning_orbit(), read.samples(), None)
+    table = platform_table(readings, _ITRS)
+    trajectory = TabulatedTrajectory(table)
+    first = float(read.first_line.instants("UTC").since(table.epoch)[0])
+    if effects is None:
+        effects = replace(NO_EFFECTS, refraction=read.refracted)
+    camera = polynomial_line(read.name, read.pixels, read.forward, read.right)
+    try:
+        sensor = Sensor(camera, trajectory, Earth(), read.line_time, first, read.lines, effects)
+    except ValueError as error:
+        raise InputError(Issue(str(error), read.file, None, ("Refined_Model",), None, _REMEDY)) from None
+    middle = 0.5 * (read.lines - 1), 0.5 * (read.pixels - 1)
+    if not np.all(np.isfinite(sensor.ground(*(np.array([v]) for v in middle)))):
+        problem = "the middle of the image does not look at the Earth"
+        raise InputError(Issue(problem, read.file, None, ("Attitudes",), None, "quaternions with their scalar first"))
+    return DimapScene(read, sensor, table.epoch)
+
+
+_REMEDY = "ephemeris and attitudes from before the first line to after the last one"

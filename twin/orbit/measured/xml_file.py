@@ -64,14 +64,10 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
                     raise InputError(
                         Issue("not a number", file, lines[k], (heads[j],), shown(text), "a number")
                     ) from None
-    bad = ~np.isfinite(values)
-    if np.any(bad):
-        k, j = (int(v) for v in np.argwhere(bad)[0])
-        raise InputError(Issue("not a finite number", file, lines[k], (heads[j],), shown(cells[k][j]), "a number"))
-    huge = np.abs(values) > LARGEST_NUMBER
-    if np.any(huge):
-        k, j = (int(v) for v in np.argwhere(huge)[0])
-        raise InputError(Issue("larger than any quantity", file, lines[k], (heads[j],), shown(cells[k][j]), "a number"))
+    wrong = {"not a finite number": ~np.isfinite(values), "larger than any quantity": np.abs(values) > LARGEST_NUMBER}
+    for problem, bad in wrong.items():
+        for k, j in np.argwhere(bad)[:1].tolist():
+            raise InputError(Issue(problem, file, lines[k], (heads[j],), shown(cells[k][j]), "a number"))
     return values
 
 
@@ -89,10 +85,9 @@ def readings(file: str, texts: Sequence[str], lines: Sequence[int]) -> Readings:
 def require_rising(file: str, clock: Readings, lines: Sequence[int]) -> None:
     """InputError unless each of the readings (N,) on these lines is later than the one before it."""
     back = (np.diff(clock.day) * 86400.0 + np.diff(clock.second)) <= 0.0
-    if np.any(back):
-        row = int(np.argmax(back)) + 1
+    for row in np.flatnonzero(back)[:1]:
         problem = "a time that is not later than the one before it"
-        raise InputError(Issue(problem, file, lines[row], allowed="times in rising order, each once"))
+        raise InputError(Issue(problem, file, lines[row + 1], allowed="times in rising order, each once"))
 
 
 def _is_number(text: str) -> bool:

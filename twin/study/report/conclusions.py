@@ -351,9 +351,9 @@ def percent(value: float | None, decimals: int = 1) -> str:
     return f"{fixed(100.0 * value, decimals)}%"
 
 
-def span(interval: tuple[float, float]) -> str:
-    """An interval of a share."""
-    return f"{percent(interval[0])} … {percent(interval[1])}"
+def span(interval: tuple[float, float] | None) -> str:
+    """An interval of a share, a dash for none."""
+    return DASH if interval is None else f"{percent(interval[0])} … {percent(interval[1])}"
 
 
 def listed(texts: Sequence[str]) -> str:

@@ -14,7 +14,6 @@ from analysis.statistics import share_interval
 from scenes.specs.study import ParetoSpec, ThresholdSpec
 from twin.framework.quantity import Quantity, Record
 from twin.study.report import study_statistics as statistics
-from twin.study.report.linear_model import Effect, LinearModel, MainEffect, linear_model, main_effects
 from twin.study.report.sensitivity_indices import Index, Indices, NoIndices, sensitivity_indices
 from twin.study.report.study_statistics import Estimate, Response, StudyRuns
 
@@ -287,8 +286,8 @@ class StudyAnalysis:
 
     runs: StudyRuns
     descriptions: Mapping[str, statistics.Description]
-    linear: Mapping[str, LinearModel | None]
-    effects: Mapping[str, tuple[MainEffect, ...]]
+    linear: Mapping[str, statistics.LinearModel | None]
+    effects: Mapping[str, tuple[statistics.MainEffect, ...]]
     noise: Mapping[str, statistics.NoiseShare]
     indices: Mapping[str, Indices | NoIndices]
     convergences: Mapping[str, tuple[Convergence, ...]]
@@ -312,8 +311,8 @@ class StudyAnalysis:
         return cls(
             runs=runs,
             descriptions={r.name: statistics.describe(r.values, runs.sampled) for r in everything},
-            linear={r.name: linear_model(runs.factors, r) for r in everything},
-            effects={r.name: () if runs.sampled else main_effects(runs.factors, r) for r in everything},
+            linear={r.name: statistics.linear_model(runs.factors, r) for r in everything},
+            effects={r.name: () if runs.sampled else statistics.main_effects(runs.factors, r) for r in everything},
             noise={
                 share.response: share
                 for r in runs.responses
@@ -363,20 +362,20 @@ ESTIMATE: Record[Estimate] = Record(
     Quantity("value", lambda one: _finite(one.value), "the number"),
     Quantity("interval", lambda one: [_finite(end) for end in one.interval], "lower and upper end"),
 )
-EFFECT: Record[Effect] = Record(
+EFFECT: Record[statistics.Effect] = Record(
     "What a factor does to a response, by the linear model and by ranks.",
     Quantity("swing", lambda e: e.swing, "change from the factor's 5% to its 95% quantile", record=ESTIMATE),
     Quantity("standardised_coefficient", lambda e: e.coefficient, "sigmas per sigma of the factor", record=ESTIMATE),
     Quantity("rank_correlation", lambda e: e.rank, "Spearman's", record=ESTIMATE),
 )
-LINEAR: Record[LinearModel] = Record(
+LINEAR: Record[statistics.LinearModel] = Record(
     "Least squares fit of a response by all factors together.",
     Quantity("r2", lambda model: model.r2, "share of the variance that it explains"),
     Quantity("adjusted_r2", lambda model: model.adjusted, "corrected for the number of terms"),
     Quantity("effects", lambda model: {e.factor: e for e in model.effects}, "by factor", record=EFFECT),
     Quantity("not_separable", lambda model: model.cannot, "factors whose effects the runs do not separate"),
 )
-MAIN_EFFECT: Record[MainEffect] = Record(
+MAIN_EFFECT: Record[statistics.MainEffect] = Record(
     "Means of a response over the runs of a grid, for each value of a factor.",
     Quantity("factor", lambda effect: effect.factor, "its name"),
     Quantity("levels", lambda effect: effect.levels, "its values"),

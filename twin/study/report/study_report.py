@@ -205,23 +205,19 @@ def _requirements(found: StudyAnalysis) -> Section | None:
             r.met,
             r.count,
             words.percent(r.share),
-            words.span(r.interval) if r.interval is not None else words.DASH,
-            *([words.DASH if r.bounds is None else f"{r.met} … {r.most} of {r.runs}"] if lacking else ()),
-            *([words.DASH if r.bounds_interval is None else words.span(r.bounds_interval)] if lacking else ()),
-            words.number(r.judged.p95.value) if r.judged and r.judged.p95 else words.DASH,
-            words.number(r.judged.p997.value) if r.judged and r.judged.p997 else words.DASH,
+            words.span(r.interval),
+            *((words.DASH if r.bounds is None else f"{r.met} … {r.most} of {r.runs}",) if lacking else ()),
+            *((words.span(r.bounds_interval),) if lacking else ()),
+            *(
+                words.number(one.value if one else None)
+                for one in (r.judged and r.judged.p95, r.judged and r.judged.p997)
+            ),
         ]
         for r in found.requirements
     ]
     how = "The interval is Clopper and Pearson's, 95%." if found.runs.sampled else "A grid is no sample: no interval."
     lost = f" {failed} failed runs are not counted." if failed else ""
-    more = ("all runs", "interval of all runs") if lacking else ()
-    open_ends = ""
-    if lacking:
-        open_ends = (
-            " Runs may fail where the response is bad, or where it is good: the column of all runs goes from none of "
-            "those without a number to all of them."
-        )
+    more = ("all runs, if none … all without a number meet it", "interval of all runs") if lacking else ()
     return Section(
         "Requirements",
         (),
@@ -229,8 +225,7 @@ def _requirements(found: StudyAnalysis) -> Section | None:
             Table(
                 "requirements",
                 "Share of the runs that meet them",
-                f"Of the runs that have a number.{lost} {how}{open_ends} The last columns are quantiles of what is "
-                "judged.",
+                f"Of the runs that have a number.{lost} {how} The last columns are quantiles of what is judged.",
                 ("requirement", "", "unit", "met", "of", "share", "interval", *more, "95%", "99.7%"),
                 rows,
                 within=STATISTICS,
@@ -247,11 +242,6 @@ def _distributions(found: StudyAnalysis) -> Section | None:
         return None
     texts = [words.normality_text(r, found.descriptions[r.name]) for r in found.runs.responses if r.name in names]
     remarks = tuple(text for text in texts if text is not None)
-    if remarks:
-        remarks = (
-            *remarks,
-            "The test is D'Agostino and Pearson's; a normal distribution fails it in one of 100 studies.",
-        )
     caption = "Number of runs by value."
     if found.runs.sampled:
         caption += (
@@ -378,14 +368,8 @@ def _pairs(found: StudyAnalysis) -> Section | None:
     figures = []
     pairs = found.runs.study.report.scatter
     if pairs:
-        figures.append(
-            _figure(
-                "scatter",
-                "Pairs that were asked for",
-                "Every point is a run.",
-                lambda: plots.scatter_figure(found, pairs),
-            )
-        )
+        draw = partial(plots.scatter_figure, found, pairs)
+        figures.append(_figure("scatter", "Pairs that were asked for", "Every point is a run.", draw))
     things = plots.chosen(found)
     if len(things) > 2:
         factors = sum(isinstance(thing, Factor) for thing in things)
@@ -413,26 +397,11 @@ def _fronts(found: StudyAnalysis) -> Section | None:
         for j, run in enumerate(front.runs.tolist()):
             own: list[Cell] = [_cell(f, run) for f in others]
             rows.append([run, float(front.x[j]), float(front.y[j]), *own, "knee" if j == front.knee else ""])
-        shown = (
-            rows
-            if len(rows) <= MOST_FRONT
-            else [rows[round(i * (len(rows) - 1) / (MOST_FRONT - 1))] for i in range(MOST_FRONT)]
-        )
-        note = (
-            ""
-            if shown is rows
-            else f" {MOST_FRONT} of {len(rows)}, evenly through the front; study.csv holds all runs."
-        )
+        shown = [rows[i] for i in np.linspace(0, len(rows) - 1, min(len(rows), MOST_FRONT)).round().astype(int)]
+        thin = f" {MOST_FRONT} of {len(rows)}, evenly through the front; study.csv holds all runs."
+        note = f"From the best {x.name} on.{thin if len(shown) < len(rows) else ''}"
         heads = ("run", x.label, y.label, *(f.label for f in others), "")
-        parts.append(
-            Table(
-                f"pareto-front-{k + 1}",
-                f"Front of {x.name} and {y.name}",
-                f"From the best {x.name} on.{note}",
-                heads,
-                shown,
-            )
-        )
+        parts.append(Table(f"pareto-front-{k + 1}", f"Front of {x.name} and {y.name}", note, heads, shown))
     return Section("Best compromises", remarks, tuple(parts))
 
 

@@ -21,12 +21,11 @@ from analysis.arrays import ARCSEC
 from analysis.monitor import autocollimator
 from analysis.monitor.autocollimator import column_component, mean_difference, relation_factor
 from optics.numerics.quadrature import PupilNodes
-from scenes.models.autocollimator_model import UNITS, mirror_body
 from scenes.specs.autocollimators import AutocollimatorSetup
 from scenes.specs.load import load_autocollimator_test
 from twin.framework.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, to_png
 from twin.laboratory import autocollimator_bench as laboratory
-from twin.laboratory.autocollimator_images import AutocollimatorPath
+from twin.laboratory.autocollimator_bench import UNITS, AutocollimatorPath, mirror_body
 from twin.validation.check import CheckResult, Chosen
 from twin.validation.group import Context, group_of, load_printed
 

@@ -24,8 +24,7 @@ from twin.framework.random_streams import stream
 from twin.framework.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
-from twin.orbit.calibration.campaign_adjustment import calibrated_alone
-from twin.orbit.calibration.latitude import LatitudeFit, fitted
+from twin.orbit.calibration.campaign_adjustment import LatitudeFit, calibrated_alone, fitted
 from twin.orbit.calibration.schemes import schemes_tested, tested, tested_before, values_of
 from twin.validation.check import SIGMAS, CheckResult, Chosen, Supposed, mean_of, median_of, rms
 from twin.validation.group import Context, drawing, group_of

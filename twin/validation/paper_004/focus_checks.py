@@ -21,9 +21,8 @@ from optics.numerics.backend import one_blas_thread
 from scenes.specs.resolved import FocusSetup
 from twin.framework.artefact import Cell
 from twin.framework.svg import AFTER, BEFORE, INK, LIGHT
-from twin.laboratory.focus_bench import FocusBench
+from twin.laboratory.focus_bench import NYQUIST, FocusBench
 from twin.laboratory.focus_run import FocusState, SimulatedFocus, align, line_turn, mount_of
-from twin.laboratory.focus_scan import NYQUIST
 from twin.targets.target_images import TRACK
 from twin.validation.check import CheckResult, Chosen, mean_of, rms
 from twin.validation.group import Context, drawing, group_of, load_printed

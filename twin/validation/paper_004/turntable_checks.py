@@ -19,8 +19,7 @@ from optics.numerics.backend import one_blas_thread
 from scenes.specs.resolved import TurntableSetup
 from scenes.specs.turntable import TurntableTestSpec
 from twin.framework.artefact import Cell
-from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_run import rms, run_turntable
+from twin.laboratory.turntable_run import TurntableModel, rms, run_turntable
 from twin.validation.check import CheckResult, Chosen, median_of
 from twin.validation.group import Context, group_of, load_printed
 

@@ -1,0 +1,509 @@
+"""Maps from GeoTIFF and other rasters that GDAL reads, by parts: an orthophoto may be larger than the memory.
+
+Coordinates of any reference system to the ITRS and back, and heights above a geoid to heights above the ellipsoid.
+
+PROJ knows the systems. It is never let guess: no ballpark transformation, and where it lacks a grid it says so. WGS 84
+counts as the ITRS, as everywhere here. So does CGCS2000, from which PROJ has no way: it is ITRF97 at epoch 2000.0, and
+plates have moved since by some 3 cm a year.
+
+The part of a user's map that images show, in the plane coordinates of the ground; its pixels stay as they are.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyproj
+from pyproj.crs import GeocentricCRS
+from pyproj.exceptions import CRSError, ProjError
+from scipy.ndimage import map_coordinates
+
+from scenes.yaml.errors import InputError, Issue, Problem, shown
+from scenes.yaml.input_file import no_file
+from twin.orbit.ground.grid import GroundFrame
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit.measurements import RasterFileSpec
+
+LARGEST_PART = 100_000_000
+"""Pixels that are read at once."""
+_DRIVERS = ("GTiff", "GTX", "COG")
+"""Plain grids; other drivers of GDAL open files and addresses that a raster names."""
+
+
+@dataclass(frozen=True, eq=False)
+class GeoRaster:
+    """A raster whose places are known; made by `open_raster`. Nothing is held in memory.
+
+    Attributes:
+        file: its path.
+        crs: of its coordinates.
+        transform: (a, b, c, d, e, f): x = a column + b row + c and y = d column + e row + f, (0, 0) being the middle of
+            the first pixel.
+        shape: rows and columns.
+        band: that is read, counted from 1.
+        dtype: of its values.
+    """
+
+    file: str
+    crs: pyproj.CRS
+    transform: tuple[float, float, float, float, float, float]
+    shape: tuple[int, int]
+    band: int
+    dtype: str
+
+    def coordinates_of(self, row: Any, column: Any) -> tuple[np.ndarray, np.ndarray]:
+        """X and y in the raster's system of places (row, column), whole or not, (...)."""
+        a, b, c, d, e, f = self.transform
+        return a * np.asarray(column) + b * np.asarray(row) + c, d * np.asarray(column) + e * np.asarray(row) + f
+
+    def row_column_of(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+        """The inverse."""
+        a, b, c, d, e, f = self.transform
+        u, v, area = np.asarray(x) - c, np.asarray(y) - f, a * e - b * d
+        with np.errstate(invalid="ignore"):  # of places beyond the system, which are infinite
+            return (a * v - d * u) / area, (e * u - b * v) / area
+
+    def read(self, rows: slice | None = None, columns: slice | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Values (r, c) of a part, of the raster's own type, and which of them hold something (bool).
+
+        Args:
+            rows: of the part, within the raster; None for all.
+            columns: likewise.
+
+        Raises:
+            InputError: too large a part, or a file that is damaged.
+        """
+        part = rows or slice(0, self.shape[0]), columns or slice(0, self.shape[1])
+        size = [s.stop - s.start for s in part]
+        if size[0] * size[1] > LARGEST_PART:
+            found = f"{size[0]} x {size[1]} pixels"
+            allowed = f"at most {LARGEST_PART:.0e} pixels at once; a map that is cut to the images"
+            raise InputError(Issue("too large a part of a map", self.file, None, (), found, allowed))
+        with opened(self.file) as source:
+            from rasterio.windows import Window
+
+            window = Window(part[1].start, part[0].start, size[1], size[0])
+            values = source.read(self.band, window=window)
+            valid = source.read_masks(self.band, window=window) > 0
+        if np.issubdtype(values.dtype, np.floating):
+            valid &= np.isfinite(values)
+        return values, valid
+
+
+def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoRaster:
+    """A raster's place and size.
+
+    Args:
+        path: of the file.
+        band: that is to be read, counted from 1.
+        crs: of a file that does not say it.
+
+    Raises:
+        InputError: no such file, none that GDAL reads as a plain grid, without a place, with complex or no values.
+    """
+    file = str(path)
+    with opened(file) as source:
+        affine, tags = source.transform, source.crs
+        shape, count, dtypes = (source.height, source.width), source.count, source.dtypes
+        text = None if tags is None else tags.to_wkt()
+        ground = source.gcps[0]
+    if not 1 <= band <= count:
+        raise InputError(Issue("no such band", file, None, ("band",), str(band), f"1 to {count}"))
+    dtype = dtypes[band - 1]
+    if np.dtype(dtype).kind not in "uif":
+        raise InputError(Issue("values that are no grey values or heights", file, None, (), str(dtype), "real numbers"))
+    if affine.is_identity or affine.determinant == 0.0:
+        found = "ground control points only" if ground else "no georeference"
+        raise InputError(Issue("a raster without a place", file, None, (), found, "a GeoTIFF with a geotransform"))
+    if text is None and crs is None:
+        raise InputError(
+            Issue("a raster that does not say its system", file, None, ("crs",), None, "`crs:`, EPSG:32650")
+        )
+    try:
+        system = pyproj.CRS.from_wkt(text) if text is not None else pyproj.CRS(str(crs))
+        if text is not None and crs is not None and not system.to_2d().equals(pyproj.CRS(crs).to_2d(), True):
+            raise InputError(Issue("the file says another system", file, None, ("crs",), str(crs), system.name))
+    except pyproj.exceptions.CRSError:
+        raise InputError(Issue("no system that PROJ knows", file, None, ("crs",), crs, "EPSG:32650, ...")) from None
+    a, b, c, d, e, f = affine[:6]
+    middle = (a, b, c + 0.5 * (a + b), d, e, f + 0.5 * (d + e))
+    return GeoRaster(file, system, middle, shape, band, str(dtype))
+
+
+@contextmanager
+def opened(file: str) -> Iterator[Any]:
+    """The file as rasterio's dataset. InputError if it is none that can be read, or becomes so while it is read."""
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    # names that GDAL takes for addresses or archives are none of files
+    wrong = no_file(Path(file))
+    if wrong is not None:
+        raise InputError(Issue(wrong, file, allowed="a GeoTIFF"))
+    try:
+        # a file beside the raster is not the raster
+        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", NotGeoreferencedWarning)
+                source = rasterio.open(Path(file).resolve(), sharing=False)
+        with source:
+            if source.driver not in _DRIVERS:
+                raise InputError(Issue("a raster of another format", file, None, (), source.driver, "GeoTIFF or GTX"))
+            yield source
+    except RasterioError as error:
+        reason = str(error).replace(str(Path(file).resolve()), "").strip(" :'") or "damaged"
+        raise InputError(Issue(f"not a raster that can be read: {reason}", file, allowed="a GeoTIFF")) from None
+
+
+_ALLOWED = "a code or a text that PROJ knows, as EPSG:4979 (WGS 84 with ellipsoidal height), EPSG:32650, OGC:CRS84"
+CGCS2000 = "China 2000"
+"""Name of the datum of CGCS2000 in EPSG's registry."""
+
+
+@dataclass(frozen=True, eq=False)
+class Geoid:
+    """Heights of a geoid above the ellipsoid on a grid of longitude and latitude, bilinear between its nodes.
+
+    Attributes:
+        raster: the grid.
+    """
+
+    raster: GeoRaster
+
+    @classmethod
+    def read(cls, path: str | Path) -> Geoid:
+        """From a GeoTIFF or GTX file of one's own; InputError if it is none, or no grid over the Earth."""
+        raster = open_raster(path)
+        if not raster.crs.is_geographic:
+            name = raster.crs.name
+            raise InputError(Issue("a geoid in another system", str(path), None, (), name, "longitude and latitude"))
+        return cls(raster)
+
+    @cached_property
+    def _values(self) -> np.ndarray:
+        values, valid = self.raster.read()
+        if np.any(np.abs(values[valid]) > 150.0):
+            found = f"{np.max(np.abs(values[valid])):g}"
+            raise InputError(Issue("no heights of a geoid", self.raster.file, None, (), found, "metres, within 150 m"))
+        known = np.where(valid, values, np.nan).astype(np.float64)
+        # beyond the last column the first one comes again, or that column itself, which then has no weight
+        return np.pad(known, ((0, 0), (0, 1)), mode="wrap" if self._whole_turn else "edge")
+
+    @property
+    def _whole_turn(self) -> bool:
+        step = abs(self.raster.transform[0])
+        return abs(self.raster.shape[1] * step - 360.0) < 0.6 * step
+
+    def __call__(self, longitude: Any, latitude: Any) -> np.ndarray:
+        """Height of the geoid, metres, (...).
+
+        Args:
+            longitude: degrees, any turn, (...).
+            latitude: degrees, (...).
+
+        Raises:
+            Problem: a place beyond the grid.
+        """
+        lon, lat = np.broadcast_arrays(np.asarray(longitude, float), np.asarray(latitude, float))
+        rows, columns = self.raster.shape
+        first, around = self.raster.transform[2], self._whole_turn
+        turn = (lon - first) % 360.0
+        row, column = self.raster.row_column_of(first + turn, lat)
+        inside = (row >= -1e-6) & (row <= rows - 1.0 + 1e-6)
+        if not around:
+            inside &= (column >= -1e-6) & (column <= columns - 1.0 + 1e-6)
+        if not np.all(inside):
+            k = int(np.argmin(np.ravel(inside)))
+            found = f"{np.ravel(lat)[k]:.6g} deg N, {np.ravel(lon)[k]:.6g} deg E"
+            raise Problem("a place beyond the grid of the geoid", found, self.raster.file)
+        at = np.clip(row, 0.0, rows - 1.0), column % columns if around else np.clip(column, 0.0, columns - 1.0)
+        height = map_coordinates(self._values, at, order=1, mode="nearest")
+        if not np.all(np.isfinite(height)):
+            raise Problem("a place where the grid of the geoid holds nothing", None, self.raster.file)
+        return np.asarray(height)
+
+
+@dataclass(frozen=True, eq=False)
+class Datum:
+    """A coordinate reference system with what its heights are counted from; made by `Datum.of`.
+
+    Attributes:
+        crs: as given: two coordinates or three.
+        geoid: that heights are above; None for the ellipsoid.
+        forward: to geocentric coordinates of the ITRS.
+        geographic: to longitude and latitude, degrees, of the same system.
+    """
+
+    crs: pyproj.CRS
+    geoid: Geoid | None
+    forward: pyproj.Transformer
+    geographic: pyproj.Transformer
+
+    @classmethod
+    def of(cls, text: str, heights: str | None, geoid: Geoid | None) -> Datum:
+        """The system of this name.
+
+        Args:
+            text: of the system, for PROJ.
+            heights: ``ellipsoid`` or ``geoid``; None where the system itself says it.
+            geoid: for heights above it.
+
+        Raises:
+            Problem: no such system, heights that are not said or said twice, no way to the ITRS without a guess.
+        """
+        try:
+            crs = pyproj.CRS(text)
+        except CRSError:
+            raise Problem("no such coordinate reference system", shown(text), _ALLOWED) from None
+        if not (crs.is_geographic or crs.is_projected or crs.is_geocentric or crs.is_compound):
+            raise Problem("a system without a place on the Earth", crs.name, _ALLOWED)
+        if len(crs.axis_info) == 3 and heights is not None:
+            allowed = "a system of two coordinates, or no `heights:`"
+            raise Problem(f"{crs.name} says itself what its heights are", heights, allowed)
+        if len(crs.axis_info) == 2 and heights is None:
+            problem = f"{crs.name} does not say what heights are counted from"
+            raise Problem(problem, text, "heights: ellipsoid, heights: geoid with geoid: FILE, or EPSG:4979")
+        whole = crs if len(crs.axis_info) == 3 else crs.to_3d()
+        try:
+            forward = _to_itrs(whole)
+            flat = crs.sub_crs_list[0] if crs.is_compound else crs
+            geodetic = flat.geodetic_crs
+            assert geodetic is not None
+            near = geodetic if geodetic.is_geographic else pyproj.CRS("EPSG:4326")
+            geographic = pyproj.Transformer.from_crs(flat.to_2d() if not flat.is_geocentric else near.to_2d(),
+                                                     near.to_2d(), always_xy=True)  # fmt: skip
+        except ProjError as error:
+            reason = str(error).rsplit("(", 1)[-1].rstrip(") ")
+            allowed = "a system that needs no grid of PROJ's: EPSG:4979, EPSG:4326 with heights, a zone of UTM"
+            raise Problem(f"PROJ knows no exact way from {crs.name}: {reason}", text, allowed) from None
+        return cls(crs, geoid, forward, geographic)
+
+    def itrs(self, x: Any, y: Any, z: Any) -> np.ndarray:
+        """Places (..., 3) in the ITRS, metres.
+
+        Args:
+            x: longitude in degrees, easting, or geocentric, (...).
+            y: latitude in degrees, northing, or geocentric, (...).
+            z: height, or geocentric, metres, (...).
+
+        Raises:
+            Problem: a place where the system has none, or beyond the geoid's grid.
+        """
+        x, y, z = (np.asarray(v, np.float64) for v in np.broadcast_arrays(x, y, z))
+        if self.crs.is_geographic and (np.any(np.abs(y) > 90.0) or np.any(np.abs(x) > 540.0)):
+            k = int(np.argmax((np.abs(y) > 90.0) | (np.abs(x) > 540.0)))
+            found = f"longitude {np.ravel(x)[k]:g}, latitude {np.ravel(y)[k]:g}"
+            raise Problem("no longitude and latitude", found, "degrees, and longitude before latitude", within=(k,))
+        height = z
+        if self.geoid is not None:
+            height = z + self.geoid(*self.geographic.transform(x, y))
+        places = np.stack(self.forward.transform(x, y, height), axis=-1)
+        good = np.all(np.isfinite(places), axis=-1)
+        if not np.all(good):
+            k = int(np.argmin(np.ravel(good)))
+            text = f"{np.ravel(x)[k]:g}, {np.ravel(y)[k]:g}"
+            raise Problem(f"no place in {self.crs.name}", text, "coordinates of that system", within=(k,))
+        return places
+
+    @property
+    def accuracy(self) -> float | None:
+        """Accuracy of the way to the ITRS as its authority states it, metres; None if it does not, or before `itrs`."""
+        stated = self.forward.accuracy
+        if stated < 0.0:
+            try:
+                stated = float(self.forward.get_last_used_operation().accuracy)
+            except ProjError:
+                return None
+        return stated if stated >= 0.0 else None
+
+
+def _to_itrs(crs: pyproj.CRS) -> pyproj.Transformer:
+    geodetic, target = crs.geodetic_crs, pyproj.CRS("EPSG:4978")
+    if geodetic is not None and geodetic.datum is not None and geodetic.datum.name == CGCS2000:
+        target = GeocentricCRS(datum=geodetic.datum)
+    return pyproj.Transformer.from_crs(crs, target, always_xy=True, allow_ballpark=False, only_best=True)
+
+
+MOST_HEIGHT = 2.0e4
+"""Metres above or below the ellipsoid or a geoid: farther no ground lies, whatever its datum."""
+_SAMPLED = 512
+"""Rows and columns at which a map is looked through for its extreme heights."""
+_WGS84 = "EPSG:4326"
+
+
+@dataclass(frozen=True, eq=False)
+class MapPart:
+    """A part of a map; see `twin.orbit.ground.orthophoto.Map`.
+
+    Attributes:
+        values: (rows, columns); grey values float32 with NaN where there are none, or heights above the ellipsoid.
+        valid: (rows, columns) bool; None for all.
+        raster: that it is cut from.
+        first: row and column of its first value there.
+        frame: plane coordinates of the ground.
+        way: from the raster's system to longitude and latitude, degrees.
+        spacing: of rows and columns on the ground, metres, their geometric mean.
+    """
+
+    values: np.ndarray
+    valid: np.ndarray | None
+    raster: GeoRaster
+    first: tuple[int, int]
+    frame: GroundFrame
+    way: pyproj.Transformer
+    spacing: float
+
+    def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates of places (row, column), whole or not, metres, broadcast."""
+        row, column = np.broadcast_arrays(np.asarray(row, float), np.asarray(column, float))
+        x, y = self.raster.coordinates_of(row + self.first[0], column + self.first[1])
+        return self.frame.plane(*np.radians(self.way.transform(x, y)))
+
+    def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The inverse."""
+        east, north = np.broadcast_arrays(np.asarray(east, float), np.asarray(north, float))
+        longitude, latitude = np.degrees(self.frame.geographic(east, north))
+        x, y = self.way.transform(longitude, latitude, direction="INVERSE")
+        if self.raster.crs.is_geographic:
+            # the turn of longitude that the map has
+            middle = self.raster.coordinates_of(0.5 * self.raster.shape[0], 0.5 * self.raster.shape[1])[0]
+            x = middle + (x - middle + 180.0) % 360.0 - 180.0
+        row, column = self.raster.row_column_of(x, y)
+        return row - self.first[0], column - self.first[1]
+
+
+@dataclass(frozen=True, eq=False)
+class UserMap:
+    """A map in a file, of which parts are read; made by `UserMap.open`.
+
+    Attributes:
+        raster: the file.
+        way: from its system to longitude and latitude, degrees.
+        geoid: that its values are heights above; None for the ellipsoid, or for grey values.
+    """
+
+    raster: GeoRaster
+    way: pyproj.Transformer
+    geoid: Geoid | None
+
+    @classmethod
+    def open(cls, spec: RasterFileSpec, folder: Path, heights: bool = False) -> UserMap:
+        """A map of a file.
+
+        Args:
+            spec: the file, and what it does not say itself.
+            folder: that relative paths start from.
+            heights: whether it is an elevation model, whose heights must be said to be above something.
+
+        Raises:
+            InputError: it cannot be read, no way from its system without a guess, heights above nothing.
+        """
+        raster = open_raster(folder / spec.file, spec.band, spec.crs)
+        flat = raster.crs.sub_crs_list[0] if raster.crs.is_compound else raster.crs
+        itself = len(raster.crs.axis_info) == 3 and not raster.crs.is_compound
+        if heights and spec.heights is None and not itself:
+            problem = "what the heights are counted from is not said"
+            allowed = "heights: ellipsoid, or heights: geoid with geoid: FILE"
+            raise spec.error(problem, ("heights",), allowed=allowed)
+        geoid = None if spec.geoid is None else Geoid.read(folder / spec.geoid)
+        try:
+            geodetic, target = flat.geodetic_crs, pyproj.CRS(_WGS84)
+            if geodetic is not None and geodetic.datum is not None and geodetic.datum.name == CGCS2000:
+                target = geodetic.to_2d()
+            way = pyproj.Transformer.from_crs(
+                flat.to_2d(), target, always_xy=True, allow_ballpark=False, only_best=True
+            )
+        except ProjError as error:
+            raise InputError(Issue(f"no exact way from {flat.name}: {error}", raster.file)) from None
+        return cls(raster, way, geoid)
+
+    def limits(self) -> tuple[float, float]:
+        """Least and largest height of some thousand places over the whole elevation model.
+
+        Raises:
+            InputError: there are none, or they are no heights of ground.
+        """
+        shape = tuple(min(n, _SAMPLED) for n in self.raster.shape)
+        with opened(self.raster.file) as source:
+            some = source.read(self.raster.band, out_shape=shape, masked=True)
+        with np.errstate(invalid="ignore"):  # of a damaged file some are not even right NaN
+            values = np.asarray(some.compressed(), float)
+        values = values[np.isfinite(values)]
+        if not len(values):
+            raise InputError(Issue("a map without values", self.raster.file))
+        low, high = float(values.min()), float(values.max())
+        if max(-low, high) > MOST_HEIGHT:
+            found, allowed = f"{low:.6g} to {high:.6g} m", f"up to {MOST_HEIGHT:g} m; empty pixels as nodata"
+            raise InputError(Issue("no heights of ground", self.raster.file, found=found, allowed=allowed))
+        return low, high
+
+    def part(self, frame: GroundFrame, ends: tuple[float, float, float, float], heights: bool = False) -> MapPart:
+        """What lies within some ends.
+
+        Args:
+            frame: plane coordinates of the ground.
+            ends: west, east, south and north, metres.
+            heights: whether its values are heights.
+
+        Raises:
+            InputError: nothing does, or too much for the memory; a place without a geoid.
+        """
+        side = np.linspace(0.0, 1.0, 21)
+        east = ends[0] + (ends[1] - ends[0]) * np.concatenate([side, side, 0.0 * side, 0.0 * side + 1.0])
+        north = ends[2] + (ends[3] - ends[2]) * np.concatenate([0.0 * side, 0.0 * side + 1.0, side, side])
+        whole = MapPart(np.empty((0, 0)), None, self.raster, (0, 0), frame, self.way, 1.0)
+        row, column = whole.row_column(east, north)
+        good = np.isfinite(row) & np.isfinite(column)
+        if not good.any():
+            raise InputError(Issue("the images lie beyond the system of this map", self.raster.file))
+        bounds = []
+        for place, count in ((row[good], self.raster.shape[0]), (column[good], self.raster.shape[1])):
+            low, high = int(max(np.floor(place.min()) - 2, 0)), int(min(np.ceil(place.max()) + 3, count))
+            if high - low < 4:
+                lon, lat = np.degrees((frame.longitude, frame.latitude))
+                found = f"images near {lat:.4f} deg N, {lon:.4f} deg E"
+                allowed = "a map of the ground that the images show; its own longitude and latitude are "
+                x, y = self.way.transform(*self.raster.coordinates_of(*(0.5 * n for n in self.raster.shape)))
+                raise InputError(
+                    Issue("the map does not show what the images show", self.raster.file, None, (), found,
+                          f"{allowed}{float(x):.4f} deg E, {float(y):.4f} deg N")
+                )  # fmt: skip
+            bounds.append(slice(low, high))
+        values, valid = self.raster.read(*bounds)
+        first = (bounds[0].start, bounds[1].start)
+        middle = np.array([0.5 * n for n in values.shape])
+        part = MapPart(values, None if valid.all() else valid, self.raster, first, frame, self.way, 1.0)
+        e, n = part.east_north(middle[0] + np.array([0.0, 1.0, 0.0]), middle[1] + np.array([0.0, 0.0, 1.0]))
+        area = abs((e[1] - e[0]) * (n[2] - n[0]) - (e[2] - e[0]) * (n[1] - n[0]))
+        if heights:
+            shown = self._heights(part)
+        else:
+            shown = values.astype(np.float32)
+            shown[~valid] = np.nan
+        return MapPart(shown, part.valid, self.raster, first, frame, self.way, float(np.sqrt(area)))
+
+    def _heights(self, part: MapPart) -> np.ndarray:
+        """Above the ellipsoid."""
+        values = part.values.astype(np.float64)
+        if self.geoid is not None:
+            rows, columns = (np.arange(n, dtype=float) for n in values.shape)
+            for k in range(0, len(rows), 256):  # a part at a time: a geoid needs several numbers a post
+                east, north = part.east_north(rows[k : k + 256, None], columns[None])
+                try:
+                    values[k : k + 256] += self.geoid(*np.degrees(part.frame.geographic(east, north)))
+                except Problem as problem:
+                    raise InputError(problem.at(self.raster.file)) from None
+        known = values if part.valid is None else values[part.valid]
+        if known.size and (known.min() < -1000.0 or known.max() > 10000.0):
+            found = f"{known.min():g} to {known.max():g} m"
+            allowed = "heights within -1000 m to 10 000 m; a nodata value that the file does not say?"
+            raise InputError(Issue("no heights of ground", self.raster.file, None, (), found, allowed))
+        return values
