@@ -147,14 +147,14 @@ def _llvm() -> Check:
 
 def _probe(name: str, arguments: list[str], describe: Any) -> Check:
     try:
-        return Check(name, "ok", describe(run_probe(["-m", f"{__package__}.run.probe", *arguments])))
+        return Check(name, "ok", describe(run_probe(["-m", f"{__package__}.framework.doctor_probe", *arguments])))
     except RuntimeError as error:
         return Check(name, "failed", str(error))
 
 
 def _gpu() -> Check:
     try:
-        result = run_probe(["-m", f"{__package__}.run.probe", "gpu"])
+        result = run_probe(["-m", f"{__package__}.framework.doctor_probe", "gpu"])
     except RuntimeError as error:
         return Check("GPU", "note", f"--backend cuda does not work: {error}")
     if not result["available"]:

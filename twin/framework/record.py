@@ -198,6 +198,15 @@ class Record(Generic[S]):
 
         return [Quantity(**vars(one) | {"of": through(one.of)}) for one in self]
 
+    def flat(self) -> Record[S]:
+        """The record of its rows as a table has them: quantities with a head, and those of records that have one."""
+        found: list[Quantity[Any]] = []
+        for one in self:
+            below = () if one.record is None else one.record.flat()
+            found += [replace(q, key=f"{one.key}.{q.key}", head=f"{q.head} {one.head}") for q in below if one.head]
+            found += [one] if one.head and one.record is None else []
+        return Record(self.meaning, *found)
+
     def _chosen(self, keys: Sequence[str]) -> list[Quantity[S]]:
         return [self[key] for key in keys] if keys else list(self.quantities)
 
@@ -217,14 +226,15 @@ class Record(Generic[S]):
             name: of its file.
             title: heading.
             caption: what it shows.
-            rows: as this record gives them, or by name, which then is the first column.
+            rows: as this record gives them, or the record that this one is `flat` of; or by name, which then is the
+                first column.
             keys: of the columns, in their order; all if none are given.
             label: head of the column of names.
             digits: significant ones of numbers without decimals of their own.
         """
 
         def told(row: Mapping[str, Any]) -> list[Cell]:
-            return [one.shown_value(row.get(one.key)) for one in shown]
+            return [one.shown_value(_below(row, one.key)) for one in shown]
 
         shown = self._chosen(keys)
         heads, decimals = [one.shown_head for one in shown], [one.decimals for one in shown]
@@ -266,6 +276,13 @@ class Record(Generic[S]):
             for one in self._chosen(keys)
         )
         return DataTable(name, title, tuple(columns))
+
+
+def _below(row: Mapping[str, Any], key: str) -> Any:
+    """Return what stands in a row under a key, whose dots lead into the mappings of the row; None for nothing."""
+    for name in key.split("."):
+        row = (row or {}).get(name)  # type: ignore[assignment]
+    return row
 
 
 def plain_data(value: Any) -> Any:

@@ -1,6 +1,7 @@
 """The loop over a path's surfaces, recorded once as one Dr.Jit kernel; all numbers of the scene enter as arrays.
 
-In each step a path flies to the next surface (``surface_intersection``), the surface shares its light out, and the path goes one of
+In each step a path flies to the next surface (``surface_intersection``), the surface shares its light out, and the path
+goes one of
 the ways that there are. Neighbouring paths are worked on together, in packets of the machine's vectors. A packet takes
 as long as its longest path, and all that any of its paths needs: what only some surfaces need (Newton's method,
 Fresnel's formulas, a lobe, a detector) is computed by packets that need it. Sources let neighbours start alike, and

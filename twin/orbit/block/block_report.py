@@ -14,7 +14,7 @@ from analysis.block.block_adjustment import LawTest
 from analysis.block.network import DatumTest, Network, Open
 from analysis.block.reweighting import GroupTest
 from analysis.orbit.forward_intersection import Accuracy
-from twin.framework.artefact import Cell, Table
+from twin.framework.artefact import Table
 from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
 from twin.orbit.block.block_run import ALL, DATUM_ALARM, BlockRun, CameraChange, Worth
@@ -31,9 +31,17 @@ ALARM = 1e-3
 WORTH: Record[Worth] = Record(
     "Check points by some of the block's sensors.",
     Quantity("left_out", lambda one: list(one.left_out), "sensors that were not used"),
-    Quantity("predicted", lambda one: one.predicted, "by the covariances of the points", record=ACCURACY),
-    Quantity("found", lambda one: one.found, "by true or given places of check points", record=ACCURACY),
-    Quantity("agreement", lambda one: one.agreement, "mean square of errors over sigmas; 1 where the sigmas are right"),
+    Quantity("predicted", lambda one: one.predicted, "by the covariances of the points", "predicted", record=ACCURACY),
+    Quantity("found", lambda one: one.found, "by true or given places of check points", "found", record=ACCURACY),
+    Quantity("plan_ratio", lambda one: one.plan, "predicted CE90 over that with all sensors", "plan ×", 2),
+    Quantity("height_ratio", lambda one: one.height, "predicted LE90 over that with all sensors", "height ×", 2),
+    Quantity(
+        "agreement",
+        lambda one: one.agreement,
+        "mean square of errors over sigmas; 1 where the sigmas are right",
+        "agreement",
+        2,
+    ),
 )
 GROUP: Record[GroupTest] = Record(
     "A group of observations, or a law of errors, after the adjustment.",
@@ -144,11 +152,7 @@ def block_report(run: BlockRun) -> Report:
 def _verdict(run: BlockRun) -> tuple[str, tuple[str, ...]]:
     full = run.worth[ALL]
     said, found = full.predicted, full.found
-    losses = {
-        name: (one.predicted.ce90 / said.ce90, one.predicted.le90 / said.le90)
-        for name, one in run.worth.items()
-        if len(one.left_out) == 1
-    }
+    losses = {name: (one.plan, one.height) for name, one in run.worth.items() if len(one.left_out) == 1}
     most = ""
     if losses:
         plan, height = (max(losses, key=lambda name: losses[name][k]) for k in (0, 1))
@@ -184,21 +188,14 @@ def _facts(run: BlockRun) -> tuple[tuple[str, str], ...]:
 
 
 def _summary(run: BlockRun) -> Table:
-    full = run.worth[ALL].predicted
-    rows: list[tuple[Cell, ...]] = []
-    for name, one in run.worth.items():
-        ratio = (one.predicted.ce90 / full.ce90, one.predicted.le90 / full.le90)
-        errors = (None, None) if one.found is None else (one.found.ce90, one.found.le90)
-        rows.append((name, one.predicted.ce90, one.predicted.le90, *errors, *ratio, one.agreement))
-    return Table(
+    return WORTH.flat().table(
         "sensors",
         "What each sensor is worth",
         "Errors that hold nine check points in ten, by the covariances and by the true places, and the former over"
         " those with all sensors. Agreement: mean square of the errors over their sigmas. Points of a block err alike,"
         " so that the found errors of one block scatter.",
-        ("sensors", "CE90 [m]", "LE90 [m]", "CE90 found [m]", "LE90 found [m]", "plan ×", "height ×", "agreement"),
-        rows,
-        (None, 3, 3, 3, 3, 2, 2, 2),
+        {name: WORTH(one) for name, one in run.worth.items()},
+        label="sensors",
     )
 
 

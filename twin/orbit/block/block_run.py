@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,12 +54,15 @@ class Worth:
         found: by their true or given places; None without check points.
         agreement: mean square of the errors over their sigmas, of the three coordinates: 1 where sigmas are right;
             None likewise.
+        plan, height: CE90 and LE90 by the covariances, over those with all sensors.
     """
 
     left_out: tuple[str, ...]
     predicted: Accuracy
     found: Accuracy | None
     agreement: float | None
+    plan: float = 1.0
+    height: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +245,7 @@ def _worth(
     cases |= {f"without {name.replace('_', ' ')}": (name,) for name in kept.sensors if name != "ties" or enough}
     if len(sensors) > 1:
         cases[NOTHING] = tuple(sensors)
-    rows = {}
+    rows: dict[str, Worth] = {}
     for k, (case, left_out) in enumerate(cases.items()):
         advance("sensors", k, len(cases))
         block = kept
@@ -251,7 +254,10 @@ def _worth(
         one = found
         if left_out:
             one = adjust_block(block, pool=pool)
-        rows[case] = _accuracy(left_out, one, known)
+        worth = _accuracy(left_out, one, known)
+        full = rows.get(ALL, worth).predicted
+        plan, height = worth.predicted.ce90 / full.ce90, worth.predicted.le90 / full.le90
+        rows[case] = replace(worth, plan=plan, height=height)
     advance("sensors", len(cases), len(cases))
     return FrozenMap(rows)
 
