@@ -33,7 +33,7 @@ LONGEST = (
     "test_wheel.py",
     "twin/test_monitor_derivative.py",
     "twin/test_orbit_calibration.py",
-    "validation/test_mutations_001.py",
+    "validation/test_formulas_001.py",
     "test_extension_points.py",
     "twin/test_study.py",
     "twin/test_camera_instrument.py",

@@ -16,8 +16,7 @@ from rich.table import Table
 
 from optics.numerics.backend import cores
 from tests.benchmarks.beside import compared, print_pairs, ratios, sources_of
-from tests.benchmarks.number import Speed, shown
-from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.workbench import Speed, Workbench, shown
 from twin.framework.cli import InputErrorText, explained, print_whole
 from twin.framework.durable import exit_on_terminate
 from twin.framework.provenance import Provenance

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from scenes.yaml.standard_output import BAD_INPUT
-from tests.benchmarks.number import shown
+from tests.benchmarks.workbench import shown
 from twin.framework.cli import InputErrorText, print_whole
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -33,8 +33,7 @@ from tests.analysis.drawn_blocks import (
     drawn_process,
     project,
 )
-from tests.benchmarks.number import Number, Speed
-from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.workbench import Number, Speed, Workbench
 
 TIES, QUICK_TIES = 1_000_000, 20_000
 """Of the largest of three sizes; the others have a quarter and a half."""

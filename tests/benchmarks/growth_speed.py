@@ -15,9 +15,7 @@ from optics.geometry.tree import Body, Motion, RigidTree
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
 from tests.benchmarks.monitor_speed import random_states
-from tests.benchmarks.number import Number, Speed
-from tests.benchmarks.stopwatch import Work, timed
-from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.workbench import Number, Speed, Work, Workbench, timed
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe, one_detector
 

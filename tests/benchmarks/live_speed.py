@@ -6,8 +6,7 @@ import time
 
 import numpy as np
 
-from tests.benchmarks.number import Number, Speed
-from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.workbench import Number, Speed, Workbench
 from tests.twin.live_client import connect, numbered, state
 from tests.twin.live_page import Command, running
 

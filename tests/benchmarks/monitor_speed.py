@@ -9,9 +9,7 @@ import numpy as np
 from analysis.arrays import ARCSEC
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
-from tests.benchmarks.number import Number, Speed
-from tests.benchmarks.stopwatch import Work, in_turns
-from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.workbench import Number, Speed, Work, Workbench, in_turns
 from twin.monitor.observation import Observing, StateReader, observe, one_detector
 from twin.sensors.poisson_numbers import poisson_numbers
 

@@ -14,9 +14,7 @@ import numpy as np
 
 from optics.numerics import quadrature
 from optics.waves.diffraction import Grid, image
-from tests.benchmarks.number import Number, Speed
-from tests.benchmarks.stopwatch import Work, in_turns
-from tests.benchmarks.workbench import Workbench, absent, installed
+from tests.benchmarks.workbench import Number, Speed, Work, Workbench, absent, in_turns, installed
 from tests.oracles.pupil_grid import FarPoint, fitted, poppy_wave, pupil_grid
 
 PUPIL, QUICK_PUPIL = 256, 64

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.specs.operation import read_operation
-from tests.benchmarks.number import Number, Speed
-from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.workbench import Number, Speed, Workbench
 from tests.twin.record_bench import A_DAY, START, given, made
 from twin.operate.estimate.operation_filter import Operation
 from twin.operate.record import FILE

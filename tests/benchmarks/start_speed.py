@@ -14,8 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.benchmarks.number import Number, Speed
-from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.workbench import Number, Speed, Workbench
 from twin.framework.console import PROGRAMS as ALL_PROGRAMS
 from twin.monitor.calibration_cache import VARIABLE
 

@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from tests.benchmarks.number import Number, Speed
-from tests.benchmarks.stopwatch import processor_s
-from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.workbench import Number, Speed, Workbench, processor_s
 from tests.twin.study_bench import write_study
 from twin.framework.cluster import local_workers
 from twin.study.runs.blocks import BLOCKS, Engine, journal_of

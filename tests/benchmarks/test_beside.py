@@ -1,15 +1,21 @@
-"""The tool that measures speed: it works, and two commits run in turns. Runs of both are drawn, not timed."""
+"""The tool that measures speed: it works, and two commits run in turns. Runs of both are drawn, not timed.
+
+What speed rests on and can be told without a clock: kernels compiled once.
+"""
 
 import json
 from importlib import import_module
 from pathlib import Path
 
+import drjit as dr
 import pytest
 from typer.testing import CliRunner
 
 from tests.benchmarks.__main__ import BENCHMARKS, app
 from tests.benchmarks.beside import ROOT, compared, numbers_of, ratios, sources_of
+from tests.benchmarks.monitor_speed import random_states
 from twin.framework.cli import InputErrorText
+from twin.monitor.truth import trace_truth
 
 OLD = Path("/old")
 
@@ -65,3 +71,24 @@ def test_every_benchmark_of_the_list_is_there() -> None:
     assert all(callable(import_module(f"tests.benchmarks.{name}_speed").measure) for name in BENCHMARKS)
     files = {file.name.removesuffix("_speed.py") for file in Path(__file__).parent.glob("*_speed.py")}
     assert files == set(BENCHMARKS)
+
+
+# --- kernels ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.second
+def test_other_numbers_compile_no_new_kernel(experiment, backend) -> None:
+    setup = experiment("gf7_pair")
+
+    def work(seed: int) -> None:
+        states = random_states(5, seed)
+        setup.path.expected_photons(states)
+        trace_truth(setup.instrument, backend, states)
+
+    work(1)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        work(2)
+        launched = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    assert len(launched) > 5
+    assert all(kernel["cache_hit"] for kernel in launched)

@@ -15,9 +15,7 @@ import numpy as np
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, field_direction
-from tests.benchmarks.number import Number, Speed
-from tests.benchmarks.stopwatch import Spent, Work, in_turns
-from tests.benchmarks.workbench import Workbench, absent, installed
+from tests.benchmarks.workbench import Number, Speed, Spent, Work, Workbench, absent, in_turns, installed
 from tests.oracles.peers import batoid_camera, batoid_rays, optiland_camera, optiland_rays
 
 CAMERAS = ("gf7", "gf7_conic")

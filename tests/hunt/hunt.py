@@ -18,8 +18,7 @@ from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.hunt.dense_images import DenseImages
-from tests.hunt.legal_instruments import legal_instrument
-from tests.hunt.legal_jobs import legal_job, legal_statement
+from tests.hunt.legal_jobs import legal_instrument, legal_job, legal_statement
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
 from twin.main_job.verdict import judge, readings

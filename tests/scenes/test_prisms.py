@@ -56,15 +56,22 @@ def send(backend, parts, position, direction, state=None):
     return run(backend, assembly, np.array(position), np.array(direction), state)
 
 
-def beam(middle, count: int = 12, radius: float = 0.5 * WIDTH) -> np.ndarray:
-    """Starting points over a beam's cross-section, in the plane z = -0.2 of the prism."""
+def beam(middle, count: int = 12, radius: float = 0.5 * WIDTH, rings: int = 1) -> np.ndarray:
+    """Starting points over a beam's cross-section, its middle first."""
     angle = 2.0 * np.pi * np.arange(count) / count
     ring = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=-1)
-    return np.array([middle[0], middle[1], -0.2]) + np.concatenate([np.zeros((1, 3)), radius * ring])
+    return middle + np.concatenate([np.zeros((1, 3)), *(radius * (k + 1) / rings * ring for k in range(rings))])
 
 
-def entry(hand: float = 1.0) -> tuple[float, float]:
-    return -0.5 * LENGTH, hand * reflectors.roof_offset(WIDTH)
+def plane_wave(start: np.ndarray, slant: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """A beam's starting points moved into one wavefront that comes at a slant, and its direction."""
+    into = np.array([*slant, 1.0]) / np.linalg.norm([*slant, 1.0])
+    return start - ((start - start[0]) @ into)[:, None] * into, into
+
+
+def entry(hand: float = 1.0) -> tuple[float, float, float]:
+    """Where the beam of the 180-deg prism begins."""
+    return -0.5 * LENGTH, hand * reflectors.roof_offset(WIDTH), -0.2
 
 
 def turned(vector, pivot: str = "apex") -> dict[str, Motion]:
@@ -88,9 +95,7 @@ def test_corner_cube(backend, hand, turn, slant) -> None:
         2 (A - P) . d + 2 z_A (n cos j - cos i).
     """
     made = parts_180(hand)
-    into = np.array([*slant, 1.0]) / np.linalg.norm([*slant, 1.0])
-    start = beam(entry(hand), radius=0.4 * WIDTH)
-    start = start - ((start - start[0]) @ into)[:, None] * into  # a plane wave
+    start, into = plane_wave(beam(entry(hand), radius=0.4 * WIDTH), slant)
     position, direction, path, valid = send(backend, made, start, np.broadcast_to(into, start.shape), turned(turn))
     assert valid.all()
     assert np.abs(direction + into).max() < 1e-14
@@ -129,7 +134,7 @@ def test_angle_errors(backend, prism, face, axis) -> None:
     """
     hand, s = (-1.0 if "other" in prism else 1.0), np.sqrt(0.5)
     if prism == "0":
-        make, middle, into = parts_0, (-0.5 * SHIFT, 0.0), UP
+        make, middle, into = parts_0, (-0.5 * SHIFT, 0.0, -0.2), UP
         normals = [s * np.array([-1.0, 0.0, 1.0])] * 2
     else:
         make, middle, into = partial(parts_180, hand), entry(hand), -UP
@@ -177,9 +182,7 @@ def test_rhomboid(backend, turn, slant) -> None:
     shift; the mirrors then move everything by shift (x - w), with w the entry's inward normal.
     """
     made = parts_0()
-    into = np.array([*slant, 1.0]) / np.linalg.norm([*slant, 1.0])
-    start = beam((-0.5 * SHIFT, 0.0), radius=0.4 * WIDTH)
-    start = start - ((start - start[0]) @ into)[:, None] * into
+    start, into = plane_wave(beam((-0.5 * SHIFT, 0.0, -0.2), radius=0.4 * WIDTH), slant)
     rays = np.broadcast_to(into, start.shape)
     position, direction, path, valid = send(backend, made, start, rays, turned(turn, "origin"))
     assert valid.all()
@@ -229,7 +232,7 @@ def test_bodies(hand, width) -> None:
     assert solid_mesh(small.solids[0], placed).mesh.volume == pytest.approx(box, rel=1e-9)
 
 
-ATTITUDES = [(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, 0.0, 10.0), (2000.0, -1500.0, 3000.0)]
+ATTITUDES = [(0.0, 0.0, 0.0), *TURNS[:4]]
 ERRORS = ((20e-6, -30e-6), (-10e-6, 5e-6), (15e-6, 25e-6))
 
 
@@ -246,12 +249,6 @@ def made(kind: str, hand: float = 1.0, errors=None):
     if kind == "periscope":
         return small(errors=errors), np.array([-0.5 * SHIFT, 0.0, -0.2])
     return hollow(hand=hand, errors=errors), np.array([-0.5 * LENGTH, hand * reflectors.hollow_offset(WIDTH), -0.2])
-
-
-def wide_beam(middle, radius: float = 0.5 * WIDTH, rings: int = 1) -> np.ndarray:
-    angle = 2.0 * np.pi * np.arange(24) / 24
-    ring = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=-1)
-    return middle + np.concatenate([np.zeros((1, 3)), *(radius * (k + 1) / rings * ring for k in range(rings))])
 
 
 def by_hand(parts, state, position, direction):
@@ -276,9 +273,7 @@ def test_light_goes_as_plain_mirrors_send_it(backend, kind, turn, slant) -> None
     """In any attitude; the direction is the entering one, or its opposite, whatever the attitude."""
     for hand in (1.0, -1.0):
         parts, middle = made(kind, hand)
-        into = np.array([*slant, 1.0]) / np.linalg.norm([*slant, 1.0])
-        start = wide_beam(middle)
-        start = start - ((start - start[0]) @ into)[:, None] * into
+        start, into = plane_wave(beam(middle, 24), slant)
         ways = np.broadcast_to(into, start.shape)
         state = {"frame": Motion(rotate=tuple(ARCSEC * np.array(turn)), pivot="apex")}
         place, way, path, valid = send(backend, parts, start, ways, state)
@@ -329,7 +324,7 @@ def test_plates_and_frame_leave_room_to_the_beam_and_to_each_other(kind, width, 
         for a, b in combinations(bodies, 2):
             assert separation(bodies[a], bodies[b]) > LEAST_GAP, (a, b)
         y = hand * reflectors.hollow_offset(width) if kind == "hollow_transfer" else 0.0
-        start = wide_beam(np.array([-0.5 * length, y, -1.0]), 0.5 * width, 4)
+        start = beam(np.array([-0.5 * length, y, -1.0]), 24, 0.5 * width, 4)
         places, way, _ = by_hand(parts, {}, start, np.broadcast_to(UP, start.shape))
         places = np.concatenate([places, places[-1:] + way])
         segments = np.stack([places[:-1], places[1:]], axis=1).transpose(2, 0, 1, 3)

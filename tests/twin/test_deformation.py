@@ -18,7 +18,7 @@ from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.errors import InputError
-from tests.scenes.test_temperature_tables import lattice, quadratic, write
+from tests.scenes.test_thermal_model import lattice, quadratic, write
 from twin.main_job.render_files import deformation_warnings
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import series_states
