@@ -328,8 +328,7 @@ def test_rates_that_residuals_show_are_assumed_with_their_uncertainty(monkeypatc
 # --- cameras that drift from field to field, with and without an on-board monitor -------------------------------------
 
 
-MONITORED_FILE = SCENES / ORBIT / "calibrate_monitor.yaml"
-MONITORED = CalibrationSetup.read(MONITORED_FILE)
+MONITORED = CalibrationSetup.read(SCENES / ORBIT / "calibrate_monitor.yaml")
 KEPT = ("Beijing", "Anhui", "Xinjiang")
 SEED = np.random.SeedSequence(3)
 
@@ -417,8 +416,7 @@ def test_a_constant_error_of_the_monitor_goes_into_the_interior() -> None:
 # --- passes adjusted on tie points before check points are intersected ------------------------------------------------
 
 
-STRIP_FILE = SCENES / ORBIT / "calibrate_strip.yaml"
-STRIP = CalibrationSetup.read(STRIP_FILE)
+STRIP = CalibrationSetup.read(SCENES / ORBIT / "calibrate_strip.yaml")
 
 
 def strip_with(slow: float) -> CalibrationSetup:
