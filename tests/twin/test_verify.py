@@ -195,9 +195,7 @@ def test_numbers_that_no_run_gave_are_found(study) -> None:
 
 
 def json_pair(tmp_path: Path, old: object, new: object):
-    for name, data in (("old.json", old), ("new.json", new)):
-        (tmp_path / name).write_text(json.dumps(data))
-    return file_state("numbers.json", tmp_path / "old.json", tmp_path / "new.json", False)
+    return pair(tmp_path, "json", *(json.dumps(data).encode() for data in (old, new)))
 
 
 @pytest.mark.parametrize("case", REFUSED["compared"])
@@ -213,9 +211,7 @@ def test_terms_are_held_against_the_terms_beside_them(tmp_path) -> None:
     assert json_pair(tmp_path, old, new).state == ROUNDED
     alone = [{"fields": [{"name": "a", "zernike_waves": {"7-foil 0 deg": value}}]} for value in (1e-12, 2e-12)]
     assert json_pair(tmp_path, *alone).state == DIFFERENT
-    for name, value in (("one", 1.0), ("two", 1.0 + 1e-8)):
-        (tmp_path / name).write_text(json.dumps({"a": value}))
-    states = [file_state("a.json", tmp_path / "one", tmp_path / "two", where).state for where in (False, True)]
+    states = [pair(tmp_path, "json", b'{"a": 1.0}', b'{"a": 1.00000001}', where).state for where in (False, True)]
     assert states == [DIFFERENT, ROUNDED]
 
 
