@@ -270,7 +270,7 @@ def test_entries_after_a_place_in_their_order(record: Path) -> None:
         assert [row["id"] for row in history.entries("temperature", after_us=at)] == [3, 7, 4, 8]
         with history.reading() as connection:
             plan = connection.exec_driver_sql(
-                "EXPLAIN QUERY PLAN_DIGEST SELECT * FROM entry WHERE time_us > 5 ORDER BY time_us, id"
+                "EXPLAIN QUERY PLAN SELECT * FROM entry WHERE time_us > 5 ORDER BY time_us, id"
             ).all()
         # without a table of its own to sort in, ten years are read from where they are wanted
         assert len(plan) == 1
