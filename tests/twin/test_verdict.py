@@ -318,9 +318,9 @@ def test_motions_far_from_what_is_stated_are_found_out(job) -> None:
         (warning,) = [text for text in told.warnings if "contradict" in text]
         assert run.reading.consistency is not None
         assert "contradict the prior launch: chi-square" in warning
-        assert f"where {run.consistency.limit:.1f} is exceeded with a chance of 0.001" in warning
-        assert f"motions of {run.consistency.suspects[0].body} would explain them best" in warning
-        assert run.consistency.suspects[0].body == body
+        assert f"where {run.reading.consistency.limit:.1f} is exceeded with a chance of 0.001" in warning
+        assert f"motions of {run.reading.consistency.suspects[0].body} would explain them best" in warning
+        assert run.reading.consistency.suspects[0].body == body
         times = float(re.search(r"with (\S+) times the standard deviations of the prior", warning)[1])
         # of a body one or two motions are measured, which tell its sigma within a factor of some
         assert 5.0 < times < 300.0
