@@ -114,7 +114,7 @@ SORTS = (COMPARISON_COLUMNS, SPOT_COLUMNS, MTF_COLUMNS, IMAGE_COLUMNS, *COLUMNS.
 SORTS = (*SORTS, COATING_COLUMNS)
 """Columns of the sorts of tables of measurements and nodes."""
 ORBIT_FILES = "docs/orbit_files.md"
-"""Its blocks are read by tests/twin/test_orbit_file_examples.py."""
+"""Its blocks are read by tests/twin/test_orbit_refusals.py."""
 
 
 def models_of(text: str) -> list[type[Any]]:

@@ -1,4 +1,6 @@
-"""One camera as designers look at it: wavefront, spot and MTF at fields, against other ways to the same numbers."""
+"""One camera as designers look at it: wavefront, spot, MTF, colours, against other ways to the same numbers."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,15 +8,20 @@ import pytest
 from optics.geometry.tree import Motion
 from optics.numerics.array_math import UnphysicalError
 from optics.raytrace.trace import BeamMissedError
+from optics.waves.optical_transfer import polychromatic_transfer
 from scenes.models.camera_model import field_direction
 from scenes.models.camera_sharpness import FieldBeams
+from scenes.specs.spectrum import SpectrumSpec
 from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error
+from tests.scenes.lens.colour_cameras import colour_camera
 from twin.camera import varied_beams
 from twin.camera.camera_optics import CameraOptics
+from twin.camera.colour import axial_colour, lateral_colour, spectral_mtfs
 from twin.camera.cut_wavefront import RAYS_ACCURACY
 from twin.camera.field_maps import through_focus
 from twin.camera.varied_beams import VariedBeams
 from twin.monitor.image_quality import image_quality
+from twin.targets import target_images
 
 FIELDS = [(0.0, 0.0), (1.0, 0.0), (0.3, -1.0)]
 
@@ -105,3 +112,92 @@ def test_fields_are_shares_of_the_half_field(gf7, gf7_alone) -> None:
         gf7_alone.wavefront((1.2, 0.0))
     with pytest.raises(ValueError, match="pairs"):
         gf7_alone.wavefronts([0.0, 1.0])  # type: ignore[list-item]
+
+
+# --- over all wavelengths of its light --------------------------------------------------------------------------------
+
+
+TWO_FIELDS = [(0.0, 0.0), (1.0, 1.0)]
+
+
+@pytest.fixture(scope="module")
+def achromat(backend) -> CameraOptics:
+    return CameraOptics.alone(colour_camera("achromat"), backend)
+
+
+@pytest.mark.second
+def test_a_camera_of_one_colour_is_that_of_its_wavelength(achromat, backend) -> None:
+    """The same file with another design wavelength, but for its stop and pupil."""
+    blue = 486.1327e-9
+    other = CameraOptics.alone(
+        colour_camera("achromat").model_copy(update={"wavelength": blue, "spectrum": None}), backend
+    )
+    for ours, theirs in zip(achromat.at(blue).wavefronts(TWO_FIELDS), other.wavefronts(TWO_FIELDS), strict=True):
+        assert ours.wavelength == blue
+        # the reference sphere's radius is that of the design's exit pupil: second order in the error
+        assert ours.rms == pytest.approx(theirs.rms, rel=1e-5)
+        np.testing.assert_allclose(ours.place, theirs.place, atol=1e-12)
+    assert achromat.at(achromat.wavelength).wavefront().rms == achromat.wavefront().rms
+    with pytest.raises(ValueError, match="outside the range"):
+        achromat.at(5e-6)
+
+
+@pytest.mark.second
+def test_lateral_colour_is_in_the_pupils(achromat) -> None:
+    """The phase of a line's transfer function is that of where its light falls, seen from the design's chief ray."""
+    lines, field, frequency = np.array([486.1327e-9, 656.2725e-9]), (1.0, 0.0), np.array([0.0, 100.0, 40e3])
+    moved = lateral_colour(achromat, [field], lines, achromat.wavelength)[0, :, 0]
+    (both,) = achromat.colour_pupils([field], lines)
+    design, values = achromat.spot(field), []
+    for k, (line, pupil) in enumerate(zip(lines, both, strict=True)):
+        own = polychromatic_transfer(pupil, frequency[:, None] * [1.0, 0.0], np.array([line]), np.ones(1), np.zeros(1))
+        values.append(own[0])
+        spot = achromat.at(float(line)).spot(field)
+        assert spot.place[0] - design.place[0] == pytest.approx(moved[k], abs=1e-13)
+        middle = np.angle(own[0, 1]) / (-2.0 * np.pi * frequency[1])
+        assert middle == pytest.approx(moved[k] + spot.centroid[0], abs=2e-9)
+    assert abs(moved[0] - moved[1]) > 1e-7
+    mtf = achromat.mtfs([field], frequency, lines, np.array([1.0, 3.0]))[0]
+    assert mtf.values[0, 2] == pytest.approx(abs(values[0][2] + 3.0 * values[1][2]) / 4.0, rel=1e-12)
+    assert mtf.weights.tolist() == [0.25, 0.75]
+
+
+@pytest.mark.second
+def test_rules_of_more_wavelengths_until_nothing_changes(achromat, monkeypatch) -> None:
+    light, frequency = SpectrumSpec.evenly(500e-9, 640e-9), np.array([0.0, 30e3, 70e3])
+    (mtf,) = spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
+    (fine,) = achromat.mtfs([(0.0, 0.0)], frequency, *light.rule(24))
+    assert 0.0 < mtf.error <= target_images.WORST_CHANGE
+    np.testing.assert_allclose(mtf.values, fine.values, atol=mtf.error)
+    monkeypatch.setattr(target_images, "LARGEST_RULE", 9)
+    monkeypatch.setattr(target_images, "WORST_CHANGE", 1e-9)
+    with pytest.raises(UnphysicalError, match="still changes by"):
+        spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
+
+
+def test_axial_colour_is_that_of_the_state(achromat, backend) -> None:
+    """Of a moved focal plane, and of a lens whose last face has moved: as of a file that says so."""
+    lines, middle, step = np.array([486.1327e-9, 656.2725e-9]), [(0.0, 0.0)], 20e-6
+    spec = achromat.model.spec
+    still = axial_colour(achromat, middle, lines)
+    away = replace(achromat, state={"camera/focal_plane": Motion(shift=(0.0, 0.0, step))})
+    moved = axial_colour(away, middle, lines) - still
+    np.testing.assert_allclose(np.abs(moved), step, rtol=1e-6)
+    last = list(spec.mirrors)[-1]
+    mirrors = {**spec.mirrors, last: spec.mirrors[last].model_copy(update={"z": spec.mirrors[last].z + step})}
+    written = CameraOptics.alone(spec.model_copy(update={"mirrors": mirrors}), backend)
+    bent = replace(achromat, state={f"camera/{last}": Motion(shift=(0.0, 0.0, step))})
+    found, wanted = axial_colour(bent, middle, lines) - still, axial_colour(written, middle, lines) - still
+    assert np.min(np.abs(wanted)) > 0.1 * step
+    np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-9)
+
+
+def test_no_colours_without_named_glass(achromat, backend) -> None:
+    lenses = {**achromat.model.spec.mirrors}
+    lenses["L1"] = lenses["L1"].model_copy(update={"glass": None, "index": 1.5168})
+    old = replace(achromat, path=CameraOptics.alone(
+        achromat.model.spec.model_copy(update={"mirrors": lenses, "spectrum": None}), backend).path)  # fmt: skip
+    with pytest.raises(ValueError, match="name its glass"):
+        old.at(500e-9)
+    with pytest.raises(ValueError, match="name its glass"):
+        axial_colour(old, [(0.0, 0.0)], np.array([500e-9]))

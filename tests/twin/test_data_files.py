@@ -1,15 +1,33 @@
-"""What a TIFF file of frames says of itself to any reader."""
+"""What files of frames, tables and grids say of themselves to any reader, and numbers of a run as JSON holds them."""
 
 import csv
 import io
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import tifffile
+import xarray as xr
 
-from twin.framework.data_files import WRITER, FrameFacts, csv_table, frame_files, tiff
+from optics.numerics.number_tree import FrozenMap
+from scenes.specs.study import UNITS
+from twin.framework.data_files import (
+    COUNTS,
+    SPELT,
+    WRITER,
+    FrameFacts,
+    GridData,
+    csv_table,
+    follow_cf,
+    frame_files,
+    netcdf,
+    tiff,
+)
+from twin.framework.record import plain_data
 
 FRAMES = np.arange(3 * 5 * 4, dtype=np.uint16).reshape(3, 5, 4)
 FACTS = FrameFacts("forward, left area CCD", 5.5e-6, 0.01, (0.0, 720.0, 1800.0), "perturbed")
@@ -58,3 +76,130 @@ def test_no_cell_of_a_table_is_a_formula() -> None:
     same = ["-5", "+1e-3", "-.5", "-inf", "M1 = M2", "-", "", "a@b"]
     rows = list(csv.reader(io.StringIO(csv_table([evil + same, [-5.0, None]]).decode())))
     assert rows == [[f"'{cell}" for cell in evil] + same, ["-5.0", ""]]
+
+
+# --- netCDF files follow CF 1.11 --------------------------------------------------------------------------------------
+
+
+UDUNITS = {
+    *("arcsec", "arcmin", "milliarcsec", "degree", "rad", "urad", "mrad", "pm", "nm", "um", "mm", "m", "km"),
+    *("us", "ms", "s", "K", "mK", "percent", "ppm", "mW", "W", "K/m", "m/s", "1/m", "1"),
+}
+"""Units of which UDUNITS 2.2 was asked (by cf_units 3): it knows them, and knows none of COUNTS."""
+
+
+def data_set() -> xr.Dataset:
+    variables = {
+        "shift": (("run", "axis"), np.array([[1.0, np.nan], [3.0, 4.0]]), {"units": "px", "long_name": "shift"}),
+        "error": ("run", np.array([0.1, 0.2]), {"units": "waves rms", "long_name": "error"}),
+        "angle": ("run", np.array([0.1, 0.2]), {"units": "mas", "long_name": "angle"}),
+        "share": ("run", np.array([1, 0], np.int8), {"units": "", "long_name": "share"}),
+        "why": ("run", np.array(["", "it was dark"], object), {"units": "", "long_name": "why"}),
+    }
+    coords = {"run": ("run", np.array([0.0, 1.0]), {"units": "s", "long_name": "time"})}
+    return xr.Dataset(variables, coords, {"title": "a test", "reference_frames": "none"})
+
+
+@pytest.mark.second
+def test_units_are_those_that_udunits_knows_and_the_numbers_stay() -> None:
+    given = data_set()
+    content = netcdf(given)
+    assert content == netcdf(given)  # no time of the day
+    with h5py.File(io.BytesIO(content)) as file:
+        told = {name: {k: v for k, v in file[name].attrs.items() if k in ("units", "counted_in")} for name in file}
+        assert told["shift"] == {"units": "1", "counted_in": "px"}
+        assert told["error"] == {"units": "1", "counted_in": "waves rms"}
+        assert told["angle"] == {"units": "milliarcsec"}
+        assert told["share"] == {"units": "1"}
+        assert told["why"] == {}
+        assert file.attrs["Conventions"] == "CF-1.11"
+        assert "_FillValue" not in file["run"].attrs
+        assert np.isnan(file["shift"].attrs["_FillValue"])
+    with xr.open_dataset(io.BytesIO(content), engine="h5netcdf", decode_timedelta=False) as read:
+        for name in given.variables:
+            np.testing.assert_array_equal(read[name].values, given[name].values)
+    assert given["shift"].attrs["units"] == "px"  # what a script holds keeps its units
+
+
+def test_without_xarray_the_file_is_the_same_to_the_byte() -> None:
+    """With coordinates of an axis, of an axis that has another name, of none, with texts, and in either precision."""
+    photons = (("state", "row"), np.array([[1.0, np.nan], [3.0, 4.0]]), {"units": "photons", "long_name": "photons"})
+    coords = {
+        "state": ("state", ["before", "after"], {"long_name": "when"}),
+        "y": ("row", np.array([0.0, 1e-5]), {"units": "m", "long_name": "place"}),
+        "wavelength": ((), 6.5e-7, {"units": "m", "long_name": "of the light"}),
+    }
+    mean = ("state", np.array([1.0, 3.5]), {"units": "deg", "long_name": "angle"})
+    single = ("row", np.array([0.1, np.nan], np.float32), {"units": "photons", "long_name": "of a course"})
+    data = GridData({"photons": photons, "mean": mean, "single": single}, coords, {"title": "a test", "pitch_m": 1e-5})
+    content = netcdf(data)
+    assert content == netcdf(data.to_xarray())
+    with pytest.raises(TypeError, match="n: neither real numbers nor texts: int64"):
+        netcdf(GridData({"n": ("x", np.arange(3), {})}, {}, {"title": "whole numbers"}))
+
+
+def test_every_unit_of_results_is_known_or_a_count() -> None:
+    for unit in {*UNITS.values(), *SPELT, *COUNTS}:
+        found = follow_cf(xr.Dataset({"a": ("x", np.zeros(2), {"units": unit})}))["a"].attrs
+        assert found["units"] in UDUNITS, unit
+        assert (found.get("counted_in") == unit) == (unit in COUNTS), unit
+
+
+# --- numbers as JSON, from dataclasses whose fields are the keys ------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Place:
+    x_um: float
+    y_um: float
+
+
+@dataclass(frozen=True)
+class Shift(Place):
+    sigma_um: np.ndarray
+    of: Mapping[str, Place]
+    rounds: tuple[Place, ...] = ()
+    why: str | None = None
+
+
+PLACES = FrozenMap({"b": Place(1.0, 2.0), "a": Place(3.0, 4.0)})
+SHIFT = Shift(1.5, -0.0, np.array([[0.1, 0.2]]), PLACES, (Place(5, 6),))
+
+
+def test_fields_are_keys_in_their_order_those_of_a_base_first() -> None:
+    assert json.dumps(plain_data(SHIFT)) == (
+        '{"x_um": 1.5, "y_um": -0.0, "sigma_um": [[0.1, 0.2]], '
+        '"of": {"b": {"x_um": 1.0, "y_um": 2.0}, "a": {"x_um": 3.0, "y_um": 4.0}}, '
+        '"rounds": [{"x_um": 5, "y_um": 6}], "why": null}'
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "plain"),
+    [
+        (np.float64(0.1), 0.1),
+        (np.float32(0.1), 0.10000000149011612),
+        (np.int64(3), 3),
+        (np.bool_(True), True),
+        (True, True),
+        (np.array(2.5), 2.5),
+        (np.array([True, False]), [True, False]),
+        ((), []),
+        ({}, {}),
+    ],
+)
+def test_numbers_keep_their_kind_and_all_digits(value, plain) -> None:
+    found = plain_data(value)
+    assert found == plain
+    assert type(found) is type(plain)
+
+
+def test_plain_data_stay_as_they_are() -> None:
+    once = plain_data(SHIFT)
+    assert plain_data(once) == once
+
+
+@pytest.mark.parametrize("value", [1j, {1: "one"}, {"a", "b"}, object(), Place, np.array([1j]), [b"bytes"]])
+def test_what_json_cannot_hold_is_refused(value) -> None:
+    with pytest.raises(TypeError):
+        plain_data(value)

@@ -218,18 +218,15 @@ def test_every_value_of_a_message_that_is_none_of_its_kind_is_refused_in_few_wor
     assert 0.8 * count < refused < count
 
 
-def test_a_page_that_says_nothing_sensible_is_sent_away(running):
+@pytest.mark.parametrize(
+    ("messages", "code"),
+    [(["nonsense"] * (BAD_MESSAGES + 5), 1008), (["x" * (LARGEST_MESSAGE + 1)], 1009), ([b"\x00\x01"], 1008)],
+    ids=["no sense", "too long", "binary"],
+)
+def test_a_page_that_says_nothing_sensible_is_sent_away(running, messages, code):
     port, _ = running
     with connect(port) as ws:
-        assert sent_away(ws, *["nonsense"] * (BAD_MESSAGES + 5)) == 1008
-    assert alive(port)
-
-
-@pytest.mark.parametrize(("message", "code"), [("x" * (LARGEST_MESSAGE + 1), 1009), (b"\x00\x01", 1008)])
-def test_long_and_binary_messages(running, message, code):
-    port, _ = running
-    with connect(port) as ws:
-        assert sent_away(ws, message) == code
+        assert sent_away(ws, *messages) == code
     assert alive(port)
 
 

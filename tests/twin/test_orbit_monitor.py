@@ -1,18 +1,35 @@
-"""From the on-board monitor to heights on the ground, end to end, and as a user runs it."""
+"""From the on-board monitor to heights on the ground, end to end and as a user runs it. The monitor in a loop: commands
+against a recursion of its own, and rendered courses against the exact trace.
+"""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.model_fit import unseen_modes
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, intersect_pair
 from optics.geometry.tree import Motion
+from scenes.models.disturbances import state_of
+from scenes.specs.course import CourseSpec
+from scenes.specs.orbit.monitor import CorrectionSpec, LoopImagesSpec, MotionSpec
 from scenes.specs.orbit.setup import MonitorSetup
+from scenes.specs.resolved import line_detector
 from twin.framework.procedure import silent
+from twin.framework.provenance import negative_verdicts
+from twin.monitor.image_quality import image_quality
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
+from twin.orbit.monitoring import closed_loop
+from twin.orbit.monitoring.closed_loop import FOCUS_FIELDS, Commands, Corrector, LoopCourse, LoopModel, defocus
+from twin.orbit.monitoring.loop_run import LoopRun
+from twin.orbit.monitoring.monitoring_numbers import CORRECTION, LOOP
+from twin.orbit.monitoring.monitoring_report import monitor_report
 from twin.orbit.monitoring.monitoring_run import run_monitor
 from twin.orbit.monitoring.pair_flight import rms
 
@@ -216,3 +233,222 @@ def test_smoothed_heights(stated) -> None:
         assert one.agrees
         assert one.consistency.agrees
         assert one.consistency.degrees % 8 == 0
+
+
+# --- the monitor in a loop --------------------------------------------------------------------------------------------
+
+
+def loop_of(*specs: dict) -> LoopModel:
+    """Loops without an instrument: mechanism k moves quantity k by 2 k + 1, and a little of the next one's."""
+    count = len(specs)
+    correctors = []
+    for k, given in enumerate(specs):
+        spec = CorrectionSpec(camera="one", quantity="d_alpha", mechanism="body rotate y", **given)
+        effect = np.zeros(count)
+        effect[(k + 1) % count] = 0.1
+        effect[k] = 2.0 * k + 1.0
+        correctors.append(Corrector(f"c{k}", spec, None, k, effect, np.zeros(2)))
+    nothing = Disturbances(
+        "none", (), (), (), np.zeros(0), (), np.zeros((2, 0)), np.zeros((count, 0)), np.zeros((0, 0)), ()
+    )
+    return LoopModel(None, nothing, tuple(correctors))  # type: ignore[arg-type]
+
+
+def commanded(model: LoopModel, course: np.ndarray) -> np.ndarray:
+    """(T, n) where mechanisms stand after each reading of a course (T, n)."""
+    commands, out = Commands.none(model, False), []
+    for row in course:
+        commands = commands.given(row)
+        out.append(commands.standing)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_commands_are_those_of_an_integrator_with_a_delay(delay: int) -> None:
+    course = np.random.default_rng(delay).standard_normal((30, 2)) * ARCSEC
+    specs = ({"gain": 0.4, "delay": delay}, {"gain": 0.2, "step": "0.3 arcsec"})
+    found = commanded(loop_of(*specs), course)
+    effect = np.array([[1.0, 0.1], [0.1, 3.0]])
+    first, second, stands = [0.0] * (delay + 1), 0.0, np.zeros(2)
+    for row, seen in zip(course, found, strict=True):
+        left = row + effect @ stands
+        first.append(first[-1] - 0.4 * left[0])
+        second -= 0.2 * left[1] / 3.0
+        step = 0.3 * ARCSEC
+        stands = np.array([first[-1 - delay], step * round(second / step)])
+        np.testing.assert_allclose(seen, stands, rtol=1e-12, atol=1e-18)
+
+
+def test_above_the_limit_commands_grow_until_the_range_ends() -> None:
+    course = np.full((60, 1), ARCSEC)
+    model = loop_of({"gain": 1.1, "delay": 1, "range": "3 arcsec"})
+    assert np.abs(commanded(model, course)).max() == pytest.approx(3.0 * ARCSEC)
+    commands = [Commands.none(model, False)]
+    for row in course:
+        commands.append(commands[-1].given(row))
+    assert any(one.held[0] for one in commands)
+
+
+def test_gain_nothing_dead_bands_and_the_open_loop_leave_mechanisms_alone() -> None:
+    course = np.random.default_rng(1).standard_normal((10, 2)) * ARCSEC
+    assert not commanded(loop_of({"gain": 0.0}, {"gain": 0.0}), course).any()
+    assert not commanded(loop_of({"gain": 0.5, "dead_band": "9 arcsec"}, {"gain": 0.0}), course).any()
+    commands = Commands.none(loop_of({"gain": 0.5}, {"gain": 0.5}), True)
+    assert not commands.given(course[0]).given(course[1]).standing.any()
+
+
+@pytest.fixture(scope="module")
+def loop_setup(tmp_path_factory) -> MonitorSetup:
+    return MonitorSetup.read(Path(__file__).with_name("orbit_loop.yaml"))
+
+
+@pytest.fixture(scope="module")
+def model(loop_setup: MonitorSetup, backend) -> LoopModel:
+    return closed_loop.loop_model(loop_setup, MonitorExperiment(loop_setup.resolved, backend))
+
+
+def course_of(loop_setup: MonitorSetup, model: LoopModel, still: bool = False, **changed: dict) -> LoopCourse:
+    """A rendered course, with other keys of some corrections."""
+    own = tuple(replace(one, spec=one.spec.model_copy(update=changed.get(one.name, {}))) for one in model.correctors)
+    loop = LoopModel(model.experiment, model.stated, own)
+    states = closed_loop.drifting_states(loop_setup.test, model.experiment, 3)
+    return closed_loop.gone_through(loop, loop_setup.test, states, closed_loop.reader(loop, loop_setup.test, 7), still)
+
+
+@pytest.fixture(scope="module")
+def left_alone(loop_setup: MonitorSetup, model: LoopModel) -> LoopCourse:
+    return course_of(loop_setup, model, still=True)
+
+
+@pytest.fixture(scope="module")
+def perfect(loop_setup: MonitorSetup, model: LoopModel) -> LoopCourse:
+    return course_of(loop_setup, model)
+
+
+@pytest.fixture(scope="module")
+def idle(loop_setup: MonitorSetup, backend) -> LoopRun:
+    """A whole run, with images, whose corrections all have gain 0."""
+    test = loop_setup.test
+    still = {name: one.model_copy(update={"gain": 0.0}) for name, one in test.loop.corrections.items()}
+    images = LoopImagesSpec.model_validate(
+        {"times": ["10 min"], "side": 200, "points": {"control": 0, "tie": 20, "reach": 10}}
+    )
+    readings = test.loop.readings.model_copy(update={"count": 2})
+    loop = test.loop.model_copy(update={"corrections": still, "images": images, "readings": readings})
+    sheets = {name: line_detector(one) for name, one in loop_setup.cameras.items()}
+    parts = {"test": test.model_copy(update={"mechanisms": loop}), "line_detectors": sheets}
+    return run_monitor(loop_setup.model_copy(update=parts), backend, 3)
+
+
+@pytest.mark.second
+def test_a_loop_near_its_limit_or_that_makes_anything_worse_leads_the_verdict(idle: LoopRun) -> None:
+    """Changes of cameras a fifth larger with the loop closed, and foci half of a percent, of which nobody speaks."""
+    told = monitor_report(idle)
+    assert not told.warnings
+    gains = {"tilt": 9.0, "roll": 1.03, "focus": 2.0}
+    loops = {name: replace(one, margins=replace(one.margins, gain=gains[name])) for name, one in idle.loops.items()}
+    near = monitor_report(replace(idle, margin=1.03, radius=0.99, loops=loops))
+    assert near.warnings[0].endswith("lower gains, that of roll first")
+    assert near.verdict.startswith("The loop is barely stable; with the loop closed")
+    assert near.warnings[0].startswith(
+        "the loop is barely stable: gains of 1.03 times the stated ones make it unstable"
+    )
+    assert negative_verdicts(LOOP(replace(idle, margin=1.03, radius=0.99))) == ["margins_hold"]
+    lost = monitor_report(replace(idle, margin=0.9, radius=1.1))
+    assert lost.verdict.startswith("The loop is unstable; ")
+    assert lost.warnings[0].startswith(
+        "the loops together are unstable: largest eigenvalue 1.1; gains below 0.900 times"
+    )
+    alone = CORRECTION["stable"].warning((idle, "tilt", replace(idle.loops["tilt"], loop_gain=3.0)))
+    assert alone.startswith("tilt is unstable by itself: its loop gain of 3 is not below 2, the limit of a delay of 0")
+    larger = np.ones(idle.open.truth.shape[1])
+    cameras = len(idle.model.cameras)
+    larger[: 4 * cameras], larger[4 * cameras :] = 1.2, 1.005
+    worse = replace(idle, closed=replace(idle.closed, truth=larger * idle.open.truth))
+    moved = np.sqrt(np.mean(idle.open.truth**2, axis=0)) > 1e-9
+    assert {name.partition(" ")[0] for name in worse.worse} >= {"angle", "d_alpha", "d_beta", "d_gamma"}
+    assert len(worse.worse) == 1 + moved[: 4 * cameras].sum()
+    for free, left in worse.worse.values():
+        assert left == pytest.approx(1.2 * free, rel=1e-12)
+    told = monitor_report(worse)
+    assert told.verdict.startswith("The loop makes angle, d_alpha of forward, ")
+    assert "the loop makes angle worse: its error, RMS over the moments, is 1.20 times" in told.warnings[0]
+    assert LOOP(worse)["made_worse"] == list(worse.worse)
+
+
+@pytest.mark.second
+def test_heights_of_rendered_line_images_are_those_of_the_cameras(idle: LoopRun) -> None:
+    """Orbit and attitude are exact here, so that what is left is the cameras, and the noise of matching."""
+    pair, passed = idle.open.images[0], idle.open
+    mean, sigma = pair.height
+    # the cameras alone move heights by metres; over the swath what they do differs by a few centimetres
+    by_cameras = float(passed.heights.camera[pair.moment])
+    assert abs(by_cameras) > 0.3
+    assert mean == pytest.approx(by_cameras, abs=0.1 + 5.0 * sigma)
+    assert np.all(pair.matching < 0.1)
+    assert pair.matching == pytest.approx(pair.sigma, rel=0.8)
+
+
+@pytest.mark.second
+def test_a_perfect_loop_leaves_the_sigma_of_the_posterior(model, left_alone, perfect) -> None:
+    rows = [one.row for one in model.correctors]
+    # nothing is left of what the posterior says but what mechanisms do to each other's quantities, and what it does not
+    # know is as without a loop
+    assert np.all(np.abs(perfect.expected[:, rows]) < 1e-2 * perfect.sigma[:, rows])
+    np.testing.assert_allclose(perfect.covariance, left_alone.covariance, rtol=1e-2, atol=1e-30)
+    # and by the exact trace of the states that the mechanisms have left, it is what the posterior was wrong by
+    for course in (left_alone, perfect):
+        truth = model.experiment.sight.truth(list(course.states))
+        quality = image_quality(
+            model.experiment.instrument, model.experiment.backend, list(course.states), FOCUS_FIELDS, obstruction=False
+        )
+        true = np.concatenate([truth.vector("forward"), truth.vector("backward"), defocus(quality).T], axis=1)
+        for k, one in enumerate(model.correctors):
+            if one.motion is None:
+                true[:, one.row] += course.positions[:, k]
+        ratio = (course.expected - true)[:, rows] / course.sigma[:, rows]
+        # 18 normal numbers: one in 10^5 is beyond 4.9
+        assert np.abs(ratio).max() < 4.9
+        if course is perfect:
+            assert np.all(np.abs(true[:, rows]) < 4.9 * course.sigma[:, rows])
+    tilt = model.row("forward", "d_alpha")
+    assert np.abs(left_alone.expected[:, tilt]).max() > 5.0 * left_alone.sigma[:, tilt].max()
+
+
+@pytest.mark.second
+def test_a_loop_takes_back_what_a_course_and_its_motions_do(loop_setup, model) -> None:
+    """Readings at the times of a course: a camera that jumps by 2 arcsec is turned back to what the posterior knows."""
+    course = CourseSpec.model_validate(
+        {"times": ["0 min", "10 min"], "temperature": {"base/forward": {"change": ["0 K", "0.1 K"]}}}
+    )
+    jump = MotionSpec.model_validate({"rotate": ["0 arcsec", "2 arcsec", "0 arcsec"], "begin": "5 min"})
+    loop = loop_setup.test.loop.model_copy(update={"readings": None})
+    test = loop_setup.test.model_copy(update={"course": course, "motion": {"base/forward": jump}, "mechanisms": loop})
+    own = loop_setup.model_copy(update={"test": test})
+    left, free = (course_of(own, model, still=still) for still in (False, True))
+    true, free_true = (model.experiment.sight.truth(list(one.states)).vector("forward")[:, 0] for one in (left, free))
+    assert free_true[1] - free_true[0] == pytest.approx(2.0 * ARCSEC, rel=0.05)
+    assert np.all(np.abs(true) < 4.9 * left.sigma[:, model.row("forward", "d_alpha")])
+
+
+@pytest.mark.second
+def test_a_mode_that_no_spot_shows_moves_heights_by_the_exact_trace(loop_setup, model, backend) -> None:
+    experiment = model.experiment
+    angle, first, second = np.zeros(10), np.zeros(10), np.zeros(10)
+    angle[[model.row("forward", "d_alpha"), model.row("backward", "d_alpha")]] = 1.0, -1.0
+    first[model.row("forward", "defocus")] = second[model.row("backward", "defocus")] = 1.0
+    modes = unseen_modes(model.stated, np.stack([angle, first, second]), np.array([ARCSEC, 1e-5, 1e-5]))
+    assert len(modes) == 3
+    components = experiment.stated.components
+    for mode in modes:
+        amounts = mode.motions * experiment.stated.sigma
+        state = state_of(amounts, components, experiment.thermal)
+        spots = experiment.path.mean_spots([{}, state])
+        moved = np.abs(spots[1] - spots[0]).max()
+        # a reading knows a spot to 1e-3 px; products of two small motions are left
+        assert moved < 5e-4
+        change = experiment.sight.truth([state])
+        angle_moved = float(change.vector("forward")[0, 0] - change.vector("backward")[0, 0])
+        foci = defocus(image_quality(experiment.instrument, backend, [{}, state], FOCUS_FIELDS, obstruction=False))
+        found = np.array([angle_moved, *(foci[:, 1] - foci[:, 0])])
+        np.testing.assert_allclose(found / [ARCSEC, 1e-5, 1e-5], mode.quantities / [ARCSEC, 1e-5, 1e-5], atol=2e-3)

@@ -1,13 +1,12 @@
-"""`python -m twin.verify`: whatever is done to a run folder is found, and a run made again is compared in every number.
-
-Run folders of other commands are in test_verify_kinds.py.
-"""
+"""`python -m twin.verify`: whatever is done to a run folder is found, and a run made again is compared by number."""
 
 import csv
 import io
 import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import tifffile
 import xarray as xr
 
 from scenes.yaml.errors import InputError
+from tests.golden.jobs import BY_NAME, ROOT, SET, UNSET, run
 from tests.twin.commands import invoke
 from tests.twin.study_bench import REFUSED, write_study
 from twin.compare.__main__ import app as compare_app
@@ -195,9 +195,7 @@ def test_numbers_that_no_run_gave_are_found(study) -> None:
 
 
 def json_pair(tmp_path: Path, old: object, new: object):
-    for name, data in (("old.json", old), ("new.json", new)):
-        (tmp_path / name).write_text(json.dumps(data))
-    return file_state("numbers.json", tmp_path / "old.json", tmp_path / "new.json", False)
+    return pair(tmp_path, "json", *(json.dumps(data).encode() for data in (old, new)))
 
 
 @pytest.mark.parametrize("case", REFUSED["compared"])
@@ -213,9 +211,7 @@ def test_terms_are_held_against_the_terms_beside_them(tmp_path) -> None:
     assert json_pair(tmp_path, old, new).state == ROUNDED
     alone = [{"fields": [{"name": "a", "zernike_waves": {"7-foil 0 deg": value}}]} for value in (1e-12, 2e-12)]
     assert json_pair(tmp_path, *alone).state == DIFFERENT
-    for name, value in (("one", 1.0), ("two", 1.0 + 1e-8)):
-        (tmp_path / name).write_text(json.dumps({"a": value}))
-    states = [file_state("a.json", tmp_path / "one", tmp_path / "two", where).state for where in (False, True)]
+    states = [pair(tmp_path, "json", b'{"a": 1.0}', b'{"a": 1.00000001}', where).state for where in (False, True)]
     assert states == [DIFFERENT, ROUNDED]
 
 
@@ -433,3 +429,61 @@ def test_runs_that_cannot_be_made_again_are_told(tmp_path) -> None:
         result = invoke(app, place)
         assert result.exit_code == 2, result.output
         assert said in " ".join(result.output.split()), result.output
+
+
+# --- run folders of several commands ----------------------------------------------------------------------------------
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("name", ["lab_turntable", "orbit_adjust", "study_gradient"])
+def test_a_changed_byte_is_found_and_the_run_comes_out_the_same(name, tmp_path) -> None:
+    """A byte in the middle of each file, one file after the other; then the run is made again."""
+    done = run(BY_NAME[name], tmp_path)
+    assert (done.out / MANIFEST).exists(), done.stderr
+    for path in [path for path in done.out.rglob("*") if path.is_file() and path.name != MANIFEST]:
+        kept = path.read_bytes()
+        content = bytearray(kept or b"x")
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+        assert path.relative_to(done.out).as_posix() in folder_state(done.out).changed
+        path.write_bytes(kept)
+    environment = {key: value for key, value in os.environ.items() if key not in UNSET} | SET
+    command = [sys.executable, "-m", "twin.verify", str(done.out), "--json"]
+    found = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stdout + found.stderr
+    told = json.loads(found.stdout)["made_again"]
+    assert (told["state"], told["other_program"], told["other_processor"]) == ("same", [], [])
+
+
+AUDITED = """
+import json, os, runpy, sys
+opened = []
+def hook(event, told):
+    if event == "open" and isinstance(told[0], (str, bytes)) and not told[2] & (os.O_WRONLY | os.O_RDWR):
+        opened.append(os.path.abspath(os.fsdecode(told[0])))
+sys.addaudithook(hook)
+sys.path.insert(0, os.getcwd())
+place, sys.argv = sys.argv[1], sys.argv[2:]
+try:
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+finally:
+    with open(place, "w") as file:
+        json.dump(opened, file)
+"""
+"""Runs a module and writes down which files were opened to be read."""
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("command", ["orbit check", "lab focus"])
+def test_every_file_that_was_read_is_an_input(command, tmp_path) -> None:
+    """Whatever a test opens of its measurements stands in the manifest; its own YAML is in config.yaml."""
+    program, test = command.split()
+    shutil.copytree(ROOT / "scenes" / program / "measured", tmp_path / "in")
+    words = [f"twin.{program}", test, tmp_path / f"in/{test}.yaml", "--out", tmp_path / "out", "--quiet"]
+    ran = [sys.executable, "-c", AUDITED, tmp_path / "opened.json", *words]
+    subprocess.run(list(map(str, ran)), cwd=ROOT, check=True)
+    opened = {Path(name) for name in json.loads((tmp_path / "opened.json").read_text())}
+    read = {str(path) for path in opened if tmp_path / "in" in path.parents and path.suffix != ".yaml"}
+    state = folder_state(tmp_path / "out")
+    assert read
+    assert read == set(state.manifest.inputs)
