@@ -820,6 +820,27 @@ def test_another_distribution(tmp_path: Path) -> None:
 
 
 @pytest.mark.second
+def test_the_command_of_the_page(tmp_path: Path) -> None:
+    """docs/extending.md, file by file: a command with its help, its run folder, and what it says of a wrong key."""
+    text = (PAGE.parent / "extending.md").read_text("utf-8")
+    path = install(tmp_path / "path", {"procedures": "lab level = levelling.entry:LEVEL"})
+    for name, content in re.findall(r"^`([\w/]+\.(?:py|yaml))`:\n```\w*\n(.*?)```", text, re.M | re.S):
+        (path / name).parent.mkdir(exist_ok=True)
+        (path / name).write_text(content, "utf-8")
+    done = run_with(path, "-m", "twin.lab", "level", path / "my_level.yaml", "--out", tmp_path / "run", "--seed", 4)
+    assert done.returncode == 0, done.stderr
+    level = read(tmp_path / "run", "level")
+    # the seed gives 25 readings, of 0.5 arcsec: a false alarm in 1e5 seeds
+    assert abs(level["tilt_arcsec"] - 3.0) < 0.45
+    assert 0.04 < level["tilt_arcsec_sigma"] < 0.2
+    assert "gf7 is tilted by" in done.stdout
+    assert "tilt [arcsec]" in page_text(tmp_path / "run")
+    (path / "my_level.yaml").write_text("name: x\ncamera: gf7\ntilts: 3 arcsec\n", "utf-8")
+    done = run_with(path, "-m", "twin.lab", "level", path / "my_level.yaml", "--out", tmp_path / "none")
+    assert (done.returncode, "tilts" in done.stderr, (tmp_path / "none").exists()) == (2, True, False)
+
+
+@pytest.mark.second
 def test_another_distribution_in_workers(tmp_path: Path) -> None:
     """Worker processes see its entries; a study does not go on with another version of it."""
     path, study, out = install(tmp_path / "path", INSTALLED), noisy_job(tmp_path), tmp_path / "run"
