@@ -9,7 +9,8 @@ from functools import cache, cached_property
 from importlib.metadata import EntryPoint, distribution, distributions
 from typing import Any, TypeVar
 
-PREFIX = "space_camera_twin."
+# not in one word: in a wheel that is what stands before the modules' names
+PREFIX = "space_camera_twin" + "."
 """Beginning of the names of the groups of entry points; the name of the table follows."""
 
 Value = TypeVar("Value")
