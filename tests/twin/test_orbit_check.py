@@ -38,7 +38,7 @@ def checked(files: tuple[Path, dict[str, Any]], *changes: tuple[tuple[str, ...],
         place = data
         for key in keys[:-1]:
             place = place.setdefault(key, {})
-        place[keys[-1]] = value
+        place[keys[-1]] = copy.deepcopy(value)
     spec = with_absolute_files(OrbitCheckSpec.model_validate(data), folder)
     setup = CheckSetup.model_construct(test=spec, camera=load_three_line_camera("th1"))
     return run_check(setup, None, 0)
