@@ -82,9 +82,11 @@ Kind = TypeVar("Kind", bound=type)
 def shows(*chosen: str) -> Callable[[Kind], Kind]:
     """Give a class a short ``__repr__``, which those that inherit from it have, too.
 
-    Args:
-        chosen: ``name``, or ``name [unit]`` for a value that is kept in SI units; a name may be a property, or lead to
-            one (``report.verdict``). All fields of a dataclass that its own repr would tell, where none is named.
+    Parameters
+    ----------
+    chosen : str
+        ``name``, or ``name [unit]`` for a value that is kept in SI units; a name may be a property, or lead to one
+        (``report.verdict``). All fields of a dataclass that its own repr would tell, where none is named.
     """
     parsed = [match for text in chosen if (match := _FIELD.fullmatch(text)) is not None]
     if len(parsed) != len(chosen):
@@ -109,9 +111,12 @@ def shows(*chosen: str) -> Callable[[Kind], Kind]:
 def summary(value: Any, unit: str = "") -> str:
     """One value in a few words; empty for nothing.
 
-    Args:
-        value: SI where a unit is given.
-        unit: in which it is told.
+    Parameters
+    ----------
+    value : Any
+        SI where a unit is given.
+    unit : str
+        In which it is told.
     """
     if value is None or (isinstance(value, tuple | list | Mapping | str) and not value):
         return ""
@@ -208,8 +213,10 @@ class OfStates:
     def at(self, states: slice) -> Self:
         """The result of some of the states.
 
-        Args:
-            states: which, along the first axis.
+        Parameters
+        ----------
+        states : slice
+            Which, along the first axis.
         """
         return type(self)(**{name: _at(getattr(self, name), states) for name in _names(self)})
 
@@ -217,8 +224,10 @@ class OfStates:
     def joined(cls, parts: Sequence[Self]) -> Self:
         """The result of several series of states, one after the other.
 
-        Args:
-            parts: at least one; a field is None in all of them or in none.
+        Parameters
+        ----------
+        parts : Sequence[Self]
+            At least one; a field is None in all of them or in none.
         """
         return cls(**{name: _joined([getattr(one, name) for one in parts]) for name in _names(cls)})
 

@@ -25,9 +25,12 @@ _NORMAL_SIZE = 1.4826
 def chance_beyond(chi_square: Any, degrees: Any) -> Any:
     """Probability of a larger chi-square.
 
-    Args:
-        chi_square: at least 0, a number or an array of any shape.
-        degrees: of freedom, likewise.
+    Parameters
+    ----------
+    chi_square : Any
+        At least 0, a number or an array of any shape.
+    degrees : Any
+        Of freedom, likewise.
     """
     return chdtrc(degrees, chi_square)
 
@@ -35,9 +38,12 @@ def chance_beyond(chi_square: Any, degrees: Any) -> Any:
 def limit_of(chance: Any, degrees: Any) -> Any:
     """Chi-square that is exceeded with a probability.
 
-    Args:
-        chance: above 0 and at most 1, a number or an array of any shape.
-        degrees: of freedom, likewise.
+    Parameters
+    ----------
+    chance : Any
+        Above 0 and at most 1, a number or an array of any shape.
+    degrees : Any
+        Of freedom, likewise.
     """
     return chdtri(degrees, chance)
 
@@ -45,9 +51,12 @@ def limit_of(chance: Any, degrees: Any) -> Any:
 def density(chi_square: Any, degrees: Any) -> Any:
     """Probability density.
 
-    Args:
-        chi_square: at least 0, a number or an array of any shape.
-        degrees: of freedom, likewise.
+    Parameters
+    ----------
+    chi_square : Any
+        At least 0, a number or an array of any shape.
+    degrees : Any
+        Of freedom, likewise.
     """
     half = 0.5 * np.asarray(degrees, dtype=np.float64)
     return np.exp(xlogy(half - 1.0, chi_square) - 0.5 * np.asarray(chi_square) - gammaln(half) - np.log(2.0) * half)
@@ -63,12 +72,18 @@ def gain(columns: np.ndarray, root: np.ndarray | None = None, cutoff: float = 1e
 
     The columns are scaled to length one, as their units may differ by many orders of magnitude.
 
-    Args:
-        columns: derivatives of the observations by the unknowns, (..., N, P).
-        root: Cholesky factor of the observations' covariance, (..., N, N); None where all are alike.
-        cutoff: share of the largest singular value below which a combination of unknowns is none.
+    Parameters
+    ----------
+    columns : np.ndarray
+        Derivatives of the observations by the unknowns, (..., N, P).
+    root : np.ndarray | None
+        Cholesky factor of the observations' covariance, (..., N, N); None where all are alike.
+    cutoff : float
+        Share of the largest singular value below which a combination of unknowns is none.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (..., P, N).
     """
     white: np.ndarray = columns
@@ -82,10 +97,14 @@ def gain(columns: np.ndarray, root: np.ndarray | None = None, cutoff: float = 1e
 def share_interval(met: int, count: int, confidence: float) -> tuple[float, float]:
     """Return the interval of Clopper and Pearson (Biometrika 26, 404 (1934)) of a share; 0 to 1 of none.
 
-    Args:
-        met: how many of the trials succeeded.
-        count: trials.
-        confidence: with which the interval holds the share, at least.
+    Parameters
+    ----------
+    met : int
+        How many of the trials succeeded.
+    count : int
+        trials.
+    confidence : float
+        With which the interval holds the share, at least.
     """
     if count == 0:
         return 0.0, 1.0
@@ -99,8 +118,10 @@ def share_interval(met: int, count: int, confidence: float) -> tuple[float, floa
 def robust_sigma(residuals: ArrayLike) -> float:
     """Return the standard deviation of normal residuals by the median of their sizes, of which half may be wrong.
 
-    Args:
-        residuals: about their middle, of any shape.
+    Parameters
+    ----------
+    residuals : ArrayLike
+        About their middle, of any shape.
     """
     return _NORMAL_SIZE * float(np.median(np.abs(np.asarray(residuals))))
 
@@ -108,8 +129,10 @@ def robust_sigma(residuals: ArrayLike) -> float:
 def robust_variance(squares: ArrayLike) -> float:
     """Return the variance of normal residuals in a plane, in each direction, by the median: half of them may be wrong.
 
-    Args:
-        squares: of their lengths, (n,).
+    Parameters
+    ----------
+    squares : ArrayLike
+        Of their lengths, (n,).
     """
     # median of chi-square with two degrees of freedom is 2 ln 2
     return float(np.median(np.asarray(squares)) / (2.0 * np.log(2.0)))
@@ -147,9 +170,12 @@ def measured_bias(modulus: ArrayLike, sigma_across: ArrayLike) -> Array:
     |m|. The mean of this one is right to 0.03 sigma from |m| = 3 sigma on, to 0.09 sigma from 0.6 sigma on, and too
     small below, by half a sigma where there is no signal. It falls from sigma sqrt(pi/2) at r = 0 on.
 
-    Args:
-        modulus: |m + noise|, any shape.
-        sigma_across: rms of the noise across m, of that shape, same unit.
+    Parameters
+    ----------
+    modulus : ArrayLike
+        |m + noise|, any shape.
+    sigma_across : ArrayLike
+        Rms of the noise across m, of that shape, same unit.
     """
     r, s = np.broadcast_arrays(np.asarray(modulus, dtype=np.float64), np.asarray(sigma_across, dtype=np.float64))
     root = np.sqrt(np.maximum(r - s, 0.0) * (r + s))
@@ -163,10 +189,14 @@ def rice_sigma(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLi
 
     Exact for equal noise along and across m, and in the limit of a large m, where only the noise along it counts.
 
-    Args:
-        modulus: |m|, any shape.
-        sigma_along: of the noise along m, of that shape.
-        sigma_across: across m, likewise.
+    Parameters
+    ----------
+    modulus : ArrayLike
+        |m|, any shape.
+    sigma_along : ArrayLike
+        Of the noise along m, of that shape.
+    sigma_across : ArrayLike
+        Across m, likewise.
     """
     m, along, across = np.broadcast_arrays(
         np.asarray(modulus, dtype=np.float64), np.asarray(sigma_along), np.asarray(sigma_across)
@@ -180,10 +210,14 @@ def rice_sigma(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLi
 def signal_modulus(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLike) -> Array:
     """Best guess of |m| from a measured |m + noise|: its square less the mean square of the noise, not below 0.
 
-    Args:
-        modulus: |m + noise|, any shape.
-        sigma_along: of the noise along m, of that shape.
-        sigma_across: across m, likewise.
+    Parameters
+    ----------
+    modulus : ArrayLike
+        |m + noise|, any shape.
+    sigma_along : ArrayLike
+        Of the noise along m, of that shape.
+    sigma_across : ArrayLike
+        Across m, likewise.
     """
     square = np.square(modulus) - np.square(sigma_along) - np.square(sigma_across)
     return np.sqrt(np.maximum(square, 0.0))

@@ -54,11 +54,15 @@ def __getattr__(name: str) -> Any:
 def json_schema(name: str) -> dict[str, Any]:
     """The JSON Schema of one sort of file.
 
-    Args:
-        name: one of MODELS.
+    Parameters
+    ----------
+    name : str
+        One of MODELS.
 
-    Raises:
-        KeyError: another name.
+    Raises
+    ------
+    KeyError
+        Another name.
     """
     schema = _models()[name].model_json_schema(schema_generator=WithUnits)
     for model in (schema, *schema.get("$defs", {}).values()):
@@ -95,8 +99,10 @@ def _describe(model: dict[str, Any]) -> None:
 def shipped_nodes() -> dict[str, Mapping[str, NodeInfo]]:
     """Instrument of the library -> node path -> what may be done to it.
 
-    Raises:
-        BackendUnavailable, LibraryMissing: instruments cannot be traced on this machine.
+    Raises
+    ------
+    BackendUnavailable, LibraryMissing
+        Instruments cannot be traced on this machine.
     """
     from optics.numerics.backend import load_backend
     from scenes.models.instrument_builder import build_instrument
@@ -114,9 +120,12 @@ def shipped_nodes() -> dict[str, Mapping[str, NodeInfo]]:
 def with_nodes(schema: dict[str, Any], instruments: Mapping[str, Mapping[str, NodeInfo]]) -> dict[str, Any]:
     """The schema of a job in which the nodes of known instruments, their pivots and what they allow are listed.
 
-    Args:
-        schema: of a job.
-        instruments: name -> node path -> what may be done to it. A job of another instrument may name any node.
+    Parameters
+    ----------
+    schema : dict[str, Any]
+        Of a job.
+    instruments : Mapping[str, Mapping[str, NodeInfo]]
+        Name -> node path -> what may be done to it. A job of another instrument may name any node.
     """
     named = {**schema["properties"]["instrument"], "examples": list(instruments)}
     rules = []
@@ -151,12 +160,17 @@ def _of_nodes(nodes: Mapping[str, NodeInfo]) -> dict[str, Any]:
 def write_schemas(folder: Path, instruments: Mapping[str, Mapping[str, NodeInfo]]) -> list[Path]:
     """Write all schemas as `<name>.schema.json` into a folder, which is made if need be, and return their paths.
 
-    Args:
-        folder: to write into.
-        instruments: those whose nodes the schema of jobs lists, as for ``with_nodes``.
+    Parameters
+    ----------
+    folder : Path
+        To write into.
+    instruments : Mapping[str, Mapping[str, NodeInfo]]
+        Those whose nodes the schema of jobs lists, as for ``with_nodes``.
 
-    Raises:
-        OSError: it cannot be written.
+    Raises
+    ------
+    OSError
+        It cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []

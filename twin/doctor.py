@@ -50,12 +50,17 @@ class Check:
 def run_probe(arguments: list[str], timeout_s: float = PROBE_TIMEOUT_S) -> dict[str, Any]:
     """Run Python with these arguments in a child process and return the JSON object on its last line of stdout.
 
-    Args:
-        arguments: what follows the interpreter, for instance ["-m", "twin.framework.doctor_probe", "kernel"].
-        timeout_s: the child is killed after this many seconds.
+    Parameters
+    ----------
+    arguments : list[str]
+        What follows the interpreter, for instance ["-m", "twin.framework.doctor_probe", "kernel"].
+    timeout_s : float
+        The child is killed after this many seconds.
 
-    Raises:
-        RuntimeError: it crashed, hung, failed, or answered no JSON; the message is fit to show to a user.
+    Raises
+    ------
+    RuntimeError
+        It crashed, hung, failed, or answered no JSON; the message is fit to show to a user.
     """
     root = str(Path(__file__).resolve().parent.parent)
     environment = dict(os.environ)
@@ -89,8 +94,10 @@ def run_probe(arguments: list[str], timeout_s: float = PROBE_TIMEOUT_S) -> dict[
 def examine(quick: bool = False) -> list[Check]:
     """All checks, in the order of the report.
 
-    Args:
-        quick: leave out what the twin can do without: the GPU and the second Mitsuba variant.
+    Parameters
+    ----------
+    quick : bool
+        Leave out what the twin can do without: the GPU and the second Mitsuba variant.
     """
     checks = [_python(), _system(), _libatomic(), _llvm()]
     checks.append(

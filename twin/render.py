@@ -111,8 +111,10 @@ def main(
 def print_nodes(job: Path, backend: str, as_json: bool) -> None:
     """Print what can be perturbed in the instrument of a job.
 
-    Raises:
-        typer.Exit: with the exit code of a failure, which has been told.
+    Raises
+    ------
+    typer.Exit
+        With the exit code of a failure, which has been told.
     """
     errors = Console(stderr=True)
     with cli.explained(errors):

@@ -26,11 +26,16 @@ _FLOOR = 1e-10
 class Process:
     """The unknowns of one law in one scope.
 
-    Attributes:
-        name: "PASS attitude walk" and so on.
-        support: of the law.
-        column: of its first unknown.
-        kind: what it corrects.
+    Attributes
+    ----------
+    name : str
+        "PASS attitude walk" and so on.
+    support : Support
+        Of the law.
+    column : int
+        Of its first unknown.
+    kind : str
+        What it corrects.
     """
 
     name: str
@@ -48,15 +53,24 @@ class Process:
 class Assembly:
     """A block in equations.
 
-    Attributes:
-        block: it is of.
-        reduction: its packets and priors.
-        processes: kind ("attitude", "station") and pass -> its laws.
-        every: all processes, each once.
-        changes: scene -> (4,) unknowns of its camera. units: scene -> (4,) their sizes, radians and metres.
-        datum: (0,) or (3,) unknowns of a common shift of the control points.
-        axes: pass -> (3, 3) mean body axes as columns, ITRS.
-        images: set of each scene within the reduction.
+    Attributes
+    ----------
+    block : Block
+        It is of.
+    reduction : Reduction
+        Its packets and priors.
+    processes : Mapping[tuple[str, str], tuple[Process, ...]]
+        Kind ("attitude", "station") and pass -> its laws.
+    every : tuple[Process, ...]
+        All processes, each once.
+    changes : Mapping[str, Indices]
+        Scene -> (4,) unknowns of its camera. units: scene -> (4,) their sizes, radians and metres.
+    datum : Indices
+        (0,) or (3,) unknowns of a common shift of the control points.
+    axes : Mapping[str, Array]
+        Pass -> (3, 3) mean body axes as columns, ITRS.
+    images : Mapping[str, int]
+        Set of each scene within the reduction.
     """
 
     block: Block
@@ -93,12 +107,17 @@ class Assembly:
 def assembled(block: Block, datum: bool = False) -> Assembly:
     """The equations of a block.
 
-    Args:
-        block: what is observed; its `check` has found nothing.
-        datum: whether a shift that all control points share is an unknown, known to `DATUM`.
+    Parameters
+    ----------
+    block : Block
+        What is observed; its `check` has found nothing.
+    datum : bool
+        Whether a shift that all control points share is an unknown, known to `DATUM`.
 
-    Raises:
-        BlockError: a block that cannot be used.
+    Raises
+    ------
+    BlockError
+        a block that cannot be used.
     """
     times = _times(block)
     every: list[Process] = []

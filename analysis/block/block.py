@@ -30,10 +30,14 @@ class Term:
 class Pass:
     """A pass of the satellite.
 
-    Attributes:
-        name: of the pass.
-        tracker: star tracker that gave its attitude.
-        middle: when rates and walks of its own are zero, seconds; None for the middle of its observations.
+    Attributes
+    ----------
+    name : str
+        Of the pass.
+    tracker : str
+        Star tracker that gave its attitude.
+    middle : float | None
+        When rates and walks of its own are zero, seconds; None for the middle of its observations.
     """
 
     name: str
@@ -45,11 +49,16 @@ class Pass:
 class Scene:
     """The image of one line camera in one pass.
 
-    Attributes:
-        name: of the scene.
-        of: name of its pass.
-        camera: of the block's cameras.
-        rays: image points with times; `point` counts the block's points.
+    Attributes
+    ----------
+    name : str
+        Of the scene.
+    of : str
+        Name of its pass.
+    camera : str
+        Of the block's cameras.
+    rays : Rays
+        Image points with times; `point` counts the block's points.
     """
 
     name: str
@@ -62,9 +71,12 @@ class Scene:
 class CameraKnowledge:
     """What is known of a camera's d_alpha, d_beta, d_gamma (radians) and d_f (metres) in all passes of the block.
 
-    Attributes:
-        mean: (T, 4), in the order of the block's passes.
-        covariance: (4 T, 4 T), pass by pass.
+    Attributes
+    ----------
+    mean : Array
+        (T, 4), in the order of the block's passes.
+    covariance : Array
+        (4 T, 4 T), pass by pass.
     """
 
     mean: Array
@@ -75,10 +87,14 @@ class CameraKnowledge:
 class CamerasKnowledge:
     """The same of all cameras together, of which one body may have moved several.
 
-    Attributes:
-        cameras: C names.
-        mean: (C, T, 4).
-        covariance: (4 T C, 4 T C), camera by camera and in each pass by pass.
+    Attributes
+    ----------
+    cameras : tuple[str, ...]
+        C names.
+    mean : Array
+        (C, T, 4).
+    covariance : Array
+        (4 T C, 4 T C), camera by camera and in each pass by pass.
     """
 
     cameras: tuple[str, ...]
@@ -96,11 +112,16 @@ class CamerasKnowledge:
 class Points:
     """Ground points.
 
-    Attributes:
-        ids: (m,) names.
-        start: (m, 3) given coordinates of control points, first guesses of the others, ITRS, metres.
-        role: (m,) "control", "tie" or "check". Check points are tie points that are compared afterwards.
-        covariance: (m, 3, 3) of control points, m^2.
+    Attributes
+    ----------
+    ids : NDArray[np.object_]
+        (m,) names.
+    start : Array
+        (m, 3) given coordinates of control points, first guesses of the others, ITRS, metres.
+    role : NDArray[np.object_]
+        (m,) "control", "tie" or "check". Check points are tie points that are compared afterwards.
+    covariance : Array
+        (m, 3, 3) of control points, m^2.
     """
 
     ids: NDArray[np.object_]
@@ -113,13 +134,20 @@ class Points:
 class Footprints:
     """Laser footprints of one pass.
 
-    Attributes:
-        of: name of the pass.
-        point: (n,) of the block's points that they hit.
-        time: (n,) seconds. station: (n, 3) readings, ITRS, metres. attitude: (n, 3, 3) body to ITRS.
-        aim: (n, 3) unit vectors of the beam in the body frame.
-        distance: (n,) metres.
-        sigma: of the range, metres, and of the pointing with the beam's width about each of two axes, radians.
+    Attributes
+    ----------
+    of : str
+        Name of the pass.
+    point : Indices
+        (n,) of the block's points that they hit.
+    time : Array
+        (n,) seconds. station: (n, 3) readings, ITRS, metres. attitude: (n, 3, 3) body to ITRS.
+    aim : Array
+        (n, 3) unit vectors of the beam in the body frame.
+    distance : Array
+        (n,) metres.
+    sigma : tuple[float, float]
+        Of the range, metres, and of the pointing with the beam's width about each of two axes, radians.
     """
 
     of: str
@@ -142,12 +170,18 @@ class Footprints:
 class Terrain:
     """A terrain model as weak control of heights.
 
-    Attributes:
-        point: (n,) of the block's points.
-        place: (n, 3) on the model's surface, ITRS, metres.
-        normal: (n, 3) unit normals of the surface there.
-        sigma: (n,) of a height, independent, metres.
-        common: standard deviation of an error that all heights have in common, metres.
+    Attributes
+    ----------
+    point : Indices
+        (n,) of the block's points.
+    place : Array
+        (n, 3) on the model's surface, ITRS, metres.
+    normal : Array
+        (n, 3) unit normals of the surface there.
+    sigma : Array
+        (n,) of a height, independent, metres.
+    common : float
+        Standard deviation of an error that all heights have in common, metres.
     """
 
     point: Indices
@@ -174,18 +208,30 @@ class TrackerAngle:
 class Block:
     """A block of scenes.
 
-    Attributes:
-        passes: in order of the cameras' knowledge.
-        scenes: of these passes.
-        cameras: name -> camera as calibrated, without a change.
-        known: name -> what is expected of its changes, without a monitor.
-        monitored: name -> the same after the monitor's readings, or of all cameras together; None for no monitor.
-        attitude: laws of its readings' errors. station: likewise along the axes of the pass.
-        image: unit of the rays' spread, metres.
-        points: on the ground.
-        footprints: of a laser altimeter.
-        terrain: heights; None for none.
-        angles: between star trackers.
+    Attributes
+    ----------
+    passes : tuple[Pass, ...]
+        In order of the cameras' knowledge.
+    scenes : tuple[Scene, ...]
+        Of these passes.
+    cameras : Mapping[str, LineModel]
+        Name -> camera as calibrated, without a change.
+    known : Mapping[str, CameraKnowledge]
+        Name -> what is expected of its changes, without a monitor.
+    monitored : Mapping[str, CameraKnowledge] | CamerasKnowledge | None
+        Name -> the same after the monitor's readings, or of all cameras together; None for no monitor.
+    attitude : tuple[Term, ...]
+        Laws of its readings' errors. station: likewise along the axes of the pass.
+    image : float
+        Unit of the rays' spread, metres.
+    points : Points
+        On the ground.
+    footprints : tuple[Footprints, ...]
+        Of a laser altimeter.
+    terrain : Terrain | None
+        Heights; None for none.
+    angles : tuple[TrackerAngle, ...]
+        Between star trackers.
     """
 
     passes: tuple[Pass, ...]
@@ -217,8 +263,10 @@ class Block:
     def without(self, sensor: str) -> Block:
         """The block without one of its sensors. Control points become check points, whose images stay.
 
-        Raises:
-            BlockError: no such sensor.
+        Raises
+        ------
+        BlockError
+            No such sensor.
         """
         if sensor not in SENSORS:
             raise BlockError(f"block: no sensor is called {sensor!r}; there are {', '.join(SENSORS)}")

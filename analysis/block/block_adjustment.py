@@ -46,8 +46,10 @@ _NAMED = 8
 def pruned(block: Block) -> Block:
     """The block without observations of points that they do not determine: fewer than three rows at a point.
 
-    Raises:
-        BlockError: nothing is left.
+    Raises
+    ------
+    BlockError
+        Nothing is left.
     """
     rows = np.zeros(len(block.points.ids), np.intp)
     for scene in block.scenes:
@@ -70,8 +72,10 @@ def pruned(block: Block) -> Block:
 def check_places(block: Block) -> None:
     """Whether every point lies about where its images look.
 
-    Raises:
-        BlockError: points that do not, by name.
+    Raises
+    ------
+    BlockError
+        Points that do not, by name.
     """
     wrong: list[str] = []
     control: list[bool] = []
@@ -113,16 +117,26 @@ _HUBER_ROUNDS = 4
 class BlockAdjustment:
     """Solution of a block.
 
-    Attributes:
-        assembly: the block in equations.
-        x: (P,) unknowns in units of their priors' sigmas. covariance: (P, P) of them, with the factors.
-        ground: (m, 3) points, ITRS, metres; NaN for those that nothing determines.
-        spread: (m, 3, 3) their covariance at known x.
-        weight: set -> (n,) robust weights. standard: set -> (n, d) standardised residuals.
-        groups: variance group -> test.
-        chi_square, degrees_of_freedom: of all observations and priors.
-        reduced: the equations at the solution.
-        iterations: Gauss-Newton steps in all.
+    Attributes
+    ----------
+    assembly : Assembly
+        The block in equations.
+    x : Array
+        (P,) unknowns in units of their priors' sigmas. covariance: (P, P) of them, with the factors.
+    ground : Array
+        (m, 3) points, ITRS, metres; NaN for those that nothing determines.
+    spread : Array
+        (m, 3, 3) their covariance at known x.
+    weight : tuple[Array, ...]
+        Set -> (n,) robust weights. standard: set -> (n, d) standardised residuals.
+    groups : Mapping[str, GroupTest]
+        Variance group -> test.
+    chi_square, degrees_of_freedom : float
+        Of all observations and priors.
+    reduced : Reduced
+        The equations at the solution.
+    iterations : int
+        Gauss-Newton steps in all.
     """
 
     assembly: Assembly
@@ -260,16 +274,24 @@ def adjust_block(
 ) -> BlockAdjustment:
     """Adjust a block.
 
-    Args:
-        block: what is observed, and what is known of it.
-        robust: "huber" takes weight from packets with large residuals; "reject" leaves out those that stand out from
-            the others so weighed, one good packet in 10 000, and with them points of which too little is left.
-        variance_components: estimate a factor on the variances of every group, or of those named.
-        datum: look for a shift that all control points have in common.
-        pool: processes that reduce the points; None for this one alone.
+    Parameters
+    ----------
+    block : Block
+        What is observed, and what is known of it.
+    robust : Literal['huber', 'reject'] | None
+        "huber" takes weight from packets with large residuals; "reject" leaves out those that stand out from the others
+        so weighed, one good packet in 10 000, and with them points of which too little is left.
+    variance_components : bool | Collection[str]
+        Estimate a factor on the variances of every group, or of those named.
+    datum : bool
+        Look for a shift that all control points have in common.
+    pool : Pool | None
+        Processes that reduce the points; None for this one alone.
 
-    Raises:
-        BlockError: input that cannot be used, points that are not what was photographed, no convergence.
+    Raises
+    ------
+    BlockError
+        Input that cannot be used, points that are not what was photographed, no convergence.
     """
     block.check()
     block = pruned(block)
@@ -445,10 +467,12 @@ _LEAST = 2.0
 class LawTest:
     """Neighbours in time of one law's errors, in all its scopes.
 
-    Attributes:
-        group: of the law. kind: as stated.
-        excess: sum of products of neighbours beyond its expectation, in standard deviations; positive where they are
-            alike.
+    Attributes
+    ----------
+    group : str
+        Of the law. kind: as stated.
+    excess : float
+        Sum of products of neighbours beyond its expectation, in standard deviations; positive where they are alike.
     """
 
     group: str

@@ -57,13 +57,20 @@ class BlockError(MeasurementError, ValueError):
 class Law:
     """One source of error of attitude or station.
 
-    Attributes:
-        group: its name, and that of its variance component.
-        kind: of process, see the module.
-        sigma: about or along three axes, radians or metres; of a rate per second, of a walk in a second.
-        interval: between the unknowns of `white`, `walk`, `slow` and `jitter`, seconds.
-        time: correlation time of `slow` and of the amplitudes of `jitter`, period of `orbital`, seconds.
-        frequency: of `jitter`, hertz.
+    Attributes
+    ----------
+    group : str
+        Its name, and that of its variance component.
+    kind : Kind
+        Of process, see the module.
+    sigma : tuple[float, float, float]
+        About or along three axes, radians or metres; of a rate per second, of a walk in a second.
+    interval : float
+        Between the unknowns of `white`, `walk`, `slow` and `jitter`, seconds.
+    time : float
+        Correlation time of `slow` and of the amplitudes of `jitter`, period of `orbital`, seconds.
+    frequency : float
+        Of `jitter`, hertz.
     """
 
     group: str
@@ -97,12 +104,17 @@ class Law:
 class Support:
     """The unknowns of one law in one scope: a pass, all passes of a star tracker, or the block.
 
-    Attributes:
-        law: which.
-        numbers: (k,) of the unknowns of one axis: multiples of the interval where there is one, else 0, 1; of jitter
-            twice the multiple for the cosine, and one more for the sine.
-        middle: time at which a rate vanishes, seconds.
-        precision: (k, k) sparse, of the unknowns of one axis.
+    Attributes
+    ----------
+    law : Law
+        which.
+    numbers : Indices
+        (k,) of the unknowns of one axis: multiples of the interval where there is one, else 0, 1; of jitter twice the
+        multiple for the cosine, and one more for the sine.
+    middle : float
+        Time at which a rate vanishes, seconds.
+    precision : sparse.csr_matrix
+        (k, k) sparse, of the unknowns of one axis.
     """
 
     law: Law
@@ -114,13 +126,19 @@ class Support:
     def of(cls, law: Law, times: Array, middle: float | None = None) -> Support:
         """The unknowns that observations meet.
 
-        Args:
-            law: of the process.
-            times: of the observations, (n,), seconds.
-            middle: where a rate and a walk are zero, seconds; None for the middle of the times.
+        Parameters
+        ----------
+        law : Law
+            Of the process.
+        times : Array
+            Of the observations, (n,), seconds.
+        middle : float | None
+            Where a rate and a walk are zero, seconds; None for the middle of the times.
 
-        Raises:
-            BlockError: numbers of the law that cannot be used, or no times.
+        Raises
+        ------
+        BlockError
+            Numbers of the law that cannot be used, or no times.
         """
         law.check()
         if not len(times):
@@ -207,10 +225,14 @@ def _chain(kept: Array, gained: Array) -> sparse.csr_matrix:
 class Part:
     """One law's share of a correction.
 
-    Attributes:
-        turns: whether it turns the body, radians; else it shifts the station along the axes of the pass, metres.
-        first: of its unknowns, three axes of each number.
-        support: of the law.
+    Attributes
+    ----------
+    turns : bool
+        Whether it turns the body, radians; else it shifts the station along the axes of the pass, metres.
+    first : int
+        Of its unknowns, three axes of each number.
+    support : Support
+        Of the law.
     """
 
     turns: bool
@@ -227,10 +249,14 @@ class Part:
 class Corrections:
     """Corrections at the times of n observations.
 
-    Attributes:
-        parts: of the laws; those that turn come first.
-        axes: (3, 3) axes of the pass (along, across, down) as columns, ITRS.
-        time: (n,) seconds.
+    Attributes
+    ----------
+    parts : tuple[Part, ...]
+        Of the laws; those that turn come first.
+    axes : Array
+        (3, 3) axes of the pass (along, across, down) as columns, ITRS.
+    time : Array
+        (n,) seconds.
     """
 
     parts: tuple[Part, ...]
@@ -279,9 +305,12 @@ class Corrections:
     def slopes(self, by_turn: Array, by_station: Array) -> Array:
         """(n, d, w) derivatives of d rows by the unknowns.
 
-        Args:
-            by_turn: derivatives by the rotation vector, (n, d, 3), 1/rad.
-            by_station: by the station, ITRS, (n, d, 3), 1/m.
+        Parameters
+        ----------
+        by_turn : Array
+            Derivatives by the rotation vector, (n, d, 3), 1/rad.
+        by_station : Array
+            By the station, ITRS, (n, d, 3), 1/m.
         """
         count, depth = by_turn.shape[:2]
         widths = [3 * blend.shape[1] for _, blend in self._blends]

@@ -36,11 +36,16 @@ _MOST = 12
 class Network:
     """How scenes hang together.
 
-    Attributes:
-        parts: scenes that points connect, the largest part first; scenes with no observation are in none.
-        controlled: of each part, whether a control point, or footprint, is seen in it.
-        alone: scenes that share no point with any other.
-        empty: scenes without image points.
+    Attributes
+    ----------
+    parts : tuple[tuple[str, ...], ...]
+        Scenes that points connect, the largest part first; scenes with no observation are in none.
+    controlled : tuple[bool, ...]
+        Of each part, whether a control point, or footprint, is seen in it.
+    alone : tuple[str, ...]
+        Scenes that share no point with any other.
+    empty : tuple[str, ...]
+        Scenes without image points.
     """
 
     parts: tuple[tuple[str, ...], ...]
@@ -92,10 +97,14 @@ def simplified(block: Block) -> Block:
 class Open:
     """A change that the observations tell less well than the priors.
 
-    Attributes:
-        names: unknowns that take part.
-        change: of each, for one sigma of what the observations allow, at most that of the prior; metres and radians.
-        told: sigma of the prior over that of the observations alone: 0 where they say nothing, below 1.
+    Attributes
+    ----------
+    names : tuple[str, ...]
+        Unknowns that take part.
+    change : tuple[float, ...]
+        Of each, for one sigma of what the observations allow, at most that of the prior; metres and radians.
+    told : float
+        Sigma of the prior over that of the observations alone: 0 where they say nothing, below 1.
     """
 
     names: tuple[str, ...]
@@ -154,10 +163,14 @@ def _sizes(block: Block, names: tuple[str, ...]) -> Array:
 class DatumTest:
     """A shift that all control points have in common, as the readings and the other sensors see it.
 
-    Attributes:
-        east, north, up: of the given coordinates against the rest of the block, metres.
-        sigma: of each.
-        chi_square: of the three, with three degrees of freedom where there is no such shift.
+    Attributes
+    ----------
+    east, north, up : float
+        Of the given coordinates against the rest of the block, metres.
+    sigma : tuple[float, float, float]
+        Of each.
+    chi_square : float
+        Of the three, with three degrees of freedom where there is no such shift.
     """
 
     east: float

@@ -61,10 +61,14 @@ class Packets(Protocol):
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
         """Misclosures (k, d), their derivatives by the columns (k, d, w) and by the points (k, d, 3), whitened.
 
-        Args:
-            which: packets, (k,).
-            x: all unknowns, (P,).
-            ground: points of these packets, (k, 3), ITRS, metres.
+        Parameters
+        ----------
+        which : Indices
+            Packets, (k,).
+        x : Array
+            All unknowns, (P,).
+        ground : Array
+            Points of these packets, (k, 3), ITRS, metres.
         """
 
     def taken(self, which: Indices, point: Indices) -> Packets:
@@ -75,15 +79,24 @@ class Packets(Protocol):
 class LineImage:
     """Image points of one line camera in one pass.
 
-    Attributes:
-        name: of the scene.
-        camera: as it is known, before its changes in this pass.
-        rays: image points with readings of station and attitude.
-        white: (n, 2, 2) whitens their misclosures.
-        corrections: of the readings.
-        change: (4,) unknowns of the camera's d_alpha, d_beta, d_gamma, d_f.
-        unit: (4,) size of each, radians and metres.
-        group: variance group.
+    Attributes
+    ----------
+    name : str
+        Of the scene.
+    camera : LineModel
+        As it is known, before its changes in this pass.
+    rays : Rays
+        Image points with readings of station and attitude.
+    white : Array
+        (n, 2, 2) whitens their misclosures.
+    corrections : Corrections
+        Of the readings.
+    change : Indices
+        (4,) unknowns of the camera's d_alpha, d_beta, d_gamma, d_f.
+    unit : Array
+        (4,) size of each, radians and metres.
+    group : str
+        Variance group.
     """
 
     name: str
@@ -110,10 +123,14 @@ class LineImage:
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
         """See `Packets`.
 
-        Args:
-            which: packets, (k,).
-            x: all unknowns, (P,).
-            ground: points of these packets, (k, 3), ITRS, metres.
+        Parameters
+        ----------
+        which : Indices
+            Packets, (k,).
+        x : Array
+            All unknowns, (P,).
+        ground : Array
+            Points of these packets, (k, 3), ITRS, metres.
         """
         rays, camera = self.rays, self.camera.drifted(self.unit * x[self.change])
         corrections = self.corrections.taken(which)
@@ -145,15 +162,24 @@ class LineImage:
 class Pointings:
     """Laser altimeter footprints: range, and where the beam points in the body frame.
 
-    Attributes:
-        name: of the pass.
-        point: (n,) footprints.
-        station: (n, 3) readings, ITRS, metres. attitude: (n, 3, 3) body to ITRS.
-        aim: (n, 3) unit vectors of the beam in the body frame.
-        distance: (n,) measured, metres.
-        corrections: of the readings.
-        sigma: of the range, metres, and of the pointing about each of two axes, radians, with the beam's width.
-        group: variance group.
+    Attributes
+    ----------
+    name : str
+        Of the pass.
+    point : Indices
+        (n,) footprints.
+    station : Array
+        (n, 3) readings, ITRS, metres. attitude: (n, 3, 3) body to ITRS.
+    aim : Array
+        (n, 3) unit vectors of the beam in the body frame.
+    distance : Array
+        (n,) measured, metres.
+    corrections : Corrections
+        Of the readings.
+    sigma : tuple[float, float]
+        Of the range, metres, and of the pointing about each of two axes, radians, with the beam's width.
+    group : str
+        Variance group.
     """
 
     name: str
@@ -175,10 +201,14 @@ class Pointings:
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
         """See `Packets`: range, then the beam's two components.
 
-        Args:
-            which: packets, (k,).
-            x: all unknowns, (P,).
-            ground: points of these packets, (k, 3), ITRS, metres.
+        Parameters
+        ----------
+        which : Indices
+            Packets, (k,).
+        x : Array
+            All unknowns, (P,).
+        ground : Array
+            Points of these packets, (k, 3), ITRS, metres.
         """
         corrections = self.corrections.taken(which)
         turn, shift = corrections.at(x)
@@ -225,13 +255,20 @@ class Pointings:
 class FixedPoints:
     """Given coordinates of control points, with a shift that they may have in common.
 
-    Attributes:
-        name: of the set.
-        point: (n,).
-        given: (n, 3) ITRS, metres.
-        white: (n, 3, 3) whitens their misclosures.
-        datum: (0,) or (3,) unknowns of what all given coordinates are too large by, along ITRS axes, metres.
-        group: variance group.
+    Attributes
+    ----------
+    name : str
+        Of the set.
+    point : Indices
+        (n,).
+    given : Array
+        (n, 3) ITRS, metres.
+    white : Array
+        (n, 3, 3) whitens their misclosures.
+    datum : Indices
+        (0,) or (3,) unknowns of what all given coordinates are too large by, along ITRS axes, metres.
+    group : str
+        Variance group.
     """
 
     name: str
@@ -250,10 +287,14 @@ class FixedPoints:
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
         """See `Packets`.
 
-        Args:
-            which: packets, (k,).
-            x: all unknowns, (P,).
-            ground: points of these packets, (k, 3), ITRS, metres.
+        Parameters
+        ----------
+        which : Indices
+            Packets, (k,).
+        x : Array
+            All unknowns, (P,).
+        ground : Array
+            Points of these packets, (k, 3), ITRS, metres.
         """
         white = self.white[which]
         shift = x[self.datum] if len(self.datum) else np.zeros(3)
@@ -269,14 +310,22 @@ class FixedPoints:
 class Heights:
     """Heights of a terrain model at points, with an error that the model has everywhere.
 
-    Attributes:
-        name: of the model.
-        point: (n,).
-        place: (n, 3) where the model's surface lies at the point's first place, ITRS, metres.
-        normal: (n, 3) of the surface there; unit vectors.
-        sigma: (n,) of a height, independent from point to point, metres.
-        common: (1,) unknown of the model's common error. unit: its size, metres.
-        group: variance group.
+    Attributes
+    ----------
+    name : str
+        Of the model.
+    point : Indices
+        (n,).
+    place : Array
+        (n, 3) where the model's surface lies at the point's first place, ITRS, metres.
+    normal : Array
+        (n, 3) of the surface there; unit vectors.
+    sigma : Array
+        (n,) of a height, independent from point to point, metres.
+    common : Indices
+        (1,) unknown of the model's common error. unit: its size, metres.
+    group : str
+        Variance group.
     """
 
     name: str
@@ -297,10 +346,14 @@ class Heights:
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
         """See `Packets`.
 
-        Args:
-            which: packets, (k,).
-            x: all unknowns, (P,).
-            ground: points of these packets, (k, 3), ITRS, metres.
+        Parameters
+        ----------
+        which : Indices
+            Packets, (k,).
+        x : Array
+            All unknowns, (P,).
+        ground : Array
+            Points of these packets, (k, 3), ITRS, metres.
         """
         normal, sigma = self.normal[which], self.sigma[which]
         above = np.sum(normal * (ground - self.place[which]), axis=1) - self.unit * float(x[self.common[0]])
@@ -327,11 +380,16 @@ _LOOSE = 1e-10
 class PriorGroup:
     """What is known beforehand of some unknowns: precision (k, k) sparse of x[columns] - mean.
 
-    Attributes:
-        group: variance group.
-        columns: (k,).
-        precision: (k, k).
-        mean: (k,).
+    Attributes
+    ----------
+    group : str
+        Variance group.
+    columns : Indices
+        (k,).
+    precision : sparse.csr_matrix
+        (k, k).
+    mean : Array
+        (k,).
     """
 
     group: str
@@ -344,11 +402,16 @@ class PriorGroup:
 class Bundle:
     """Points whose packets meet the same unknowns.
 
-    Attributes:
-        points: (n,).
-        members: set and its packets (n,), in order.
-        columns: (W,) unknowns of all packets of a point, each once.
-        places: of each member, where its unknowns stand among the columns.
+    Attributes
+    ----------
+    points : Indices
+        (n,).
+    members : tuple[tuple[int, Indices], ...]
+        Set and its packets (n,), in order.
+    columns : Indices
+        (W,) unknowns of all packets of a point, each once.
+    places : tuple[Indices, ...]
+        Of each member, where its unknowns stand among the columns.
     """
 
     points: Indices
@@ -371,11 +434,16 @@ class Rows:
 class Eliminated:
     """Equations of packets at one state, their points eliminated.
 
-    Attributes:
-        data: (P, P) sparse.
-        right: (P,) gradient of half the squares.
-        spread: (m, 3, 3) covariance of the points at known x. start: (m, 3) their steps where x stays.
-        square: weighted squares of the packets by group.
+    Attributes
+    ----------
+    data : sparse.csc_matrix
+        (P, P) sparse.
+    right : Array
+        (P,) gradient of half the squares.
+    spread : Array
+        (m, 3, 3) covariance of the points at known x. start: (m, 3) their steps where x stays.
+    square : Mapping[str, float]
+        Weighted squares of the packets by group.
     """
 
     data: sparse.csc_matrix
@@ -389,8 +457,10 @@ class Eliminated:
 class Reduced(Eliminated):
     """Equations of packets and priors: `right` has the priors, too.
 
-    Attributes:
-        prior: (P, P) sparse, with the factors.
+    Attributes
+    ----------
+    prior : sparse.csc_matrix
+        (P, P) sparse, with the factors.
     """
 
     prior: sparse.csc_matrix
@@ -400,11 +470,16 @@ class Reduced(Eliminated):
 class State:
     """Where an iteration stands.
 
-    Attributes:
-        x: unknowns, (P,).
-        ground: points, (m, 3), ITRS, metres.
-        weight: set -> robust weights of its packets.
-        factor: group -> variance factor.
+    Attributes
+    ----------
+    x : Array
+        Unknowns, (P,).
+    ground : Array
+        Points, (m, 3), ITRS, metres.
+    weight : tuple[Array, ...]
+        Set -> robust weights of its packets.
+    factor : Mapping[str, float]
+        Group -> variance factor.
     """
 
     x: Array
@@ -417,9 +492,12 @@ class State:
 class Checked:
     """Packets beside what all others say.
 
-    Attributes:
-        standard: set -> (n, d) standardised residuals.
-        taken: group -> what the adjustment took of its observations: their count less their redundancy.
+    Attributes
+    ----------
+    standard : tuple[Array, ...]
+        Set -> (n, d) standardised residuals.
+    taken : Mapping[str, float]
+        Group -> what the adjustment took of its observations: their count less their redundancy.
     """
 
     standard: tuple[Array, ...]
@@ -430,10 +508,14 @@ class Checked:
 class Reduction:
     """Packets and priors of a block.
 
-    Attributes:
-        sets: of packets.
-        priors: of the unknowns, which must leave none free.
-        size: P, number of unknowns. count: m, number of points.
+    Attributes
+    ----------
+    sets : Sequence[Packets]
+        Of packets.
+    priors : Sequence[PriorGroup]
+        Of the unknowns, which must leave none free.
+    size : int
+        P, number of unknowns. count: m, number of points.
     """
 
     sets: Sequence[Packets]
@@ -505,9 +587,12 @@ class Reduction:
     def rows(self, at: State, weighted: bool = True) -> Iterator[Rows]:
         """Rows of all bundles, in the order of `pieces`.
 
-        Args:
-            at: state.
-            weighted: whether rows are multiplied by the roots of their weights.
+        Parameters
+        ----------
+        at : State
+            state.
+        weighted : bool
+            Whether rows are multiplied by the roots of their weights.
         """
         for piece in self.pieces:
             wanted: dict[int, list[Indices]] = {}
@@ -606,10 +691,14 @@ class Reduction:
     def point_steps(self, at: State, found: Eliminated, step: Array) -> Array:
         """(m, 3) change of the points that goes with a change of the unknowns.
 
-        Args:
-            at: state.
-            found: equations of this state.
-            step: change of the unknowns, (P,).
+        Parameters
+        ----------
+        at : State
+            state.
+        found : Eliminated
+            Equations of this state.
+        step : Array
+            Change of the unknowns, (P,).
         """
         moved = found.start.copy()
         for rows in self.rows(at):
@@ -621,10 +710,14 @@ class Reduction:
     def checked(self, at: State, spread: Array, covariance: Callable[[Indices], Array]) -> Checked:
         """Residuals over their standard deviations, and what the adjustment took of the observations.
 
-        Args:
-            at: state.
-            spread: covariance of the points at known x, (m, 3, 3).
-            covariance: of some unknowns (w,): (w, w).
+        Parameters
+        ----------
+        at : State
+            state.
+        spread : Array
+            Covariance of the points at known x, (m, 3, 3).
+        covariance : Callable[[Indices], Array]
+            Of some unknowns (w,): (w, w).
         """
         sets = self.sets
         standard = [np.zeros((len(one.point), one.rows)) for one in sets]
@@ -746,13 +839,20 @@ class Pool(Protocol):
 class SharedReduction:
     """Packets of a block by shares of the points; see `Reduction`, whose methods these are.
 
-    Attributes:
-        whole: packets and priors of the block.
-        pool: where the shares are.
-        points: of each share, (m_k,).
-        packets: of each share, set -> packets.
-        held: what stands for each share.
-        columns: (w_k,) unknowns that each share meets.
+    Attributes
+    ----------
+    whole : Reduction
+        Packets and priors of the block.
+    pool : Pool
+        Where the shares are.
+    points : tuple[Indices, ...]
+        Of each share, (m_k,).
+    packets : tuple[tuple[Indices, ...], ...]
+        Of each share, set -> packets.
+    held : tuple[Any, ...]
+        What stands for each share.
+    columns : tuple[Indices, ...]
+        (w_k,) unknowns that each share meets.
     """
 
     whole: Reduction
@@ -800,10 +900,14 @@ class SharedReduction:
     def point_steps(self, at: State, found: Eliminated, step: Array) -> Array:
         """(m, 3) change of the points that goes with a change of the unknowns.
 
-        Args:
-            at: state.
-            found: equations of this state.
-            step: change of the unknowns, (P,).
+        Parameters
+        ----------
+        at : State
+            state.
+        found : Eliminated
+            Equations of this state.
+        step : Array
+            Change of the unknowns, (P,).
         """
         moved = np.zeros((self.whole.count, 3))
         arguments = [
@@ -817,10 +921,14 @@ class SharedReduction:
     def checked(self, at: State, spread: Array, covariance: Callable[[Indices], Array]) -> Checked:
         """Residuals over their standard deviations, and what the adjustment took of the observations.
 
-        Args:
-            at: state.
-            spread: covariance of the points at known x, (m, 3, 3).
-            covariance: of some unknowns (w,): (w, w).
+        Parameters
+        ----------
+        at : State
+            state.
+        spread : Array
+            Covariance of the points at known x, (m, 3, 3).
+        covariance : Callable[[Indices], Array]
+            Of some unknowns (w,): (w, w).
         """
         standard = [np.zeros((len(one.point), one.rows)) for one in self.whole.sets]
         taken = dict.fromkeys((one.group for one in self.whole.sets), 0.0)

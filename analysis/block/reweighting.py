@@ -42,10 +42,14 @@ a factor of ten.
 class GroupTest:
     """A variance group after the adjustment.
 
-    Attributes:
-        count: observations. redundancy: how many of them the others check.
-        square: their weighted squares, whose expectation is the redundancy.
-        factor: on the variances; 1 where not estimated.
+    Attributes
+    ----------
+    count : int
+        observations. redundancy: how many of them the others check.
+    square : float
+        Their weighted squares, whose expectation is the redundancy.
+    factor : float
+        On the variances; 1 where not estimated.
     """
 
     count: int
@@ -88,11 +92,16 @@ def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit:
     residual does not depend on the observation's own weight, which could otherwise swing for ever where others hardly
     check it. It is exact where the weights of the others stand for their variances.
 
-    Args:
-        residual: whitened, (n, d).
-        cofactors: covariance of the adjusted packets, whitened, (n, d, d).
-        weight: robust weights, (n,).
-        unit: variance factor of their group.
+    Parameters
+    ----------
+    residual : Array
+        Whitened, (n, d).
+    cofactors : Array
+        Covariance of the adjusted packets, whitened, (n, d, d).
+    weight : Array
+        Robust weights, (n,).
+    unit : float
+        Variance factor of their group.
     """
     values, axes = np.linalg.eigh(cofactors)
     along = np.einsum("nji,nj->ni", axes, residual)
@@ -150,13 +159,18 @@ def extrapolated(factors: Sequence[Mapping[str, float]]) -> dict[str, float]:
 class Rule:
     """How weights of packets and factors of groups follow from residuals.
 
-    Attributes:
-        packets: Huber's weights, IGG III, or "accept": 1 up to where IGG III ends and zero beyond; None leaves them.
-        factor: of the image points by the median of their residuals, or of groups by variance components; None leaves
-            them.
-        groups: whose components are estimated; None for all.
-        screening: rounds with Huber's weights that come first, in which no factor is estimated.
-        tolerance: largest change of a weight, or relative one of a factor, at rest.
+    Attributes
+    ----------
+    packets : Robust | Literal['accept'] | None
+        Huber's weights, IGG III, or "accept": 1 up to where IGG III ends and zero beyond; None leaves them.
+    factor : Literal['median', 'components'] | None
+        Of the image points by the median of their residuals, or of groups by variance components; None leaves them.
+    groups : Collection[str] | None
+        Whose components are estimated; None for all.
+    screening : int
+        Rounds with Huber's weights that come first, in which no factor is estimated.
+    tolerance : float
+        Largest change of a weight, or relative one of a factor, at rest.
     """
 
     packets: Robust | Literal["accept"] | None = None
@@ -193,18 +207,24 @@ class Reweighted(Protocol[S, T]):
     def weighed(self, at: S, weight: tuple[Array, ...], factor: Mapping[str, float]) -> S:
         """The state with other weights, and with none at points that too little is left of.
 
-        Args:
-            at: state.
-            weight: robust weights of each set of packets, (n,), 0 to 1.
-            factor: group -> factor on its variances.
+        Parameters
+        ----------
+        at : S
+            state.
+        weight : tuple[Array, ...]
+            Robust weights of each set of packets, (n,), 0 to 1.
+        factor : Mapping[str, float]
+            Group -> factor on its variances.
         """
 
 
 def settled(problem: Reweighted[S, T], at: S, rule: Rule) -> tuple[S, T]:
     """Solve until weights and factors rest.
 
-    Raises:
-        UnsettledError: they do not.
+    Raises
+    ------
+    UnsettledError
+        They do not.
     """
     factors: list[Mapping[str, float]] = []
     for turn in range(_ROUNDS):

@@ -69,11 +69,16 @@ class Rates:
     def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
         """(n, 2, size) derivatives of the misclosures.
 
-        Args:
-            field: the pass.
-            line: of the camera.
-            rays: n image points of it.
-            by: derivatives of their misclosures.
+        Parameters
+        ----------
+        field : calibration_parameters.CalibrationField
+            The pass.
+        line : str
+            Of the camera.
+        rays : Rays
+            n image points of it.
+        by : Partials
+            Derivatives of their misclosures.
         """
         found = np.zeros((len(rays.point), 2, self.size))
         if rays.time is not None and field.name in self.middles:
@@ -116,11 +121,16 @@ class Courses:
     def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
         """(n, 2, size) derivatives of the misclosures.
 
-        Args:
-            field: the pass.
-            line: of the camera.
-            rays: n image points of it.
-            by: derivatives of their misclosures.
+        Parameters
+        ----------
+        field : calibration_parameters.CalibrationField
+            The pass.
+        line : str
+            Of the camera.
+        rays : Rays
+            n image points of it.
+        by : Partials
+            Derivatives of their misclosures.
         """
         found = np.zeros((len(rays.point), 2, self.size))
         if (field.name, line) in self.waves and rays.time is not None:
@@ -148,11 +158,16 @@ class Steps:
     def columns(self, field: calibration_parameters.CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
         """(n, 2, size) derivatives of the misclosures: an image point displaced by 1 m has one that is 1 m larger.
 
-        Args:
-            field: the pass.
-            line: of the camera.
-            rays: n image points of it.
-            by: derivatives of their misclosures.
+        Parameters
+        ----------
+        field : calibration_parameters.CalibrationField
+            The pass.
+        line : str
+            Of the camera.
+        rays : Rays
+            n image points of it.
+        by : Partials
+            Derivatives of their misclosures.
         """
         found = np.zeros((len(rays.point), 2, self.size))
         for k, (name, place) in enumerate(self.places):
@@ -169,10 +184,14 @@ HiddenTerms = Rates | Courses | Steps
 class Unseen:
     """What the residuals say of terms that are left out.
 
-    Attributes:
-        terms: which, G of them.
-        score: (G,) gradient. cofactor: (G, G) its covariance, S.
-        moved: (P, G) by how much the estimates are wrong for a term of one unit.
+    Attributes
+    ----------
+    terms : HiddenTerms
+        Which, G of them.
+    score : Array
+        (G,) gradient. cofactor: (G, G) its covariance, S.
+    moved : Array
+        (P, G) by how much the estimates are wrong for a term of one unit.
     """
 
     terms: HiddenTerms
@@ -184,10 +203,14 @@ class Unseen:
     def of(cls, terms: HiddenTerms, wide: Equations, covariance: Array) -> Unseen:
         """Read equations that contain the terms, at a solution.
 
-        Args:
-            terms: G of them.
-            wide: equations of P unknowns and the G terms, which are zero.
-            covariance: of the P unknowns, (P, P), SI.
+        Parameters
+        ----------
+        terms : HiddenTerms
+            G of them.
+        wide : Equations
+            Equations of P unknowns and the G terms, which are zero.
+        covariance : Array
+            Of the P unknowns, (P, P), SI.
         """
         count = len(covariance)
         moved = covariance @ wide.reduced[:count, count:]
@@ -273,10 +296,14 @@ def single_ray(
 ) -> dict[str, float]:
     """Source -> standard deviation of one image point in x or y, metres, median of all: each source of noise alone.
 
-    Args:
-        fields: their rays.
-        cameras: line -> camera at the start values.
-        noise: of image, attitude and station.
+    Parameters
+    ----------
+    fields : Sequence[calibration_parameters.CalibrationField]
+        Their rays.
+    cameras : Mapping[str, LineModel]
+        Line -> camera at the start values.
+    noise : calibration_parameters.Noise
+        Of image, attitude and station.
     """
     alone = {"image": replace(noise, attitude=0.0, station=0.0, slow_attitude=0.0)}
     tiny = 1e-6 * noise.image
@@ -302,14 +329,19 @@ def check_places(
 ) -> None:
     """Do control points lie where their image points look, by the start values?
 
-    Args:
-        fields: with their control points.
-        cameras: line -> camera at the start values.
-        start: name -> sigma of a start value, metres or radians; None where nothing is said.
+    Parameters
+    ----------
+    fields : Sequence[calibration_parameters.CalibrationField]
+        With their control points.
+    cameras : Mapping[str, LineModel]
+        Line -> camera at the start values.
+    start : Mapping[str, float] | None
+        Name -> sigma of a start value, metres or radians; None where nothing is said.
 
-    Raises:
-        FarPointsError: half of a field's control points lie farther off than `FARTHEST`, and than 20 sigmas of the
-            start values.
+    Raises
+    ------
+    FarPointsError
+        Half of a field's control points lie farther off than `FARTHEST`, and than 20 sigmas of the start values.
     """
     for one in fields:
         far, expected = [], []
@@ -343,23 +375,36 @@ def _mean_square(covariance: Array) -> Array:
 class Adjustment:
     """Solution of a calibration.
 
-    Attributes:
-        names: of the unknowns. values: (P,) metres and radians. covariance: (P, P) from the sigmas as given times
-            `factors`, and of the start values where these close what is open. Held unknowns count as exact: zero rows.
-        gauge: what was fixed. open: combinations that the gauge closed. weak: combinations of low strength that were
-            solved for all the same.
-        from_start: (P,) share of each variance that comes from the start values and not from the points, 0 to 1.
-        follow: (P, H) change of the values with the start values of the H held unknowns.
-        cameras: with the adjusted interior, in the reference state.
-        ground: field -> (m, 3) adjusted points; NaN for those that robust weights gave up. ground_covariance:
-            field -> (m, 3, 3), likewise.
-        residual: field -> line -> (n, 2) standardised residuals of image points. weight: field -> line -> (n,) robust.
-        chi_square, degrees_of_freedom: weighted, points left out do not count.
-        factors: variance group -> estimated factor (1 where not estimated). redundancy: of each group. Noise that image
-            points share is a group of its own.
-        iterations: Gauss-Newton steps in all.
-        fields: that were adjusted.
-        unseen: what the residuals say of terms that are left out.
+    Attributes
+    ----------
+    names : tuple[str, ...]
+        Of the unknowns. values: (P,) metres and radians. covariance: (P, P) from the sigmas as given times `factors`,
+        and of the start values where these close what is open. Held unknowns count as exact: zero rows.
+    gauge : calibration_parameters.Gauge
+        What was fixed. open: combinations that the gauge closed. weak: combinations of low strength that were solved
+        for all the same.
+    from_start : Array
+        (P,) share of each variance that comes from the start values and not from the points, 0 to 1.
+    follow : Array
+        (P, H) change of the values with the start values of the H held unknowns.
+    cameras : Mapping[str, LineModel]
+        With the adjusted interior, in the reference state.
+    ground : Mapping[str, Array]
+        Field -> (m, 3) adjusted points; NaN for those that robust weights gave up. ground_covariance: field -> (m, 3,
+        3), likewise.
+    residual : Mapping[str, Mapping[str, Array]]
+        Field -> line -> (n, 2) standardised residuals of image points. weight: field -> line -> (n,) robust.
+    chi_square, degrees_of_freedom : float
+        Weighted, points left out do not count.
+    factors : Mapping[str, float]
+        Variance group -> estimated factor (1 where not estimated). redundancy: of each group. Noise that image points
+        share is a group of its own.
+    iterations : int
+        Gauss-Newton steps in all.
+    fields : Sequence[calibration_parameters.CalibrationField]
+        That were adjusted.
+    unseen : Callable[[HiddenTerms], Unseen]
+        What the residuals say of terms that are left out.
     """
 
     names: tuple[str, ...]
@@ -459,28 +504,43 @@ def adjust(
 ) -> Adjustment:
     """Adjust everything at once.
 
-    Args:
-        fields: passes over fields of points.
-        cameras: line -> mounting, distortion and start values of the interior.
-        noise: of image, attitude and station.
-        unknowns: what is solved for beside the interior and one bias for each field.
-        start: values by name where not the cameras' interior and zero.
-        priors: pseudo-observations, for example of an on-board monitor of the cameras.
-        gauge: how open combinations are closed.
-        robust: "huber" takes weight from image points with large residuals, "igg" leaves the worst out, and with them
-            points without coordinates that fewer than two rays are left of.
-        variance_components: estimate a factor on the variances of "image", "control", each group of priors and, where
-            image points share them, "attitude", "slow attitude" and "station", within a hundredth and a hundred. With
-            robust weights they come from image points within the limit of "igg", all of full weight, which are found
-            with the noise of the image by the median of its residuals; the robust weights then use these factors. Names
-            of groups: of these alone.
-        iterations: most Gauss-Newton steps of one round.
+    Parameters
+    ----------
+    fields : Sequence[calibration_parameters.CalibrationField]
+        Passes over fields of points.
+    cameras : Mapping[str, LineModel]
+        Line -> mounting, distortion and start values of the interior.
+    noise : calibration_parameters.Noise
+        Of image, attitude and station.
+    unknowns : calibration_parameters.Unknowns | None
+        What is solved for beside the interior and one bias for each field.
+    start : Mapping[str, float] | None
+        Values by name where not the cameras' interior and zero.
+    priors : Sequence[calibration_parameters.Prior]
+        Pseudo-observations, for example of an on-board monitor of the cameras.
+    gauge : calibration_parameters.Gauge | None
+        How open combinations are closed.
+    robust : reweighting.Robust | None
+        "huber" takes weight from image points with large residuals, "igg" leaves the worst out, and with them points
+        without coordinates that fewer than two rays are left of.
+    variance_components : bool | Collection[str]
+        Estimate a factor on the variances of "image", "control", each group of priors and, where image points share
+        them, "attitude", "slow attitude" and "station", within a hundredth and a hundred. With robust weights they come
+        from image points within the limit of "igg", all of full weight, which are found with the noise of the image by
+        the median of its residuals; the robust weights then use these factors. Names of groups: of these alone.
+    iterations : int
+        Most Gauss-Newton steps of one round.
 
-    Raises:
-        RankError: open combinations that nothing closes.
-        NoiseError: a single image point is more uncertain than all that start values leave open.
-        FarPointsError: points that are not what was photographed, or that contradict each other.
-        CalibrationError: other input that cannot be used, fewer observations than unknowns, no convergence.
+    Raises
+    ------
+    RankError
+        Open combinations that nothing closes.
+    NoiseError
+        a single image point is more uncertain than all that start values leave open.
+    FarPointsError
+        Points that are not what was photographed, or that contradict each other.
+    CalibrationError
+        Other input that cannot be used, fewer observations than unknowns, no convergence.
     """
     noise.check()
     if robust not in (None, "huber", "igg"):

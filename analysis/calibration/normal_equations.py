@@ -47,12 +47,18 @@ from analysis.orbit.three_line_model import LineModel, Partials, Rays, misclosur
 class SharedNoise:
     """The laws of all fields, and how the rays meet their unknowns.
 
-    Attributes:
-        parts: field -> its laws. Station and offsets of it are along the axes of the ITRS.
-        met: (field, line) -> the corrections of its rays; lines without times have none.
-        spans: first and last + 1 unknown of each field.
-        groups: variance group -> its unknowns.
-        precision: (K, K) sparse, of all unknowns.
+    Attributes
+    ----------
+    parts : Mapping[str, tuple[Part, ...]]
+        Field -> its laws. Station and offsets of it are along the axes of the ITRS.
+    met : Mapping[tuple[str, str], Corrections]
+        (field, line) -> the corrections of its rays; lines without times have none.
+    spans : tuple[tuple[int, int], ...]
+        First and last + 1 unknown of each field.
+    groups : Mapping[str, NDArray[np.intp]]
+        Variance group -> its unknowns.
+    precision : sparse.csr_matrix
+        (K, K) sparse, of all unknowns.
     """
 
     parts: Mapping[str, tuple[Part, ...]]
@@ -93,21 +99,30 @@ class SharedNoise:
     def corrected(self, name: str, line: str, rays: Rays, shared: Array) -> Rays:
         """Rays of a line of a field with the corrections (K,) applied.
 
-        Args:
-            name: of the field.
-            line: of the camera.
-            rays: of that line.
-            shared: corrections of the noise that points share, (K,).
+        Parameters
+        ----------
+        name : str
+            Of the field.
+        line : str
+            Of the camera.
+        rays : Rays
+            Of that line.
+        shared : Array
+            Corrections of the noise that points share, (K,).
         """
         return _moved(rays, self.met.get((name, line)), shared)
 
     def corrected_at(self, name: str, rays: Rays, shared: Array) -> Rays:
         """Other rays of a field, with times.
 
-        Args:
-            name: of the field.
-            rays: with times.
-            shared: corrections of the noise that points share, (K,).
+        Parameters
+        ----------
+        name : str
+            Of the field.
+        rays : Rays
+            With times.
+        shared : Array
+            Corrections of the noise that points share, (K,).
         """
         assert rays.time is not None
         return _moved(rays, Corrections(self.parts[name], np.eye(3), rays.time), shared)
@@ -115,11 +130,16 @@ class SharedNoise:
     def rows(self, name: str, line: str, white: Array, by: Partials) -> sparse.csr_matrix:
         """Whitened rows (2n, K) of the rays of a line of a field.
 
-        Args:
-            name: of the field.
-            line: of the camera.
-            white: (n, 2, 2) whitens the misclosures of n rays.
-            by: their derivatives.
+        Parameters
+        ----------
+        name : str
+            Of the field.
+        line : str
+            Of the camera.
+        white : Array
+            (n, 2, 2) whitens the misclosures of n rays.
+        by : Partials
+            Their derivatives.
         """
         count, met = len(white), self.met.get((name, line))
         if met is None:
@@ -190,20 +210,33 @@ class Residuals:
 class Equations:
     """Linearised system at one state: P unknowns x, S unknowns z of the shared noise, m points p, M image points.
 
-    Attributes:
-        design: (2M, P) sparse by x, design_shared: (2M, S) by z, design_point: (2M, 3m) by p; whitened, not weighted.
-        row_weight: (2M,) weight of each row.
-        design_prior: (K, P) whitened. prior_weight: (K,).
-        control_weight: (3m, 3m) sparse, weights of the control coordinates with the factor; 0 for tie points.
-        residuals: at this state.
-        reduced: (P, P) normal matrix with z and p eliminated. right: (P,) its negative right side.
-        length: (P,) root of the diagonal, of the image points alone and before anything was eliminated.
-        shared: what z stands for. shared_weight: (S, S) sparse, their prior with the factors. shared_normal: (S, S)
-            sparse, their normal matrix with p eliminated.
-        follow: (S, P) change of z with x. shared_start: (S,) change of z where x stays.
-        point_inverse: (3m, 3m) sparse block inverse. cross: (3m, P + S) N_py. right_point: (3m,).
-        movable: (m,) points that are unknown.
-        row_spans, point_spans: first and last + 1 row (of 2M) and coordinate (of 3m) of each field.
+    Attributes
+    ----------
+    design : sparse.csr_matrix
+        (2M, P) sparse by x, design_shared: (2M, S) by z, design_point: (2M, 3m) by p; whitened, not weighted.
+    row_weight : Array
+        (2M,) weight of each row.
+    design_prior : Array
+        (K, P) whitened. prior_weight: (K,).
+    control_weight : sparse.csr_matrix
+        (3m, 3m) sparse, weights of the control coordinates with the factor; 0 for tie points.
+    residuals : Residuals
+        At this state.
+    reduced : Array
+        (P, P) normal matrix with z and p eliminated. right: (P,) its negative right side.
+    length : Array
+        (P,) root of the diagonal, of the image points alone and before anything was eliminated.
+    shared : SharedNoise
+        What z stands for. shared_weight: (S, S) sparse, their prior with the factors. shared_normal: (S, S) sparse,
+        their normal matrix with p eliminated.
+    follow : Array
+        (S, P) change of z with x. shared_start: (S,) change of z where x stays.
+    point_inverse : sparse.bsr_matrix
+        (3m, 3m) sparse block inverse. cross: (3m, P + S) N_py. right_point: (3m,).
+    movable : NDArray[np.bool_]
+        (m,) points that are unknown.
+    row_spans, point_spans : tuple[tuple[int, int], ...]
+        First and last + 1 row (of 2M) and coordinate (of 3m) of each field.
     """
 
     design: sparse.csr_matrix
@@ -273,11 +306,16 @@ class Equations:
     ) -> dict[str, GroupTest]:
         """Variance groups after an adjustment.
 
-        Args:
-            covariance: of the P unknowns, (P, P), SI.
-            cofactors: of the adjusted image points, (M, 2, 2), whitened.
-            weights: of the observations.
-            priors: further observations of the unknowns.
+        Parameters
+        ----------
+        covariance : Array
+            Of the P unknowns, (P, P), SI.
+        cofactors : Array
+            Of the adjusted image points, (M, 2, 2), whitened.
+        weights : Weights
+            Of the observations.
+        priors : Sequence[Prior]
+            Further observations of the unknowns.
         """
         residuals, factor = self.residuals, weights.factor
         squares = weights.image * np.sum(residuals.image**2, axis=1) / factor["image"]
@@ -396,11 +434,16 @@ class Hidden(Protocol):
     def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
         """(n, 2, size) change of the misclosures with each of them.
 
-        Args:
-            field: the pass.
-            line: of the camera.
-            rays: n image points of it.
-            by: derivatives of their misclosures.
+        Parameters
+        ----------
+        field : CalibrationField
+            The pass.
+        line : str
+            Of the camera.
+        rays : Rays
+            n image points of it.
+        by : Partials
+            Derivatives of their misclosures.
         """
 
 

@@ -73,11 +73,16 @@ class Datum:
 class StripAdjustment:
     """Solution of a pass.
 
-    Attributes:
-        ground: (m, 3) points, ITRS, metres; NaN where fewer than two rays see one.
-        covariance: (m, 3, 3), with the errors of attitude and station that are left.
-        datum: common turns and their rates, from all rays.
-        chi_square, degrees_of_freedom: of the rays that meet others, and of the readings' corrections.
+    Attributes
+    ----------
+    ground : Array
+        (m, 3) points, ITRS, metres; NaN where fewer than two rays see one.
+    covariance : Array
+        (m, 3, 3), with the errors of attitude and station that are left.
+    datum : tuple[Datum, ...]
+        Common turns and their rates, from all rays.
+    chi_square, degrees_of_freedom : float
+        Of the rays that meet others, and of the readings' corrections.
     """
 
     ground: Array
@@ -97,8 +102,10 @@ class StripAdjustment:
     def corrected(self, rays: Rays) -> Rays:
         """Any rays of the pass, with times, with corrected attitude and station.
 
-        Raises:
-            CalibrationError: no times.
+        Raises
+        ------
+        CalibrationError
+            No times.
         """
         if rays.time is None:
             raise CalibrationError("strip adjustment: these rays have no times")
@@ -114,14 +121,21 @@ def adjust_strip(
     Time goes with the number of points, memory with the square of that of readings near rays: 800 readings of the
     attitude take 50 MB.
 
-    Args:
-        rays: line -> its image points, with times.
-        cameras: line -> calibrated camera, in its state during this pass.
-        noise: of image, attitude and station, with at least one interval.
-        bias: (3,) calibrated roll, pitch, yaw, radians.
+    Parameters
+    ----------
+    rays : Mapping[str, Rays]
+        Line -> its image points, with times.
+    cameras : Mapping[str, LineModel]
+        Line -> calibrated camera, in its state during this pass.
+    noise : Noise
+        Of image, attitude and station, with at least one interval.
+    bias : ArrayLike
+        (3,) calibrated roll, pitch, yaw, radians.
 
-    Raises:
-        CalibrationError: rays without times or a noise without intervals, no point with two rays, no convergence.
+    Raises
+    ------
+    CalibrationError
+        Rays without times or a noise without intervals, no point with two rays, no convergence.
     """
     noise.check()
     if any(r.time is None for r in rays.values()) or all(t.interval is None for t in noise.terms):
@@ -198,11 +212,15 @@ _RELINEARISED = 3
 class Stepwise:
     """Solution of the stepwise iteration.
 
-    Attributes:
-        names: of the unknowns. values: (P,) at the end.
-        converged: whether the steps fell below the tolerance. steps: (rounds,) largest change of any unknown in each
-            round, in conditional sigmas.
-        rate: fraction of the slowest error that a round leaves by theory, open combinations apart.
+    Attributes
+    ----------
+    names : tuple[str, ...]
+        Of the unknowns. values: (P,) at the end.
+    converged : bool
+        Whether the steps fell below the tolerance. steps: (rounds,) largest change of any unknown in each round, in
+        conditional sigmas.
+    rate : float
+        Fraction of the slowest error that a round leaves by theory, open combinations apart.
     """
 
     names: tuple[str, ...]
@@ -234,9 +252,12 @@ def stepwise(
     held: unknowns that keep their start values. rounds: at most. The error that is left is about the last step times
     rate / (1 - rate). The first rounds are linearised anew, later ones only after all steps have become small.
 
-    Raises:
-        RankError: a block that is open on its own.
-        CalibrationError: only one block is to be solved for; other bad input.
+    Raises
+    ------
+    RankError
+        a block that is open on its own.
+    CalibrationError
+        Only one block is to be solved for; other bad input.
     """
     parameters = Parameters.of(fields, cameras, unknowns or Unknowns(), start)
     names, scale = parameters.names, parameters.scale

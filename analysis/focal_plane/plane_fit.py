@@ -59,10 +59,14 @@ class RigidMotion:
     def of(cls, rotation: ArrayLike, shift: ArrayLike, covariance: ArrayLike | None = None) -> RigidMotion:
         """The motion, with its input checked. Raises ValueError for wrong shapes or numbers that are not finite.
 
-        Args:
-            rotation: small, about X', Y', Z', (3,), radians.
-            shift: (3,), metres.
-            covariance: (6, 6) of both, radians and metres; exact by default.
+        Parameters
+        ----------
+        rotation : ArrayLike
+            Small, about X', Y', Z', (3,), radians.
+        shift : ArrayLike
+            (3,), metres.
+        covariance : ArrayLike | None
+            (6, 6) of both, radians and metres; exact by default.
         """
         turn, move = np.asarray(rotation, np.float64), np.asarray(shift, np.float64)
         spread = np.zeros((6, 6)) if covariance is None else np.asarray(covariance, np.float64)
@@ -103,9 +107,12 @@ class ObservabilityError(MeasurementError, ValueError):
 class LineLevel:
     """Level of the line CCD: its rotation about +Z' out of the Y' axis.
 
-    Attributes:
-        angle: radians, right-handed about +Z'.
-        sigma: standard deviation of the angle, radians.
+    Attributes
+    ----------
+    angle : float
+        Radians, right-handed about +Z'.
+    sigma : float
+        Standard deviation of the angle, radians.
     """
 
     angle: float
@@ -116,19 +123,29 @@ class LineLevel:
 class FocalPlaneFit:
     """A weighted plane through the defocus of N places.
 
-    Attributes:
-        piston: metres.
-        slope_x, slope_y: rises of the best focus along +X' and +Y', radians.
-        covariance: of piston, slope_x and slope_y, (3, 3).
-        place: (N, 2), metres.
-        residual: defocus minus plane, (N,), metres.
-        sigma: of the defocus as given, (N,), metres.
-        chi_square, degrees_of_freedom: with the sigmas as given.
-        p_value: chance of such a chi-square or a larger one, if the best foci lie on a plane and the sigmas are right;
-            1 without redundancy.
-        extra_sigma: scatter of the places about the plane beyond their sigmas (chips that are not coplanar, curvature
-            of field), metres, for which the weighted chi-square equals the degrees of freedom; 0 when it was not asked
-            for or is not there. The weights and all covariances include it.
+    Attributes
+    ----------
+    piston : float
+        metres.
+    slope_x, slope_y : float
+        Rises of the best focus along +X' and +Y', radians.
+    covariance : Array
+        Of piston, slope_x and slope_y, (3, 3).
+    place : Array
+        (N, 2), metres.
+    residual : Array
+        Defocus minus plane, (N,), metres.
+    sigma : Array
+        Of the defocus as given, (N,), metres.
+    chi_square, degrees_of_freedom : float
+        With the sigmas as given.
+    p_value : float
+        Chance of such a chi-square or a larger one, if the best foci lie on a plane and the sigmas are right; 1 without
+        redundancy.
+    extra_sigma : float
+        Scatter of the places about the plane beyond their sigmas (chips that are not coplanar, curvature of field),
+        metres, for which the weighted chi-square equals the degrees of freedom; 0 when it was not asked for or is not
+        there. The weights and all covariances include it.
     """
 
     piston: float
@@ -201,16 +218,24 @@ def fit_focal_plane(
 ) -> FocalPlaneFit:
     """Weighted least-squares plane through the defocus of N places.
 
-    Args:
-        place: (N, 2) X', Y', metres.
-        defocus: (N,) metres, best focus minus CCD along +Z'.
-        sigma: (N,) or a number, metres.
-        estimate_extra: when the residuals are larger than the sigmas say, estimate a common extra scatter (Paule and
-            Mandel, J. Res. NBS 87, 377 (1982)) and weight with it; see FocalPlaneFit.extra_sigma.
+    Parameters
+    ----------
+    place : ArrayLike
+        (N, 2) X', Y', metres.
+    defocus : ArrayLike
+        (N,) metres, best focus minus CCD along +Z'.
+    sigma : ArrayLike
+        (N,) or a number, metres.
+    estimate_extra : bool
+        When the residuals are larger than the sigmas say, estimate a common extra scatter (Paule and Mandel, J. Res.
+        NBS 87, 377 (1982)) and weight with it; see FocalPlaneFit.extra_sigma.
 
-    Raises:
-        ObservabilityError: the places lie so that a slope cannot be told.
-        ValueError: wrong shapes, numbers that are not finite, a sigma that is not positive.
+    Raises
+    ------
+    ObservabilityError
+        The places lie so that a slope cannot be told.
+    ValueError
+        Wrong shapes, numbers that are not finite, a sigma that is not positive.
     """
     spots, height = np.asarray(place, np.float64), np.asarray(defocus, np.float64)
     if spots.ndim != 2 or spots.shape[1] != 2 or height.shape != spots.shape[:1]:
@@ -321,11 +346,16 @@ class Mount:
 
         Raises ShimError when the holes cannot carry a tilt; ValueError for bad input.
 
-        Args:
-            holes: centres of the pads in O'-X'Y'Z', (H, 3), metres.
-            normal: from the structure into the assembly, (3,), of any length.
-            clearance: how far a hole may slide against its screw, radius, metres.
-            step: the workshop grinds shims to multiples of this, metres.
+        Parameters
+        ----------
+        holes : ArrayLike
+            Centres of the pads in O'-X'Y'Z', (H, 3), metres.
+        normal : ArrayLike
+            From the structure into the assembly, (3,), of any length.
+        clearance : float
+            How far a hole may slide against its screw, radius, metres.
+        step : float
+            The workshop grinds shims to multiples of this, metres.
         """
         place, up = np.asarray(holes, np.float64), np.asarray(normal, np.float64)
         if place.ndim != 2 or place.shape[1] != 3 or up.shape != (3,):
@@ -396,14 +426,21 @@ def shim_plan(correction: RigidMotion, mount: Mount, present: ArrayLike) -> Shim
 
     A hole that moves by d needs n . d more shim; what is left of d lies in the mounting surface.
 
-    Args:
-        correction: for example FocalPlaneFit.correction().
-        mount: where the shims are.
-        present: (H,) or a number, thickness of the shims now, metres.
+    Parameters
+    ----------
+    correction : RigidMotion
+        For example FocalPlaneFit.correction().
+    mount : Mount
+        Where the shims are.
+    present : ArrayLike
+        (H,) or a number, thickness of the shims now, metres.
 
-    Raises:
-        ShimError: a hole would slide beyond its clearance, or a shim would be thinner than nothing.
-        ValueError: a thickness that is not finite.
+    Raises
+    ------
+    ShimError
+        a hole would slide beyond its clearance, or a shim would be thinner than nothing.
+    ValueError
+        a thickness that is not finite.
     """
     up, holes = mount.normal, mount.holes
     move = correction.displacement(holes)

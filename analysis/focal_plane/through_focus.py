@@ -51,10 +51,14 @@ def _main_peak(z: Array, v: Array, weight: Array) -> tuple[NDArray[np.intp], NDA
 
     The smoothing is a binomial of a twelfth of the scan's points, at least 1-2-1, weighted by the inverse variances.
 
-    Args:
-        z: positions in rising order, (B, Z).
-        v: values there, (B, Z).
-        weight: inverse variances, (B, Z).
+    Parameters
+    ----------
+    z : Array
+        Positions in rising order, (B, Z).
+    v : Array
+        Values there, (B, Z).
+    weight : Array
+        Inverse variances, (B, Z).
     """
     count, size = z.shape
     top, bottom = v * weight, weight
@@ -301,10 +305,14 @@ def focus_vertex(position: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> Foc
 
     Raises FocusError when the curve has no peak to measure; ValueError for bad arguments.
 
-    Args:
-        position: (Z,), a length.
-        value: (Z,), MTF.
-        sigma: of the values, (Z,) or a number.
+    Parameters
+    ----------
+    position : ArrayLike
+        (Z,), a length.
+    value : ArrayLike
+        (Z,), MTF.
+    sigma : ArrayLike
+        Of the values, (Z,) or a number.
     """
     if np.ndim(value) != 1:
         raise ValueError(f"through focus: one curve must be (Z,), found {np.shape(value)}")
@@ -316,11 +324,16 @@ def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, s
 
     Within a scan the highest smoothed value decides which peak is the main one.
 
-    Args:
-        position: (..., Z) or (Z,), length.
-        value: (..., Z), MTF.
-        sigma: of the values, broadcast to them, positive; infinite for a point that was not measured.
-        strict: raise FocusError for the first faults found; else return them in `fault`.
+    Parameters
+    ----------
+    position : ArrayLike
+        (..., Z) or (Z,), length.
+    value : ArrayLike
+        (..., Z), MTF.
+    sigma : ArrayLike
+        Of the values, broadcast to them, positive; infinite for a point that was not measured.
+    strict : bool
+        Raise FocusError for the first faults found; else return them in `fault`.
     """
     where, data, spread = (np.asarray(item, dtype=np.float64) for item in (position, value, sigma))
     _check(where, data, spread)
@@ -375,11 +388,16 @@ def outlying_points(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, lim
     where there is none, the two that together do, which hide each other. Sigmas that are too small for the others'
     scatter are enlarged. A point beyond half of the peak disagrees only if it is higher than that.
 
-    Args:
-        position: (Z,), a length.
-        value: (Z,), MTF.
-        sigma: of the values, (Z,), infinite for a point that was not measured.
-        limit: in sigmas, from which a point disagrees.
+    Parameters
+    ----------
+    position : ArrayLike
+        (Z,), a length.
+    value : ArrayLike
+        (Z,), MTF.
+    sigma : ArrayLike
+        Of the values, (Z,), infinite for a point that was not measured.
+    limit : float
+        In sigmas, from which a point disagrees.
     """
     z, v, s = (np.array(item, np.float64) for item in (position, value, sigma))
     out = np.zeros(z.size)

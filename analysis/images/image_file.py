@@ -48,17 +48,27 @@ class ImageError(Exception):
 class ImageHeader:
     """Header of the pages that belong together.
 
-    Attributes:
-        kind: TIFF, FITS, PNG or JPEG.
-        pages: their numbers in the file, the first is 0.
-        rows, columns: of every page.
-        channels: 1 of grey, 2 with alpha, 3 and more of colour.
-        page_bytes: of a decoded page.
-        full_scale: largest grey value that the file's type holds, infinity for signed and real numbers.
-        coded: why grey values probably follow a tone curve and not the light; empty if nothing says so.
-        inverted: the largest value is black.
-        turned: how the file says that rows and columns are to be drawn, where it is not the order in which they are
-            stored; empty if it is.
+    Attributes
+    ----------
+    kind : str
+        TIFF, FITS, PNG or JPEG.
+    pages : tuple[int, ...]
+        Their numbers in the file, the first is 0.
+    rows, columns : int
+        Of every page.
+    channels : int
+        1 of grey, 2 with alpha, 3 and more of colour.
+    page_bytes : int
+        Of a decoded page.
+    full_scale : float
+        Largest grey value that the file's type holds, infinity for signed and real numbers.
+    coded : str
+        Why grey values probably follow a tone curve and not the light; empty if nothing says so.
+    inverted : bool
+        The largest value is black.
+    turned : str
+        How the file says that rows and columns are to be drawn, where it is not the order in which they are stored;
+        empty if it is.
     """
 
     kind: str
@@ -76,9 +86,12 @@ class ImageHeader:
 def full_scale(dtype: np.dtype[Any], bits: int | None = None) -> float:
     """Largest value of a type, of which perhaps not all bits are used; infinity for signed and real numbers.
 
-    Args:
-        dtype: of the decoded pages.
-        bits: of a sample in the file.
+    Parameters
+    ----------
+    dtype : np.dtype[Any]
+        Of the decoded pages.
+    bits : int | None
+        Of a sample in the file.
     """
     if dtype.kind != "u":
         return math.inf
@@ -88,10 +101,14 @@ def full_scale(dtype: np.dtype[Any], bits: int | None = None) -> float:
 def different_pages(path: Path, kinds: dict[str, list[int]], choose: str) -> ImageError:
     """The error for pages that do not belong together.
 
-    Args:
-        path: of the file.
-        kinds: what they are -> their numbers.
-        choose: by which option the user can name one, empty for none.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    kinds : dict[str, list[int]]
+        What they are -> their numbers.
+    choose : str
+        By which option the user can name one, empty for none.
     """
     listed = ", ".join(f"{kind} (first: {numbers[0]})" for kind, numbers in list(kinds.items())[:4])
     remedy = f"say which with {choose} NUMBER" if choose else "save those that belong together as a file of their own"
@@ -101,11 +118,16 @@ def different_pages(path: Path, kinds: dict[str, list[int]], choose: str) -> Ima
 def no_such_page(path: Path, page: int, count: int, choose: str) -> ImageError:
     """The error for a page that is not there.
 
-    Args:
-        path: of the file.
-        page: its number.
-        count: of pages.
-        choose: by which option it was named.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    page : int
+        Its number.
+    count : int
+        Of pages.
+    choose : str
+        By which option it was named.
     """
     return ImageError(f"{choose or 'page'} {page} does not exist: {path} has {count} pages, the first is 0")
 
@@ -118,11 +140,15 @@ _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
 def png_header(path: Path) -> ImageHeader:
     """Size, type and named tone curve of a PNG.
 
-    Args:
-        path: of the file.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
 
-    Raises:
-        ImageError: it is cut off or damaged.
+    Raises
+    ------
+    ImageError
+        It is cut off or damaged.
     """
     rows = columns = depth = colour = 0
     coded, name, damaged = "", b"", f"{path} cannot be read as an image: it is cut off or damaged"
@@ -157,11 +183,15 @@ def png_header(path: Path) -> ImageHeader:
 def jpeg_header(path: Path) -> ImageHeader:
     """Size of a JPEG; wherever its tables stand.
 
-    Args:
-        path: of the file.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
 
-    Raises:
-        ImageError: it is cut off, damaged, or not of 8 bits.
+    Raises
+    ------
+    ImageError
+        It is cut off, damaged, or not of 8 bits.
     """
     data = path.read_bytes()
     place = 2
@@ -241,13 +271,19 @@ def _planes(units: Any) -> list[tuple[Any, tuple[int, ...]]]:
 def fits_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
     """What the header says of all planes, or of one.
 
-    Args:
-        path: of the file.
-        wanted: number of the one plane, None for all.
-        choose: option that names a plane, for messages.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    wanted : int | None
+        Number of the one plane, None for all.
+    choose : str
+        Option that names a plane, for messages.
 
-    Raises:
-        ImageError: no image in it, or planes of several kinds.
+    Raises
+    ------
+    ImageError
+        No image in it, or planes of several kinds.
     """
     with _opened(path) as units:
         planes = _planes(units)
@@ -272,8 +308,10 @@ def fits_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
 def fits_time(path: Path) -> datetime | None:
     """When the first image was recorded, by DATE-BEG, DATE-OBS (with TIME-OBS) or MJD-OBS; None where it does not say.
 
-    Args:
-        path: of the file.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
     """
     with _opened(path) as units:
         for unit in units:
@@ -293,12 +331,17 @@ def fits_time(path: Path) -> datetime | None:
 def fits_cards(path: Path, number: int) -> dict[str, Any]:
     """Keys and values of the header of the unit that holds a plane.
 
-    Args:
-        path: of the file.
-        number: of the plane.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    number : int
+        Of the plane.
 
-    Raises:
-        ImageError: a header that cannot be read.
+    Raises
+    ------
+    ImageError
+        a header that cannot be read.
     """
     try:
         with _opened(path) as units:
@@ -314,9 +357,12 @@ def fits_cards(path: Path, number: int) -> dict[str, Any]:
 def fits_planes(path: Path, pages: Iterable[int]) -> Iterator[NDArray[Any]]:
     """Planes (rows, columns) of physical values.
 
-    Args:
-        path: of the file.
-        pages: their numbers.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    pages : Iterable[int]
+        Their numbers.
     """
     with _opened(path) as units:
         planes = _planes(units)
@@ -352,13 +398,19 @@ def _page(file: tifffile.TiffFile, number: int) -> tifffile.TiffPage:
 def tiff_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
     """What the header says of all full pages, or of one.
 
-    Args:
-        path: of the file.
-        wanted: number of the one page, None for all but thumbnails and masks.
-        choose: option that names a page, for messages.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    wanted : int | None
+        Number of the one page, None for all but thumbnails and masks.
+    choose : str
+        Option that names a page, for messages.
 
-    Raises:
-        ImageError: no pages, pages of several kinds, no grey values or colours linear in light.
+    Raises
+    ------
+    ImageError
+        No pages, pages of several kinds, no grey values or colours linear in light.
     """
     with tifffile.TiffFile(path) as file:
         file.pages.useframes = False
@@ -412,8 +464,10 @@ def tiff_origin(path: Path) -> tuple[datetime | None, str]:
     """When the first page was recorded, by Exif's DateTimeOriginal, None where it does not say; and the ``note`` in a
     description that is JSON, as this program writes it.
 
-    Args:
-        path: of the file.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
     """
     with tifffile.TiffFile(path) as file:
         page = _page(file, 0)
@@ -430,10 +484,14 @@ def tiff_origin(path: Path) -> tuple[datetime | None, str]:
 def tiff_pages(path: Path, pages: Iterable[int], check: Callable[[], None]) -> Iterator[NDArray[Any]]:
     """Every page, (rows, columns) or with channels last; of an uncompressed one only what is looked at is read.
 
-    Args:
-        path: of the file.
-        pages: their numbers.
-        check: called before a page is decoded as a whole.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    pages : Iterable[int]
+        Their numbers.
+    check : Callable[[], None]
+        Called before a page is decoded as a whole.
     """
     with tifffile.TiffFile(path) as file:
         for number in pages:
@@ -480,9 +538,12 @@ class Region:
 class ImageFile:
     """An image file whose header has been read.
 
-    Attributes:
-        path: of the file.
-        header: of the pages that are used.
+    Attributes
+    ----------
+    path : Path
+        Of the file.
+    header : ImageHeader
+        Of the pages that are used.
     """
 
     path: Path
@@ -492,14 +553,21 @@ class ImageFile:
     def open(cls, path: Path, frames: int | None = None, page: int | None = None, choose: str = "--page") -> ImageFile:
         """Read the header.
 
-        Args:
-            path: of the file.
-            frames: number of pages to use, from the first on; None for all.
-            page: the only page to use, from 0; None for all.
-            choose: by which option the user names a page, empty if there is none; for messages.
+        Parameters
+        ----------
+        path : Path
+            Of the file.
+        frames : int | None
+            Number of pages to use, from the first on; None for all.
+        page : int | None
+            The only page to use, from 0; None for all.
+        choose : str
+            By which option the user names a page, empty if there is none; for messages.
 
-        Raises:
-            ImageError: not a readable image, pages of different sizes, or no such page.
+        Raises
+        ------
+        ImageError
+            Not a readable image, pages of different sizes, or no such page.
         """
         try:
             if path.is_dir():
@@ -527,12 +595,17 @@ class ImageFile:
     def read(self, regions: dict[str, Region], gamma: str | None = None) -> dict[str, Array]:
         """Grey values of all pages, name -> (P, H, W), linear in light.
 
-        Args:
-            regions: name -> what to read; names are options of the command, for messages.
-            gamma: tone curve of the file, ``srgb`` or the exponent as text; None and "1" for none.
+        Parameters
+        ----------
+        regions : dict[str, Region]
+            Name -> what to read; names are options of the command, for messages.
+        gamma : str | None
+            Tone curve of the file, ``srgb`` or the exponent as text; None and "1" for none.
 
-        Raises:
-            ImageError: a region beyond the image or too large, too large an image, or one that cannot be decoded.
+        Raises
+        ------
+        ImageError
+            a region beyond the image or too large, too large an image, or one that cannot be decoded.
         """
         for name, region in regions.items():
             self._check(name, region)
@@ -557,22 +630,30 @@ class ImageFile:
     def frames(self, region: Region | None = None) -> NDArray[Any]:
         """All pages as they are, (frames, H, W) in the file's type, the byte order being the machine's.
 
-        Args:
-            region: part of every page, None for all of it.
+        Parameters
+        ----------
+        region : Region | None
+            Part of every page, None for all of it.
 
-        Raises:
-            ImageError: colours, too large an image, or one that cannot be decoded.
+        Raises
+        ------
+        ImageError
+            Colours, too large an image, or one that cannot be decoded.
         """
         return np.stack(list(self.pages(region)))
 
     def pages(self, region: Region | None = None) -> Iterator[NDArray[Any]]:
         """The pages of `frames`, (H, W) each, one at a time.
 
-        Args:
-            region: as there.
+        Parameters
+        ----------
+        region : Region | None
+            As there.
 
-        Raises:
-            ImageError: as there.
+        Raises
+        ------
+        ImageError
+            As there.
         """
         head = self.header
         if head.channels > 2:
@@ -608,8 +689,10 @@ class ImageFile:
     def _decoded(self) -> Iterator[NDArray[Any]]:
         """Every page, (rows, columns) or with channels last.
 
-        Raises:
-            ImageError: it cannot be decoded, or is not what the header says.
+        Raises
+        ------
+        ImageError
+            It cannot be decoded, or is not what the header says.
         """
         try:
             for data in self._stored():
@@ -696,8 +779,10 @@ def _reason(error: Exception) -> str:
 def tone_curve(gamma: str | None, full_scale: float) -> Callable[[Array], Array]:
     """From the file's grey values to grey values linear in light, both up to the full scale.
 
-    Raises:
-        ImageError: no such curve, or no full scale.
+    Raises
+    ------
+    ImageError
+        No such curve, or no full scale.
     """
     if gamma is None or gamma == "1":
         return lambda grey: grey
@@ -739,8 +824,10 @@ def recorded(path: Path) -> tuple[datetime | None, str]:
 
     The time at which a file was written or changed does not count: a copy has another one.
 
-    Args:
-        path: of an image file.
+    Parameters
+    ----------
+    path : Path
+        Of an image file.
     """
     # a header that cannot be read says nothing; whether the image can be is told where it is
     try:

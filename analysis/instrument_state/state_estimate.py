@@ -55,10 +55,14 @@ _NO_RANK = 1e-9
 class StatePrior:
     """What is known of a state before anything is measured.
 
-    Attributes:
-        labels: (M,) names of the motions.
-        mean: (M,) SI.
-        root: G, (M, U), SI; the covariance is G G'.
+    Attributes
+    ----------
+    labels : tuple[str, ...]
+        (M,) names of the motions.
+    mean : Array
+        (M,) SI.
+    root : Array
+        G, (M, U), SI; the covariance is G G'.
     """
 
     labels: tuple[str, ...]
@@ -69,10 +73,14 @@ class StatePrior:
     def of(cls, labels: Sequence[str], covariance: Array, mean: Array | None = None) -> StatePrior:
         """Prior of a covariance.
 
-        Args:
-            labels: names of the motions, (M,).
-            covariance: (M, M), SI, positive semidefinite.
-            mean: (M,), SI; zero by default.
+        Parameters
+        ----------
+        labels : Sequence[str]
+            Names of the motions, (M,).
+        covariance : Array
+            (M, M), SI, positive semidefinite.
+        mean : Array | None
+            (M,), SI; zero by default.
         """
         mean = np.zeros(len(covariance)) if mean is None else np.asarray(mean, np.float64)
         return cls(tuple(labels), mean, covariance_root(covariance))
@@ -92,15 +100,24 @@ class StatePrior:
 class MeasuredGroup:
     """Numbers of one measurement.
 
-    Attributes:
-        name: of the measurement.
-        kind: what was measured: ``wavefronts``, ``focus`` ...
-        labels: (D,) of the numbers.
-        values: (D,) SI.
-        covariance: (D, D) of their errors, SI.
-        biases: (D, B) what one unit of each bias does to the numbers.
-        bias_sigmas: (B,) standard deviations of the biases; infinite for a free one.
-        blocks: (D,) name of what one gross error would spoil together, such as a field.
+    Attributes
+    ----------
+    name : str
+        Of the measurement.
+    kind : str
+        What was measured: ``wavefronts``, ``focus`` ...
+    labels : tuple[str, ...]
+        (D,) of the numbers.
+    values : Array
+        (D,) SI.
+    covariance : Array
+        (D, D) of their errors, SI.
+    biases : Array
+        (D, B) what one unit of each bias does to the numbers.
+    bias_sigmas : Array
+        (B,) standard deviations of the biases; infinite for a free one.
+    blocks : tuple[str, ...]
+        (D,) name of what one gross error would spoil together, such as a field.
     """
 
     name: str
@@ -129,11 +146,15 @@ class MeasuredGroup:
     def whitener(self, without: Sequence[str] = ()) -> Array:
         """W (R, D) by which errors become independent with unit variance and free biases vanish.
 
-        Args:
-            without: blocks that are left out.
+        Parameters
+        ----------
+        without : Sequence[str]
+            Blocks that are left out.
 
-        Raises:
-            UndeterminedError: the covariance is not positive definite.
+        Raises
+        ------
+        UndeterminedError
+            The covariance is not positive definite.
         """
         kept = np.array([block not in without for block in self.blocks])
         out = np.zeros((0, len(self.values)))
@@ -163,11 +184,16 @@ class MeasuredGroup:
 class Agreement:
     """Do some numbers agree with what all others, the prior and the instrument predict of them?
 
-    Attributes:
-        name: of a measurement, or of one of its blocks.
-        chi_square: of the numbers about their prediction from all others.
-        degrees: of freedom.
-        chance: probability of so large a chi-square if everything is as stated.
+    Attributes
+    ----------
+    name : str
+        Of a measurement, or of one of its blocks.
+    chi_square : float
+        Of the numbers about their prediction from all others.
+    degrees : int
+        Of freedom.
+    chance : float
+        Probability of so large a chi-square if everything is as stated.
     """
 
     name: str
@@ -191,19 +217,32 @@ class Agreement:
 class StateEstimate:
     """The state after the measurements.
 
-    Attributes:
-        prior: before them.
-        groups: the measurements.
-        unit: u, (U,), the estimate in the prior's independent units.
-        root: posterior covariance of u is root root', (U, U).
-        slope: whitened derivatives of all measurements by u at the estimate, (R, U).
-        residual: whitened, (R,).
-        whole: chi-square of everything together.
-        measurements: of each measurement, as all others predict it.
-        blocks: of each block of each measurement, likewise: name of the measurement -> agreements.
-        left_out: blocks that were left out since they contradict all else: (measurement, block, agreement then).
-        steps: Gauss-Newton steps that were taken.
-        settled: change of the predicted measurements by the last step, in standard deviations.
+    Attributes
+    ----------
+    prior : StatePrior
+        Before them.
+    groups : tuple[MeasuredGroup, ...]
+        The measurements.
+    unit : Array
+        u, (U,), the estimate in the prior's independent units.
+    root : Array
+        Posterior covariance of u is root root', (U, U).
+    slope : Array
+        Whitened derivatives of all measurements by u at the estimate, (R, U).
+    residual : Array
+        Whitened, (R,).
+    whole : Agreement
+        Chi-square of everything together.
+    measurements : tuple[Agreement, ...]
+        Of each measurement, as all others predict it.
+    blocks : dict[str, tuple[Agreement, ...]]
+        Of each block of each measurement, likewise: name of the measurement -> agreements.
+    left_out : tuple[tuple[str, str, Agreement], ...]
+        Blocks that were left out since they contradict all else: (measurement, block, agreement then).
+    steps : int
+        Gauss-Newton steps that were taken.
+    settled : float
+        Change of the predicted measurements by the last step, in standard deviations.
     """
 
     prior: StatePrior
@@ -252,9 +291,12 @@ class StateEstimate:
     def draw(self, rng: np.random.Generator, count: int) -> Array:
         """Random states of the posterior, (count, M), SI; wider where the measurements contradict what is stated.
 
-        Args:
-            rng: their source.
-            count: how many.
+        Parameters
+        ----------
+        rng : np.random.Generator
+            Their source.
+        count : int
+            How many.
         """
         unit = rng.standard_normal((count, self.root.shape[1])) * np.sqrt(self.variance_factor)
         return np.asarray(self.mean + unit @ self.spread.T)
@@ -268,15 +310,23 @@ def estimate_state(
     A block of numbers that contradicts everything else at the chance of a false alarm, shared among all blocks, is left
     out and the estimate is made again (data snooping: Baarda, A testing procedure for use in geodetic networks, 1968).
 
-    Args:
-        prior: what is known before.
-        groups: measurements, in the order of the predictions.
-        predict: states -> what the measurements would read.
-        slope: one state -> derivatives of that.
-        start: state from which the steps go, (M,), SI; the prior's mean by default.
+    Parameters
+    ----------
+    prior : StatePrior
+        What is known before.
+    groups : Sequence[MeasuredGroup]
+        Measurements, in the order of the predictions.
+    predict : Predict
+        States -> what the measurements would read.
+    slope : Slope
+        One state -> derivatives of that.
+    start : Array | None
+        State from which the steps go, (M,), SI; the prior's mean by default.
 
-    Raises:
-        UndeterminedError: no number, a covariance that is none, or no light at the prior's mean.
+    Raises
+    ------
+    UndeterminedError
+        No number, a covariance that is none, or no light at the prior's mean.
     """
     if not groups:
         raise UndeterminedError("nothing was measured")
@@ -423,12 +473,17 @@ _MOST_NAMED = 4
 class Combination:
     """One combination of motions.
 
-    Attributes:
-        name: its largest motions with their weights: ``0.71 M2 shift x + 0.52 M3 rotate y``, each motion in units of
-            its prior standard deviation.
-        weights: (M,) of the motions in their prior standard deviations.
-        value: estimate, in standard deviations of the prior.
-        sigma: standard deviation after the measurements; it was 1 before.
+    Attributes
+    ----------
+    name : str
+        Its largest motions with their weights: ``0.71 M2 shift x + 0.52 M3 rotate y``, each motion in units of its
+        prior standard deviation.
+    weights : Array
+        (M,) of the motions in their prior standard deviations.
+    value : float
+        Estimate, in standard deviations of the prior.
+    sigma : float
+        Standard deviation after the measurements; it was 1 before.
     """
 
     name: str
@@ -444,10 +499,14 @@ class Combination:
     def of(self, amounts: Array, prior_sigma: Array, mean: Array) -> Array:
         """Value of the combination in states (..., M), SI.
 
-        Args:
-            amounts: the states.
-            prior_sigma: (M,) SI.
-            mean: (M,) of the prior, SI.
+        Parameters
+        ----------
+        amounts : Array
+            The states.
+        prior_sigma : Array
+            (M,) SI.
+        mean : Array
+            (M,) of the prior, SI.
         """
         safe = np.where(prior_sigma > 0.0, prior_sigma, np.inf)
         return np.asarray((amounts - mean) / safe @ self.weights)
@@ -456,9 +515,12 @@ class Combination:
 def combinations(found: StateEstimate, most: int | None = None) -> tuple[Combination, ...]:
     """The combinations by what the measurements know of them, the best known first.
 
-    Args:
-        found: an estimate.
-        most: how many; all by default.
+    Parameters
+    ----------
+    found : StateEstimate
+        An estimate.
+    most : int | None
+        How many; all by default.
     """
     _, values, rows = np.linalg.svd(found.slope, full_matrices=True)
     values = np.pad(values, (0, len(rows) - len(values)))
@@ -496,12 +558,18 @@ _TINY = 1e-6
 class Actuators:
     """What can be moved.
 
-    Attributes:
-        names: (C,).
-        low, high: (C,) limits of the next move, SI.
-        steps: (C,) of which moves are whole numbers, SI; 0 for any amount.
-        relative: (C,) standard deviation of a move as a share of it.
-        absolute: (C,) standard deviation of any move, SI.
+    Attributes
+    ----------
+    names : tuple[str, ...]
+        (C,).
+    low, high : Array
+        (C,) limits of the next move, SI.
+    steps : Array
+        (C,) of which moves are whole numbers, SI; 0 for any amount.
+    relative : Array
+        (C,) standard deviation of a move as a share of it.
+    absolute : Array
+        (C,) standard deviation of any move, SI.
     """
 
     names: tuple[str, ...]
@@ -514,9 +582,12 @@ class Actuators:
     def made(self, wanted: Array, errors: Array) -> Array:
         """What moves (..., C) come to with random errors; an actuator that is not moved makes none.
 
-        Args:
-            wanted: the moves.
-            errors: standard normal, (..., 2, C): of the share and of the amount.
+        Parameters
+        ----------
+        wanted : Array
+            The moves.
+        errors : Array
+            Standard normal, (..., 2, C): of the share and of the amount.
         """
         moved = wanted != 0.0
         share, amount = errors[..., 0, :], errors[..., 1, :]
@@ -527,11 +598,15 @@ class Actuators:
 class NextMove:
     """A move.
 
-    Attributes:
-        amounts: (C,) SI.
-        expected: merit after it, by the linear model and with the errors of the move; the part due to what is not known
-            of the state is not in it.
-        searched: whether all whole steps were enumerated.
+    Attributes
+    ----------
+    amounts : Array
+        (C,) SI.
+    expected : float
+        Merit after it, by the linear model and with the errors of the move; the part due to what is not known of the
+        state is not in it.
+    searched : bool
+        Whether all whole steps were enumerated.
     """
 
     amounts: Array
@@ -542,10 +617,14 @@ class NextMove:
 def best_move(residual: Array, slope: Array, actuators: Actuators) -> NextMove:
     """The move that makes the expected merit least.
 
-    Args:
-        residual: r0 + D E x, (R,).
-        slope: A, (R, C), per SI unit of each actuator.
-        actuators: limits, steps and errors.
+    Parameters
+    ----------
+    residual : Array
+        r0 + D E x, (R,).
+    slope : Array
+        A, (R, C), per SI unit of each actuator.
+    actuators : Actuators
+        Limits, steps and errors.
     """
     count = slope.shape[1]
     length = np.linalg.norm(slope, axis=0)
@@ -572,12 +651,18 @@ def measurement_worth(
     What is not known of the state costs only where actuators could have mended it: tr(H D P D' H) with H the projection
     on what they reach.
 
-    Args:
-        spread: P = spread spread', (U, U) in independent units of the prior.
-        slope: D, derivatives of the merit's numbers by these units, (R, U).
-        actuators: as of ``best_move``; steps and limits do not count here.
-        response: A, (R, C).
-        candidates: name -> whitened derivatives of its numbers by the units, (N, U).
+    Parameters
+    ----------
+    spread : Array
+        P = spread spread', (U, U) in independent units of the prior.
+    slope : Array
+        D, derivatives of the merit's numbers by these units, (R, U).
+    actuators : Actuators
+        As of ``best_move``; steps and limits do not count here.
+    response : Array
+        A, (R, C).
+    candidates : Mapping[str, Array]
+        Name -> whitened derivatives of its numbers by the units, (N, U).
     """
     length = np.linalg.norm(response, axis=0)
     used = (length > 0.0) & (actuators.high > actuators.low)

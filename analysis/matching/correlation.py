@@ -30,8 +30,10 @@ _LEAST_TEMPLATE = 11
 def checked_image(image: ArrayLike, what: str) -> NDArray[np.generic]:
     """The image as an array (rows, columns) of real numbers; not copied.
 
-    Raises:
-        ValueError: not a plane of real grey values, or empty.
+    Raises
+    ------
+    ValueError
+        Not a plane of real grey values, or empty.
     """
     array = np.asarray(image)
     if array.ndim != 2 or array.dtype.kind not in "uif" or array.size == 0:
@@ -45,13 +47,19 @@ def checked_image(image: ArrayLike, what: str) -> NDArray[np.generic]:
 def checked_places(places: ArrayLike, count: int | None, what: str) -> Array:
     """Places (n, 2) row and column as float64; they may be NaN.
 
-    Args:
-        places: (n, 2), px.
-        count: n that is asked for, None for any.
-        what: what they are, for the message.
+    Parameters
+    ----------
+    places : ArrayLike
+        (n, 2), px.
+    count : int | None
+        n that is asked for, None for any.
+    what : str
+        What they are, for the message.
 
-    Raises:
-        ValueError: another shape, or another number than count.
+    Raises
+    ------
+    ValueError
+        Another shape, or another number than count.
     """
     array = np.asarray(places, np.float64)
     if array.ndim != 2 or array.shape[1] != 2 or (count is not None and len(array) != count):
@@ -63,8 +71,10 @@ def checked_places(places: ArrayLike, count: int | None, what: str) -> Array:
 def checked_templates(templates: ArrayLike, what: str) -> Array:
     """Templates (n, k, k) as float64.
 
-    Raises:
-        ValueError: not square, k even or below 11.
+    Raises
+    ------
+    ValueError
+        Not square, k even or below 11.
     """
     array = np.asarray(templates, np.float64)
     if (
@@ -142,26 +152,38 @@ def joined(parts: Sequence[Part]) -> Part:
 class MatchOptions:
     """What least squares matching solves for, and what is accepted.
 
-    Attributes:
-        sharpness: solve for a difference in sharpness along rows and columns (second derivatives of the template).
-            They also fit what the smoothing of a noisy template leaves; without it the place of image against image
-            is drawn towards whole pixels.
-        margin: rows and columns at each side of a template that only feed its interpolation, px; also bounds how far
-            the fit may go before the template's rim enters it.
-        iterations: most Gauss-Newton steps.
-        least_correlation: of the fitted, smoothed template and the image; below it WEAK. A guard against the unrelated
-            only: white noise of r times the texture's standard deviation in the image alone brings it down to
-            1 / sqrt(1 + r^2), and largest_sigma judges what that leaves.
-        largest_ratio: of the second best to the best peak of the search; above it AMBIGUOUS.
-        largest_move: of the fit from the search's peak along an axis, px.
-        largest_distortion: of any element of the affine matrix from the unit matrix.
-        largest_sigma: of the place along its worst direction, px; above it UNCERTAIN, or RELIEF where only
-            displacements within the window bring it there.
-        largest_risk: chance of a step of displacement within a window that passes the test for one; above it UNTESTED.
-            The share of windows that fail the test and its power give it (`analysis.matching.window_checks`).
-        least_contrast: standard deviation of the image under the template over that of one pixel's noise; a point that
-            fails otherwise is called FLAT below it.
-        saturation: DN from which a pixel counts as saturated; None: the largest value of an integer type.
+    Attributes
+    ----------
+    sharpness : bool
+        Solve for a difference in sharpness along rows and columns (second derivatives of the template). They also fit
+        what the smoothing of a noisy template leaves; without it the place of image against image is drawn towards
+        whole pixels.
+    margin : int
+        Rows and columns at each side of a template that only feed its interpolation, px; also bounds how far the fit
+        may go before the template's rim enters it.
+    iterations : int
+        Most Gauss-Newton steps.
+    least_correlation : float
+        Of the fitted, smoothed template and the image; below it WEAK. A guard against the unrelated only: white noise
+        of r times the texture's standard deviation in the image alone brings it down to 1 / sqrt(1 + r^2), and
+        largest_sigma judges what that leaves.
+    largest_ratio : float
+        Of the second best to the best peak of the search; above it AMBIGUOUS.
+    largest_move : float
+        Of the fit from the search's peak along an axis, px.
+    largest_distortion : float
+        Of any element of the affine matrix from the unit matrix.
+    largest_sigma : float
+        Of the place along its worst direction, px; above it UNCERTAIN, or RELIEF where only displacements within the
+        window bring it there.
+    largest_risk : float
+        Chance of a step of displacement within a window that passes the test for one; above it UNTESTED. The share of
+        windows that fail the test and its power give it (`analysis.matching.window_checks`).
+    least_contrast : float
+        Standard deviation of the image under the template over that of one pixel's noise; a point that fails otherwise
+        is called FLAT below it.
+    saturation : float | None
+        DN from which a pixel counts as saturated; None: the largest value of an integer type.
     """
 
     sharpness: bool = True
@@ -179,9 +201,11 @@ class MatchOptions:
     def __post_init__(self) -> None:
         """Check the ranges.
 
-        Raises:
-            ValueError: a value that is not positive and finite, correlation, ratio or risk above 1, a margin
-                below 2 px or too small for the largest move.
+        Raises
+        ------
+        ValueError
+            a value that is not positive and finite, correlation, ratio or risk above 1, a margin below 2 px or too
+            small for the largest move.
         """
         for field in fields(self):
             value = getattr(self, field.name)
@@ -214,18 +238,27 @@ _LEAST = 2.0
 def distinct_points(image: ArrayLike, count: int, *, spacing: float, border: int) -> Array:
     """Well-defined points, spread evenly: the strongest of each cell of a grid first, then the second strongest ...
 
-    Args:
-        image: (H, W), any real type; around pixels that are not finite there are no points.
-        count: most points.
-        spacing: least distance of two points along rows or columns, px.
-        border: rows and columns at each side without points; at least half of a template and the reach.
+    Parameters
+    ----------
+    image : ArrayLike
+        (H, W), any real type; around pixels that are not finite there are no points.
+    count : int
+        Most points.
+    spacing : float
+        Least distance of two points along rows or columns, px.
+    border : int
+        Rows and columns at each side without points; at least half of a template and the reach.
 
-    Returns:
-        (n, 2) rows and columns, whole pixels, n <= count; fewer where the image has no more. The same image gives
-        the same points.
+    Returns
+    -------
+    Array
+        (n, 2) rows and columns, whole pixels, n <= count; fewer where the image has no more. The same image gives the
+        same points.
 
-    Raises:
-        ValueError: image not a plane, count or spacing below 1, border negative or so large that nothing is left.
+    Raises
+    ------
+    ValueError
+        Image not a plane, count or spacing below 1, border negative or so large that nothing is left.
     """
     plane = checked_image(image, "distinct points")
     if count < 1 or not spacing >= 1 or border < 0:
@@ -312,13 +345,18 @@ _EVEN = 1e-6
 class Peaks:
     """Best places.
 
-    Attributes:
-        place: (n, 2) row and column of the templates' middles; NaN where nothing was searched.
-        value: (n,) coefficient of the best peak, -1 to 1; NaN likewise.
-        ratio: (n,) second best local maximum, more than three pixels from the best, over the best; 0 without one,
-            1 if the best is not positive.
-        reason: (n,) codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, FLAT or BORDER. BORDER also where the
-            image's edge cuts the window.
+    Attributes
+    ----------
+    place : Array
+        (n, 2) row and column of the templates' middles; NaN where nothing was searched.
+    value : Array
+        (n,) coefficient of the best peak, -1 to 1; NaN likewise.
+    ratio : Array
+        (n,) second best local maximum, more than three pixels from the best, over the best; 0 without one, 1 if the
+        best is not positive.
+    reason : NDArray[np.int8]
+        (n,) codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, FLAT or BORDER. BORDER also where the image's edge
+        cuts the window.
     """
 
     place: Array
@@ -330,14 +368,21 @@ class Peaks:
 def search(image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, reach: int) -> Peaks:
     """Best place of each template within reach of its predicted place.
 
-    Args:
-        image: (H, W), any real type.
-        templates: (n, k, k), k odd, in the image's geometry.
-        predicted: (n, 2) row and column at which their middles are expected; searched from the nearest pixel.
-        reach: rows and columns to each side, px.
+    Parameters
+    ----------
+    image : ArrayLike
+        (H, W), any real type.
+    templates : ArrayLike
+        (n, k, k), k odd, in the image's geometry.
+    predicted : ArrayLike
+        (n, 2) row and column at which their middles are expected; searched from the nearest pixel.
+    reach : int
+        Rows and columns to each side, px.
 
-    Raises:
-        ValueError: wrong shapes, reach not 1 to 200 px.
+    Raises
+    ------
+    ValueError
+        Wrong shapes, reach not 1 to 200 px.
     """
     plane = checked_image(image, "search")
     patch = checked_templates(templates, "search")

@@ -92,11 +92,16 @@ _REACH, _PHASES = 30, 64
 class TemplateNoise:
     """Noise of the templates in n fits with q unknowns; NaN where there is no fit, or where it is mostly noise.
 
-    Attributes:
-        inverse: (n, q, q) H^-1.
-        lean: (n, 2) px, row and column, for a share of 1.
-        energy: (n,) curvature of the noise's energy along an axis where it is largest, for a share of 1.
-        share: (n,) least s_t^2 / s^2 by the low pass.
+    Attributes
+    ----------
+    inverse : Array
+        (n, q, q) H^-1.
+    lean : Array
+        (n, 2) px, row and column, for a share of 1.
+    energy : Array
+        (n,) curvature of the noise's energy along an axis where it is largest, for a share of 1.
+    share : Array
+        (n,) least s_t^2 / s^2 by the low pass.
     """
 
     inverse: Array
@@ -143,18 +148,29 @@ def template_noise(
 ) -> TemplateNoise:
     """From converged fits.
 
-    Args:
-        stack: low-passed templates.
-        which: (n,) of them.
-        window: rows and columns (p,) of the pixels, px about the window's middle.
-        shift: (n, 2) fitted place against the window's middle.
-        affine: (n, 2, 2).
-        linear: (n, 2 or 4) offset, gain and perhaps sharpness along rows and columns.
-        smoothing: (n,) rms of the low pass, px.
-        design: (n, q, p): by place, perhaps by the affine matrix, by the linear unknowns.
-        residual: (n, p), DN; NaN where there is no fit.
-        lowered: (n,) and (n,), by how much the low pass lowers the square sum of residuals and the energy of white
-            noise of unit variance in a pixel, against none.
+    Parameters
+    ----------
+    stack : SplineStack
+        Low-passed templates.
+    which : NDArray[np.intp]
+        (n,) of them.
+    window : tuple[Array, Array]
+        Rows and columns (p,) of the pixels, px about the window's middle.
+    shift : Array
+        (n, 2) fitted place against the window's middle.
+    affine : Array
+        (n, 2, 2).
+    linear : Array
+        (n, 2 or 4) offset, gain and perhaps sharpness along rows and columns.
+    smoothing : Array
+        (n,) rms of the low pass, px.
+    design : Array
+        (n, q, p): by place, perhaps by the affine matrix, by the linear unknowns.
+    residual : Array
+        (n, p), DN; NaN where there is no fit.
+    lowered : tuple[Array, Array]
+        (n,) and (n,), by how much the low pass lowers the square sum of residuals and the energy of white noise of unit
+        variance in a pixel, against none.
     """
     count, unknowns, pixels = design.shape
     inverse, lean = np.full((count, unknowns, unknowns), np.nan), np.full((count, 2), np.nan)
@@ -260,9 +276,12 @@ def _products(row: Array, column: Array) -> Array:
 def noise_energy(factors: Array, smoothing: float) -> Array:
     """(n,) variance of a pixel of the model for white noise in the template, over all phases; it is 1 after the gain.
 
-    Args:
-        factors: (n, 1 or 3) gain and perhaps sharpness along rows and columns.
-        smoothing: rms of the low pass, px.
+    Parameters
+    ----------
+    factors : Array
+        (n, 1 or 3) gain and perhaps sharpness along rows and columns.
+    smoothing : float
+        Rms of the low pass, px.
     """
     mean = _noise_gain(smoothing)[0][:, None, None]
     size = factors.shape[1]
@@ -311,23 +330,37 @@ _INTERPOLATION = 0.004
 class Fits:
     """Fitted points; numbers are NaN where the window could not be fitted at all.
 
-    Attributes:
-        place: (n, 2) row and column of the templates' middles in the image.
-        affine: (n, 2, 2) A: template pixels by image pixels.
-        gain: (n,) of the image against the template.
-        correlation: (n,) of the image with the fitted template.
-        sigma: (n,) residual standard deviation, DN of the image, by redundancy.
-        contrast: (n,) standard deviation of the image in the window over that of one pixel's noise, the latter from
-            differences of 2 x 2 pixels.
-        smoothing: (n,) rms of the Gaussian that the template was smoothed by, px.
-        iterations: (n,) steps.
-        reason: (n,) codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, SATURATED, FLAT, DIVERGED, MOVED,
-            DISTORTED.
-        spread: what the covariance of the noise is made of.
-        template: what noise of the templates does to the places.
-        relief: what is seen of displacements within the windows.
-        halves: how far apart halves of the windows put the places.
-        scales: how far coarse detail puts the places from where all detail does.
+    Attributes
+    ----------
+    place : Array
+        (n, 2) row and column of the templates' middles in the image.
+    affine : Array
+        (n, 2, 2) A: template pixels by image pixels.
+    gain : Array
+        (n,) of the image against the template.
+    correlation : Array
+        (n,) of the image with the fitted template.
+    sigma : Array
+        (n,) residual standard deviation, DN of the image, by redundancy.
+    contrast : Array
+        (n,) standard deviation of the image in the window over that of one pixel's noise, the latter from differences
+        of 2 x 2 pixels.
+    smoothing : Array
+        (n,) rms of the Gaussian that the template was smoothed by, px.
+    iterations : Index
+        (n,) steps.
+    reason : NDArray[np.int8]
+        (n,) codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, SATURATED, FLAT, DIVERGED, MOVED, DISTORTED.
+    spread : ResidualCorrelation
+        What the covariance of the noise is made of.
+    template : TemplateNoise
+        What noise of the templates does to the places.
+    relief : WindowRelief
+        What is seen of displacements within the windows.
+    halves : WindowHalves
+        How far apart halves of the windows put the places.
+    scales : WindowScales
+        How far coarse detail puts the places from where all detail does.
     """
 
     place: Array
@@ -398,14 +431,21 @@ def least_squares(
 ) -> Fits:
     """Places of templates near start.
 
-    Args:
-        image: (H, W), any real type.
-        templates: (n, k, k), k odd.
-        start: (n, 2) row and column, good to a pixel.
-        options: model and limits; the thresholds on correlation, ratio and sigma are not applied here.
+    Parameters
+    ----------
+    image : ArrayLike
+        (H, W), any real type.
+    templates : ArrayLike
+        (n, k, k), k odd.
+    start : ArrayLike
+        (n, 2) row and column, good to a pixel.
+    options : MatchOptions | None
+        Model and limits; the thresholds on correlation, ratio and sigma are not applied here.
 
-    Raises:
-        ValueError: wrong shapes, a template too small for its margin.
+    Raises
+    ------
+    ValueError
+        Wrong shapes, a template too small for its margin.
     """
     plane = checked_image(image, "least squares matching")
     patch = checked_templates(templates, "least squares matching")

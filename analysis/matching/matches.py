@@ -33,14 +33,20 @@ _BLOCKY = 2.2
 class Matches:
     """Matched points.
 
-    Attributes:
-        place: (n, 2) row and column of the templates' middles in the image; NaN where least squares matching gave none.
-        covariance: (n, 2, 2) px^2, of noise and of displacements within the window; see
-            `analysis.matching.least_squares`.
-        correlation: (n,) of the image with the fitted template; of the search where there is no fit; NaN if neither.
-        ratio: (n,) second best to best peak of the search.
-        accepted: (n,) bool.
-        reason: (n,) codes of `Reason`.
+    Attributes
+    ----------
+    place : Array
+        (n, 2) row and column of the templates' middles in the image; NaN where least squares matching gave none.
+    covariance : Array
+        (n, 2, 2) px^2, of noise and of displacements within the window; see `analysis.matching.least_squares`.
+    correlation : Array
+        (n,) of the image with the fitted template; of the search where there is no fit; NaN if neither.
+    ratio : Array
+        (n,) second best to best peak of the search.
+    accepted : NDArray[np.bool_]
+        (n,) bool.
+    reason : NDArray[np.int8]
+        (n,) codes of `Reason`.
     """
 
     place: Array
@@ -73,15 +79,23 @@ def match(
 ) -> Matches:
     """Find templates in an image, each near its predicted place.
 
-    Args:
-        image: (H, W), any real type.
-        templates: (n, k, k), k odd, resampled into the image's geometry (`resampled`); NaN makes a point unusable.
-        predicted: (n, 2) row and column at which their middles are expected.
-        reach: how far the prediction may be off along rows and columns, px.
-        options: model and thresholds.
+    Parameters
+    ----------
+    image : ArrayLike
+        (H, W), any real type.
+    templates : ArrayLike
+        (n, k, k), k odd, resampled into the image's geometry (`resampled`); NaN makes a point unusable.
+    predicted : ArrayLike
+        (n, 2) row and column at which their middles are expected.
+    reach : int
+        How far the prediction may be off along rows and columns, px.
+    options : MatchOptions | None
+        Model and thresholds.
 
-    Raises:
-        ValueError: wrong shapes, reach out of range, a template too small for its margin.
+    Raises
+    ------
+    ValueError
+        Wrong shapes, reach out of range, a template too small for its margin.
     """
     plane = checked_image(image, "match")
     patch = checked_templates(templates, "match")
@@ -172,12 +186,18 @@ _ROUNDS = 50
 class DisplacementField:
     """Polynomial displacement.
 
-    Attributes:
-        coefficients: (terms, 2) of rows and columns, px: monomials of the scaled place by rising degree, then height.
-        middle: (2,) place that is 0, px.
-        scale: place difference that is 1, px.
-        degree: of the polynomial of row and column.
-        heights: mean and scale of height, or None without it.
+    Attributes
+    ----------
+    coefficients : Array
+        (terms, 2) of rows and columns, px: monomials of the scaled place by rising degree, then height.
+    middle : Array
+        (2,) place that is 0, px.
+    scale : float
+        Place difference that is 1, px.
+    degree : int
+        Of the polynomial of row and column.
+    heights : tuple[float, float] | None
+        Mean and scale of height, or None without it.
     """
 
     coefficients: Array
@@ -189,8 +209,10 @@ class DisplacementField:
     def __call__(self, place: ArrayLike, height: ArrayLike | None = None) -> Array:
         """Displacement (n, 2), px, at places (n, 2) and heights (n,).
 
-        Raises:
-            ValueError: heights given or missing against the fit.
+        Raises
+        ------
+        ValueError
+            Heights given or missing against the fit.
         """
         at = checked_places(place, None, "displacement field")
         if (height is None) != (self.heights is None):
@@ -202,13 +224,20 @@ class DisplacementField:
 class Consensus:
     """Which matches agree.
 
-    Attributes:
-        accepted: (n,) bool; none if there is no consensus.
-        field: the fitted displacement of the accepted, or the best candidate.
-        distance: (n,) residual over its standard deviation; NaN where the match is not finite.
-        scatter: px along each axis, of the field beyond the covariances given; in all without them.
-        limit: of distance.
-        text: the outcome in words.
+    Attributes
+    ----------
+    accepted : Mask
+        (n,) bool; none if there is no consensus.
+    field : DisplacementField
+        The fitted displacement of the accepted, or the best candidate.
+    distance : Array
+        (n,) residual over its standard deviation; NaN where the match is not finite.
+    scatter : float
+        Px along each axis, of the field beyond the covariances given; in all without them.
+    limit : float
+        Of distance.
+    text : str
+        The outcome in words.
     """
 
     accepted: Mask
@@ -231,18 +260,27 @@ def consensus(
 ) -> Consensus:
     """Matches that follow one smooth displacement.
 
-    Args:
-        predicted: (n, 2) row and column; and found: (n, 2), NaN rows take no part.
-        found: (n, 2).
-        covariance: (n, 2, 2) px^2 of found; the scatter is then what the field needs beyond them.
-        height: (n,) of points, any unit; adds a term for what parallax an unknown tilt leaves.
-        degree: 0 to 3 of the polynomial in row and column together.
-        false_alarm: share of right matches that may be lost (normal errors).
-        largest_scatter: px; above it there is no consensus: unrelated matches over a search window scatter by a third
-            of its reach.
+    Parameters
+    ----------
+    predicted : ArrayLike
+        (n, 2) row and column; and found: (n, 2), NaN rows take no part.
+    found : ArrayLike
+        (n, 2).
+    covariance : ArrayLike | None
+        (n, 2, 2) px^2 of found; the scatter is then what the field needs beyond them.
+    height : ArrayLike | None
+        (n,) of points, any unit; adds a term for what parallax an unknown tilt leaves.
+    degree : int
+        0 to 3 of the polynomial in row and column together.
+    false_alarm : float
+        Share of right matches that may be lost (normal errors).
+    largest_scatter : float
+        Px; above it there is no consensus: unrelated matches over a search window scatter by a third of its reach.
 
-    Raises:
-        ValueError: shapes, too few points (two a term, five at least), degree or rates out of range.
+    Raises
+    ------
+    ValueError
+        Shapes, too few points (two a term, five at least), degree or rates out of range.
     """
     place = checked_places(predicted, None, "consensus")
     to = checked_places(found, len(place), "consensus")

@@ -30,18 +30,27 @@ def resampled(image: ArrayLike, rows: ArrayLike, columns: ArrayLike, *, smoothin
     An image of finer pixels than the grid must be low-passed first, or its detail aliases: smoothing about 0.3 to 0.5
     times the ratio of the pixels makes up for pixel and optics of the coarser one.
 
-    Args:
-        image: (H, W), any real type; NaN marks missing pixels.
-        rows: (..., k, l) rows of the samples; each (k, l) is one patch, and is cut out with a halo, so that only the
-            patches and not the image are filtered.
-        columns: (..., k, l).
-        smoothing: standard deviation of a Gaussian low pass in pixels of the image; 0 for none.
+    Parameters
+    ----------
+    image : ArrayLike
+        (H, W), any real type; NaN marks missing pixels.
+    rows : ArrayLike
+        (..., k, l) rows of the samples; each (k, l) is one patch, and is cut out with a halo, so that only the patches
+        and not the image are filtered.
+    columns : ArrayLike
+        (..., k, l).
+    smoothing : float
+        Standard deviation of a Gaussian low pass in pixels of the image; 0 for none.
 
-    Returns:
+    Returns
+    -------
+    Array
         (..., k, l) float64; NaN outside of the image and next to missing pixels.
 
-    Raises:
-        ValueError: image not a plane, rows and columns of different shapes or without patches, smoothing negative.
+    Raises
+    ------
+    ValueError
+        Image not a plane, rows and columns of different shapes or without patches, smoothing negative.
     """
     plane = checked_image(image, "resampling")
     row, column = np.asarray(rows, np.float64), np.asarray(columns, np.float64)
@@ -112,13 +121,20 @@ class SplineStack:
     def __call__(self, row: Array, column: Array, which: NDArray[np.intp], *, order: int) -> Array:
         """Values and derivatives.
 
-        Args:
-            row: (m, p) in pixels of the template; clipped to it.
-            column: (m, p).
-            which: (m,) template of each row of places.
-            order: highest derivative, 1 to 4.
+        Parameters
+        ----------
+        row : Array
+            (m, p) in pixels of the template; clipped to it.
+        column : Array
+            (m, p).
+        which : NDArray[np.intp]
+            (m,) template of each row of places.
+        order : int
+            Highest derivative, 1 to 4.
 
-        Returns:
+        Returns
+        -------
+        Array
             (3, 6, 10 or 15, m, p): value; by row, column; by row row, row column, column column; by row row row, row
             row column, row column column, column column column; and so on.
         """

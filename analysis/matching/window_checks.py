@@ -59,10 +59,14 @@ STEP = 1.0
 class WindowHalves:
     """How far apart halves of windows put the places of n fits, in four splits; NaN where there is no fit.
 
-    Attributes:
-        apart: (n, 4, 2) place of the one half minus that of the other, px.
-        white: (n, 4, 2, 2) its covariance for white residuals of unit variance.
-        effect: (n, 4, 2, 2) its covariance for relief of tau 1 px.
+    Attributes
+    ----------
+    apart : Array
+        (n, 4, 2) place of the one half minus that of the other, px.
+    white : Array
+        (n, 4, 2, 2) its covariance for white residuals of unit variance.
+    effect : Array
+        (n, 4, 2, 2) its covariance for relief of tau 1 px.
     """
 
     apart: Array
@@ -72,11 +76,16 @@ class WindowHalves:
     def judged(self, variance: Array, relief: float) -> tuple[Array, Array]:
         """Are the halves too far apart, and could the test tell?
 
-        Args:
-            variance: (n,) of the noise, DN^2, with its colour.
-            relief: tau^2 of a window that is like most, px^2.
+        Parameters
+        ----------
+        variance : Array
+            (n,) of the noise, DN^2, with its colour.
+        relief : float
+            Tau^2 of a window that is like most, px^2.
 
-        Returns:
+        Returns
+        -------
+        tuple[Array, Array]
             (n,) chance that halves of one displacement field are so far apart; (n,) power: chance that the split with
             the least power notices a step of `STEP` in its worst direction. NaN where there is no fit.
         """
@@ -99,10 +108,14 @@ def risk(share: float, power: Array) -> Array:
 def window_halves(design: Array, residual: Array, side: int) -> WindowHalves:
     """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit.
 
-    Args:
-        design: derivatives of the model, (n, q, p), the first two by place.
-        residual: (n, p), grey values; NaN where there is no fit.
-        side: of the windows, px, with p = side^2.
+    Parameters
+    ----------
+    design : Array
+        Derivatives of the model, (n, q, p), the first two by place.
+    residual : Array
+        (n, p), grey values; NaN where there is no fit.
+    side : int
+        Of the windows, px, with p = side^2.
     """
     count = len(design)
     apart = np.full((count, SPLITS, 2), np.nan)
@@ -150,13 +163,19 @@ _LEAST = 0.5
 class ResidualCorrelation:
     """Correlation of the residuals of n fits; lags are half of those within `LAG`.
 
-    Attributes:
-        variance: (n,) of the residuals, DN^2, by redundancy.
-        white: (n, 2, 2) covariance of the place for residuals that are white with unit variance; NaN where most of what
-            the fit knows is noise of the template.
-        influence: (n, lags, 2, 2) by how much correlation 1 at a lag and at its opposite raises it.
-        correlation: (n, lags) of the residuals, freed of what the fit takes out of white noise.
-        pixels, unknowns: (n,) of the fits.
+    Attributes
+    ----------
+    variance : Array
+        (n,) of the residuals, DN^2, by redundancy.
+    white : Array
+        (n, 2, 2) covariance of the place for residuals that are white with unit variance; NaN where most of what the
+        fit knows is noise of the template.
+    influence : Array
+        (n, lags, 2, 2) by how much correlation 1 at a lag and at its opposite raises it.
+    correlation : Array
+        (n, lags) of the residuals, freed of what the fit takes out of white noise.
+    pixels, unknowns : NDArray[np.intp]
+        (n,) of the fits.
     """
 
     variance: Array
@@ -195,12 +214,17 @@ def residual_correlation(
 ) -> ResidualCorrelation:
     """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit.
 
-    Args:
-        design: derivatives of the model, (n, q, p), the first two by place.
-        residual: (n, p), grey values; NaN where there is no fit.
-        side: of the windows, px, with p = side^2.
-        inverse: (n, q, q) of the curvature, by which the unknowns answer to residuals
-            (`analysis.matching.least_squares`); NaN where that is not known. None: of the normal matrix.
+    Parameters
+    ----------
+    design : Array
+        Derivatives of the model, (n, q, p), the first two by place.
+    residual : Array
+        (n, p), grey values; NaN where there is no fit.
+    side : int
+        Of the windows, px, with p = side^2.
+    inverse : Array | None
+        (n, q, q) of the curvature, by which the unknowns answer to residuals (`analysis.matching.least_squares`); NaN
+        where that is not known. None: of the normal matrix.
     """
     count, unknowns, pixels = design.shape
     variance = np.full(count, np.nan)
@@ -271,9 +295,12 @@ _CLIPPED = 3.0
 class WindowScales:
     """How far coarse detail puts the places of n fits from where all detail does; NaN where there is no fit.
 
-    Attributes:
-        apart: (n, 2) px.
-        spread: what its covariance is made of.
+    Attributes
+    ----------
+    apart : Array
+        (n, 2) px.
+    spread : ResidualCorrelation
+        What its covariance is made of.
     """
 
     apart: Array
@@ -282,9 +309,12 @@ class WindowScales:
     def excess(self, factor: Array, good: NDArray[np.bool_]) -> Array:
         """Return the (n, 2, 2) covariance, px^2, that distances beyond noise ask for; NaN for those that stand out.
 
-        Args:
-            factor: (n,) of the noise.
-            good: (n,) points that share what they have in common.
+        Parameters
+        ----------
+        factor : Array
+            (n,) of the noise.
+        good : NDArray[np.bool_]
+            (n,) points that share what they have in common.
         """
         covariance = self.spread.covariance(good) * factor[:, None, None]
         known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(self.apart).all(axis=1)
@@ -314,11 +344,16 @@ def window_scales(design: Array, residual: Array, side: int, spread: ResidualCor
     A fit to the low-passed window differs by (D W D')^-1 D W r - (D D')^-1 D r, with W the low pass twice: where the
     model is right both see the same place, and the difference is noise (Hausman, Econometrica 46(6), 1978).
 
-    Args:
-        design: derivatives of the model, (n, q, p), the first two by place.
-        residual: (n, p), grey values; NaN where there is no fit.
-        side: of the windows, px, with p = side^2.
-        spread: of the residuals.
+    Parameters
+    ----------
+    design : Array
+        Derivatives of the model, (n, q, p), the first two by place.
+    residual : Array
+        (n, p), grey values; NaN where there is no fit.
+    side : int
+        Of the windows, px, with p = side^2.
+    spread : ResidualCorrelation
+        Of the residuals.
     """
     apart = np.full((len(design), 2), np.nan)
     white, influence = np.full_like(spread.white, np.nan), np.full_like(spread.influence, np.nan)
@@ -360,12 +395,18 @@ _HELD = 2.5
 class WindowRelief:
     """What residuals of n fits show of relief within their windows; NaN where there is no fit.
 
-    Attributes:
-        score: (n,) q, DN^2.
-        first: (n,) tr(K G): the score's expectation for white residuals of unit variance.
-        second: (n,) tr(K G K G), DN^2 px^-2: its expectation for tau of 1 px.
-        redundancy: (n,) of the fit.
-        effect: (n, 2, 2) covariance of the place for tau of 1 px.
+    Attributes
+    ----------
+    score : Array
+        (n,) q, DN^2.
+    first : Array
+        (n,) tr(K G): the score's expectation for white residuals of unit variance.
+    second : Array
+        (n,) tr(K G K G), DN^2 px^-2: its expectation for tau of 1 px.
+    redundancy : Array
+        (n,) of the fit.
+    effect : Array
+        (n, 2, 2) covariance of the place for tau of 1 px.
     """
 
     score: Array
@@ -377,13 +418,19 @@ class WindowRelief:
     def square(self, variance: Array, coloured: Array, good: NDArray[np.bool_]) -> tuple[Array, float]:
         """tau^2 of each point, and of one that is like most.
 
-        Args:
-            variance: (n,) of the residuals, DN^2, by redundancy.
-            coloured: (n,) how much larger the correlation of residuals makes the covariance of the place than white
-                residuals would.
-            good: (n,) points that share what they have in common.
+        Parameters
+        ----------
+        variance : Array
+            (n,) of the residuals, DN^2, by redundancy.
+        coloured : Array
+            (n,) how much larger the correlation of residuals makes the covariance of the place than white residuals
+            would.
+        good : NDArray[np.bool_]
+            (n,) points that share what they have in common.
 
-        Returns:
+        Returns
+        -------
+        tuple[Array, float]
             (n,) px^2, and px^2.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -414,10 +461,14 @@ def _not_negative(value: float, error: float) -> float:
 def window_relief(design: Array, residual: Array, side: int) -> WindowRelief:
     """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit.
 
-    Args:
-        design: derivatives of the model, (n, q, p), the first two by place.
-        residual: (n, p), grey values; NaN where there is no fit.
-        side: of the windows, px, with p = side^2.
+    Parameters
+    ----------
+    design : Array
+        Derivatives of the model, (n, q, p), the first two by place.
+    residual : Array
+        (n, p), grey values; NaN where there is no fit.
+    side : int
+        Of the windows, px, with p = side^2.
     """
     count, unknowns, pixels = design.shape
     score, first, second, redundancy = np.full((4, count), np.nan)

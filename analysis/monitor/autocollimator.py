@@ -73,11 +73,16 @@ def exact_reading(axis: str, angle: ArrayLike, unit: int, between: float) -> Arr
     it adds to the relations: about Y2 a relative -sin^2(b) a^2 / 6 for a turn about Y1 (-cos^2(b) a^2 / 6 about Z1),
     0.0003" at 720"; but about X2 a second-order sin(b) cos(b) a^2 / 2 in size, 0.54" at 720" and 30 or 60 deg.
 
-    Args:
-        axis: of the turn: X, Y or Z.
-        angle: (...), radians.
-        unit: which autocollimator, 1 or 2.
-        between: angle b between the two, radians.
+    Parameters
+    ----------
+    axis : str
+        Of the turn: X, Y or Z.
+    angle : ArrayLike
+        (...), radians.
+    unit : int
+        Which autocollimator, 1 or 2.
+    between : float
+        Angle b between the two, radians.
     """
     a = np.asarray(angle, np.float64)
     b = between if unit == 2 else 0.0
@@ -128,10 +133,14 @@ class ReadingMap:
 
         Raises ValueError when there are too few of them.
 
-        Args:
-            place: (P, 2) spots (row, column), px.
-            reading: (P, 2) about X, about Y, radians.
-            degree: of the polynomials.
+        Parameters
+        ----------
+        place : ArrayLike
+            (P, 2) spots (row, column), px.
+        reading : ArrayLike
+            (P, 2) about X, about Y, radians.
+        degree : int
+            Of the polynomials.
         """
         spots, known = np.asarray(place, np.float64), np.asarray(reading, np.float64)
         if spots.ndim != 2 or spots.shape[1] != 2 or known.shape != spots.shape:

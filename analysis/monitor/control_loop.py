@@ -45,10 +45,14 @@ _OFFSETS = 41
 def open_loop(gain: float, delay: int, frequency: ArrayLike) -> NDArray[np.complex128]:
     """Transfer L of the open loop.
 
-    Args:
-        gain: g.
-        delay: d, readings.
-        frequency: of any shape, cycles per reading, above 0 up to 0.5.
+    Parameters
+    ----------
+    gain : float
+        g.
+    delay : int
+        d, readings.
+    frequency : ArrayLike
+        Of any shape, cycles per reading, above 0 up to 0.5.
     """
     turn = np.exp(-2j * np.pi * np.asarray(frequency, np.float64))
     return np.asarray(gain * turn ** (delay + 1) / (1.0 - turn))
@@ -60,10 +64,14 @@ def rejection(gain: float, delay: int, frequency: ArrayLike) -> Array:
     Images are taken after the command of the same reading: of delay 0 and gain 1 nothing is left, whatever the
     frequency.
 
-    Args:
-        gain: g.
-        delay: d, readings.
-        frequency: of any shape, cycles per reading, above 0 up to 0.5.
+    Parameters
+    ----------
+    gain : float
+        g.
+    delay : int
+        d, readings.
+    frequency : ArrayLike
+        Of any shape, cycles per reading, above 0 up to 0.5.
     """
     turn = np.exp(-2j * np.pi * np.asarray(frequency, np.float64))
     return np.asarray(np.abs(1.0 - gain * turn**delay / (1.0 - turn + gain * turn ** (delay + 1))))
@@ -73,12 +81,16 @@ def rejection(gain: float, delay: int, frequency: ArrayLike) -> Array:
 class Margins:
     """How far a loop is from becoming unstable.
 
-    Attributes:
-        limit: gain below which a loop with this delay is stable.
-        gain: the limit over the loop's own gain; infinite for gain 0.
-        phase_deg: what the phase may lose where the open loop's size is 1; NaN where it is larger or smaller at all
-            frequencies.
-        crossover: that frequency, cycles per reading; NaN likewise.
+    Attributes
+    ----------
+    limit : float
+        Gain below which a loop with this delay is stable.
+    gain : float
+        The limit over the loop's own gain; infinite for gain 0.
+    phase_deg : float
+        What the phase may lose where the open loop's size is 1; NaN where it is larger or smaller at all frequencies.
+    crossover : float
+        That frequency, cycles per reading; NaN likewise.
     """
 
     limit: float
@@ -95,9 +107,12 @@ class Margins:
 def margins(gain: float, delay: int) -> Margins:
     """Margins of one loop by itself.
 
-    Args:
-        gain: g, 0 or more.
-        delay: d, readings.
+    Parameters
+    ----------
+    gain : float
+        g, 0 or more.
+    delay : int
+        d, readings.
     """
     limit = 2.0 * math.sin(math.pi / (4 * delay + 2))
     if not 0.0 < gain <= 2.0:
@@ -115,12 +130,17 @@ def spectral_radius(
     A loop of gain 0, which does nothing, does not count. Loops on one quantity add up the same numbers, so that what
     their mechanisms do against each other is not a state of its own.
 
-    Args:
-        coupling: (n, n) what the mechanism of a column does to the quantity of a row, over what the row's own mechanism
-            does to it; 1 on the diagonal.
-        gains: (n,) of the loops.
-        delays: (n,) of them, readings.
-        quantities: (n,) which quantity each acts on, by number; by default each on its own.
+    Parameters
+    ----------
+    coupling : ArrayLike
+        (n, n) what the mechanism of a column does to the quantity of a row, over what the row's own mechanism does to
+        it; 1 on the diagonal.
+    gains : Sequence[float]
+        (n,) of the loops.
+    delays : Sequence[int]
+        (n,) of them, readings.
+    quantities : Sequence[int] | None
+        (n,) which quantity each acts on, by number; by default each on its own.
     """
     every, g = np.asarray(coupling, np.float64), np.asarray(gains, np.float64)
     acting = np.flatnonzero(g != 0.0).tolist()
@@ -147,11 +167,16 @@ def common_margin(
 ) -> float:
     """By how much all gains together may be larger (or must be smaller) for the loops to be at the limit of stability.
 
-    Args:
-        coupling: (n, n) as of `spectral_radius`.
-        gains: (n,) likewise.
-        delays: (n,) likewise.
-        quantities: (n,) likewise.
+    Parameters
+    ----------
+    coupling : ArrayLike
+        (n, n) as of `spectral_radius`.
+    gains : Sequence[float]
+        (n,) likewise.
+    delays : Sequence[int]
+        (n,) likewise.
+    quantities : Sequence[int] | None
+        (n,) likewise.
     """
     g = np.asarray(gains, np.float64)
     if not np.any(g):
@@ -177,10 +202,14 @@ def common_margin(
 class LimitCycle:
     """How a mechanism of whole steps goes on moving although nothing changes, at the worst place between two steps.
 
-    Attributes:
-        steps: largest distance between positions that it goes to and fro, steps; 0 where it comes to rest everywhere.
-        left: largest of what is then left of the quantity, in what one step does to it.
-        period: readings of the longest cycle; 0 for none, NaN where it does not come back within the time watched.
+    Attributes
+    ----------
+    steps : int
+        Largest distance between positions that it goes to and fro, steps; 0 where it comes to rest everywhere.
+    left : float
+        Largest of what is then left of the quantity, in what one step does to it.
+    period : float
+        Readings of the longest cycle; 0 for none, NaN where it does not come back within the time watched.
     """
 
     steps: int
@@ -191,10 +220,14 @@ class LimitCycle:
 def limit_cycle(gain: float, delay: int, dead_band: float = 0.0) -> LimitCycle:
     """The limit cycle of a mechanism of whole steps, by going through the recursion.
 
-    Args:
-        gain: g.
-        delay: d, readings.
-        dead_band: what is left and is smaller is left alone, in what one step does.
+    Parameters
+    ----------
+    gain : float
+        g.
+    delay : int
+        d, readings.
+    dead_band : float
+        What is left and is smaller is left alone, in what one step does.
     """
     offset = np.linspace(0.0, 1.0, _OFFSETS) + 0.5 / _OFFSETS
     command = np.zeros((delay + 2, len(offset)))

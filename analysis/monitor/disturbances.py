@@ -32,21 +32,30 @@ class TimeLaw:
     The law is g(t) g(t') rho(t - t') C(t, t'): an amplitude that is known but for its size, a correlation over the gap,
     and the chance that a step has come by both times. Each factor is positive semidefinite, and so is their product.
 
-    Attributes:
-        white: independent at different times; all others are then None.
-        drift_s: time in which it forgets where it was, seconds, None for never.
-        period_s: it comes back with, seconds, None for none.
-        trend_s: it grows linearly, g = (t - since) / trend_s; seconds, None for no growth.
-        relaxation_s: it goes to a new value, g = 1 - exp(-(t - since) / relaxation_s) and 0 before; None for none.
-        since_s: where trend and relaxation start, seconds.
-        event: a step, (time, chance that it has come by then) in the order of time, linear between; one entry
-            (time, 1) for a known moment; above 1 it is the mean number of steps of many. C is the chance at the earlier
-            of two times: at a time that is not sure to be after the step the motion is known the less. Empty for no
-            step.
-        jump: a step whose time nobody knows: it counts as not there until it is found (`jump_detection`), and is then
-            an event. All others but ``every_s`` are then as by default.
-        every_s: mean time between two such steps, seconds; None where nothing is stated, and what is too small to be
-            found then counts as not there.
+    Attributes
+    ----------
+    white : bool
+        Independent at different times; all others are then None.
+    drift_s : float | None
+        Time in which it forgets where it was, seconds, None for never.
+    period_s : float | None
+        It comes back with, seconds, None for none.
+    trend_s : float | None
+        It grows linearly, g = (t - since) / trend_s; seconds, None for no growth.
+    relaxation_s : float | None
+        It goes to a new value, g = 1 - exp(-(t - since) / relaxation_s) and 0 before; None for none.
+    since_s : float
+        Where trend and relaxation start, seconds.
+    event : tuple[tuple[float, float], ...]
+        a step, (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a
+        known moment; above 1 it is the mean number of steps of many. C is the chance at the earlier of two times: at a
+        time that is not sure to be after the step the motion is known the less. Empty for no step.
+    jump : bool
+        a step whose time nobody knows: it counts as not there until it is found (`jump_detection`), and is then an
+        event. All others but ``every_s`` are then as by default.
+    every_s : float | None
+        Mean time between two such steps, seconds; None where nothing is stated, and what is too small to be found then
+        counts as not there.
     """
 
     white: bool = False
@@ -89,9 +98,12 @@ class TimeLaw:
     def over(self, then: float, now: float) -> tuple[float, float, float]:
         """Variance at one time, covariance with a later one and variance there; a jump may have come between them.
 
-        Args:
-            then: the earlier time, seconds.
-            now: the later one.
+        Parameters
+        ----------
+        then : float
+            The earlier time, seconds.
+        now : float
+            The later one.
         """
         if self.jump:
             return 0.0, 0.0, 1.0
@@ -114,17 +126,28 @@ class TimeLaw:
 class Disturbances:
     """Stated disturbances of K cameras with D spot coordinates together.
 
-    Attributes:
-        name: of the statement.
-        labels: (M,) names of the motions: ``base/forward/M2 shift z``.
-        bodies: (M,) whose they are.
-        causes: (M,) to which of the stated causes they belong.
-        sigmas: (M,) standard deviations in units for people; units: (M,) these units.
-        spots: (D, M) px for one standard deviation, spots in the order of the calibration, each row then column.
-        parameters: (4 K, M) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other, likewise.
-        correlation: (M, M), positive semidefinite.
-        laws: (M,) in time.
-        jump_false_alarm: chance that a series without a jump has one reported, over all times and motions together.
+    Attributes
+    ----------
+    name : str
+        Of the statement.
+    labels : tuple[str, ...]
+        (M,) names of the motions: ``base/forward/M2 shift z``.
+    bodies : tuple[str, ...]
+        (M,) whose they are.
+    causes : tuple[str, ...]
+        (M,) to which of the stated causes they belong.
+    sigmas : Array
+        (M,) standard deviations in units for people; units: (M,) these units.
+    spots : Array
+        (D, M) px for one standard deviation, spots in the order of the calibration, each row then column.
+    parameters : Array
+        (4 K, M) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other, likewise.
+    correlation : Array
+        (M, M), positive semidefinite.
+    laws : tuple[TimeLaw, ...]
+        (M,) in time.
+    jump_false_alarm : float
+        Chance that a series without a jump has one reported, over all times and motions together.
     """
 
     name: str
@@ -175,8 +198,10 @@ class Disturbances:
     def scaled(self, factors: Sequence[float] | Array) -> Disturbances:
         """Disturbances whose motions have their standard deviations times factors (M,).
 
-        Args:
-            factors: one for each motion; 0 takes it out.
+        Parameters
+        ----------
+        factors : Sequence[float] | Array
+            One for each motion; 0 takes it out.
         """
         f = np.asarray(factors, np.float64)
         return replace(self, sigmas=self.sigmas * f, spots=self.spots * f, parameters=self.parameters * f)
@@ -184,9 +209,12 @@ class Disturbances:
     def between(self, then: float, now: float) -> Disturbances:
         """Disturbances from one time to another, in place of those from what the instrument is meant to be.
 
-        Args:
-            then: the earlier time, seconds.
-            now: the later one.
+        Parameters
+        ----------
+        then : float
+            The earlier time, seconds.
+        now : float
+            The later one.
         """
         over = np.array([law.over(then, now) for law in self.laws]).reshape(-1, 3)
         return self.scaled(np.sqrt(np.maximum(over[:, 0] + over[:, 2] - 2.0 * over[:, 1], 0.0)))
@@ -195,10 +223,14 @@ class Disturbances:
         """Disturbances with copies of some motions beside them, which go together as those do and are independent of
         them.
 
-        Args:
-            which: numbers of the motions.
-            times: standard deviations of the copies over those of the motions.
-            law: of the copies in time.
+        Parameters
+        ----------
+        which : Sequence[int]
+            Numbers of the motions.
+        times : float
+            Standard deviations of the copies over those of the motions.
+        law : TimeLaw
+            Of the copies in time.
         """
         own = list(which)
         count = len(self.labels)
@@ -226,16 +258,20 @@ class Disturbances:
     def best_gain(self, noise: Array) -> Array:
         """Parameters per pixel of the best linear unbiased prediction, B C A' (A C A' + R)^-1, (..., 4 K, D).
 
-        Args:
-            noise: R, (..., D, D) of the shifts, px^2.
+        Parameters
+        ----------
+        noise : Array
+            R, (..., D, D) of the shifts, px^2.
         """
         return self._best(self.parameters, noise)
 
     def best_amounts(self, noise: Array) -> Array:
         """Motions of the best prediction in standard deviations per pixel, C A' (A C A' + R)^-1, (..., M, D).
 
-        Args:
-            noise: R, (..., D, D) of the shifts, px^2.
+        Parameters
+        ----------
+        noise : Array
+            R, (..., D, D) of the shifts, px^2.
         """
         return self._best(np.eye(len(self.labels)), noise)
 
@@ -250,8 +286,10 @@ class Disturbances:
     def misfit(self, gain: Array) -> Array:
         """(..., 4 K, 4 K) covariance of what an estimator makes wrong of the motions themselves.
 
-        Args:
-            gain: parameters per pixel of an estimator, (..., 4 K, D).
+        Parameters
+        ----------
+        gain : Array
+            Parameters per pixel of an estimator, (..., 4 K, D).
         """
         left = (gain @ self.spots - self.parameters) @ self.root
         return np.asarray(left @ np.swapaxes(left, -1, -2))
@@ -261,10 +299,14 @@ class Disturbances:
 class Suspect:
     """A body whose motion would explain shifts that contradict the statement.
 
-    Attributes:
-        body: its path.
-        times: how many times its stated standard deviations would have to be larger.
-        gain: of the log likelihood by that.
+    Attributes
+    ----------
+    body : str
+        Its path.
+    times : float
+        How many times its stated standard deviations would have to be larger.
+    gain : float
+        Of the log likelihood by that.
     """
 
     body: str
@@ -277,13 +319,20 @@ class Suspect:
 class Consistency:
     """Do the measured shifts agree with disturbances and noise?
 
-    Attributes:
-        chi_square: s' (A C A' + R)^-1 s.
-        degrees: of freedom, the number of spot coordinates.
-        limit: of ``chi_square``, exceeded with a chance of ``false_alarm`` by shifts that are as stated.
-        suspects: bodies that would explain a contradiction, the best first; empty where there is none.
-        false_alarm: the chance that ``limit`` is for.
-        sigma_noise: by how much the noise of the images moves ``chi_square``, one standard deviation, to first order.
+    Attributes
+    ----------
+    chi_square : float
+        s' (A C A' + R)^-1 s.
+    degrees : int
+        Of freedom, the number of spot coordinates.
+    limit : float
+        Of ``chi_square``, exceeded with a chance of ``false_alarm`` by shifts that are as stated.
+    suspects : tuple[Suspect, ...]
+        Bodies that would explain a contradiction, the best first; empty where there is none.
+    false_alarm : float
+        The chance that ``limit`` is for.
+    sigma_noise : float
+        By how much the noise of the images moves ``chi_square``, one standard deviation, to first order.
     """
 
     chi_square: float
@@ -312,9 +361,12 @@ class Consistency:
     def power(times: float, degrees: int) -> float:
         """Chance to find disturbances that are all so many times larger than stated, where noise is small.
 
-        Args:
-            times: larger standard deviations.
-            degrees: number of spot coordinates.
+        Parameters
+        ----------
+        times : float
+            Larger standard deviations.
+        degrees : int
+            Number of spot coordinates.
         """
         return float(chance_beyond(limit_of(FALSE_ALARM, degrees) / times**2, degrees))
 
@@ -322,10 +374,14 @@ class Consistency:
 def chi_squares(shifts: Array, noise: Array, stated: Disturbances) -> Array:
     """Return (T,) the predictive chi-square of each of T measurements by itself; no suspects are looked for.
 
-    Args:
-        shifts: (T, D) measured, px.
-        noise: (T, D, D) their covariance, px^2.
-        stated: what was to be expected.
+    Parameters
+    ----------
+    shifts : Array
+        (T, D) measured, px.
+    noise : Array
+        (T, D, D) their covariance, px^2.
+    stated : Disturbances
+        What was to be expected.
     """
     return np.array([consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(shifts, noise, strict=True)])
 
@@ -339,14 +395,19 @@ def consistency(
 ) -> Consistency:
     """Predictive chi-square of one measurement.
 
-    Args:
-        shift: (D,) measured, px.
-        noise: (D, D) its covariance, px^2.
-        stated: what was to be expected.
-        others: bodies of which nothing is stated -> what motions of theirs do to the spots, (D, k) px, to be suspected
-            too.
-        false_alarm: chance that shifts as stated are called a contradiction; of one of T measurements that are tested
-            together a T-th of what all may have.
+    Parameters
+    ----------
+    shift : Array
+        (D,) measured, px.
+    noise : Array
+        (D, D) its covariance, px^2.
+    stated : Disturbances
+        What was to be expected.
+    others : Mapping[str, Array] | None
+        Bodies of which nothing is stated -> what motions of theirs do to the spots, (D, k) px, to be suspected too.
+    false_alarm : float
+        Chance that shifts as stated are called a contradiction; of one of T measurements that are tested together a
+        T-th of what all may have.
     """
     spread = stated.spot_covariance + noise
     root = np.linalg.cholesky(spread)

@@ -33,11 +33,16 @@ PARAMETERS_EACH = 4
 class Shifts:
     """What an estimator is given: S states of K cameras with C spots together.
 
-    Attributes:
-        before, after: (S, C, 2) spot positions (row, column), px, one camera's after the other's.
-        covariance: (S, 2 C, 2 C) px^2 of after - before; zeros without noise.
-        cameras: what is calibrated of each.
-        disturbances: what is stated to move, None for nothing.
+    Attributes
+    ----------
+    before, after : Array
+        (S, C, 2) spot positions (row, column), px, one camera's after the other's.
+    covariance : Array
+        (S, 2 C, 2 C) px^2 of after - before; zeros without noise.
+    cameras : Mapping[str, CameraCalibration]
+        What is calibrated of each.
+    disturbances : Disturbances | None
+        What is stated to move, None for nothing.
     """
 
     before: Array
@@ -66,10 +71,14 @@ class Shifts:
 class Estimator(ABC):
     """Makes changes of all cameras of the shifts of all spots.
 
-    Attributes:
-        title: for readers, its name in files with blanks.
-        note: for readers, what it is.
-        stated: whether it needs stated disturbances; without any it does not stand in the results.
+    Attributes
+    ----------
+    title : str
+        For readers, its name in files with blanks.
+    note : str
+        For readers, what it is.
+    stated : bool
+        Whether it needs stated disturbances; without any it does not stand in the results.
     """
 
     title: str
@@ -79,9 +88,12 @@ class Estimator(ABC):
     def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
         """Whether it can be used with these cameras and with what is stated.
 
-        Args:
-            cameras: what is calibrated of each.
-            disturbances: what is stated to move, None for nothing.
+        Parameters
+        ----------
+        cameras : Mapping[str, CameraCalibration]
+            What is calibrated of each.
+        disturbances : Disturbances | None
+            What is stated to move, None for nothing.
         """
         return disturbances is not None or not self.stated
 
@@ -89,15 +101,19 @@ class Estimator(ABC):
     def gain(self, shifts: Shifts) -> Array:
         """Parameters per pixel of shift, (S, 4 K, 2 C).
 
-        Args:
-            shifts: what was measured.
+        Parameters
+        ----------
+        shifts : Shifts
+            What was measured.
         """
 
     def read(self, shifts: Shifts) -> Array:
         """The parameters, (S, 4 K): gain x shifts, unless an estimator has something better.
 
-        Args:
-            shifts: what was measured.
+        Parameters
+        ----------
+        shifts : Shifts
+            What was measured.
         """
         return np.einsum("spd,sd->sp", self.gain(shifts), shifts.vector)
 
@@ -109,9 +125,12 @@ class OfEachCamera(Estimator):
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
         """(4, 2 n) or (S, 4, 2 n) parameters of one camera per pixel.
 
-        Args:
-            camera: its calibration.
-            covariance: (S, 2 n, 2 n) of its shifts, px^2.
+        Parameters
+        ----------
+        camera : CameraCalibration
+            Its calibration.
+        covariance : Array
+            (S, 2 n, 2 n) of its shifts, px^2.
         """
 
     def gain(self, shifts: Shifts) -> Array:
@@ -131,10 +150,14 @@ Exact = Callable[[ArrayLike, ArrayLike, ArrayLike, MonitorGeometry], CameraParam
 class Formula(OfEachCamera):
     """A set of formulas of `analysis.monitor.monitor_formulas`.
 
-    Attributes:
-        name: there and in files.
-        note: for readers.
-        exact: the formulas as they are, where they are not linear.
+    Attributes
+    ----------
+    name : str
+        There and in files.
+    note : str
+        For readers.
+    exact : Exact | None
+        The formulas as they are, where they are not linear.
     """
 
     name: str
@@ -149,9 +172,12 @@ class Formula(OfEachCamera):
     def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
         """To cameras with a left and a right spot.
 
-        Args:
-            cameras: what is calibrated of each.
-            disturbances: of no matter.
+        Parameters
+        ----------
+        cameras : Mapping[str, CameraCalibration]
+            What is calibrated of each.
+        disturbances : Disturbances | None
+            Of no matter.
         """
         return all(camera.pair is not None for camera in cameras.values())
 
@@ -245,11 +271,15 @@ JUDGED = ("posterior", "model")
 def judged(names: Iterable[str]) -> str:
     """The estimator that verdicts, quoted sigmas and studies are about: the best one that could be used.
 
-    Args:
-        names: of those that stand in the results.
+    Parameters
+    ----------
+    names : Iterable[str]
+        Of those that stand in the results.
 
-    Raises:
-        ValueError: none of them is judged by.
+    Raises
+    ------
+    ValueError
+        None of them is judged by.
     """
     known = list(names)
     for name in JUDGED:
@@ -261,8 +291,11 @@ def judged(names: Iterable[str]) -> str:
 def applicable(cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> dict[str, Estimator]:
     """The estimators that can be used with these cameras and with what is stated.
 
-    Args:
-        cameras: what is calibrated of each.
-        disturbances: what is stated to move, None for nothing.
+    Parameters
+    ----------
+    cameras : Mapping[str, CameraCalibration]
+        What is calibrated of each.
+    disturbances : Disturbances | None
+        What is stated to move, None for nothing.
     """
     return {name: one for name, one in ESTIMATORS.items() if one.applies(cameras, disturbances)}

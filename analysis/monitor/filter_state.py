@@ -54,12 +54,18 @@ from analysis.monitor.jump_detection import Amounts, Candidate, Jump
 class Observed:
     """One reading: of all spots, or of d sensors or combinations of parameters.
 
-    Attributes:
-        time: seconds.
-        value: (D,) shifts of the spots since the reference, px; (d,) of another reading, in its unit.
-        noise: its covariance.
-        sensors: numbers of the sensors of `HeatInputs` that read it, d of them.
-        parameters: (d, P) rows on the parameters that it reads.
+    Attributes
+    ----------
+    time : float
+        seconds.
+    value : Array
+        (D,) shifts of the spots since the reference, px; (d,) of another reading, in its unit.
+    noise : Array
+        Its covariance.
+    sensors : tuple[int, ...]
+        Numbers of the sensors of `HeatInputs` that read it, d of them.
+    parameters : Array | None
+        (d, P) rows on the parameters that it reads.
     """
 
     time: float
@@ -78,10 +84,14 @@ class Observed:
 class BadReading:
     """Evidence that a reading is bad.
 
-    Attributes:
-        log_ratio: logarithm of the likelihood if it is bad, chance beforehand included, over that if it is not.
-        z: the coordinate that is furthest from what all others and the past make of it, in standard deviations.
-        coordinate: number of it.
+    Attributes
+    ----------
+    log_ratio : float
+        Logarithm of the likelihood if it is bad, chance beforehand included, over that if it is not.
+    z : float
+        The coordinate that is furthest from what all others and the past make of it, in standard deviations.
+    coordinate : int
+        Number of it.
     """
 
     log_ratio: float
@@ -93,14 +103,22 @@ class BadReading:
 class Innovation:
     """A reading against what was expected of it before it came.
 
-    Attributes:
-        observed: the reading.
-        white: (d,) the difference in independent standard deviations.
-        log_score: logarithm of the density that was stated for what came.
-        jump: told at this reading; None for none.
-        bad: what speaks for the reading being bad, where it was set aside; None where it was taken.
-        earlier: the reading that was set aside before it, if that was taken after all.
-        settled: whether one was set aside before it, of which it is decided now whether it is taken or left out.
+    Attributes
+    ----------
+    observed : Observed
+        The reading.
+    white : Array
+        (d,) the difference in independent standard deviations.
+    log_score : float
+        Logarithm of the density that was stated for what came.
+    jump : Jump | None
+        Told at this reading; None for none.
+    bad : BadReading | None
+        What speaks for the reading being bad, where it was set aside; None where it was taken.
+    earlier : Innovation | None
+        The reading that was set aside before it, if that was taken after all.
+    settled : bool
+        Whether one was set aside before it, of which it is decided now whether it is taken or left out.
     """
 
     observed: Observed
@@ -121,10 +139,14 @@ class Innovation:
 class Track:
     """A filter, and what steps just before each of L readings would do to it.
 
-    Attributes:
-        mean: (n,); covariance: (n, n).
-        response: (L, n, q) of the mean to steps of unit outputs.
-        score: (L, q) b of the module's text; information: (L, q, q) J.
+    Attributes
+    ----------
+    mean : Array
+        (n,); covariance: (n, n).
+    response : Array
+        (L, n, q) of the mean to steps of unit outputs.
+    score : Array
+        (L, q) b of the module's text; information: (L, q, q) J.
     """
 
     mean: Array
@@ -142,10 +164,14 @@ class Track:
 class Whitened:
     """A reading divided by the root of its covariance.
 
-    Attributes:
-        root: Cholesky factor (d, d) of its covariance, noise included.
-        white: (d,) root^-1 (value - what was expected).
-        rows: (d, n) root^-1 H; gain: (d, n) root^-1 H P; picked: (d, q) root^-1 what unit outputs do to it.
+    Attributes
+    ----------
+    root : Array
+        Cholesky factor (d, d) of its covariance, noise included.
+    white : Array
+        (d,) root^-1 (value - what was expected).
+    rows : Array
+        (d, n) root^-1 H; gain: (d, n) root^-1 H P; picked: (d, q) root^-1 what unit outputs do to it.
     """
 
     root: Array
@@ -159,10 +185,14 @@ class Whitened:
 class Aside:
     """A reading that was set aside until the next one, since it may be bad or the first after a jump.
 
-    Attributes:
-        taken: what is known if it is good.
-        innovation: of it.
-        log_odds: logarithm of the odds that it is bad.
+    Attributes
+    ----------
+    taken : Belief
+        What is known if it is good.
+    innovation : Innovation
+        Of it.
+    log_odds : float
+        Logarithm of the odds that it is bad.
     """
 
     taken: Belief
@@ -174,14 +204,22 @@ class Aside:
 class Belief:
     """All that is known from the readings so far.
 
-    Attributes:
-        time: of the newest reading or of the start, seconds.
-        last: time of the newest reading of spots; NaN before the first.
-        after, until: (L,) between which times each step that is looked for comes, seconds.
-        state: the filter. search: the one that looks for jumps, which knows of no walk; None where they are the same.
-        left: (m,) what share of the mean square of jumps cannot be told, of each motion of a stated rate.
-        recent: whether each of the last readings of spots was left out as a bad one.
-        aside: a reading after which this is what is known if it is bad; None for none.
+    Attributes
+    ----------
+    time : float
+        Of the newest reading or of the start, seconds.
+    last : float
+        Time of the newest reading of spots; NaN before the first.
+    after, until : Array
+        (L,) between which times each step that is looked for comes, seconds.
+    state : Track
+        The filter. search: the one that looks for jumps, which knows of no walk; None where they are the same.
+    left : Array
+        (m,) what share of the mean square of jumps cannot be told, of each motion of a stated rate.
+    recent : tuple[bool, ...]
+        Whether each of the last readings of spots was left out as a bad one.
+    aside : Aside | None
+        a reading after which this is what is known if it is bad; None for none.
     """
 
     time: float
@@ -221,11 +259,16 @@ more."""
 class Jumper:
     """A body that jumps at a stated rate.
 
-    Attributes:
-        motions: r numbers of all its motions that jump.
-        spots: (q, r) what independent amounts of unit variance do that make the stated motions.
-        root: (r, r) the motions by these amounts.
-        every_s: mean time between two jumps, seconds.
+    Attributes
+    ----------
+    motions : tuple[int, ...]
+        r numbers of all its motions that jump.
+    spots : Array
+        (q, r) what independent amounts of unit variance do that make the stated motions.
+    root : Array
+        (r, r) the motions by these amounts.
+    every_s : float
+        Mean time between two jumps, seconds.
     """
 
     motions: tuple[int, ...]
@@ -237,10 +280,14 @@ class Jumper:
 def jumpers(stated: Disturbances, may: Sequence[Candidate], otherwise: float | None = None) -> tuple[Jumper, ...]:
     """Bodies of which all motions that jump do so at a stated rate.
 
-    Args:
-        stated: disturbances.
-        may: what may jump.
-        otherwise: seconds between two jumps of a motion of which no rate is stated; None for bodies with a rate alone.
+    Parameters
+    ----------
+    stated : Disturbances
+        disturbances.
+    may : Sequence[Candidate]
+        What may jump.
+    otherwise : float | None
+        Seconds between two jumps of a motion of which no rate is stated; None for bodies with a rate alone.
     """
     out = []
     for body in dict.fromkeys(one.body for one in may):
@@ -256,10 +303,14 @@ def jumpers(stated: Disturbances, may: Sequence[Candidate], otherwise: float | N
 class Hint:
     """Of a jump of a body whose size is not known, for each of L places.
 
-    Attributes:
-        log_weight: (L,) logarithm of w.
-        mean: (L, r) of the amounts if it came there.
-        covariance: (L, r, r) of them.
+    Attributes
+    ----------
+    log_weight : Array
+        (L,) logarithm of w.
+    mean : Array
+        (L, r) of the amounts if it came there.
+    covariance : Array
+        (L, r, r) of them.
     """
 
     log_weight: Array
@@ -270,11 +321,16 @@ class Hint:
     def of(cls, looked: tuple[Array, Array], own: tuple[Array, Array], outputs: Array, expected: Array) -> Hint:
         """From scores and information.
 
-        Args:
-            looked: score (L, q) and information (L, q, q) by which it is judged.
-            own: likewise, by which its amounts are.
-            outputs: (q, r) what unit amounts do.
-            expected: (L,) mean number of jumps in the gap of each place; 0 where there is no gap.
+        Parameters
+        ----------
+        looked : tuple[Array, Array]
+            Score (L, q) and information (L, q, q) by which it is judged.
+        own : tuple[Array, Array]
+            Likewise, by which its amounts are.
+        outputs : Array
+            (q, r) what unit amounts do.
+        expected : Array
+            (L,) mean number of jumps in the gap of each place; 0 where there is no gap.
         """
         logs, means, squares = [], [], []
         for times in _SCALES:
@@ -307,11 +363,16 @@ def _chances(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
 def blended(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequence[Array]) -> tuple[Array, Array]:
     """Mean (n,) and covariance (n, n) of states where a jump that is not told counts by its chance.
 
-    Args:
-        mean: (n,) of the states without one.
-        covariance: (n, n) likewise.
-        hints: of each body.
-        moved: (L, n, r) of each body, what unit amounts at each place have done to the states by now.
+    Parameters
+    ----------
+    mean : Array
+        (n,) of the states without one.
+    covariance : Array
+        (n, n) likewise.
+    hints : Sequence[Hint]
+        Of each body.
+    moved : Sequence[Array]
+        (L, n, r) of each body, what unit amounts at each place have done to the states by now.
     """
     found = _chances(hints)
     away = [np.einsum("knr,kr->kn", m, one.mean) for m, one in zip(moved, hints, strict=True)]
@@ -329,12 +390,18 @@ def added(
     """(N, r) of each body, what a smoother takes jumps to add that were not told, over the mean square that the motions
     are stated to have at their rate.
 
-    Args:
-        score: (N, r) of each body, of unit amounts before each of N readings, by all readings.
-        information: (N, r, r) of each, likewise.
-        gap: (N,) seconds from the reading before, 0 where none is.
-        bodies: that jump.
-        window: readings among which one jump is looked for.
+    Parameters
+    ----------
+    score : Sequence[Array]
+        (N, r) of each body, of unit amounts before each of N readings, by all readings.
+    information : Sequence[Array]
+        (N, r, r) of each, likewise.
+    gap : Array
+        (N,) seconds from the reading before, 0 where none is.
+    bodies : Sequence[Jumper]
+        That jump.
+    window : int
+        Readings among which one jump is looked for.
     """
     if not bodies:
         return []
@@ -372,10 +439,14 @@ _UNSTATED = math.log(1e-3)
 def may_be_bad(bad: BadReading | None, log_odds: float, recent: Sequence[bool]) -> bool:
     """Return whether a reading is set aside until the next one.
 
-    Args:
-        bad: what speaks for it being bad; None where nothing does.
-        log_odds: logarithm of the odds of that against all else.
-        recent: whether each of the last readings was left out.
+    Parameters
+    ----------
+    bad : BadReading | None
+        What speaks for it being bad; None where nothing does.
+    log_odds : float
+        Logarithm of the odds of that against all else.
+    recent : Sequence[bool]
+        Whether each of the last readings was left out.
     """
     return bad is not None and bad.log_ratio > _UNSURE and log_odds > _SURE and sum(recent) < _MOST
 
@@ -383,8 +454,10 @@ def may_be_bad(bad: BadReading | None, log_odds: float, recent: Sequence[bool]) 
 def chance_good(log_odds: float) -> float:
     """Return the chance with which a reading that is set aside counts as a good one meanwhile.
 
-    Args:
-        log_odds: logarithm of the odds that it is bad.
+    Parameters
+    ----------
+    log_odds : float
+        Logarithm of the odds that it is bad.
     """
     return min(_MOST_FOR_JUMP, float(expit(-log_odds)))
 
@@ -392,10 +465,14 @@ def chance_good(log_odds: float) -> float:
 def bad_reading(white: Array, root: Array, noise: Array) -> BadReading | None:
     """Return a reading as one with errors weighed against one without; None where it cannot be set aside.
 
-    Args:
-        white: (D,) root^-1 times its difference from the prediction.
-        root: (D, D) Cholesky factor of the covariance of that difference.
-        noise: (D, D) of the reading.
+    Parameters
+    ----------
+    white : Array
+        (D,) root^-1 times its difference from the prediction.
+    root : Array
+        (D, D) Cholesky factor of the covariance of that difference.
+    noise : Array
+        (D, D) of the reading.
     """
     count = len(white)
     if 0.5 * float(white @ white) + math.log(_SHARE) < _UNSURE:  # no errors explain more than all of it
@@ -432,12 +509,18 @@ def _with_errors(precision: Array, pulled: Array, variance: Array) -> Array:
 def jump_evidence(track: Track, gap: Array, bodies: Sequence[Jumper], life: float, noise: Array) -> float:
     """Logarithm of the likelihood of all readings with a jump at one of L places or none, over that with none.
 
-    Args:
-        track: the filter, with what steps at the L places would do.
-        gap: (L,) seconds within which each comes.
-        bodies: that jump.
-        life: seconds in which a step that nothing explains comes with a small chance.
-        noise: (D, D) of the reading, whose multiples are the sizes of such a step.
+    Parameters
+    ----------
+    track : Track
+        The filter, with what steps at the L places would do.
+    gap : Array
+        (L,) seconds within which each comes.
+    bodies : Sequence[Jumper]
+        That jump.
+    life : float
+        Seconds in which a step that nothing explains comes with a small chance.
+    noise : Array
+        (D, D) of the reading, whose multiples are the sizes of such a step.
     """
     if not len(gap):
         return 0.0

@@ -63,11 +63,16 @@ _MEAN_SQUARE = 2.0 * (_SIZES[1] - _SIZES[0]) * _SIZES**2 * np.exp(-0.5 * _SIZES*
 class Candidate:
     """Motions that may jump together.
 
-    Attributes:
-        body: whose they are.
-        motions: their numbers among the disturbances.
-        spots: (D, r) px, for independent amounts of unit variance that make the stated motions.
-        root: (r, r) the motions by these amounts.
+    Attributes
+    ----------
+    body : str
+        Whose they are.
+    motions : tuple[int, ...]
+        Their numbers among the disturbances.
+    spots : Array
+        (D, r) px, for independent amounts of unit variance that make the stated motions.
+    root : Array
+        (r, r) the motions by these amounts.
     """
 
     body: str
@@ -80,10 +85,14 @@ class Candidate:
 class Steps:
     """Of steps at K times, what all of them need; `likeliest` takes it for motions of any body.
 
-    Attributes:
-        after, until: (K,) the step comes after the one and not after the other, seconds.
-        score: (K, D) G' u.
-        information: (K, D, D) G' G.
+    Attributes
+    ----------
+    after, until : Array
+        (K,) the step comes after the one and not after the other, seconds.
+    score : Array
+        (K, D) G' u.
+    information : Array
+        (K, D, D) G' G.
     """
 
     after: Array
@@ -96,21 +105,34 @@ class Steps:
 class Jump:
     """A jump that was found.
 
-    Attributes:
-        body: that explains it best.
-        motions: numbers of its motions among the disturbances; labels, units: theirs.
-        sizes: of the jump in these units; sigmas: their standard deviations.
-        after, until: between which measurements it is likeliest, seconds.
-        chances: (time, chance that it has come by then), seconds, linear between.
-        log_ratio: of the likelihoods with it and without it.
-        chance: of as large a ratio anywhere in the series if nothing jumps, at most.
-        rivals: other bodies -> their best log ratio at the same time, best first.
-        times: standard deviations of the jump over those stated, which the smoother takes it to have.
-        parts: (motions, variance) of each body that may have jumped, over that stated and times the chance that it was
-            this body; empty for the motions above alone.
-        change: (D + P) of the spots, px, and of the parameters by the jump, whichever body it was; empty where that is
-            not worked out. spread: covariance of its error; width: D.
-        rest: chi-square and degrees of freedom of what no jump of this body explains of a step at the same time.
+    Attributes
+    ----------
+    body : str
+        That explains it best.
+    motions : tuple[int, ...]
+        Numbers of its motions among the disturbances; labels, units: theirs.
+    sizes : tuple[float, ...]
+        Of the jump in these units; sigmas: their standard deviations.
+    after, until : float
+        Between which measurements it is likeliest, seconds.
+    chances : tuple[tuple[float, float], ...]
+        (time, chance that it has come by then), seconds, linear between.
+    log_ratio : float
+        Of the likelihoods with it and without it.
+    chance : float
+        Of as large a ratio anywhere in the series if nothing jumps, at most.
+    rivals : Mapping[str, float]
+        Other bodies -> their best log ratio at the same time, best first.
+    times : float
+        Standard deviations of the jump over those stated, which the smoother takes it to have.
+    parts : tuple[tuple[tuple[int, ...], float], ...]
+        (motions, variance) of each body that may have jumped, over that stated and times the chance that it was this
+        body; empty for the motions above alone.
+    change : tuple[float, ...]
+        (D + P) of the spots, px, and of the parameters by the jump, whichever body it was; empty where that is not
+        worked out. spread: covariance of its error; width: D.
+    rest : tuple[float, int]
+        Chi-square and degrees of freedom of what no jump of this body explains of a step at the same time.
     """
 
     body: str
@@ -155,11 +177,15 @@ class Jump:
 class Step:
     """Motions that step once, by amounts that nobody knows: at an event, or a jump that was told.
 
-    Attributes:
-        parts: (motions, variance over that stated) of what steps, independent of each other.
-        chances: (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a
-            known moment, seconds.
-        moment: (D + P, D + P) mean square of what it does to spots and parameters; None for that of independent parts.
+    Attributes
+    ----------
+    parts : tuple[tuple[tuple[int, ...], float], ...]
+        (motions, variance over that stated) of what steps, independent of each other.
+    chances : tuple[tuple[float, float], ...]
+        (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a known
+        moment, seconds.
+    moment : Array | None
+        (D + P, D + P) mean square of what it does to spots and parameters; None for that of independent parts.
     """
 
     parts: tuple[tuple[tuple[int, ...], float], ...]
@@ -201,11 +227,16 @@ class Amounts:
     def of(cls, score: Array, information: Array, outputs: Array, times: float) -> Amounts:
         """By what is known of steps.
 
-        Args:
-            score: (L, q) as of `Steps`.
-            information: (L, q, q) likewise.
-            outputs: (q, r) what the motions do.
-            times: their standard deviations over those of ``outputs``.
+        Parameters
+        ----------
+        score : Array
+            (L, q) as of `Steps`.
+        information : Array
+            (L, q, q) likewise.
+        outputs : Array
+            (q, r) what the motions do.
+        times : float
+            Their standard deviations over those of ``outputs``.
         """
         information = outputs.T @ information @ outputs
         score = score @ outputs
@@ -219,8 +250,10 @@ class Amounts:
 def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
     """What may jump: each motion whose law is `jump` alone, and those of a body together.
 
-    Args:
-        stated: disturbances; motions that move no spot are left out.
+    Parameters
+    ----------
+    stated : Disturbances
+        Disturbances; motions that move no spot are left out.
     """
     jumping = [k for k, law in enumerate(stated.laws) if law.jump and np.any(stated.spots[:, k])]
     bodies: dict[str, list[int]] = {}
@@ -238,13 +271,19 @@ def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
 def steps(root: Array, white: Array, when: Array, inside: slice, reference: float | None) -> Steps:
     """Steps between any two measurements that follow each other.
 
-    Args:
-        root: L, (n D, n D) lower triangular.
-        white: (n D,) L^-1 s.
-        when: (n,) times of the measurements, seconds, ascending.
-        inside: measurements of which each may be the first after the step; of all, of the piece that is looked at.
-        reference: from when changes are counted, seconds; None for the calibration, and a step before the first
-            measurement is then no step.
+    Parameters
+    ----------
+    root : Array
+        L, (n D, n D) lower triangular.
+    white : Array
+        (n D,) L^-1 s.
+    when : Array
+        (n,) times of the measurements, seconds, ascending.
+    inside : slice
+        Measurements of which each may be the first after the step; of all, of the piece that is looked at.
+    reference : float | None
+        From when changes are counted, seconds; None for the calibration, and a step before the first measurement is
+        then no step.
     """
     each = len(white) // len(when)
     before = np.concatenate([[np.inf if reference is None else reference], when[:-1]])
@@ -262,10 +301,14 @@ def steps(root: Array, white: Array, when: Array, inside: slice, reference: floa
 def likeliest(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturbances) -> Jump | None:
     """The jump that is hardest to explain by chance; None where nothing can be looked for. Its sizes are not yet known.
 
-    Args:
-        found: steps at all times that are looked at, piece by piece.
-        may: what may jump.
-        stated: disturbances that have these motions.
+    Parameters
+    ----------
+    found : Sequence[Steps]
+        Steps at all times that are looked at, piece by piece.
+    may : Sequence[Candidate]
+        What may jump.
+    stated : Disturbances
+        Disturbances that have these motions.
     """
     parts = [one for one in found if len(one.until)]
     if not parts or not may:
@@ -321,10 +364,14 @@ def _chances(after: Array, until: Array, log_ratio: Array) -> tuple[tuple[float,
 def knots(after: Array, until: Array, weight: Array) -> tuple[tuple[float, float], ...]:
     """(time, chance that a step has come by then), linear between.
 
-    Args:
-        after: (L,) seconds, ascending; the step comes after the one and not after the other.
-        until: (L,) likewise.
-        weight: (L,) chances of each place, together 1.
+    Parameters
+    ----------
+    after : Array
+        (L,) seconds, ascending; the step comes after the one and not after the other.
+    until : Array
+        (L,) likewise.
+    weight : Array
+        (L,) chances of each place, together 1.
     """
     sure = np.minimum(np.cumsum(weight), 1.0)
     out: dict[float, float] = {}
@@ -337,9 +384,12 @@ def knots(after: Array, until: Array, weight: Array) -> tuple[tuple[float, float
 def larger(information: Array, score: Array) -> float:
     """Standard deviation over that stated that makes a jump most likely, not less than the jump itself, nor than 1.
 
-    Args:
-        information: (r, r) of its amounts.
-        score: (r,) of them.
+    Parameters
+    ----------
+    information : Array
+        (r, r) of its amounts.
+    score : Array
+        (r,) of them.
     """
     values, vectors = np.linalg.eigh(information)
     values, along = np.maximum(values, 0.0), vectors.T @ score
@@ -353,9 +403,12 @@ def larger(information: Array, score: Array) -> float:
 def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
     """Disturbances in which jumps that were found are events, after all that was stated and in this order.
 
-    Args:
-        stated: disturbances.
-        found: jumps of their motions.
+    Parameters
+    ----------
+    stated : Disturbances
+        disturbances.
+    found : Sequence[Jump]
+        Jumps of their motions.
     """
     for one in found:
         stated = stated.with_copies(one.motions, one.times, one.law)
@@ -365,9 +418,12 @@ def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
 def untold_share(limit: float, seen: Array) -> Array:
     """(n,) share of the mean square of normal jumps that is of those which are not told.
 
-    Args:
-        limit: standard deviations from which on a jump is told.
-        seen: (n,) standard deviations by which a jump of the stated size is seen.
+    Parameters
+    ----------
+    limit : float
+        Standard deviations from which on a jump is told.
+    seen : Array
+        (n,) standard deviations by which a jump of the stated size is seen.
     """
     return np.asarray(ndtr(limit - _SIZES * seen[:, None]) @ _MEAN_SQUARE)
 
@@ -378,12 +434,18 @@ def with_unfound(
     """Disturbances with what jumps leave that are too small to be found, where it is stated how often a motion jumps: a
     walk whose variance grows by the mean square of such steps, the more where measurements are few.
 
-    Args:
-        model: disturbances with the jumps that were found.
-        found: steps at all times, with those jumps known.
-        stated: disturbances as stated, which the first motions of ``model`` are.
-        looks: of the search.
-        last: time of the last measurement, seconds; from there on no jump is found.
+    Parameters
+    ----------
+    model : Disturbances
+        Disturbances with the jumps that were found.
+    found : Sequence[Steps]
+        Steps at all times, with those jumps known.
+    stated : Disturbances
+        Disturbances as stated, which the first motions of ``model`` are.
+    looks : int
+        Of the search.
+    last : float
+        Time of the last measurement, seconds; from there on no jump is found.
     """
     after, until, information = (
         np.concatenate([getattr(one, name) for one in found]) for name in ("after", "until", "information")
@@ -408,13 +470,20 @@ def with_unfound(
 def sized(one: Jump, stated: Disturbances, root: Array, white: Array, when: Array, reference: float | None) -> Jump:
     """The jump with its sizes, as all measurements and all other jumps leave them.
 
-    Args:
-        one: a jump of some motions.
-        stated: disturbances that have these motions.
-        root: L, with all jumps that were found as events.
-        white: L^-1 s.
-        when: times of the measurements, seconds.
-        reference: from when changes are counted, seconds; None for the calibration.
+    Parameters
+    ----------
+    one : Jump
+        a jump of some motions.
+    stated : Disturbances
+        Disturbances that have these motions.
+    root : Array
+        L, with all jumps that were found as events.
+    white : Array
+        L^-1 s.
+    when : Array
+        Times of the measurements, seconds.
+    reference : float | None
+        From when changes are counted, seconds; None for the calibration.
     """
     own = list(one.motions)
     prior = one.times**2 * stated.correlation[np.ix_(own, own)]
@@ -429,11 +498,16 @@ def sized(one: Jump, stated: Disturbances, root: Array, white: Array, when: Arra
 class Bodies:
     """Bodies that may have jumped, B of them, before each of L readings.
 
-    Attributes:
-        own: all motions of each that may jump.
-        times: (B,) standard deviations of its jump over those stated.
-        weight: (B, L) chances, together 1.
-        judged: amounts by the filter that looks for jumps; amounts: by the other.
+    Attributes
+    ----------
+    own : tuple[Candidate, ...]
+        All motions of each that may jump.
+    times : tuple[float, ...]
+        (B,) standard deviations of its jump over those stated.
+    weight : Array
+        (B, L) chances, together 1.
+    judged : tuple[Amounts, ...]
+        Amounts by the filter that looks for jumps; amounts: by the other.
     """
 
     own: tuple[Candidate, ...]
@@ -454,13 +528,20 @@ class Bodies:
     ) -> Bodies:
         """All that are not much less likely than the likeliest.
 
-        Args:
-            may: what may jump.
-            jump: that was told.
-            until: (L,) times of the readings, seconds.
-            gap: (L,) seconds from the reading before each.
-            looking: score (L, q) and information (L, q, q) by which bodies and places are judged.
-            state: likewise, by which amounts are for the estimate.
+        Parameters
+        ----------
+        may : Sequence[Candidate]
+            What may jump.
+        jump : Jump
+            That was told.
+        until : Array
+            (L,) times of the readings, seconds.
+        gap : Array
+            (L,) seconds from the reading before each.
+        looking : tuple[Array, Array]
+            Score (L, q) and information (L, q, q) by which bodies and places are judged.
+        state : tuple[Array, Array]
+            Likewise, by which amounts are for the estimate.
         """
         place, found = int(np.argmin(np.abs(until - jump.until))), []
         for body in dict.fromkeys(one.body for one in may):
@@ -492,12 +573,18 @@ class Bodies:
     ) -> tuple[Array, Array]:
         """States of a filter as if it had known of the jump: mean (n,) and covariance (n, n), over bodies and places.
 
-        Args:
-            mean: (n,) of the filter.
-            covariance: (n, n) of it.
-            response: (L, n, q) of the mean to steps of unit outputs at each place.
-            levels: (n, r) of each body, what unit amounts do to the states.
-            amounts: of each.
+        Parameters
+        ----------
+        mean : Array
+            (n,) of the filter.
+        covariance : Array
+            (n, n) of it.
+        response : Array
+            (L, n, q) of the mean to steps of unit outputs at each place.
+        levels : Sequence[Array]
+            (n, r) of each body, what unit amounts do to the states.
+        amounts : Sequence[Amounts]
+            Of each.
         """
         shift, spread = np.zeros(len(mean)), np.zeros(covariance.shape)
         for one, share, level, does in zip(amounts, self.weight, levels, self.spots, strict=True):
@@ -514,10 +601,14 @@ class Bodies:
 def mixed(amounts: Sequence[Amounts], does: Sequence[Array], weight: Array) -> tuple[Array, Array]:
     """Mean and covariance of what jumps do, each body and place counting by its chance.
 
-    Args:
-        amounts: of B bodies at L places.
-        does: (o, r) of each body, what unit amounts do.
-        weight: (B, L) chances, together 1.
+    Parameters
+    ----------
+    amounts : Sequence[Amounts]
+        Of B bodies at L places.
+    does : Sequence[Array]
+        (o, r) of each body, what unit amounts do.
+    weight : Array
+        (B, L) chances, together 1.
     """
     each = np.stack([one.mean @ do.T for one, do in zip(amounts, does, strict=True)])
     mean = np.einsum("bk,bko->o", weight, each)

@@ -103,12 +103,18 @@ _NEARLY = 1e-11
 class _Look:
     """A reading of spots, looked at.
 
-    Attributes:
-        before: what is known at its time without it; after: with it.
-        innovation: of it.
-        log_odds: logarithm of the odds that it is bad.
-        likely: logarithm of the density of the reading, good or bad, with a jump or without one.
-        bad: what speaks for it being bad; None where that was not worked out.
+    Attributes
+    ----------
+    before : Belief
+        What is known at its time without it; after: with it.
+    innovation : Innovation
+        Of it.
+    log_odds : float
+        Logarithm of the odds that it is bad.
+    likely : float
+        Logarithm of the density of the reading, good or bad, with a jump or without one.
+    bad : BadReading | None
+        What speaks for it being bad; None where that was not worked out.
     """
 
     before: Belief
@@ -123,20 +129,33 @@ class _Look:
 class SeriesFilter:
     """Filter of what is stated to move.
 
-    Attributes:
-        stated: what moves, and how it goes on in time.
-        reference_noise: (D, D) px^2 of the spots that shifts are counted from; None for none.
-        heat: temperatures that sensors read; None for none.
-        life_s: seconds over which ``stated.jump_false_alarm`` counts, all looks together: each gets the share of it
-            that the time between its two readings is of the life, whatever the cadence of the readings.
-        window: readings for which a jump is looked for.
-        stepping: numbers of motions that may step although their own law is another one.
-        parameters_read: whether there are readings of parameters among those of spots.
-        steps: that are known of beside what is stated.
-        unfound: whether jumps too small to be told count, where it is stated how often a motion jumps.
-        before_s: seconds before the first reading of spots in which bodies may have jumped, too; 0 for none.
-        leaving_out: whether a reading may be bad.
-        candidates: what may jump, motions alone and those of a body together.
+    Attributes
+    ----------
+    stated : Disturbances
+        What moves, and how it goes on in time.
+    reference_noise : Array | None
+        (D, D) px^2 of the spots that shifts are counted from; None for none.
+    heat : HeatInputs | None
+        Temperatures that sensors read; None for none.
+    life_s : float
+        Seconds over which ``stated.jump_false_alarm`` counts, all looks together: each gets the share of it that the
+        time between its two readings is of the life, whatever the cadence of the readings.
+    window : int
+        Readings for which a jump is looked for.
+    stepping : tuple[int, ...]
+        Numbers of motions that may step although their own law is another one.
+    parameters_read : bool
+        Whether there are readings of parameters among those of spots.
+    steps : tuple[Step, ...]
+        That are known of beside what is stated.
+    unfound : bool
+        Whether jumps too small to be told count, where it is stated how often a motion jumps.
+    before_s : float
+        Seconds before the first reading of spots in which bodies may have jumped, too; 0 for none.
+    leaving_out : bool
+        Whether a reading may be bad.
+    candidates : tuple[Candidate, ...]
+        What may jump, motions alone and those of a body together.
     """
 
     stated: Disturbances
@@ -216,8 +235,10 @@ class SeriesFilter:
     def looks(self, between: ArrayLike) -> Array:
         """By how much the chance of one look for a jump is to be multiplied for that of all in the whole life.
 
-        Args:
-            between: seconds between the two readings of the look, of any shape.
+        Parameters
+        ----------
+        between : ArrayLike
+            Seconds between the two readings of the look, of any shape.
         """
         share = np.asarray(between, np.float64) / self.life_s
         return np.asarray(self.window * len(self.candidates) / np.minimum(share, 1.0))
@@ -230,8 +251,10 @@ class SeriesFilter:
     def start(self, time: float) -> Belief:
         """What is known before any reading.
 
-        Args:
-            time: not after the first reading, seconds.
+        Parameters
+        ----------
+        time : float
+            Not after the first reading, seconds.
         """
         mean, covariance = self.space.start(time)
         covariance = self._stepped(covariance, -math.inf, time)
@@ -243,9 +266,12 @@ class SeriesFilter:
     def at(self, belief: Belief, time: float) -> Belief:
         """What will be known at a later time, if no reading comes until then.
 
-        Args:
-            belief: so far.
-            time: seconds.
+        Parameters
+        ----------
+        belief : Belief
+            So far.
+        time : float
+            seconds.
         """
         state = self._moved(belief.state, belief.time, time, belief.left)
         search = None if belief.search is None else self._moved(belief.search, belief.time, time, None)
@@ -272,10 +298,14 @@ class SeriesFilter:
     def with_walk(self, belief: Belief, left: Array, over: float) -> Belief:
         """What is known where jumps have come meanwhile that are not told.
 
-        Args:
-            belief: without them.
-            left: (m,) share of the mean square of jumps at their rate that they have.
-            over: seconds.
+        Parameters
+        ----------
+        belief : Belief
+            Without them.
+        left : Array
+            (m,) share of the mean square of jumps at their rate that they have.
+        over : float
+            seconds.
         """
         covariance = self._with_walk(belief.covariance, left, over)
         return replace(belief, state=replace(belief.state, covariance=covariance))
@@ -284,10 +314,14 @@ class SeriesFilter:
         """What is known where a sensor reads more than stated: the states are less well known in the direction in which
         its reading moves them, and as well as before in all others.
 
-        Args:
-            belief: at the time of the reading.
-            observed: one number of a sensor.
-            times: by which the standard deviation of what it reads is larger.
+        Parameters
+        ----------
+        belief : Belief
+            At the time of the reading.
+        observed : Observed
+            One number of a sensor.
+        times : float
+            By which the standard deviation of what it reads is larger.
         """
 
         def loose(track: Track) -> Track:
@@ -303,13 +337,19 @@ class SeriesFilter:
     def update(self, belief: Belief, observed: Observed, sure: bool = False) -> tuple[Belief, Innovation]:
         """Take one reading.
 
-        Args:
-            belief: so far.
-            observed: the reading, not before the time of ``belief``.
-            sure: whether somebody has decided that it is good.
+        Parameters
+        ----------
+        belief : Belief
+            So far.
+        observed : Observed
+            The reading, not before the time of ``belief``.
+        sure : bool
+            Whether somebody has decided that it is good.
 
-        Raises:
-            UndeterminedError: the reading has no noise and says what is known already.
+        Raises
+        ------
+        UndeterminedError
+            The reading has no noise and says what is known already.
         """
         if not observed.spots:
             put = belief.aside and replace(belief.aside, taken=self.update(belief.aside.taken, observed)[0])
@@ -338,10 +378,14 @@ class SeriesFilter:
     def _look(self, belief: Belief, observed: Observed, weighed: bool) -> _Look:
         """Return the estimate of the spots before a reading and with it, and the evidence that it is bad.
 
-        Args:
-            belief: before, nothing set aside.
-            observed: the reading.
-            weighed: whether to work out how likely it is also where it is surely good.
+        Parameters
+        ----------
+        belief : Belief
+            Before, nothing set aside.
+        observed : Observed
+            The reading.
+        weighed : bool
+            Whether to work out how likely it is also where it is surely good.
         """
         before = self.at(belief, observed.time)
         now = before
@@ -398,10 +442,14 @@ class SeriesFilter:
         """What a reading is expected to be: its mean (d,), rows on the states (d, n), covariance (d, d) of what these
         leave, noise included, and what unit outputs do to it, (d, q).
 
-        Args:
-            mean: (n,) of the states at its time.
-            covariance: (n, n) of them.
-            observed: the reading.
+        Parameters
+        ----------
+        mean : Array
+            (n,) of the states at its time.
+        covariance : Array
+            (n, n) of them.
+        observed : Observed
+            The reading.
         """
         width, q = self.space.width, self._stacked.spots.shape[0]
         if observed.sensors:
@@ -418,12 +466,17 @@ class SeriesFilter:
     def whitened(self, track: Track, observed: Observed) -> Whitened:
         """A reading divided by the root of its covariance.
 
-        Args:
-            track: the states at its time.
-            observed: the reading.
+        Parameters
+        ----------
+        track : Track
+            The states at its time.
+        observed : Observed
+            The reading.
 
-        Raises:
-            UndeterminedError: it has no noise and says what is known already.
+        Raises
+        ------
+        UndeterminedError
+            It has no noise and says what is known already.
         """
         expected, rows, noise, picked = self.read(track.mean, track.covariance, observed)
         across = track.covariance @ rows.T
@@ -440,10 +493,14 @@ class SeriesFilter:
     def taken(self, track: Track, observed: Observed, w: Whitened | None = None) -> tuple[Track, Innovation]:
         """Take one reading into a filter.
 
-        Args:
-            track: at its time.
-            observed: the reading.
-            w: as `whitened` has it, if that is known.
+        Parameters
+        ----------
+        track : Track
+            At its time.
+        observed : Observed
+            The reading.
+        w : Whitened | None
+            As `whitened` has it, if that is known.
         """
         w = self.whitened(track, observed) if w is None else w
         covariance = track.covariance - w.gain.T @ w.gain  # symmetric to the bit, as the product is
@@ -537,8 +594,10 @@ class SeriesFilter:
         """What is known where jumps that are not told count by their chances, of the state now and of forecasts; later
         readings go on from the belief that is given.
 
-        Args:
-            belief: so far.
+        Parameters
+        ----------
+        belief : Belief
+            So far.
         """
         if belief.aside is not None:
             share = chance_good(belief.aside.log_odds)
@@ -566,9 +625,12 @@ class SeriesFilter:
     def parameters(self, belief: Belief, time: float) -> tuple[Array, Array]:
         """Parameters (P,) and their covariance (P, P).
 
-        Args:
-            belief: so far, as `blended` gives it where jumps count that are not told.
-            time: not before its own, seconds.
+        Parameters
+        ----------
+        belief : Belief
+            So far, as `blended` gives it where jumps count that are not told.
+        time : float
+            Not before its own, seconds.
         """
         state = self._moved(belief.state, belief.time, time, belief.left)
         return self.parameters_of(state.mean, state.covariance, time)
@@ -576,10 +638,14 @@ class SeriesFilter:
     def parameters_of(self, mean: Array, covariance: Array, time: float) -> tuple[Array, Array]:
         """Parameters (P,) and their covariance (P, P).
 
-        Args:
-            mean: (n,) of the states.
-            covariance: (n, n) of them.
-            time: of them, seconds.
+        Parameters
+        ----------
+        mean : Array
+            (n,) of the states.
+        covariance : Array
+            (n, n) of them.
+        time : float
+            Of them, seconds.
         """
         width = self.space.width
         values, rows, left = self.space.outputs(mean, covariance, time)
@@ -591,13 +657,19 @@ class SeriesFilter:
     ) -> tuple[Array, Array]:
         """Motions (M,) and their covariance (M, M), in the standard deviations that are stated.
 
-        Args:
-            mean: (n,) of the states.
-            covariance: (n, n) of them.
-            time: of them, seconds.
-            since: from when on jumps have come that were not told, seconds.
-            acting: temperatures of bodies with sensors as they act on light: times the factor by which heat does more
-                than computed, so that what is computed of the motions is what is estimated.
+        Parameters
+        ----------
+        mean : Array
+            (n,) of the states.
+        covariance : Array
+            (n, n) of them.
+        time : float
+            Of them, seconds.
+        since : float
+            From when on jumps have come that were not told, seconds.
+        acting : bool
+            Temperatures of bodies with sensors as they act on light: times the factor by which heat does more than
+            computed, so that what is computed of the motions is what is estimated.
         """
         more = [(motions, variance * one.come(time)) for one in self.steps for motions, variance in one.parts]
         for motion in self.walking.tolist():
@@ -626,12 +698,18 @@ def hinted(
     """What is known before the first reading, and N times (m,) what share of the mean square of jumps could not be
     told, with jumps that all readings hint at.
 
-    Args:
-        how: the filter that looked for jumps.
-        knowing: the same, which looks for none but knows of those that were told.
-        start: as for `smoothed`.
-        observed: N readings in the order of time.
-        left: as for `smoothed`.
+    Parameters
+    ----------
+    how : SeriesFilter
+        The filter that looked for jumps.
+    knowing : SeriesFilter
+        The same, which looks for none but knows of those that were told.
+    start : Belief
+        As for `smoothed`.
+    observed : Sequence[Observed]
+        N readings in the order of time.
+    left : Sequence[Array]
+        As for `smoothed`.
     """
     if not how.jumpers or not observed:
         return start, list(left)
@@ -674,16 +752,24 @@ def smoothed(
 ) -> list[T]:
     """What all readings say of times past: forward to where pieces begin, then backward piece by piece.
 
-    Args:
-        how: a filter that looks for no jumps, since it knows of them.
-        start: what is known before the first reading.
-        observed: N readings in the order of time.
-        wanted: (T,) times, seconds, in any order, none before ``start``.
-        left: N times (m,) what share of the mean square of jumps could not be told, as the filter had it before each
-            reading: the process is then the filter's, and a part of a series gives what the whole gives.
-        each: (n,) mean and (n, n) covariance of the states at a wanted time, and the time -> what is made of them.
-        note: called with the number of each reading, and score (n,) and information (n, n) of a change of the states
-            just before it by the readings from it on.
+    Parameters
+    ----------
+    how : SeriesFilter
+        a filter that looks for no jumps, since it knows of them.
+    start : Belief
+        What is known before the first reading.
+    observed : Sequence[Observed]
+        N readings in the order of time.
+    wanted : ArrayLike
+        (T,) times, seconds, in any order, none before ``start``.
+    left : Sequence[Array]
+        N times (m,) what share of the mean square of jumps could not be told, as the filter had it before each reading:
+        the process is then the filter's, and a part of a series gives what the whole gives.
+    each : Callable[[Array, Array, float], T]
+        (n,) mean and (n, n) covariance of the states at a wanted time, and the time -> what is made of them.
+    note : Callable[[int, Array, Array], None]
+        Called with the number of each reading, and score (n,) and information (n, n) of a change of the states just
+        before it by the readings from it on.
     """
     times = np.asarray(wanted, np.float64)
     order = np.argsort(times, kind="stable")
@@ -734,12 +820,18 @@ def jointly(
     The states at the wanted times go along with the filter, as copies that move no more, up to the last of them; what
     comes after that is what the smoother carries back to it.
 
-    Args:
-        how: a filter that looks for no jumps, since it knows of them.
-        start: what is known before the first reading.
-        observed: N readings in the order of time.
-        wanted: (T,) times, seconds, in order, none before ``start``.
-        left: as of `smoothed`.
+    Parameters
+    ----------
+    how : SeriesFilter
+        a filter that looks for no jumps, since it knows of them.
+    start : Belief
+        What is known before the first reading.
+    observed : Sequence[Observed]
+        N readings in the order of time.
+    wanted : ArrayLike
+        (T,) times, seconds, in order, none before ``start``.
+    left : Sequence[Array]
+        As of `smoothed`.
     """
     times, space = np.asarray(wanted, np.float64), how.space
     size, ahead = space.size, 0
@@ -810,10 +902,13 @@ _DRAWS, _BEFORE = 400, 20
 class Power:
     """Smallest jumps of a body that are found.
 
-    Attributes:
-        body: whose they are.
-        sizes: (readings, shares) the smallest of which so many are found within so many readings, root mean square of
-            its motions over their stated standard deviations; NaN where the largest that is tried is not.
+    Attributes
+    ----------
+    body : str
+        Whose they are.
+    sizes : Array
+        (readings, shares) the smallest of which so many are found within so many readings, root mean square of its
+        motions over their stated standard deviations; NaN where the largest that is tried is not.
     """
 
     body: str
@@ -831,10 +926,14 @@ class Power:
 def detection_power(how: SeriesFilter, interval: float, noise: Array) -> tuple[Power, ...]:
     """Return the smallest jump of each body that is found in half and in 95 % of cases within 1, 3 and 10 readings.
 
-    Args:
-        how: the filter that looks for jumps.
-        interval: seconds from one reading of the spots to the next.
-        noise: (D, D) px^2 of a reading.
+    Parameters
+    ----------
+    how : SeriesFilter
+        The filter that looks for jumps.
+    interval : float
+        Seconds from one reading of the spots to the next.
+    noise : Array
+        (D, D) px^2 of a reading.
     """
     informations, may = _informations(how, interval, noise), how.candidates
     if not may:

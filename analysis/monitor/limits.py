@@ -39,10 +39,14 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibra
 class Quantity:
     """Something that is read, to first order a row on the parameters of all cameras.
 
-    Attributes:
-        group: a camera, ``intersection_angle`` or ``ground``.
-        parameter: which of its readings.
-        row: (4 K,) in the reading's unit per rad and m of d_alpha, d_beta, d_gamma, d_f of one camera after the other.
+    Attributes
+    ----------
+    group : str
+        a camera, ``intersection_angle`` or ``ground``.
+    parameter : Parameter
+        Which of its readings.
+    row : Array
+        (4 K,) in the reading's unit per rad and m of d_alpha, d_beta, d_gamma, d_f of one camera after the other.
     """
 
     group: str
@@ -64,9 +68,12 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
     """All that is read of an instrument: every parameter; of a pair the intersection angle; where its altitude is
     known the errors at the middle of the line on the ground.
 
-    Args:
-        cameras: by name, in the order of the spots.
-        ground: of a pair.
+    Parameters
+    ----------
+    cameras : Mapping[str, CameraCalibration]
+        By name, in the order of the spots.
+    ground : GroundGeometry | None
+        Of a pair.
     """
     count = 4
     unit = np.eye(count * len(cameras))
@@ -98,10 +105,14 @@ def unmoved(
 ) -> frozenset[tuple[str, str]]:
     """Return group and key of the quantities that no motion of the prior changes, so that they have no posterior.
 
-    Args:
-        stated: the prior.
-        cameras: what is calibrated of each.
-        ground: of a pair whose altitude is known.
+    Parameters
+    ----------
+    stated : Disturbances
+        The prior.
+    cameras : Mapping[str, CameraCalibration]
+        What is calibrated of each.
+    ground : GroundGeometry | None
+        Of a pair whose altitude is known.
     """
     unit = np.concatenate([(1.0, 1.0, 1.0, one.geometry.principal_distance_m) for one in cameras.values()])
     size = np.max(np.abs(stated.parameters) / unit[:, None], axis=0, initial=0.0)
@@ -117,10 +128,14 @@ def unmoved(
 class Split:
     """The variance of Q quantities by the M stated motions.
 
-    Attributes:
-        before: (Q, M) shares without any measurement, units of the quantities squared.
-        after: (Q, M) shares of what an estimator makes wrong; negative ones are possible where motions go together.
-        noise: (Q,) what the noise of the images adds to ``after``.
+    Attributes
+    ----------
+    before : Array
+        (Q, M) shares without any measurement, units of the quantities squared.
+    after : Array
+        (Q, M) shares of what an estimator makes wrong; negative ones are possible where motions go together.
+    noise : Array
+        (Q,) what the noise of the images adds to ``after``.
     """
 
     before: Array
@@ -141,9 +156,12 @@ class Split:
     def by(shares: Array, names: Sequence[str]) -> dict[str, Array]:
         """Shares summed over the motions of one name each, (Q,); in the order of the names' first mention.
 
-        Args:
-            shares: (Q, M).
-            names: (M,), for example their bodies.
+        Parameters
+        ----------
+        shares : Array
+            (Q, M).
+        names : Sequence[str]
+            (M,), for example their bodies.
         """
         own = np.array(names)
         return {name: shares[:, own == name].sum(axis=1) for name in dict.fromkeys(names)}
@@ -152,11 +170,16 @@ class Split:
 def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split:
     """The variance of quantities by motions, before a measurement and after it.
 
-    Args:
-        rows: (Q, 4 K) of the quantities.
-        stated: what moves.
-        noise: (D, D) of the shifts, px^2.
-        gain: (4 K, D) of an estimator.
+    Parameters
+    ----------
+    rows : Array
+        (Q, 4 K) of the quantities.
+    stated : Disturbances
+        What moves.
+    noise : Array
+        (D, D) of the shifts, px^2.
+    gain : Array
+        (4 K, D) of an estimator.
     """
     prior, reading = rows @ stated.parameters, rows @ gain
     error = reading @ stated.spots - prior
@@ -167,10 +190,14 @@ def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split
 def posterior_sigma(rows: Array, stated: Disturbances, noise: Array) -> Array:
     """(Q,) standard deviations that the best linear unbiased prediction leaves.
 
-    Args:
-        rows: (Q, 4 K) of the quantities.
-        stated: what moves, with any number of spots.
-        noise: (D, D) of their shifts, px^2.
+    Parameters
+    ----------
+    rows : Array
+        (Q, 4 K) of the quantities.
+    stated : Disturbances
+        What moves, with any number of spots.
+    noise : Array
+        (D, D) of their shifts, px^2.
     """
     return split(rows, stated, noise, stated.best_gain(noise)).sigma
 
@@ -179,11 +206,16 @@ def posterior_sigma(rows: Array, stated: Disturbances, noise: Array) -> Array:
 class LeastSeen:
     """The most likely motions by which a quantity is wrong by one sigma though all spots have been measured.
 
-    Attributes:
-        amounts: (M,) in standard deviations.
-        change: of the quantity, its posterior standard deviation.
-        spots: (D,) px by which the spots move with them.
-        noise: (D,) px, standard deviations of the measured shifts.
+    Attributes
+    ----------
+    amounts : Array
+        (M,) in standard deviations.
+    change : float
+        Of the quantity, its posterior standard deviation.
+    spots : Array
+        (D,) px by which the spots move with them.
+    noise : Array
+        (D,) px, standard deviations of the measured shifts.
     """
 
     amounts: Array
@@ -198,10 +230,14 @@ def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastSeen:
     With Q the posterior covariance of the motions and b = row B it is Q b / sqrt(b' Q b): of all combinations that
     change the quantity by its posterior sigma the one of the largest posterior probability.
 
-    Args:
-        row: (4 K,) of the quantity.
-        stated: what moves.
-        noise: (D, D) of the shifts, px^2.
+    Parameters
+    ----------
+    row : Array
+        (4 K,) of the quantity.
+    stated : Disturbances
+        What moves.
+    noise : Array
+        (D, D) of the shifts, px^2.
     """
     b = row @ stated.parameters
     spread = stated.spot_covariance + noise
@@ -216,11 +252,16 @@ def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastSeen:
 def known_sigma(rows: Array, stated: Disturbances, noise: Array, groups: Sequence[Sequence[str]]) -> Array:
     """(G, Q) standard deviations that the best linear unbiased prediction leaves, if some motions were known exactly.
 
-    Args:
-        rows: (Q, 4 K) of the quantities.
-        stated: what moves.
-        noise: (D, D) of the shifts, px^2.
-        groups: G times the labels of motions that are known; those that go with them are then known better, too.
+    Parameters
+    ----------
+    rows : Array
+        (Q, 4 K) of the quantities.
+    stated : Disturbances
+        What moves.
+    noise : Array
+        (D, D) of the shifts, px^2.
+    groups : Sequence[Sequence[str]]
+        G times the labels of motions that are known; those that go with them are then known better, too.
     """
     prior, c, labels = rows @ stated.parameters, stated.correlation, np.array(stated.labels)
     both = np.concatenate([stated.spots, prior])
@@ -240,11 +281,15 @@ def known_sigma(rows: Array, stated: Disturbances, noise: Array, groups: Sequenc
 def extended(stated: Disturbances, spots: Array, own: Sequence[bool]) -> Disturbances:
     """Disturbances seen by further spots that are measured at the same time.
 
-    Args:
-        stated: what moves.
-        spots: (D', M) px for one standard deviation of the motions.
-        own: (M,) whether a body exists once more for the further spots, as the prisms of their channels do, and moves
-            there as much but independently.
+    Parameters
+    ----------
+    stated : Disturbances
+        What moves.
+    spots : Array
+        (D', M) px for one standard deviation of the motions.
+    own : Sequence[bool]
+        (M,) whether a body exists once more for the further spots, as the prisms of their channels do, and moves there
+        as much but independently.
     """
     apart = np.array(own, bool)
     copies = np.flatnonzero(apart)
@@ -282,10 +327,14 @@ def field_covariance(
     """(4 K, 4 K) of parameters that points on the ground give, when they fix the directions of the line's middle and of
     each half of the line against the other to some angle: d_gamma and d_f are that angle at the line's end.
 
-    Args:
-        direction_rad: standard deviation of a direction, rad.
-        cameras: by name.
-        half_field: tangent of half the field along the line, of each camera.
+    Parameters
+    ----------
+    direction_rad : float
+        Standard deviation of a direction, rad.
+    cameras : Mapping[str, CameraCalibration]
+        By name.
+    half_field : Sequence[float]
+        Tangent of half the field along the line, of each camera.
     """
     sigma = [
         direction_rad * np.array([1.0, 1.0, 1.0 / t, camera.geometry.principal_distance_m / t])
@@ -298,12 +347,18 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
     """(Q,) standard deviations when a test field on the ground gave the parameters some time ago and the monitor
     measured then as well as now: what is the same as then is known, what went on is not.
 
-    Args:
-        rows: (Q, 4 K) of the quantities.
-        stated: what moves, with its laws in time; motions that go together have the same one.
-        noise: (D, D) of the shifts, px^2, of each of the two measurements.
-        field: (4 K, 4 K) covariance of what the test field gives.
-        gap_s: since then, seconds.
+    Parameters
+    ----------
+    rows : Array
+        (Q, 4 K) of the quantities.
+    stated : Disturbances
+        What moves, with its laws in time; motions that go together have the same one.
+    noise : Array
+        (D, D) of the shifts, px^2, of each of the two measurements.
+    field : Array
+        (4 K, 4 K) covariance of what the test field gives.
+    gap_s : float
+        Since then, seconds.
     """
     before, across, after = np.array([law.over(0.0, gap_s) for law in stated.laws]).reshape(-1, 3).T
     now, then, old_now = stated.correlation * after, stated.correlation * across, stated.correlation * before
@@ -343,13 +398,20 @@ _LEVELS = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
 class Elasticity:
     """Answer of Q quantities to one stated number.
 
-    Attributes:
-        number: its cause and motion: ``mirror_figure figure Z7``.
-        size, unit: as stated.
-        bodies: that have it.
-        elasticity: (Q,) relative change of sigma per relative change of the number.
-        doubled: (Q,) sigma of the error if it is twice as large and nobody says so.
-        told: (Q,) sigma if it is twice as large and stated so.
+    Attributes
+    ----------
+    number : str
+        Its cause and motion: ``mirror_figure figure Z7``.
+    size, unit : float
+        As stated.
+    bodies : tuple[str, ...]
+        That have it.
+    elasticity : Array
+        (Q,) relative change of sigma per relative change of the number.
+    doubled : Array
+        (Q,) sigma of the error if it is twice as large and nobody says so.
+    told : Array
+        (Q,) sigma if it is twice as large and stated so.
     """
 
     number: str
@@ -365,11 +427,16 @@ class Elasticity:
 class HeavyTail:
     """What a statement with heavy tails would leave of Q quantities, read by the same estimator.
 
-    Attributes:
-        degrees: of freedom.
-        rms: (Q,) root of the mean square error.
-        held: (3, Q) half widths that hold as many errors as 1, 2 and 3 sigma of a normal statement do.
-        beyond: (Q,) chance of an error beyond 3 of the stated sigmas, 0.0027 of a normal statement.
+    Attributes
+    ----------
+    degrees : float
+        Of freedom.
+    rms : Array
+        (Q,) root of the mean square error.
+    held : Array
+        (3, Q) half widths that hold as many errors as 1, 2 and 3 sigma of a normal statement do.
+    beyond : Array
+        (Q,) chance of an error beyond 3 of the stated sigmas, 0.0027 of a normal statement.
     """
 
     degrees: float
@@ -381,8 +448,10 @@ class HeavyTail:
 def stated_numbers(stated: Disturbances) -> dict[str, list[int]]:
     """Number -> its motions. Axes that a cause gives the same standard deviation are one number.
 
-    Args:
-        stated: what moves.
+    Parameters
+    ----------
+    stated : Disturbances
+        What moves.
     """
     sizes: dict[tuple[str, str], set[float]] = {}
     whats = [label.removeprefix(f"{body} ") for label, body in zip(stated.labels, stated.bodies, strict=True)]
@@ -399,11 +468,16 @@ def stated_numbers(stated: Disturbances) -> dict[str, list[int]]:
 def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> tuple[Elasticity, ...]:
     """Elasticities of all stated numbers, the one first that makes most of the first quantity's variance.
 
-    Args:
-        rows: (Q, 4 K) of the quantities.
-        stated: what moves.
-        noise: (D, D) of the shifts, px^2.
-        gain: (4 K, D) of the estimator.
+    Parameters
+    ----------
+    rows : Array
+        (Q, 4 K) of the quantities.
+    stated : Disturbances
+        What moves.
+    noise : Array
+        (D, D) of the shifts, px^2.
+    gain : Array
+        (4 K, D) of the estimator.
     """
     reading = rows @ gain
     error = reading @ stated.spots - rows @ stated.parameters
@@ -434,11 +508,16 @@ def unseen(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> dict
     """Body -> (Q,) shares of the variances that are made by stated motions of it which have next to no derivative in
     the spots; of bodies for which a share is more than `SHARE`.
 
-    Args:
-        rows: (Q, 4 K) of the quantities.
-        stated: what moves.
-        noise: (D, D) of the shifts, px^2.
-        gain: (4 K, D) of the estimator.
+    Parameters
+    ----------
+    rows : Array
+        (Q, 4 K) of the quantities.
+    stated : Disturbances
+        What moves.
+    noise : Array
+        (D, D) of the shifts, px^2.
+    gain : Array
+        (4 K, D) of the estimator.
     """
     still = np.all(np.abs(stated.spots) < UNSEEN * np.sqrt(np.diag(noise))[:, None], axis=0)
     found = split(rows, stated, noise, gain)
@@ -453,12 +532,18 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
     """Errors of an estimator whose statement has Student's distribution, each number in place of its standard deviation
     with one scale for all its motions.
 
-    Args:
-        rows: (Q, 4 K) of the quantities.
-        stated: what moves; its standard deviations are the scales.
-        noise: (D, D) of the shifts, px^2.
-        gain: (4 K, D) of the estimator.
-        degrees: of freedom, above 2.
+    Parameters
+    ----------
+    rows : Array
+        (Q, 4 K) of the quantities.
+    stated : Disturbances
+        What moves; its standard deviations are the scales.
+    noise : Array
+        (D, D) of the shifts, px^2.
+    gain : Array
+        (4 K, D) of the estimator.
+    degrees : float
+        Of freedom, above 2.
     """
     if degrees <= 2.0:
         raise ValueError(f"heavy tails: Student's distribution has a variance above 2 degrees, found {degrees}")

@@ -70,11 +70,16 @@ def gain(
 
     Raises RankError naming the combination of motions that no spot sees; ValueError for bad input.
 
-    Args:
-        covariance: (..., D, D) px^2, positive definite, or all zero (no noise: equal weights).
-        spot_jacobian: (D, P) px per unit of motion.
-        parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to D.
-        motion_names: of the P motions, for messages.
+    Parameters
+    ----------
+    covariance : ArrayLike
+        (..., D, D) px^2, positive definite, or all zero (no noise: equal weights).
+    spot_jacobian : ArrayLike
+        (D, P) px per unit of motion.
+    parameter_jacobian : ArrayLike
+        (4, P), rad and m per unit of motion. P from 1 to D.
+    motion_names : Sequence[str] | None
+        Of the P motions, for messages.
     """
     spread = np.asarray(covariance, dtype=np.float64)
     spots, parameters = _jacobians(spot_jacobian, parameter_jacobian)
@@ -117,11 +122,16 @@ class MotionReport:
 class ObservabilityReport:
     """Response of the spots to M motions, and which of the motions are separable.
 
-    Attributes:
-        rank: of the noise-weighted, unit-scaled signatures of all motions.
-        family: names of the P motions that the model fits.
-        motions: a report on each.
-        statements: plain English that names what cannot be separated.
+    Attributes
+    ----------
+    rank : int
+        Of the noise-weighted, unit-scaled signatures of all motions.
+    family : tuple[str, ...]
+        Names of the P motions that the model fits.
+    motions : tuple[MotionReport, ...]
+        a report on each.
+    statements : tuple[str, ...]
+        Plain English that names what cannot be separated.
     """
 
     rank: int
@@ -142,13 +152,20 @@ def observability(
 
     Raises RankError if the family itself is degenerate.
 
-    Args:
-        motion_names: M names.
-        spot_jacobian: (D, M), px per SI unit of motion.
-        parameter_jacobian: (4, M), rad and m per SI unit of motion.
-        scales: (M,) size of one unit of each motion in SI (1e-6 for one micrometre).
-        covariance: (D, D) px^2 of the shifts, positive definite.
-        family: indices of the motions that the model fits.
+    Parameters
+    ----------
+    motion_names : Sequence[str]
+        M names.
+    spot_jacobian : ArrayLike
+        (D, M), px per SI unit of motion.
+    parameter_jacobian : ArrayLike
+        (4, M), rad and m per SI unit of motion.
+    scales : ArrayLike
+        (M,) size of one unit of each motion in SI (1e-6 for one micrometre).
+    covariance : ArrayLike
+        (D, D) px^2 of the shifts, positive definite.
+    family : Sequence[int]
+        Indices of the motions that the model fits.
     """
     spots, parameters = _jacobians(spot_jacobian, parameter_jacobian, limited=False)
     names, size = tuple(motion_names), np.asarray(scales, dtype=np.float64)
@@ -305,12 +322,18 @@ _NOTHING = 1e-12
 class UnseenMode:
     """Motions that move quantities and no spot.
 
-    Attributes:
-        quantities: (Q,) what one standard deviation of the mode does, in their units.
-        sigma: root of the sum of its squares over the quantities' scales.
-        motions: (M,) of that standard deviation, in stated standard deviations: the likeliest that make it.
-        bodies: body -> share of the mode's variance, the largest first; negative where motions go together.
-        spots: largest of what the motions do to a spot, px: rounding.
+    Attributes
+    ----------
+    quantities : Array
+        (Q,) what one standard deviation of the mode does, in their units.
+    sigma : float
+        Root of the sum of its squares over the quantities' scales.
+    motions : Array
+        (M,) of that standard deviation, in stated standard deviations: the likeliest that make it.
+    bodies : Mapping[str, float]
+        Body -> share of the mode's variance, the largest first; negative where motions go together.
+    spots : float
+        Largest of what the motions do to a spot, px: rounding.
     """
 
     quantities: Array
@@ -338,9 +361,12 @@ def _hidden(stated: Disturbances) -> Array:
 def floor(stated: Disturbances, rows: Array) -> Array:
     """(Q, Q) covariance of quantities that no estimate from the spots can have less of.
 
-    Args:
-        stated: what moves.
-        rows: (Q, P) of the quantities on the parameters.
+    Parameters
+    ----------
+    stated : Disturbances
+        What moves.
+    rows : Array
+        (Q, P) of the quantities on the parameters.
     """
     effect = rows @ stated.parameters
     return np.asarray(effect @ _hidden(stated) @ effect.T)
@@ -353,10 +379,14 @@ _LEAST_MODE = 1e-3
 def unseen_modes(stated: Disturbances, rows: Array, scale: Array) -> tuple[UnseenMode, ...]:
     """Modes of the floor, the largest first.
 
-    Args:
-        stated: what moves.
-        rows: (Q, P) of the quantities on the parameters.
-        scale: (Q,) of each quantity what counts as much as one of another.
+    Parameters
+    ----------
+    stated : Disturbances
+        What moves.
+    rows : Array
+        (Q, P) of the quantities on the parameters.
+    scale : Array
+        (Q,) of each quantity what counts as much as one of another.
     """
     effect = rows @ stated.parameters
     hidden = _hidden(stated)

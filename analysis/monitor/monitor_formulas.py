@@ -119,10 +119,14 @@ class CameraParameters(OfStates):
     def from_vector(cls, values: ArrayLike, covariance: ArrayLike, total: ArrayLike | None = None) -> CameraParameters:
         """From plain arrays.
 
-        Args:
-            values: (..., 4) d_alpha, d_beta, d_gamma (rad), d_f (m).
-            covariance: (..., 4, 4) of the noise.
-            total: (..., 4, 4) of noise and misfit; None where no disturbances are stated.
+        Parameters
+        ----------
+        values : ArrayLike
+            (..., 4) d_alpha, d_beta, d_gamma (rad), d_f (m).
+        covariance : ArrayLike
+            (..., 4, 4) of the noise.
+        total : ArrayLike | None
+            (..., 4, 4) of noise and misfit; None where no disturbances are stated.
         """
         vector, spread = np.asarray(values, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
         if vector.shape[-1:] != (4,) or spread.shape[-2:] != (4, 4):
@@ -194,12 +198,17 @@ def paper_single(
 ) -> CameraParameters:
     """Eq. (2), (3), (5), (7) of paper 001 as printed, with the arctangent.
 
-    Args:
-        before: (..., 2 channels, 2) spot positions (row, column) of the nominal state, px.
-        after: of the changed state, likewise.
-        covariance: (..., 4, 4) of after - before, px^2, in order [left row, left column, right row, right column];
-            zeros where there is no noise.
-        geometry: of the camera.
+    Parameters
+    ----------
+    before : ArrayLike
+        (..., 2 channels, 2) spot positions (row, column) of the nominal state, px.
+    after : ArrayLike
+        Of the changed state, likewise.
+    covariance : ArrayLike
+        (..., 4, 4) of after - before, px^2, in order [left row, left column, right row, right column]; zeros where
+        there is no noise.
+    geometry : MonitorGeometry
+        Of the camera.
     """
     argument, spread = linear(coefficients("paper_single", geometry), before, after, covariance)
     values = argument.copy()
@@ -214,12 +223,17 @@ def paper_joint(
 ) -> CameraParameters:
     """Table 1 of paper 001, last column, as printed; arguments as `paper_single`, sign of Y_L: see the module.
 
-    Args:
-        before: spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
-        after: of the changed state, likewise.
-        covariance: of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column;
-            zeros where there is no noise.
-        geometry: of the camera.
+    Parameters
+    ----------
+    before : ArrayLike
+        Spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
+    after : ArrayLike
+        Of the changed state, likewise.
+    covariance : ArrayLike
+        Of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column; zeros where
+        there is no noise.
+    geometry : MonitorGeometry
+        Of the camera.
     """
     return CameraParameters.from_vector(*linear(coefficients("paper_joint", geometry), before, after, covariance))
 
@@ -227,12 +241,17 @@ def paper_joint(
 def derived(before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry) -> CameraParameters:
     """The corrected factors (see the module's text); arguments as `paper_single`.
 
-    Args:
-        before: spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
-        after: of the changed state, likewise.
-        covariance: of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column;
-            zeros where there is no noise.
-        geometry: of the camera.
+    Parameters
+    ----------
+    before : ArrayLike
+        Spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
+    after : ArrayLike
+        Of the changed state, likewise.
+    covariance : ArrayLike
+        Of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column; zeros where
+        there is no noise.
+    geometry : MonitorGeometry
+        Of the camera.
     """
     return CameraParameters.from_vector(*linear(coefficients("derived", geometry), before, after, covariance))
 
@@ -241,12 +260,17 @@ def linear(matrix: Array, before: ArrayLike, after: ArrayLike, covariance: Array
     """What a matrix (4, 4) as of `coefficients` makes of the shifts, (..., 4), and its covariance (..., 4, 4); the
     other arguments as `paper_single`.
 
-    Args:
-        matrix: as of `coefficients`, (4, 4).
-        before: spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
-        after: of the changed state, likewise.
-        covariance: of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column;
-            zeros where there is no noise.
+    Parameters
+    ----------
+    matrix : Array
+        As of `coefficients`, (4, 4).
+    before : ArrayLike
+        Spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
+    after : ArrayLike
+        Of the changed state, likewise.
+    covariance : ArrayLike
+        Of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column; zeros where
+        there is no noise.
     """
     start, end = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
     spread = np.asarray(covariance, dtype=np.float64)
@@ -291,13 +315,20 @@ def exact(
 
     Raises ValueError for look angles that are not within +-pi/2 and different.
 
-    Args:
-        forward: changes of the camera of the larger look angle.
-        backward: of the other.
-        forward_look_rad: its look angle, rad.
-        backward_look_rad: likewise.
-        across: (..., 4, 4) covariance of the forward with the backward parameters by noise, None for none.
-        across_total: likewise of the whole error.
+    Parameters
+    ----------
+    forward : CameraParameters
+        Changes of the camera of the larger look angle.
+    backward : CameraParameters
+        Of the other.
+    forward_look_rad : float
+        Its look angle, rad.
+    backward_look_rad : float
+        likewise.
+    across : Array | None
+        (..., 4, 4) covariance of the forward with the backward parameters by noise, None for none.
+    across_total : Array | None
+        Likewise of the whole error.
     """
     for name, look in (("forward", forward_look_rad), ("backward", backward_look_rad)):
         if not (math.isfinite(look) and abs(look) < math.pi / 2):
@@ -363,12 +394,16 @@ _PLACES = 9
 class GroundError(OfStates):
     """Errors of points on the ground for S states.
 
-    Attributes:
-        error_m: (S, 3) along the track, across it and up at the middle of the line, when the cameras' changes are
-            ignored: found minus true.
-        sigma_m: (S, 3) what is left of it when the cameras are corrected by the estimate, one standard deviation;
-            sigma_noise_m: of that what the noise does.
-        plan_rms_m, height_rms_m: (S,) likewise, RMS over the line: of both plan axes together, and of the height.
+    Attributes
+    ----------
+    error_m : Array
+        (S, 3) along the track, across it and up at the middle of the line, when the cameras' changes are ignored: found
+        minus true.
+    sigma_m : Array
+        (S, 3) what is left of it when the cameras are corrected by the estimate, one standard deviation; sigma_noise_m:
+        of that what the noise does.
+    plan_rms_m, height_rms_m : Array
+        (S,) likewise, RMS over the line: of both plan axes together, and of the height.
     """
 
     error_m: Array
@@ -382,14 +417,21 @@ class GroundError(OfStates):
 class GroundGeometry:
     """A pair of line cameras over the ground.
 
-    Attributes:
-        altitude_m: of the orbit.
-        cameras: names of the two, in the calibration's order.
-        looks_rad: their look angles, forward positive.
-        half_field: tangent of half the field across the track that both lines see, of each.
+    Attributes
+    ----------
+    altitude_m : float
+        Of the orbit.
+    cameras : tuple[str, str]
+        Names of the two, in the calibration's order.
+    looks_rad : tuple[float, float]
+        Their look angles, forward positive.
+    half_field : tuple[float, float]
+        Tangent of half the field across the track that both lines see, of each.
 
-    Raises:
-        ValueError: a camera does not look at the Earth, or both look the same way.
+    Raises
+    ------
+    ValueError
+        a camera does not look at the Earth, or both look the same way.
     """
 
     altitude_m: float
@@ -450,8 +492,10 @@ class GroundGeometry:
     def rows(self, principal_distances_m: tuple[float, float]) -> Array:
         """(places, 3, 8) as `matrices`, for d_f in metres.
 
-        Args:
-            principal_distances_m: of the two cameras.
+        Parameters
+        ----------
+        principal_distances_m : tuple[float, float]
+            Of the two cameras.
         """
         out = self.matrices.copy()
         for k, f in enumerate(principal_distances_m):
@@ -461,9 +505,12 @@ class GroundGeometry:
     def found(self, true: Array, assumed: Array) -> Array:
         """Error (..., 3) along, across and up of points that are located along assumed rays, exactly.
 
-        Args:
-            true: (..., 2, 3) directions of the two rays in the base frame as they are (X along the track, Z down).
-            assumed: likewise, as they are taken to be.
+        Parameters
+        ----------
+        true : Array
+            (..., 2, 3) directions of the two rays in the base frame as they are (X along the track, Z down).
+        assumed : Array
+            Likewise, as they are taken to be.
         """
         normal: Any = 0.0
         right: Any = 0.0
@@ -488,11 +535,16 @@ class GroundGeometry:
     ) -> GroundError:
         """Errors on the ground by estimated changes, and what correcting by them leaves.
 
-        Args:
-            values: (S, 8) estimated changes, rad and m.
-            noise: (S, 8, 8) their covariance by noise.
-            total: (S, 8, 8) of their error.
-            principal_distances_m: of the two cameras.
+        Parameters
+        ----------
+        values : Array
+            (S, 8) estimated changes, rad and m.
+        noise : Array
+            (S, 8, 8) their covariance by noise.
+        total : Array
+            (S, 8, 8) of their error.
+        principal_distances_m : tuple[float, float]
+            Of the two cameras.
         """
         rows = self.rows(principal_distances_m)
         middle = rows[_PLACES // 2]

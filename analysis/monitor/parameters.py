@@ -90,13 +90,19 @@ _PER_SI: Mapping[str, float] = MappingProxyType(
 class Parameter:
     """A change that is read and whose truth is traced.
 
-    Attributes:
-        key: its name in files, which ends in its unit.
-        symbol: its name in tables, figures and sentences.
-        meaning: what it is, with its sign.
-        decimals: that the terminal shows.
-        of: of a camera: what it is made of, (4,) SI units per rad and m of d_alpha, d_beta, d_gamma and d_f, or those
-            given the camera's calibration; None for a reading of two cameras together.
+    Attributes
+    ----------
+    key : str
+        Its name in files, which ends in its unit.
+    symbol : str
+        Its name in tables, figures and sentences.
+    meaning : str
+        What it is, with its sign.
+    decimals : int
+        That the terminal shows.
+    of : Callable[[CameraCalibration], ArrayLike] | tuple[float, ...] | None
+        Of a camera: what it is made of, (4,) SI units per rad and m of d_alpha, d_beta, d_gamma and d_f, or those given
+        the camera's calibration; None for a reading of two cameras together.
     """
 
     key: str
@@ -162,8 +168,10 @@ GROUND = (
 def rows_of(camera: CameraCalibration) -> Array:
     """What the readings of a camera are made of, (P, 4): each in its unit per rad and m of the four parameters.
 
-    Args:
-        camera: its calibration.
+    Parameters
+    ----------
+    camera : CameraCalibration
+        Its calibration.
     """
     made_of = ((one.per_si, one.of) for one in CAMERA_PARAMETERS.values() if one.of is not None)
     return np.array([unit * np.array(of(camera) if callable(of) else of) for unit, of in made_of])

@@ -57,11 +57,16 @@ NOISE, BEFORE, AFTER = "noise", "before", "shape"
 class SpotDoubt:
     """Why sigma does not hold for a state.
 
-    Attributes:
-        cause: `noise`, `before` or `shape`.
-        spots: which of the C spots do not fit.
-        widening: largest factor by which the sigma of a spot was widened.
-        text: in words, without a sentence's end.
+    Attributes
+    ----------
+    cause : str
+        `noise`, `before` or `shape`.
+    spots : tuple[int, ...]
+        Which of the C spots do not fit.
+    widening : float
+        Largest factor by which the sigma of a spot was widened.
+    text : str
+        In words, without a sentence's end.
     """
 
     cause: str
@@ -74,9 +79,12 @@ class SpotDoubt:
 class SpotEvidence:
     """Fits of C spots in S states.
 
-    Attributes:
-        before: (1, C) or (S, C), of the nominal state.
-        after: (S, C).
+    Attributes
+    ----------
+    before : FitStates
+        (1, C) or (S, C), of the nominal state.
+    after : FitStates
+        (S, C).
     """
 
     before: FitStates
@@ -85,8 +93,10 @@ class SpotEvidence:
     def at(self, states: slice) -> SpotEvidence:
         """The evidence of some states.
 
-        Args:
-            states: which.
+        Parameters
+        ----------
+        states : slice
+            which.
         """
         before = self.before if len(self.before.whole) == 1 else self.before.at(states)
         return SpotEvidence(before, self.after.at(states))
@@ -95,8 +105,10 @@ class SpotEvidence:
     def joined(cls, parts: Sequence[SpotEvidence]) -> SpotEvidence:
         """The evidence of several series against one nominal state, one after the other.
 
-        Args:
-            parts: at least one.
+        Parameters
+        ----------
+        parts : Sequence[SpotEvidence]
+            At least one.
         """
         return cls(parts[0].before, FitStates.joined([one.after for one in parts]))
 
@@ -118,9 +130,12 @@ class SpotEvidence:
     def course_doubt(self, moments: Sequence[str], names: Sequence[str]) -> str | None:
         """Why sigma does not hold at the worst of the states; None where it holds at all.
 
-        Args:
-            moments: of the states, in words.
-            names: of the spots.
+        Parameters
+        ----------
+        moments : Sequence[str]
+            Of the states, in words.
+        names : Sequence[str]
+            Of the spots.
         """
         told, bad = self.doubt(self.worst, names), int(np.count_nonzero(~self.holds))
         return None if told is None else f"at {moments[self.worst]}, the worst of {bad} times: {told.text}"
@@ -128,9 +143,12 @@ class SpotEvidence:
     def doubt(self, state: int = 0, names: Sequence[str] = ()) -> SpotDoubt | None:
         """Why sigma does not hold for a state; None where it does.
 
-        Args:
-            state: its number.
-            names: of the spots; their numbers if not given.
+        Parameters
+        ----------
+        state : int
+            Its number.
+        names : Sequence[str]
+            Of the spots; their numbers if not given.
         """
         if self.holds[state]:
             return None
@@ -197,9 +215,12 @@ _MOST_STEPS = 20
 class Retraced:
     """What S states do, exactly.
 
-    Attributes:
-        spots: (S, D) shifts, px; NaN in a state whose light is lost.
-        parameters: (S, 4 K) changes, rad and m, likewise.
+    Attributes
+    ----------
+    spots : Array
+        (S, D) shifts, px; NaN in a state whose light is lost.
+    parameters : Array
+        (S, 4 K) changes, rad and m, likewise.
     """
 
     spots: Array
@@ -210,13 +231,20 @@ class Retraced:
 class MotionModel:
     """The motions that an estimator knows of.
 
-    Attributes:
-        spots: A, (D, P) px per unit of each motion.
-        parameters: B, (4 K, P) rad and m, likewise.
-        amounts: covariance of the shifts (S, D, D), px^2 -> G, (S, P, D) units per px.
-        states: amounts (S, P) -> the states that they make.
-        trace: S states -> what they do. Models that have the same one are traced together.
-        near_px: states in which no spot moves by more are taken as linear and not traced, px.
+    Attributes
+    ----------
+    spots : Array
+        A, (D, P) px per unit of each motion.
+    parameters : Array
+        B, (4 K, P) rad and m, likewise.
+    amounts : Callable[[Array], Array]
+        Covariance of the shifts (S, D, D), px^2 -> G, (S, P, D) units per px.
+    states : Callable[[Array], Sequence[Any]]
+        Amounts (S, P) -> the states that they make.
+    trace : Callable[[Sequence[Any]], Retraced]
+        S states -> what they do. Models that have the same one are traced together.
+    near_px : float
+        States in which no spot moves by more are taken as linear and not traced, px.
     """
 
     spots: Array
@@ -231,10 +259,14 @@ class MotionModel:
 class Curvature(OfStates):
     """What retraced states say of the linear readings of an estimator in S states.
 
-    Attributes:
-        off: (S, Q) what the linear reading of each quantity is off by, sigmas; NaN where the state cannot be traced.
-        beyond: (S,) whether it is too much, so that the readings are those of the last step.
-        rests: (S,) whether the steps came to rest; true where none were needed.
+    Attributes
+    ----------
+    off : Array
+        (S, Q) what the linear reading of each quantity is off by, sigmas; NaN where the state cannot be traced.
+    beyond : NDArray[np.bool_]
+        (S,) whether it is too much, so that the readings are those of the last step.
+    rests : NDArray[np.bool_]
+        (S,) whether the steps came to rest; true where none were needed.
     """
 
     off: Array
@@ -259,10 +291,14 @@ class Curvature(OfStates):
 class LinearReading:
     """What an estimator reads by derivatives in S states.
 
-    Attributes:
-        values: (S, 4 K), rad and m.
-        total: (S, 4 K, 4 K) covariance of their errors.
-        model: the motions by which it reads.
+    Attributes
+    ----------
+    values : Array
+        (S, 4 K), rad and m.
+    total : Array
+        (S, 4 K, 4 K) covariance of their errors.
+    model : MotionModel
+        The motions by which it reads.
     """
 
     values: Array
@@ -275,11 +311,16 @@ def read_again(
 ) -> dict[str, tuple[Array, Curvature]]:
     """Readings (S, 4 K) of each estimator, worked out anew where they are not linear, and what was found.
 
-    Args:
-        readings: estimator -> its linear readings.
-        shift: (S, D) px.
-        noise: (S, D, D) px^2 of them.
-        rows: (Q, 4 K) of the quantities that are judged.
+    Parameters
+    ----------
+    readings : Mapping[str, LinearReading]
+        Estimator -> its linear readings.
+    shift : Array
+        (S, D) px.
+    noise : Array
+        (S, D, D) px^2 of them.
+    rows : Array
+        (Q, 4 K) of the quantities that are judged.
     """
     steps = {title: _Steps.of(reading, shift, noise, rows) for title, reading in readings.items()}
     found = _traced_together({title: (own.model, own.x[own.far]) for title, own in steps.items()})
@@ -307,11 +348,16 @@ def _traced_together(wanted: Mapping[str, tuple[MotionModel, Array]]) -> dict[st
 class _Steps:
     """Steps of Gauss and Newton about the states that S readings of an estimator stand for.
 
-    Attributes:
-        model: of its motions.
-        shift: (S, D) px; gain: G, (S, P, D); x: (S, P) motions that the readings stand for.
-        sigma: (S, Q) of the quantities; rows: theirs, (Q, 4 K).
-        far: states that are traced.
+    Attributes
+    ----------
+    model : MotionModel
+        Of its motions.
+    shift : Array
+        (S, D) px; gain: G, (S, P, D); x: (S, P) motions that the readings stand for.
+    sigma : Array
+        (S, Q) of the quantities; rows: theirs, (Q, 4 K).
+    far : NDArray[np.intp]
+        States that are traced.
     """
 
     model: MotionModel
@@ -414,8 +460,10 @@ class Recovery(OfStates):
     def at(self, states: slice) -> Recovery:
         """The recovery of some states, without ``parts``.
 
-        Args:
-            states: which.
+        Parameters
+        ----------
+        states : slice
+            which.
         """
         return OfStates.at(replace(self, parts=None), states)
 
@@ -429,10 +477,14 @@ class Recovery(OfStates):
     ) -> Consistency:
         """Do the shifts of one state agree with what is stated?
 
-        Args:
-            disturbances: stated.
-            state: its number.
-            others: see `analysis.monitor.disturbances.consistency`.
+        Parameters
+        ----------
+        disturbances : Disturbances
+            stated.
+        state : int
+            Its number.
+        others : Mapping[str, Array] | None
+            See `analysis.monitor.disturbances.consistency`.
         """
         return consistency(self.shift[state], self.shift_covariance[state], disturbances, others)
 
@@ -444,12 +496,18 @@ def measure_spots(
 
     Raises SpotError for spots that cannot be measured, and for those whose fit does not come to rest.
 
-    Args:
-        mean: mean frames, (B, H, W), grey values.
-        frames: number of frames of each mean.
-        calibration: of the nominal instrument.
-        centroid: name of a method of `analysis.spots.CENTROIDS`.
-        threads: for the fits; results do not depend on it.
+    Parameters
+    ----------
+    mean : Array
+        Mean frames, (B, H, W), grey values.
+    frames : int
+        Number of frames of each mean.
+    calibration : MonitorCalibration
+        Of the nominal instrument.
+    centroid : str
+        Name of a method of `analysis.spots.CENTROIDS`.
+    threads : int
+        For the fits; results do not depend on it.
     """
     if centroid not in CENTROIDS:
         raise ValueError(f"recovery: no centroid {centroid!r}; there are {', '.join(CENTROIDS)}")
@@ -461,12 +519,18 @@ def judged_spots(
 ) -> tuple[SpotPositions, FitStates]:
     """Measure spots with the sigmas that their fits leave them, and judge the fits, (B / C, C).
 
-    Args:
-        mean: as of `measure_spots`, as all others.
-        frames: of each mean.
-        calibration: of the nominal instrument.
-        centroid: `ml`, `gaussian` or `energy`.
-        threads: for the fits.
+    Parameters
+    ----------
+    mean : Array
+        As of `measure_spots`, as all others.
+    frames : int
+        Of each mean.
+    calibration : MonitorCalibration
+        Of the nominal instrument.
+    centroid : str
+        `ml`, `gaussian` or `energy`.
+    threads : int
+        For the fits.
     """
     found = measure_spots(mean, frames, calibration, centroid, threads)
     states = fit_states(found)
@@ -486,19 +550,26 @@ def recover(
 ) -> Recovery:
     """Recover all parameters.
 
-    Args:
-        before: (C, frames, H, W) or (S, C, frames, H, W) grey values of the nominal state, or what `judged_spots` gave
-            of them.
-        after: (S, C, frames, H, W) grey values of the states to be measured.
-        calibration: of the nominal instrument; C must be its number of spots.
-        centroid: `ml`, `gaussian` or `energy`.
-        threads: for the fits; results do not depend on it.
-        disturbances: what is stated to move; without it there is no `posterior`, and all sigmas are those of the noise
-            alone.
-        keep_parts: of the noise, which are large.
-        motions: estimator -> the motions by which it reads, traced again to see whether they are linear; None to take
-            them so.
-        frames: of which each image is the mean, (C, H, W) and (S, C, H, W); None where these are frames.
+    Parameters
+    ----------
+    before : NDArray[Any] | MeasuredSpots
+        (C, frames, H, W) or (S, C, frames, H, W) grey values of the nominal state, or what `judged_spots` gave of them.
+    after : NDArray[Any]
+        (S, C, frames, H, W) grey values of the states to be measured.
+    calibration : MonitorCalibration
+        Of the nominal instrument; C must be its number of spots.
+    centroid : str
+        `ml`, `gaussian` or `energy`.
+    threads : int
+        For the fits; results do not depend on it.
+    disturbances : Disturbances | None
+        What is stated to move; without it there is no `posterior`, and all sigmas are those of the noise alone.
+    keep_parts : bool
+        Of the noise, which are large.
+    motions : Mapping[str, MotionModel] | None
+        Estimator -> the motions by which it reads, traced again to see whether they are linear; None to take them so.
+    frames : int | None
+        Of which each image is the mean, (C, H, W) and (S, C, H, W); None where these are frames.
     """
     spots = after.shape[1]
     axis = -4 if frames is None else -3
@@ -528,15 +599,24 @@ def recovery_of(
 ) -> Recovery:
     """What spots say that have been measured already.
 
-    Args:
-        first: C spots of the nominal state, or S C, with their maps.
-        second: S C spots of the states to be measured, state by state, likewise.
-        covariance: (S C, 2, 2) px^2 of their differences.
-        calibration: of the nominal instrument; C must be its number of spots.
-        disturbances: as of `recover`.
-        keep_parts: of the noise, which are large.
-        evidence: what the fits say; the positions are those of `judged_spots`.
-        motions: as of `recover`.
+    Parameters
+    ----------
+    first : SpotPositions
+        C spots of the nominal state, or S C, with their maps.
+    second : SpotPositions
+        S C spots of the states to be measured, state by state, likewise.
+    covariance : Array
+        (S C, 2, 2) px^2 of their differences.
+    calibration : MonitorCalibration
+        Of the nominal instrument; C must be its number of spots.
+    disturbances : Disturbances | None
+        As of `recover`.
+    keep_parts : bool
+        Of the noise, which are large.
+    evidence : SpotEvidence | None
+        What the fits say; the positions are those of `judged_spots`.
+    motions : Mapping[str, MotionModel] | None
+        As of `recover`.
     """
     spots = calibration.spots
     states = second.row.size // spots
@@ -570,14 +650,22 @@ def estimates(
 ) -> Estimates:
     """All estimators on spot positions.
 
-    Args:
-        start: (S, C, 2) spot positions (row, column) before, px, one camera's after the other's.
-        end: those after, likewise.
-        covariance: (S, 2 C, 2 C) of after - before, px^2; all zero for positions without noise.
-        cameras: what is calibrated of each.
-        disturbances: what is stated to move, None for nothing.
-        ground: of a pair whose altitude is known.
-        motions: as of `recover`.
+    Parameters
+    ----------
+    start : Array
+        (S, C, 2) spot positions (row, column) before, px, one camera's after the other's.
+    end : Array
+        Those after, likewise.
+    covariance : Array
+        (S, 2 C, 2 C) of after - before, px^2; all zero for positions without noise.
+    cameras : Mapping[str, CameraCalibration]
+        What is calibrated of each.
+    disturbances : Disturbances | None
+        What is stated to move, None for nothing.
+    ground : GroundGeometry | None
+        Of a pair whose altitude is known.
+    motions : Mapping[str, MotionModel] | None
+        As of `recover`.
     """
     shifts = Shifts(start, end, covariance, cameras, disturbances)
     found: dict[str, tuple[Array, Array, Array | None]] = {}
@@ -604,11 +692,15 @@ def estimates_of(
 ) -> Estimates:
     """What follows from changes of all cameras together: those of each, of their angle, on the ground.
 
-    Args:
-        found: estimator -> (S, 4 K) changes, and (S, 4 K, 4 K) covariances by noise and of the whole error; None for
-            the last where nothing is stated to move.
-        cameras: what is calibrated of each.
-        ground: of a pair whose altitude is known.
+    Parameters
+    ----------
+    found : Mapping[str, tuple[Array, Array, Array | None]]
+        Estimator -> (S, 4 K) changes, and (S, 4 K, 4 K) covariances by noise and of the whole error; None for the last
+        where nothing is stated to move.
+    cameras : Mapping[str, CameraCalibration]
+        What is calibrated of each.
+    ground : GroundGeometry | None
+        Of a pair whose altitude is known.
     """
     parameters: dict[str, dict[str, CameraParameters]] = {name: {} for name in cameras}
     angle: dict[str, IntersectionAngleChange] = {}
@@ -635,8 +727,10 @@ def estimates_of(
 def joint(covariance: Array) -> Array:
     """(S, 2 C, 2 C) from the covariances (S, C, 2, 2) of C spots, which are independent of each other.
 
-    Args:
-        covariance: px^2.
+    Parameters
+    ----------
+    covariance : Array
+        Px^2.
     """
     states, spots = covariance.shape[:2]
     out = np.zeros((states, spots, 2, spots, 2))

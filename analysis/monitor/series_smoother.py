@@ -63,8 +63,10 @@ class ShiftNoise(Protocol):
     def covariance(self, images: Numbers) -> Array:
         """(n D, n D) px^2 of the shifts of some measurements, one measurement after the other.
 
-        Args:
-            images: (n,) their numbers in the order of the shifts.
+        Parameters
+        ----------
+        images : Numbers
+            (n,) their numbers in the order of the shifts.
         """
         ...
 
@@ -73,10 +75,14 @@ class ShiftNoise(Protocol):
 class SeriesChanges:
     """Changes of K cameras at T times.
 
-    Attributes:
-        values: (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
-        noise: (T, 4 K, 4 K) covariance of their errors by the noise of the shifts.
-        total: likewise of the whole error.
+    Attributes
+    ----------
+    values : Array
+        (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
+    noise : Array
+        (T, 4 K, 4 K) covariance of their errors by the noise of the shifts.
+    total : Array
+        Likewise of the whole error.
     """
 
     values: Array
@@ -88,14 +94,20 @@ class SeriesChanges:
 class SmoothedSeries:
     """Changes of all cameras over a series.
 
-    Attributes:
-        filtered: from the measurements up to each time.
-        smoothed: from all measurements.
-        innovations: (M,) chi-square of each measurement, in the order given, against what those before it say, each of
-            D degrees of freedom.
-        consistency: chi-square of the whole series.
-        jumps: that were found, in the order of time; None where nothing is stated to jump. Filtered changes know of
-            them from their time on, as if they had been known then.
+    Attributes
+    ----------
+    filtered : SeriesChanges
+        From the measurements up to each time.
+    smoothed : SeriesChanges
+        From all measurements.
+    innovations : Array
+        (M,) chi-square of each measurement, in the order given, against what those before it say, each of D degrees of
+        freedom.
+    consistency : Consistency
+        Chi-square of the whole series.
+    jumps : tuple[Jump, ...] | None
+        That were found, in the order of time; None where nothing is stated to jump. Filtered changes know of them from
+        their time on, as if they had been known then.
     """
 
     filtered: SeriesChanges
@@ -108,8 +120,10 @@ class SmoothedSeries:
 def window_of(values: int) -> int:
     """Measurements that are worked on at once.
 
-    Args:
-        values: shifts in each, D.
+    Parameters
+    ----------
+    values : int
+        Shifts in each, D.
     """
     return max(3, LARGEST // values)
 
@@ -124,16 +138,25 @@ def smooth(
 ) -> SmoothedSeries:
     """Filtered and smoothed changes.
 
-    Args:
-        stated: what moves, and how it goes on in time.
-        measured: (M,) when the monitor measured, seconds, in any order.
-        shifts: (M, D) what it measured, after - before, px.
-        noise: of these shifts.
-        times: (T,) for which changes are wanted, seconds, in any order.
-        reference: from which time of the process changes are counted, seconds; None for the calibration.
+    Parameters
+    ----------
+    stated : Disturbances
+        What moves, and how it goes on in time.
+    measured : ArrayLike
+        (M,) when the monitor measured, seconds, in any order.
+    shifts : Array
+        (M, D) what it measured, after - before, px.
+    noise : ShiftNoise
+        Of these shifts.
+    times : ArrayLike
+        (T,) for which changes are wanted, seconds, in any order.
+    reference : float | None
+        From which time of the process changes are counted, seconds; None for the calibration.
 
-    Raises:
-        ValueError: motions of different laws are correlated, or the shifts have no noise and say the same twice.
+    Raises
+    ------
+    ValueError
+        Motions of different laws are correlated, or the shifts have no noise and say the same twice.
     """
     when, wanted = np.asarray(measured, np.float64), np.asarray(times, np.float64)
     order = np.argsort(when, kind="stable")
@@ -167,13 +190,20 @@ def smooth(
 class _Search:
     """Looks for jumps in a series.
 
-    Args:
-        stated: what moves, and how it goes on in time.
-        when: (M,) times of the measurements, seconds, ascending.
-        shifts: (M, D) px, in their own order.
-        noise: of these.
-        order: (M,) numbers of the shifts in the order of time.
-        reference: as of `smooth`.
+    Parameters
+    ----------
+    stated
+        What moves, and how it goes on in time.
+    when
+        (M,) times of the measurements, seconds, ascending.
+    shifts
+        (M, D) px, in their own order.
+    noise
+        Of these.
+    order
+        (M,) numbers of the shifts in the order of time.
+    reference
+        As of `smooth`.
     """
 
     def __init__(
@@ -317,11 +347,16 @@ class _Factor:
     def estimate(self, times: Array, at: Numbers, filtered: SeriesChanges, smoothed: SeriesChanges) -> None:
         """Fill in the changes at some of the times.
 
-        Args:
-            times: all.
-            at: which of them.
-            filtered: to be filled.
-            smoothed: likewise.
+        Parameters
+        ----------
+        times : Array
+            all.
+        at : Numbers
+            Which of them.
+        filtered : SeriesChanges
+            To be filled.
+        smoothed : SeriesChanges
+            likewise.
         """
         wanted = times[at]
         prior = self.process.parameters(wanted)

@@ -39,13 +39,20 @@ _NOTHING = 1e-12
 class HeatInputs:
     """Temperatures that sensors read, as inputs with errors.
 
-    Attributes:
-        motions: (m,) numbers of the disturbances that are temperatures or gradients of bodies with sensors.
-        sensors: names of the S sensors.
-        rows: (S, m) kelvin at each sensor for one standard deviation of each motion.
-        factors: (m,) number of the factor by which what each motion does to light differs from what was computed.
-        names: of the factors, bodies.
-        sigma: standard deviation of a factor before any reading.
+    Attributes
+    ----------
+    motions : NDArray[np.int_]
+        (m,) numbers of the disturbances that are temperatures or gradients of bodies with sensors.
+    sensors : tuple[str, ...]
+        Names of the S sensors.
+    rows : Array
+        (S, m) kelvin at each sensor for one standard deviation of each motion.
+    factors : NDArray[np.int_]
+        (m,) number of the factor by which what each motion does to light differs from what was computed.
+    names : tuple[str, ...]
+        Of the factors, bodies.
+    sigma : float
+        Standard deviation of a factor before any reading.
     """
 
     motions: NDArray[np.int_]
@@ -64,15 +71,22 @@ _Kind = Literal["level", "law", "heat", "factor", "reference"]
 class _Block:
     """States of one law.
 
-    Attributes:
-        kind: `level` of all that steps, `law` of another law, `heat` of temperatures with sensors, `factor` and
-            `reference`.
-        law: in time.
-        at: their numbers; of a law with a period the first half goes as a cosine, the second as a sine.
-        outputs: (D + P, r) of the first r states, for amplitude 1.
-        covariance: (r, r) of the states where the law's own variance is 1.
-        motions: numbers of the disturbances that they stand for.
-        steps: (law, (r, r)) of events and jumps, of the level alone.
+    Attributes
+    ----------
+    kind : _Kind
+        `level` of all that steps, `law` of another law, `heat` of temperatures with sensors, `factor` and `reference`.
+    law : TimeLaw
+        In time.
+    at : slice
+        Their numbers; of a law with a period the first half goes as a cosine, the second as a sine.
+    outputs : Array
+        (D + P, r) of the first r states, for amplitude 1.
+    covariance : Array
+        (r, r) of the states where the law's own variance is 1.
+    motions : tuple[int, ...]
+        Numbers of the disturbances that they stand for.
+    steps : _Stepping
+        (law, (r, r)) of events and jumps, of the level alone.
     """
 
     kind: _Kind
@@ -92,10 +106,14 @@ class _Block:
 class _Transition:
     """Of the states over an interval.
 
-    Attributes:
-        kept: (n,) what is left of each; kept_both: (n, n) of the product of two.
-        turned: of each law with a period its states, and the matrix by which they turn.
-        gained: (n, n) covariance that laws without events add meanwhile.
+    Attributes
+    ----------
+    kept : Array
+        (n,) what is left of each; kept_both: (n, n) of the product of two.
+    turned : tuple[tuple[slice, Array], ...]
+        Of each law with a period its states, and the matrix by which they turn.
+    gained : Array
+        (n, n) covariance that laws without events add meanwhile.
     """
 
     kept: Array
@@ -108,14 +126,21 @@ class _Transition:
 class StateSpace:
     """The process of all disturbances, and of the error of the reference that all shifts are counted from.
 
-    Attributes:
-        stated: what moves, D spot coordinates and P parameters.
-        reference_noise: (D, D) px^2 of the reference's spots, the same error in every shift; None for none.
-        heat: temperatures that sensors read; None for none.
-        stepping: numbers of motions of any law that may step, beside those of which this is the law.
+    Attributes
+    ----------
+    stated : Disturbances
+        What moves, D spot coordinates and P parameters.
+    reference_noise : Array | None
+        (D, D) px^2 of the reference's spots, the same error in every shift; None for none.
+    heat : HeatInputs | None
+        Temperatures that sensors read; None for none.
+    stepping : tuple[int, ...]
+        Numbers of motions of any law that may step, beside those of which this is the law.
 
-    Raises:
-        ValueError: motions of different laws are correlated.
+    Raises
+    ------
+    ValueError
+        Motions of different laws are correlated.
     """
 
     stated: Disturbances
@@ -202,8 +227,10 @@ class StateSpace:
     def outputs_of(self, motions: Sequence[int] | range) -> Array:
         """(D + P, m) of motions, for one standard deviation: px of spots, then parameters.
 
-        Args:
-            motions: m numbers.
+        Parameters
+        ----------
+        motions : Sequence[int] | range
+            m numbers.
         """
         own = list(motions)
         return np.concatenate([self.stated.spots[:, own], self.stated.parameters[:, own]])
@@ -216,8 +243,10 @@ class StateSpace:
     def level_of(self, motions: Sequence[int]) -> Array:
         """(n, m) change of the states by steps of motions of one standard deviation each.
 
-        Args:
-            motions: m numbers of motions that jump or have events.
+        Parameters
+        ----------
+        motions : Sequence[int]
+            m numbers of motions that jump or have events.
         """
         out = np.zeros((self.size, len(motions)))
         block = self._blocks[0]
@@ -243,8 +272,10 @@ class StateSpace:
     def start(self, time: float) -> tuple[Array, Array]:
         """States before any reading: mean (n,) and covariance (n, n).
 
-        Args:
-            time: seconds.
+        Parameters
+        ----------
+        time : float
+            seconds.
         """
         spread = np.zeros((self.size, self.size))
         for block in self._blocks:
@@ -262,11 +293,16 @@ class StateSpace:
     def moved(self, states: Array, then: float, now: float, back: bool = False) -> Array:
         """What states, or anything that goes on as they do, are at another time; (..., n, k).
 
-        Args:
-            states: (..., n, k).
-            then: their time, seconds.
-            now: the later one.
-            back: by the transposed transition: what a smoother carries from ``now`` to ``then``.
+        Parameters
+        ----------
+        states : Array
+            (..., n, k).
+        then : float
+            Their time, seconds.
+        now : float
+            The later one.
+        back : bool
+            By the transposed transition: what a smoother carries from ``now`` to ``then``.
         """
         if now == then:
             return states
@@ -279,11 +315,16 @@ class StateSpace:
     def moved_both(self, square: Array, then: float, now: float, back: bool = False) -> Array:
         """A covariance, or anything that goes on as one, at another time; (n, n), symmetric to the bit if it is now.
 
-        Args:
-            square: (n, n).
-            then: its time, seconds.
-            now: the later one.
-            back: as of `moved`.
+        Parameters
+        ----------
+        square : Array
+            (n, n).
+        then : float
+            Its time, seconds.
+        now : float
+            The later one.
+        back : bool
+            As of `moved`.
         """
         if now == then:
             return square
@@ -331,10 +372,14 @@ class StateSpace:
     def spread(self, covariance: Array, then: float, now: float) -> Array:
         """(n, n) covariance of states at a later time, with what has been added since.
 
-        Args:
-            covariance: (n, n) at ``then``.
-            then: its time, seconds.
-            now: the later one.
+        Parameters
+        ----------
+        covariance : Array
+            (n, n) at ``then``.
+        then : float
+            Its time, seconds.
+        now : float
+            The later one.
         """
         if now == then:
             return covariance
@@ -358,10 +403,14 @@ class StateSpace:
     def outputs(self, mean: Array, covariance: Array, time: float) -> tuple[Array, Array, Array]:
         """What states do: values (D + P,), rows on the states (D + P, n), and the covariance of what rows leave out.
 
-        Args:
-            mean: (n,) of the states at ``time``.
-            covariance: (n, n) of them.
-            time: seconds.
+        Parameters
+        ----------
+        mean : Array
+            (n,) of the states at ``time``.
+        covariance : Array
+            (n, n) of them.
+        time : float
+            seconds.
         """
         return self.acting(self._rows(time), mean, covariance)
 
@@ -369,10 +418,14 @@ class StateSpace:
         """What rows on the states make of them where heat does more or less to light than computed: values (R,), rows
         (R, n) and covariance of what these leave out, as `outputs`.
 
-        Args:
-            rows: (R, n), of temperatures as if heat did what was computed.
-            mean: (n,) of the states.
-            covariance: (n, n) of them.
+        Parameters
+        ----------
+        rows : Array
+            (R, n), of temperatures as if heat did what was computed.
+        mean : Array
+            (n,) of the states.
+        covariance : Array
+            (n, n) of them.
         """
         left = np.zeros((len(rows), len(rows)))
         if self.heat is None:
@@ -390,10 +443,14 @@ class StateSpace:
     def _second(self, rows: Array, others: Array, across: Array) -> Array:
         """(R, R') covariance of the products of factors and temperatures beyond what rows make of them.
 
-        Args:
-            rows: (R, n), of temperatures as if heat did what was computed.
-            others: (R', n) likewise, of the states at another time or the same.
-            across: (n, n) covariance of the states with those.
+        Parameters
+        ----------
+        rows : Array
+            (R, n), of temperatures as if heat did what was computed.
+        others : Array
+            (R', n) likewise, of the states at another time or the same.
+        across : Array
+            (n, n) covariance of the states with those.
         """
         out = np.zeros((len(rows), len(others)))
         for factor, at in self._heated if self.heat is not None else ():
@@ -404,10 +461,14 @@ class StateSpace:
     def outputs_jointly(self, means: Array, covariance: Array, times: Array) -> tuple[Array, Array]:
         """What states at T times do together: values (T, D + P) and their covariance (T, D + P, T, D + P).
 
-        Args:
-            means: (T, n) of the states.
-            covariance: (T, n, T, n) of them.
-            times: (T,) seconds.
+        Parameters
+        ----------
+        means : Array
+            (T, n) of the states.
+        covariance : Array
+            (T, n, T, n) of them.
+        times : Array
+            (T,) seconds.
         """
         count, plain = len(times), [self._rows(float(time)).copy() for time in times]
         own = [self.acting(plain[k], means[k], covariance[k, :, k]) for k in range(count)]
@@ -465,9 +526,12 @@ class StateSpace:
     def heat_outputs(self, mean: Array, time: float) -> Array:
         """(D + P,) of the outputs what heat of bodies with sensors does.
 
-        Args:
-            mean: (n,) of the states.
-            time: seconds.
+        Parameters
+        ----------
+        mean : Array
+            (n,) of the states.
+        time : float
+            seconds.
         """
         rows, out = self._rows(time), np.zeros(self.width + self.stated.parameters.shape[0])
         for factor, at in self._heated if self.heat is not None else ():
@@ -477,9 +541,12 @@ class StateSpace:
     def sensor_rows(self, sensors: Sequence[int], time: float) -> Array:
         """(s, n) kelvin that sensors read of the states.
 
-        Args:
-            sensors: their numbers.
-            time: seconds.
+        Parameters
+        ----------
+        sensors : Sequence[int]
+            Their numbers.
+        time : float
+            seconds.
         """
         assert self.heat is not None
         out = np.zeros((len(sensors), self.size))
@@ -491,9 +558,12 @@ class StateSpace:
         """Motions by the states: rows (M, n), and (M, M) covariance of what the states leave of them, in standard
         deviations.
 
-        Args:
-            time: seconds.
-            steps: motions that have stepped beside their laws, and by which variance over the stated one.
+        Parameters
+        ----------
+        time : float
+            seconds.
+        steps : Sequence[tuple[Sequence[int], float]]
+            Motions that have stepped beside their laws, and by which variance over the stated one.
         """
         count = len(self.stated.labels)
         rows, left = np.zeros((count, self.size)), np.zeros((count, count))

@@ -119,22 +119,34 @@ def measure_bars(
 
     Of several frames of them see `bar_pages.measure_bar_pages`.
 
-    Args:
-        region: (H, W) grey values, linear in light, inside the group.
-        dark: pixels, any shape, with the level of the spaces: the same region in frames of an even field, or even
-            patches far from edges.
-        bright: likewise with that of the bars.
-        frequency: about what it is, good to one cycle over the region: (2,) cycles/pixel (down the column, along the
-            row), or one number, its length, or None for the strongest below Nyquist.
-        noise: the detector's model; without one the variance is that of the residuals and of the patches.
-        frames: number of averaged frames.
-        saturation: as in `slanted_edge.measure_edge`.
-        offset: grey value without light, for the contrast only.
-        rounding: rms of what rounding leaves in a pixel of the region and in the two levels, grey values
-            (`edge_pages.left_over`).
+    Parameters
+    ----------
+    region : ArrayLike
+        (H, W) grey values, linear in light, inside the group.
+    dark : ArrayLike
+        Pixels, any shape, with the level of the spaces: the same region in frames of an even field, or even patches far
+        from edges.
+    bright : ArrayLike
+        Likewise with that of the bars.
+    frequency : ArrayLike | None
+        About what it is, good to one cycle over the region: (2,) cycles/pixel (down the column, along the row), or one
+        number, its length, or None for the strongest below Nyquist.
+    noise : NoiseModel | None
+        The detector's model; without one the variance is that of the residuals and of the patches.
+    frames : int
+        Number of averaged frames.
+    saturation : float | None
+        As in `slanted_edge.measure_edge`.
+    offset : float
+        Grey value without light, for the contrast only.
+    rounding : tuple[float, float, float]
+        Rms of what rounding leaves in a pixel of the region and in the two levels, grey values
+        (`edge_pages.left_over`).
 
-    Raises:
-        BarError: no bars, saturated, too small, not filled, at Nyquist without tilt, or patches without contrast.
+    Raises
+    ------
+    BarError
+        No bars, saturated, too small, not filled, at Nyquist without tilt, or patches without contrast.
     """
     if saturation is None and noise is not None:
         saturation = noise.saturation_dn
@@ -414,17 +426,27 @@ def measure_bar_pages(
 ) -> BarMtf:
     """MTF from the bars that fill a region in all pages.
 
-    Args:
-        region: (P, H, W) grey values, linear in light; pages that repeat another one to the bit do not count.
-        dark: pages (Q, ...) with the level of the spaces, as in `bar_contrast.measure_bars`.
-        bright: likewise with that of the bars.
-        frequency: as there.
-        saturation: as there; one page that reaches it is enough.
-        offset: as there.
-        step: between the grey values of a page, which are rounded to it; 0 for real numbers.
+    Parameters
+    ----------
+    region : Array
+        (P, H, W) grey values, linear in light; pages that repeat another one to the bit do not count.
+    dark : Array
+        Pages (Q, ...) with the level of the spaces, as in `bar_contrast.measure_bars`.
+    bright : Array
+        Likewise with that of the bars.
+    frequency : ArrayLike | None
+        As there.
+    saturation : float | None
+        As there; one page that reaches it is enough.
+    offset : float
+        As there.
+    step : float
+        Between the grey values of a page, which are rounded to it; 0 for real numbers.
 
-    Raises:
-        BarError: as `measure_bars`, and bars that move from page to page.
+    Raises
+    ------
+    BarError
+        As `measure_bars`, and bars that move from page to page.
     """
     kept = different_pages(region)
     pages, patches = region[kept], [patch[different_pages(patch)] for patch in (dark, bright)]
@@ -489,9 +511,12 @@ def _check_drift(pages: Array, mean: Array, found: BarMtf, step: float) -> None:
 def page_warnings(found: EdgeMtf | BarMtf, step: float) -> list[str]:
     """What pages, compared with each other and with the step of their grey values, warn of.
 
-    Args:
-        found: by `measure_bar_pages` or `edge_pages.measure_pages`.
-        step: between the grey values of a page; 0 for real numbers.
+    Parameters
+    ----------
+    found : EdgeMtf | BarMtf
+        By `measure_bar_pages` or `edge_pages.measure_pages`.
+    step : float
+        Between the grey values of a page; 0 for real numbers.
     """
     if isinstance(found, EdgeMtf):
         assert found.pages is not None

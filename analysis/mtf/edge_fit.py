@@ -71,11 +71,16 @@ class EdgeDesign:
     def of(x: Array, core: float, oversampling: int, light: Array | None = None) -> EdgeDesign:
         """Return the design for pixels at the distances x.
 
-        Args:
-            x: distances from the edge, (N,), px.
-            core: half width of the spline, px, rounded up to whole knots.
-            oversampling: knots per pixel.
-            light: columns of uneven light, (K, N); none by default. They are no part of the edge-spread function.
+        Parameters
+        ----------
+        x : Array
+            Distances from the edge, (N,), px.
+        core : float
+            Half width of the spline, px, rounded up to whole knots.
+        oversampling : int
+            Knots per pixel.
+        light : Array | None
+            Columns of uneven light, (K, N); none by default. They are no part of the edge-spread function.
         """
         half = math.ceil(core * oversampling)
         place = x * oversampling + half
@@ -285,10 +290,14 @@ class EdgeRows:
     def of(lines: Array, shape: tuple[int, ...], bend: Array) -> EdgeRows:
         """Return the rows of pages, one page after the other.
 
-        Args:
-            lines: offset and slope of each page's line, (P, 2).
-            shape: rows and columns of a page.
-            bend: as the attribute.
+        Parameters
+        ----------
+        lines : Array
+            Offset and slope of each page's line, (P, 2).
+        shape : tuple[int, ...]
+            Rows and columns of a page.
+        bend : Array
+            As the attribute.
         """
         along = np.arange(shape[0]) - (shape[0] - 1) / 2.0
         offset, slope = np.repeat(lines, shape[0], axis=0).T
@@ -373,14 +382,21 @@ class FittedEdge:
 def fit_edge(rising: Array, offset: float, slope: float, even: bool = False) -> FittedEdge:
     """Return the path, the edge-spread function and the light of a region.
 
-    Args:
-        rising: grey values (H, W), from `slanted_edge.rising`.
-        offset: column of the line in the middle row, about.
-        slope: of the line, about.
-        even: the light is known to be even.
+    Parameters
+    ----------
+    rising : Array
+        Grey values (H, W), from `slanted_edge.rising`.
+    offset : float
+        Column of the line in the middle row, about.
+    slope : float
+        Of the line, about.
+    even : bool
+        The light is known to be even.
 
-    Raises:
-        EdgeError: too few sampling phases, or no sharp edge.
+    Raises
+    ------
+    EdgeError
+        Too few sampling phases, or no sharp edge.
     """
     grey = rising.ravel()
     rows = EdgeRows.of(np.array([[offset, slope]]), rising.shape, np.empty(0))
@@ -392,12 +408,18 @@ def fit_edge(rising: Array, offset: float, slope: float, even: bool = False) -> 
 def fit_rows(rows: EdgeRows, grey: Array, core: float, even: bool, line_steps: int = 0) -> FittedEdge:
     """Return the fit to rows of one page or of several, bowed as far as the edge is.
 
-    Args:
-        rows: with their straight lines.
-        grey: values (N,) of their pixels.
-        core: half width of the spline, px.
-        even: the light is known to be even.
-        line_steps: Gauss-Newton steps by which the lines are refined.
+    Parameters
+    ----------
+    rows : EdgeRows
+        With their straight lines.
+    grey : Array
+        Values (N,) of their pixels.
+    core : float
+        Half width of the spline, px.
+    even : bool
+        The light is known to be even.
+    line_steps : int
+        Gauss-Newton steps by which the lines are refined.
     """
     fitted = _fitted(rows, None, grey, core, COARSE, True)
     for step in range(line_steps):
@@ -483,10 +505,14 @@ def _chosen_order(fitted: FittedEdge, grey: Array) -> int:
 def check_phases(distance: Array, rows: int, slope: float) -> None:
     """EdgeError where the sampling phases leave a wide gap.
 
-    Args:
-        distance: of pixels from the edge, (N,), px.
-        rows: lines that they lie in, for the message.
-        slope: of the edge, likewise.
+    Parameters
+    ----------
+    distance : Array
+        Of pixels from the edge, (N,), px.
+    rows : int
+        Lines that they lie in, for the message.
+    slope : float
+        Of the edge, likewise.
     """
     near = np.sort(distance[np.abs(distance) <= 1.5])
     gap = float(np.diff(near).max()) if near.size > 1 else math.inf
@@ -502,13 +528,19 @@ def check_phases(distance: Array, rows: int, slope: float) -> None:
 def core_width(distance: Array, grey: Array, plateau: float) -> float:
     """Half width of the spline, from the 10-90% width of the edge, px.
 
-    Args:
-        distance: of pixels from the edge, (N,), px.
-        grey: their values, (N,).
-        plateau: that lies beside the edge on both sides, px.
+    Parameters
+    ----------
+    distance : Array
+        Of pixels from the edge, (N,), px.
+    grey : Array
+        Their values, (N,).
+    plateau : float
+        That lies beside the edge on both sides, px.
 
-    Raises:
-        EdgeError: the edge is too wide for it.
+    Raises
+    ------
+    EdgeError
+        The edge is too wide for it.
     """
     cell = np.round(2.0 * distance).astype(np.intp)
     low = int(cell.min())

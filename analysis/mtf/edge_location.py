@@ -67,8 +67,10 @@ def checked_region(region: ArrayLike, saturation: float | None) -> Array:
     saturation: grey value from which the detector is saturated; without it a plateau of equal extreme values counts as
     clipped. Infinity switches the check off (noise-free computed images).
 
-    Raises:
-        EdgeError: not a plane of real finite numbers, too small, saturated.
+    Raises
+    ------
+    EdgeError
+        Not a plane of real finite numbers, too small, saturated.
     """
     array = np.asarray(region)
     if array.ndim != 2 or array.dtype.kind not in "uif":
@@ -134,8 +136,10 @@ def locate_edge(grey: Array) -> EdgeLine:
 
     Good to some hundredths of a pixel; `analysis.mtf.slanted_edge` refines it on all pixels together.
 
-    Raises:
-        EdgeError: no edge, more than one, too weak, near 45 degrees, or not inside the region.
+    Raises
+    ------
+    EdgeError
+        No edge, more than one, too weak, near 45 degrees, or not inside the region.
     """
     axis, sign = _direction(grey)
     across = grey if axis == "x" else grey.T

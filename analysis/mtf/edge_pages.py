@@ -48,9 +48,12 @@ def left_over(noise: float, step: float) -> float:
     Quantization Noise, 2008, section 9). Over all levels its rms is step / sqrt(12) without noise, 0.04 steps with
     noise of 0.3, 0.002 with 0.5.
 
-    Args:
-        noise: of one value, rms, grey values.
-        step: between possible grey values; 0 for real numbers.
+    Parameters
+    ----------
+    noise : float
+        Of one value, rms, grey values.
+    step : float
+        Between possible grey values; 0 for real numbers.
     """
     if step <= 0.0:
         return 0.0
@@ -83,15 +86,23 @@ def measure_pages(
 ) -> EdgeMtf:
     """MTF of the one edge that all pages show.
 
-    Args:
-        pages: (P, H, W) grey values, linear in light; pages that repeat another one to the bit do not count.
-        noise: the detector's model, as in `slanted_edge.measure_edge`.
-        saturation: as there; one page that reaches it is enough.
-        step: between the grey values of a page, which are rounded to it; 0 for real numbers.
-        even: the light is known to be even, as in `slanted_edge.measure_edge`.
+    Parameters
+    ----------
+    pages : ArrayLike
+        (P, H, W) grey values, linear in light; pages that repeat another one to the bit do not count.
+    noise : NoiseModel | None
+        The detector's model, as in `slanted_edge.measure_edge`.
+    saturation : float | None
+        As there; one page that reaches it is enough.
+    step : float
+        Between the grey values of a page, which are rounded to it; 0 for real numbers.
+    even : bool
+        The light is known to be even, as in `slanted_edge.measure_edge`.
 
-    Raises:
-        EdgeError: the region does not show one measurable edge, or pages cannot be laid over each other.
+    Raises
+    ------
+    EdgeError
+        The region does not show one measurable edge, or pages cannot be laid over each other.
     """
     given = np.asarray(pages)
     if given.ndim != 3 or given.dtype.kind not in "uif":
@@ -172,12 +183,18 @@ class _Run:
 class _Shift:
     """What pages differ by.
 
-    Attributes:
-        line: change of each page's offset and slope, (P, 2).
-        levels: of its dark level and contrast, (P, 2).
-        covariance: of the line by noise that is new in each page, (P, 2, 2).
-        chi_square: of all lines being the same.
-        page_noise: of one pixel in one page on the dark and on the bright side, fixed pattern included, rms.
+    Attributes
+    ----------
+    line : Array
+        Change of each page's offset and slope, (P, 2).
+    levels : Array
+        Of its dark level and contrast, (P, 2).
+    covariance : Array
+        Of the line by noise that is new in each page, (P, 2, 2).
+    chi_square : float
+        Of all lines being the same.
+    page_noise : tuple[float, float]
+        Of one pixel in one page on the dark and on the bright side, fixed pattern included, rms.
     """
 
     line: Array
@@ -244,10 +261,12 @@ class _Stack:
     def differences(self, step: float, mean: Array | None = None) -> _Shift:
         """Line and levels of each page against those it has, by least squares.
 
-        Args:
-            step: between the grey values of a page.
-            mean: of all pages (H, W), which takes the place of the model; what pixels have in all pages alike then
-                drops out.
+        Parameters
+        ----------
+        step : float
+            Between the grey values of a page.
+        mean : Array | None
+            Of all pages (H, W), which takes the place of the model; what pixels have in all pages alike then drops out.
         """
         pages = self.pages if mean is not None else self.levelled
         count, x = len(pages), self.distance()

@@ -61,8 +61,10 @@ def run_mtf(
 ) -> None:
     """Measure, write and print; the options are those of ``python -m analysis.mtf``.
 
-    Raises:
-        typer.Exit: with the exit code of a failure, which has been told.
+    Raises
+    ------
+    typer.Exit
+        With the exit code of a failure, which has been told.
     """
     errors = Console(stderr=True)
     try:

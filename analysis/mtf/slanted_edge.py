@@ -59,19 +59,30 @@ def measure_edge(
 
     Of several frames of it see `edge_pages.measure_pages`.
 
-    Args:
-        region: (H, W) grey values, linear in light.
-        noise: the detector's model; its fixed pattern counts as independent from pixel to pixel. Without a model the
-            variance is estimated from the residuals on both sides of the edge and taken as linear in the grey value.
-        frames: how many frames the region is the mean of, used with `noise` only.
-        saturation: grey value of saturation; default the model's, else plateaus of equal values are looked for.
-        frequency: (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
-        rounding: rms of what rounding leaves in the dark and in the bright level, grey values (`edge_pages.left_over`).
-        even: the light is known to be even, as in a simulated image; else both levels are planes.
+    Parameters
+    ----------
+    region : ArrayLike
+        (H, W) grey values, linear in light.
+    noise : NoiseModel | None
+        The detector's model; its fixed pattern counts as independent from pixel to pixel. Without a model the variance
+        is estimated from the residuals on both sides of the edge and taken as linear in the grey value.
+    frames : int
+        How many frames the region is the mean of, used with `noise` only.
+    saturation : float | None
+        Grey value of saturation; default the model's, else plateaus of equal values are looked for.
+    frequency : ArrayLike | None
+        (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
+    rounding : tuple[float, float]
+        Rms of what rounding leaves in the dark and in the bright level, grey values (`edge_pages.left_over`).
+    even : bool
+        The light is known to be even, as in a simulated image; else both levels are planes.
 
-    Raises:
-        EdgeError: the region does not show one measurable edge.
-        ValueError: frequencies that make no sense.
+    Raises
+    ------
+    EdgeError
+        The region does not show one measurable edge.
+    ValueError
+        Frequencies that make no sense.
     """
     wanted = FREQUENCY if frequency is None else _checked_frequency(frequency)
     if saturation is None and noise is not None:
@@ -115,17 +126,27 @@ def edge_result(
 ) -> EdgeMtf:
     """What a fit says, with its sigmas.
 
-    Args:
-        pages: from `rising`, with equal levels, (P, H, W); P is 1 but for pages that are aligned.
-        line: as located; its axis and sign count.
-        fitted: line and edge-spread function of all pages together.
-        noise: as in `measure_edge`.
-        frames: each page is the mean of.
-        frequency: (F,) cycles/pixel.
-        rounding: as in `measure_edge`.
+    Parameters
+    ----------
+    pages : Array
+        From `rising`, with equal levels, (P, H, W); P is 1 but for pages that are aligned.
+    line : EdgeLine
+        As located; its axis and sign count.
+    fitted : FittedEdge
+        Line and edge-spread function of all pages together.
+    noise : NoiseModel | None
+        As in `measure_edge`.
+    frames : int
+        Each page is the mean of.
+    frequency : Array
+        (F,) cycles/pixel.
+    rounding : tuple[float, float]
+        As in `measure_edge`.
 
-    Raises:
-        EdgeError: there is more than one straight edge.
+    Raises
+    ------
+    EdgeError
+        There is more than one straight edge.
     """
     spread, design = fitted.spread, fitted.design
     grey, columns = pages.ravel(), pages.shape[2]
@@ -411,8 +432,10 @@ class EdgeMtf:
     def at(self, frequency: float) -> tuple[float, float]:
         """MTF and sigma at one frequency along the normal, cycles/pixel; cubic between the samples.
 
-        Raises:
-            ValueError: the frequency is outside of the measured ones.
+        Raises
+        ------
+        ValueError
+            The frequency is outside of the measured ones.
         """
         if not self.frequency[0] <= frequency <= self.frequency[-1]:
             raise ValueError(

@@ -61,13 +61,19 @@ class CalibrationError(MeasurementError, ValueError):
 class NoiseTerm:
     """One source of noise of attitude or station.
 
-    Attributes:
-        group: variance group.
-        kind: what it acts on.
-        sigma: of a reading, about each body axis in radians or along each axis in metres; of a random walk what it
-            gains in a second.
-        interval: of the readings, seconds, that a cubic spline joins; None where each exposure has noise of its own.
-        walks: whether it is a random walk, straight between its values at the interval.
+    Attributes
+    ----------
+    group : str
+        Variance group.
+    kind : Literal['attitude', 'station']
+        What it acts on.
+    sigma : float
+        Of a reading, about each body axis in radians or along each axis in metres; of a random walk what it gains in a
+        second.
+    interval : float | None
+        Of the readings, seconds, that a cubic spline joins; None where each exposure has noise of its own.
+    walks : bool
+        Whether it is a random walk, straight between its values at the interval.
     """
 
     group: str
@@ -81,18 +87,26 @@ class NoiseTerm:
 class Noise:
     """Standard deviations of the measurements.
 
-    Attributes:
-        image: of an image point in x and in y, metres; x is the image line times the pixel pitch. Independent. Where
-            rays have a spread of their own it counts in units of this.
-        attitude: of a reading of the attitude about each body axis, radians.
-        station: of a reading of the station along each axis, metres.
-        attitude_interval, station_interval: seconds between readings, at whole multiples of it. A cubic spline joins
-            them, so that rays with known times share errors. None: each exposure has its own.
-        slow_attitude: of slow errors of the attitude, a cubic spline through independent values every `slow_interval`
-            seconds, radians.
-        attitude_walk: of what a random walk of the attitude gains in a second, radians. Its level at the middle of a
-            pass is the bias. It needs the times of the rays.
-        walk_interval: between the values of it that are solved for, seconds.
+    Attributes
+    ----------
+    image : float
+        Of an image point in x and in y, metres; x is the image line times the pixel pitch. Independent. Where rays have
+        a spread of their own it counts in units of this.
+    attitude : float
+        Of a reading of the attitude about each body axis, radians.
+    station : float
+        Of a reading of the station along each axis, metres.
+    attitude_interval, station_interval : float | None
+        Seconds between readings, at whole multiples of it. A cubic spline joins them, so that rays with known times
+        share errors. None: each exposure has its own.
+    slow_attitude : float
+        Of slow errors of the attitude, a cubic spline through independent values every `slow_interval` seconds,
+        radians.
+    attitude_walk : float
+        Of what a random walk of the attitude gains in a second, radians. Its level at the middle of a pass is the bias.
+        It needs the times of the rays.
+    walk_interval : float
+        Between the values of it that are solved for, seconds.
     """
 
     image: float
@@ -133,12 +147,18 @@ class Noise:
 class CalibrationField:
     """One pass over one field of points.
 
-    Attributes:
-        name: of the field.
-        rays: line camera -> its image points.
-        ground: (m, 3) coordinates of the control points, start values of the others, ITRS, metres.
-        covariance: (m, 3, 3) of the control points; zero where they are exact, not used for others.
-        control: (m,) which of the points are control; the others are tie points.
+    Attributes
+    ----------
+    name : str
+        Of the field.
+    rays : Mapping[str, Rays]
+        Line camera -> its image points.
+    ground : Array
+        (m, 3) coordinates of the control points, start values of the others, ITRS, metres.
+    covariance : Array
+        (m, 3, 3) of the control points; zero where they are exact, not used for others.
+    control : NDArray[np.bool_]
+        (m,) which of the points are control; the others are tie points.
     """
 
     name: str
@@ -158,17 +178,25 @@ class CalibrationField:
     ) -> CalibrationField:
         """The field, checked.
 
-        Args:
-            name: of the field.
-            rays: line -> its image points.
-            ground: of the points, ITRS, (P, 3), metres.
-            sigma: of control points, one for all axes or (each axis in plan, height), metres, 0 for exact; or their
-                covariance, (P, 3, 3), m^2, zero for exact ones.
-            control: which points are control, (P,); all by default.
+        Parameters
+        ----------
+        name : str
+            Of the field.
+        rays : Mapping[str, Rays]
+            Line -> its image points.
+        ground : ArrayLike
+            Of the points, ITRS, (P, 3), metres.
+        sigma : float | tuple[float, float] | Array
+            Of control points, one for all axes or (each axis in plan, height), metres, 0 for exact; or their
+            covariance, (P, 3, 3), m^2, zero for exact ones.
+        control : ArrayLike | None
+            Which points are control, (P,); all by default.
 
-        Raises:
-            CalibrationError: shapes, values that are not finite, points far from the ellipsoid, rays of points that do
-                not exist, tie points that fewer than two lines see.
+        Raises
+        ------
+        CalibrationError
+            Shapes, values that are not finite, points far from the ellipsoid, rays of points that do not exist, tie
+            points that fewer than two lines see.
         """
         points = np.array(ground, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
@@ -219,10 +247,14 @@ def _control_covariance(name: str, points: Array, sigma: float | tuple[float, fl
 def level_covariance(points: Array, plan: ArrayLike, tall: ArrayLike) -> Array:
     """(m, 3, 3) covariance in ITRS axes, m^2, of points known alike in both axes in plan.
 
-    Args:
-        points: ITRS, (m, 3), metres.
-        plan: standard deviation of each axis in plan, metres, or (m,).
-        tall: of the height, likewise.
+    Parameters
+    ----------
+    points : Array
+        ITRS, (m, 3), metres.
+    plan : ArrayLike
+        Standard deviation of each axis in plan, metres, or (m,).
+    tall : ArrayLike
+        Of the height, likewise.
     """
     up = vertical(points)
     flat, high = (np.asarray(v, np.float64)[..., None, None] ** 2 for v in (plan, tall))
@@ -247,12 +279,16 @@ class Unknowns:
     """What is solved for beside the interior orientation (f, x and y of every line camera) and an attitude bias of each
     field.
 
-    Attributes:
-        offset: whether the orbit has a constant error in each field.
-        drift: whether every camera has changed during each field against its reference state. It is open against bias
-            and interior unless priors, for example of an on-board monitor, tell it.
-        rate: drift of the bias during the fields, the same in all or one in each, or none. It is weak against x and y
-            of the outer lines, which see a field before and after the nadir line, unless priors tell it.
+    Attributes
+    ----------
+    offset : bool
+        Whether the orbit has a constant error in each field.
+    drift : bool
+        Whether every camera has changed during each field against its reference state. It is open against bias and
+        interior unless priors, for example of an on-board monitor, tell it.
+    rate : Literal['common', 'field', 'none']
+        Drift of the bias during the fields, the same in all or one in each, or none. It is weak against x and y of the
+        outer lines, which see a field before and after the nadir line, unless priors tell it.
     """
 
     offset: bool = False
@@ -282,14 +318,21 @@ class Prior:
 def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike) -> list[Prior]:
     """What an on-board monitor of one camera tells of its drift during one field.
 
-    Args:
-        field: its name.
-        line: of the camera.
-        reading: (4,) of d_alpha, d_beta, d_gamma (radians) and d_f (metres), against the reference state.
-        sigma: of each, (4,); infinite where nothing is told.
+    Parameters
+    ----------
+    field : str
+        Its name.
+    line : str
+        Of the camera.
+    reading : ArrayLike
+        (4,) of d_alpha, d_beta, d_gamma (radians) and d_f (metres), against the reference state.
+    sigma : ArrayLike
+        Of each, (4,); infinite where nothing is told.
 
-    Raises:
-        CalibrationError: other shapes.
+    Raises
+    ------
+    CalibrationError
+        Other shapes.
     """
     values, sigmas = np.asarray(reading, np.float64), np.asarray(sigma, np.float64)
     if values.shape != (4,) or sigmas.shape != (4,):
@@ -302,14 +345,20 @@ def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike) 
 class Parameters:
     """The unknowns in order, with start values.
 
-    Attributes:
-        names: of the unknowns.
-        start: (P,) start values, metres and radians.
-        scale: (P,) the change of each that moves the image by about one metre: 1 for principal points, 1/f rad, range/f
-            m; of f the change that moves the ends of the line by one metre.
-        columns: (field, line) -> (indices of f, x, y), (of roll, pitch, yaw), (of along, across, down), (of d_alpha,
-            d_beta, d_gamma, d_f), (of the rates of roll, pitch, yaw), -1 if fixed.
-        middles: field -> mean time of its rays, seconds, where the bias drifts.
+    Attributes
+    ----------
+    names : tuple[str, ...]
+        Of the unknowns.
+    start : Array
+        (P,) start values, metres and radians.
+    scale : Array
+        (P,) the change of each that moves the image by about one metre: 1 for principal points, 1/f rad, range/f m; of
+        f the change that moves the ends of the line by one metre.
+    columns : Mapping[tuple[str, str], tuple[Array, Array, Array, Array, Array]]
+        (field, line) -> (indices of f, x, y), (of roll, pitch, yaw), (of along, across, down), (of d_alpha, d_beta,
+        d_gamma, d_f), (of the rates of roll, pitch, yaw), -1 if fixed.
+    middles : Mapping[str, float]
+        Field -> mean time of its rays, seconds, where the bias drifts.
     """
 
     names: tuple[str, ...]
@@ -328,9 +377,11 @@ class Parameters:
     ) -> Parameters:
         """start: by name, where not the cameras' interior and zero.
 
-        Raises:
-            CalibrationError: no fields, two of one name, a line without a camera, an unknown name in start, rates
-                without the times of the rays.
+        Raises
+        ------
+        CalibrationError
+            No fields, two of one name, a line without a camera, an unknown name in start, rates without the times of
+            the rays.
         """
         if not fields:
             raise CalibrationError("calibration: no fields")
@@ -395,11 +446,16 @@ class Parameters:
     def turned(self, values: Array, name: str, line: str, rays: Rays) -> Rays:
         """Rays with the drift of the bias since the middle of the field taken into their attitude.
 
-        Args:
-            values: of all unknowns, (U,), SI.
-            name: of the field.
-            line: of the camera.
-            rays: of that line.
+        Parameters
+        ----------
+        values : Array
+            Of all unknowns, (U,), SI.
+        name : str
+            Of the field.
+        line : str
+            Of the camera.
+        rays : Rays
+            Of that line.
         """
         columns = self.columns[name, line][4]
         if columns[0] < 0 or not len(rays.point):
@@ -410,11 +466,16 @@ class Parameters:
     def parts(self, values: Array, name: str, line: str, camera: LineModel) -> tuple[LineModel, Array, Array]:
         """Camera with interior and drift, bias (3,) and offset (3,) (field axes) of one line of one field.
 
-        Args:
-            values: of all unknowns, (U,), SI.
-            name: of the field.
-            line: of the camera.
-            camera: as the laboratory knows it.
+        Parameters
+        ----------
+        values : Array
+            Of all unknowns, (U,), SI.
+        name : str
+            Of the field.
+        line : str
+            Of the camera.
+        camera : LineModel
+            As the laboratory knows it.
         """
         inner, turn, shift, drift, _ = self.columns[name, line]
         bias, offset = (values[c] if c[0] >= 0 else np.zeros(3) for c in (turn, shift))
@@ -458,11 +519,15 @@ _ANGLES = (*BIAS, *DRIFT[:3], "rate")
 class Combination:
     """A change of unknowns that (nearly) moves no image point.
 
-    Attributes:
-        names, change: the unknowns that take part and their changes, metres and radians, for a largest image motion of
-            any single one of 1 mm.
-        strength: how much less well it is known than its unknowns alone would be.
-        sigma: what one sigma of the data allows it, metres of image motion of the unknown that moves the image most.
+    Attributes
+    ----------
+    names, change : tuple[str, ...]
+        The unknowns that take part and their changes, metres and radians, for a largest image motion of any single one
+        of 1 mm.
+    strength : float
+        How much less well it is known than its unknowns alone would be.
+    sigma : float
+        What one sigma of the data allows it, metres of image motion of the unknown that moves the image most.
     """
 
     names: tuple[str, ...]
@@ -479,10 +544,13 @@ class Combination:
 class Gauge:
     """Rule that closes open combinations.
 
-    Attributes:
-        held: unknowns that keep their start values, for example ("nadir x",).
-        start: sigmas of the start values, which observe open combinations and nothing else: by name, metres or radians,
-            or one for all, metres of image motion. None: nothing closes what the points leave open.
+    Attributes
+    ----------
+    held : tuple[str, ...]
+        Unknowns that keep their start values, for example ("nadir x",).
+    start : Mapping[str, float] | float | None
+        Sigmas of the start values, which observe open combinations and nothing else: by name, metres or radians, or one
+        for all, metres of image motion. None: nothing closes what the points leave open.
     """
 
     held: tuple[str, ...] = ()
@@ -528,10 +596,14 @@ class RankError(CalibrationError):
 class Freedom:
     """What a gauge lets an adjustment solve for.
 
-    Attributes:
-        kept: (R,) unknowns that are solved for.
-        rows: (k, P) what the start values observe: rows @ (unknowns - start) is zero to a standard deviation of 1.
-        opened: the open combinations before the gauge.
+    Attributes
+    ----------
+    kept : NDArray[np.intp]
+        (R,) unknowns that are solved for.
+    rows : Array
+        (k, P) what the start values observe: rows @ (unknowns - start) is zero to a standard deviation of 1.
+    opened : tuple[Combination, ...]
+        The open combinations before the gauge.
     """
 
     kept: NDArray[np.intp]
@@ -542,9 +614,12 @@ class Freedom:
 def null_vectors(reduced: Array, sigma: Array) -> Array:
     """(P, k) orthonormal basis of what is open, in units of `sigma`.
 
-    Args:
-        reduced: (P, P) normal matrix, of the a-priori sigmas.
-        sigma: (P,) of the start values.
+    Parameters
+    ----------
+    reduced : Array
+        (P, P) normal matrix, of the a-priori sigmas.
+    sigma : Array
+        (P,) of the start values.
     """
     values, vectors = eigh(sigma[:, None] * reduced * sigma)
     # an eigenvalue below the rounding of the largest one is no information
@@ -555,11 +630,16 @@ def null_vectors(reduced: Array, sigma: Array) -> Array:
 def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> Array:
     """(P, k) combinations within `basis` whose strength is below `WEAK`, in units of `scale`.
 
-    Args:
-        reduced: normal matrix without the ground points, (P, P).
-        length: (P,) of the columns of the normal matrix before the ground points were eliminated.
-        scale: a-priori sigmas of the unknowns, (P,), SI.
-        basis: of what may be solved for, (P, r), in units of `scale`.
+    Parameters
+    ----------
+    reduced : Array
+        Normal matrix without the ground points, (P, P).
+    length : Array
+        (P,) of the columns of the normal matrix before the ground points were eliminated.
+    scale : Array
+        a-priori sigmas of the unknowns, (P,), SI.
+    basis : Array
+        Of what may be solved for, (P, r), in units of `scale`.
     """
     unit = scale * np.where(length > 0, length, 1.0)
     squares = basis.T @ (unit[:, None] ** 2 * basis)
@@ -573,12 +653,18 @@ def combinations(
     """The space of vectors (P, k), in units of `scale`, by name: what takes part with a hundredth of the largest motion
     or more. Each combination has an unknown that is in no other one.
 
-    Args:
-        names: of the P unknowns.
-        scale: their units, (P,), SI.
-        vectors: (P, k), in units of `scale`.
-        reduced: normal matrix without the ground points, (P, P).
-        length: of the columns before the ground points were eliminated, (P,).
+    Parameters
+    ----------
+    names : Sequence[str]
+        Of the P unknowns.
+    scale : Array
+        Their units, (P,), SI.
+    vectors : Array
+        (P, k), in units of `scale`.
+    reduced : Array
+        Normal matrix without the ground points, (P, P).
+    length : Array
+        Of the columns before the ground points were eliminated, (P,).
     """
     found = []
     for vector in echelon(vectors).T:
@@ -607,19 +693,30 @@ def free_basis(
 ) -> Freedom:
     """What may be solved for. `reduced` (P, P) is of the a-priori sigmas.
 
-    Args:
-        reduced: normal matrix without the ground points, (P, P), of the a-priori sigmas.
-        length: of the columns before they were eliminated, (P,).
-        scale: units of the unknowns, (P,), SI.
-        names: of the P unknowns.
-        gauge: what closes open combinations, None for nothing.
-        ray: standard deviation of a single image point, metres, for `LOST`.
-        told: unknowns without a stated start value that have priors of their own, with the sigmas of these.
+    Parameters
+    ----------
+    reduced : Array
+        Normal matrix without the ground points, (P, P), of the a-priori sigmas.
+    length : Array
+        Of the columns before they were eliminated, (P,).
+    scale : Array
+        Units of the unknowns, (P,), SI.
+    names : Sequence[str]
+        Of the P unknowns.
+    gauge : Gauge | None
+        What closes open combinations, None for nothing.
+    ray : float
+        Standard deviation of a single image point, metres, for `LOST`.
+    told : Mapping[str, float] | None
+        Unknowns without a stated start value that have priors of their own, with the sigmas of these.
 
-    Raises:
-        RankError: open combinations that the gauge does not close, or that may move the image by `LOST` times the noise
-            of a single image point; points that tell nothing at all.
-        CalibrationError: a held unknown that does not exist, a start value whose sigma is not positive.
+    Raises
+    ------
+    RankError
+        Open combinations that the gauge does not close, or that may move the image by `LOST` times the noise of a
+        single image point; points that tell nothing at all.
+    CalibrationError
+        a held unknown that does not exist, a start value whose sigma is not positive.
     """
     gauge = gauge or Gauge()
     sigma, stated = gauge.sigmas(names, scale)

@@ -70,11 +70,16 @@ def reading_variance(time: Array, interval: float) -> Array:
 def ray_covariance(noise: Noise, rays: Rays, by: Partials, *, shared: bool) -> Array:
     """(n, 2, 2) covariance of image points, metres^2.
 
-    Args:
-        noise: model of the errors.
-        rays: n image points.
-        by: derivatives of their misclosures.
-        shared: with the noise that they share, as for one point alone; otherwise without what SharedNoise carries.
+    Parameters
+    ----------
+    noise : Noise
+        Model of the errors.
+    rays : Rays
+        n image points.
+    by : Partials
+        Derivatives of their misclosures.
+    shared : bool
+        With the noise that they share, as for one point alone; otherwise without what SharedNoise carries.
     """
     unit = np.eye(2) if rays.spread is None else rays.spread
     spread = np.broadcast_to(noise.image**2 * unit, (len(rays.point), 2, 2))
@@ -125,9 +130,12 @@ _UNEVEN = 1e-3
 class ThirdDifference:
     """Quality of one series.
 
-    Attributes:
-        rms: (k,) of the third differences of each column, as in Table 2.
-        white_sigma: (k,) rms / sqrt(20), standard deviation of one sample if the noise is white.
+    Attributes
+    ----------
+    rms : Array
+        (k,) of the third differences of each column, as in Table 2.
+    white_sigma : Array
+        (k,) rms / sqrt(20), standard deviation of one sample if the noise is white.
     """
 
     rms: Array
@@ -137,12 +145,17 @@ class ThirdDifference:
 def third_difference(time: ArrayLike, series: ArrayLike) -> ThirdDifference:
     """Third differences of an evenly sampled series.
 
-    Args:
-        time: (n,) seconds.
-        series: (n,) or (n, k), metres or radians.
+    Parameters
+    ----------
+    time : ArrayLike
+        (n,) seconds.
+    series : ArrayLike
+        (n,) or (n, k), metres or radians.
 
-    Raises:
-        ValueError: fewer than five samples, values that are not finite, gaps.
+    Raises
+    ------
+    ValueError
+        Fewer than five samples, values that are not finite, gaps.
     """
     t, x = np.asarray(time, np.float64), np.asarray(series, np.float64)
     x = x[:, None] if x.ndim == 1 else x
@@ -171,11 +184,16 @@ _PARALLEL = 3e-4
 class Intersection:
     """Intersected points.
 
-    Attributes:
-        ground: (m, 3) ITRS, metres; NaN where fewer than two rays see a point.
-        covariance: (m, 3, 3).
-        rays: (m,) how many see it.
-        chi_square: (m,) of its rays; degrees of freedom 2 rays - 3.
+    Attributes
+    ----------
+    ground : Array
+        (m, 3) ITRS, metres; NaN where fewer than two rays see a point.
+    covariance : Array
+        (m, 3, 3).
+    rays : NDArray[np.intp]
+        (m,) how many see it.
+    chi_square : Array
+        (m,) of its rays; degrees of freedom 2 rays - 3.
     """
 
     ground: Array
@@ -205,16 +223,25 @@ def intersect(
 ) -> Intersection:
     """Points of one pass from the rays of all lines.
 
-    Args:
-        rays: line -> its image points.
-        cameras: line -> calibrated camera, in its state during this pass (`LineModel.drifted`).
-        noise: of image, attitude and station.
-        bias: (3,) roll, pitch, yaw, radians.
-        offset: (3,) of the station, ITRS, metres.
-        count: of points; from the rays where not given.
+    Parameters
+    ----------
+    rays : Mapping[str, Rays]
+        Line -> its image points.
+    cameras : Mapping[str, LineModel]
+        Line -> calibrated camera, in its state during this pass (`LineModel.drifted`).
+    noise : Noise
+        Of image, attitude and station.
+    bias : ArrayLike
+        (3,) roll, pitch, yaw, radians.
+    offset : ArrayLike
+        (3,) of the station, ITRS, metres.
+    count : int | None
+        Of points; from the rays where not given.
 
-    Raises:
-        CalibrationError: no point with two rays, rays that are parallel, no convergence.
+    Raises
+    ------
+    CalibrationError
+        No point with two rays, rays that are parallel, no convergence.
     """
     turn, shift, small = bias_rotation(bias), np.asarray(offset, np.float64), np.asarray(bias, np.float64)
     total = count or 1 + max((int(r.point.max()) for r in rays.values() if r.point.size), default=-1)
@@ -251,8 +278,10 @@ def intersect(
 def check_errors(found: Array, given: ArrayLike) -> CheckErrors:
     """Errors (m, 3) of found points against given ones, ITRS, metres; points that were not found do not count.
 
-    Raises:
-        CalibrationError: shapes differ, given coordinates are not finite, no points.
+    Raises
+    ------
+    CalibrationError
+        Shapes differ, given coordinates are not finite, no points.
     """
     truth = np.asarray(given, np.float64)
     if truth.shape != found.shape or not np.all(np.isfinite(truth)):
@@ -298,13 +327,19 @@ class IntersectionError(MeasurementError, ValueError):
 class CalibratedLine:
     """What a calibration knows of a line camera.
 
-    Attributes:
-        pixels: of the line; the centre of the first is 0.
-        directions: (K, 3) Chebyshev coefficients over the line, from -0.5 to pixels - 0.5, of a vector along the look
-            in the body's axes; its length does not matter.
-        origins: (J, 3) those of a point on the look, body frame, metres.
-        axes: (3, 3) columns X, Y, Z of the camera in the body: Y along the line, Z the line of sight.
-        principal_distance: f, metres.
+    Attributes
+    ----------
+    pixels : int
+        Of the line; the centre of the first is 0.
+    directions : Array
+        (K, 3) Chebyshev coefficients over the line, from -0.5 to pixels - 0.5, of a vector along the look in the body's
+        axes; its length does not matter.
+    origins : Array
+        (J, 3) those of a point on the look, body frame, metres.
+    axes : Array
+        (3, 3) columns X, Y, Z of the camera in the body: Y along the line, Z the line of sight.
+    principal_distance : float
+        f, metres.
     """
 
     pixels: int
@@ -347,10 +382,14 @@ class CalibratedLine:
 class Sightings:
     """Where one line saw points, in the points' order.
 
-    Attributes:
-        pixel: (n,) places on the line.
-        station: (n, 3) measured position of the body's origin at their times, ITRS, metres.
-        attitude: (n, 3, 3) measured body to ITRS.
+    Attributes
+    ----------
+    pixel : Array
+        (n,) places on the line.
+    station : Array
+        (n, 3) measured position of the body's origin at their times, ITRS, metres.
+    attitude : Array
+        (n, 3, 3) measured body to ITRS.
     """
 
     pixel: Array
@@ -362,9 +401,12 @@ class Sightings:
 class StereoPoints:
     """Intersected points.
 
-    Attributes:
-        ground: (n, 3) ITRS, metres.
-        miss: (n,) distance at which the two rays pass each other, metres.
+    Attributes
+    ----------
+    ground : Array
+        (n, 3) ITRS, metres.
+    miss : Array
+        (n,) distance at which the two rays pass each other, metres.
     """
 
     ground: Array
@@ -376,8 +418,10 @@ def intersect_pair(
 ) -> StereoPoints:
     """Points nearest to their two rays in the sense of angles: each ray's miss counts against its own length.
 
-    Raises:
-        IntersectionError: different numbers of sightings, rays that are parallel.
+    Raises
+    ------
+    IntersectionError
+        Different numbers of sightings, rays that are parallel.
     """
     if len(seen_first.pixel) != len(seen_second.pixel):
         raise IntersectionError("both lines must see the same points")
@@ -401,10 +445,14 @@ def intersect_pair(
 def between(times: ArrayLike, measured: ArrayLike, values: ArrayLike) -> Array:
     """(T, 4) changes at times (T,) from those (m, 4) measured at ascending times (m,): linear, held beyond the ends.
 
-    Args:
-        times: (T,), seconds.
-        measured: (m,), ascending, seconds.
-        values: (m, 4) changes then.
+    Parameters
+    ----------
+    times : ArrayLike
+        (T,), seconds.
+    measured : ArrayLike
+        (m,), ascending, seconds.
+    values : ArrayLike
+        (m, 4) changes then.
     """
     wanted, at, known = (np.asarray(v, np.float64) for v in (times, measured, values))
     return np.stack([np.interp(wanted, at, column) for column in known.T], axis=-1)
@@ -446,15 +494,22 @@ def circular_error(covariance: ArrayLike, share: float = _SHARE) -> Array:
 
     A round covariance has 2.146 sigma, one along a line 1.645 sigma.
 
-    Args:
-        covariance: (..., 2, 2).
-        share: of the errors, between 0 and 1.
+    Parameters
+    ----------
+    covariance : ArrayLike
+        (..., 2, 2).
+    share : float
+        Of the errors, between 0 and 1.
 
-    Returns:
+    Returns
+    -------
+    Array
         (...), in the unit of the covariance's root.
 
-    Raises:
-        ValueError: a share that is none, a covariance that is none.
+    Raises
+    ------
+    ValueError
+        a share that is none, a covariance that is none.
     """
     values = _axes(covariance, share)
     longer = np.sqrt(values[..., 1])

@@ -29,16 +29,26 @@ LEAST_POINTS = {"shift": 1, "affine": 3}
 class ImageCorrection:
     """A correction, measured minus predicted.
 
-    Attributes:
-        kind: shift or affine.
-        middle, size: of the places, line and sample, (2,) each; the function counts from the one in units of the other.
-        coefficients: (2, K) of line and sample; K is 1 for a shift, and 3 for 1, line and sample of an affine function.
-        covariance: (2 K, 2 K) of them, those of the line first.
-        residual: (N, 2) line and sample that is left, of all points, pixels.
-        variance: (N, 2, 2) of what is left at points that were used, and of what lies there of those that were not.
-        used: (N,) whether the points made the estimate.
-        chi_square: of what is left at points that were used, by their covariances.
-        freedom: of it.
+    Attributes
+    ----------
+    kind : Kind
+        Shift or affine.
+    middle, size : Array
+        Of the places, line and sample, (2,) each; the function counts from the one in units of the other.
+    coefficients : Array
+        (2, K) of line and sample; K is 1 for a shift, and 3 for 1, line and sample of an affine function.
+    covariance : Array
+        (2 K, 2 K) of them, those of the line first.
+    residual : Array
+        (N, 2) line and sample that is left, of all points, pixels.
+    variance : Array
+        (N, 2, 2) of what is left at points that were used, and of what lies there of those that were not.
+    used : NDArray[np.bool_]
+        (N,) whether the points made the estimate.
+    chi_square : float
+        Of what is left at points that were used, by their covariances.
+    freedom : int
+        Of it.
     """
 
     kind: Kind
@@ -97,15 +107,23 @@ def image_correction(
 ) -> ImageCorrection:
     """The correction that points tell.
 
-    Args:
-        predicted: (N, 2) line and sample where the model sees them, pixels.
-        measured: (N, 2) where they are.
-        covariance: (N, 2, 2) of the difference, pixels^2.
-        kind: shift, from one point on, or affine, from three.
-        screened: whether points far beyond their covariances are left out.
+    Parameters
+    ----------
+    predicted : ArrayLike
+        (N, 2) line and sample where the model sees them, pixels.
+    measured : ArrayLike
+        (N, 2) where they are.
+    covariance : ArrayLike
+        (N, 2, 2) of the difference, pixels^2.
+    kind : Kind
+        Shift, from one point on, or affine, from three.
+    screened : bool
+        Whether points far beyond their covariances are left out.
 
-    Raises:
-        ValueError: too few points, points on one line, values that are not finite, a covariance that is none.
+    Raises
+    ------
+    ValueError
+        Too few points, points on one line, values that are not finite, a covariance that is none.
     """
     place, seen = np.asarray(predicted, np.float64), np.asarray(measured, np.float64)
     spread = np.asarray(covariance, np.float64)

@@ -81,15 +81,22 @@ class JitterError(MeasurementError, ValueError):
 class Observations:
     """Whitened observations of an attitude.
 
-    Attributes:
-        value: (R,) of noise with one variance, 1 if the covariances that they were whitened by are right.
-        group: (R,) whole numbers from 0 on that do not fall: which observations come from the same place.
-        time: (G, J) moments that those of a group compare, seconds.
-        weight: (R, J, A) by radian about each axis at each moment; zero where there are fewer moments.
-        nuisance: (R, P) columns of what else is unknown, of any rank.
-        mix: (R, K, W) by which the noise of an observation is made of the W unit errors of each of K kinds that its
-            group has. The variance of each kind, such as the coordinates of one line or the heights that are known
-            beforehand, may be wrong by a factor of its own.
+    Attributes
+    ----------
+    value : Array
+        (R,) of noise with one variance, 1 if the covariances that they were whitened by are right.
+    group : NDArray[np.intp]
+        (R,) whole numbers from 0 on that do not fall: which observations come from the same place.
+    time : Array
+        (G, J) moments that those of a group compare, seconds.
+    weight : Array
+        (R, J, A) by radian about each axis at each moment; zero where there are fewer moments.
+    nuisance : Array
+        (R, P) columns of what else is unknown, of any rank.
+    mix : Array
+        (R, K, W) by which the noise of an observation is made of the W unit errors of each of K kinds that its group
+        has. The variance of each kind, such as the coordinates of one line or the heights that are known beforehand,
+        may be wrong by a factor of its own.
     """
 
     value: Array
@@ -112,17 +119,27 @@ class Observations:
     ) -> Observations:
         """Checked.
 
-        Args:
-            value: (R,).
-            group: (R,).
-            time: (G, J), seconds.
-            weight: (R, J, A), by radian.
-            nuisance: (R, P).
-            kind: (R,) whole numbers from 0 on, of observations with independent errors; None for all alike.
-            mix: (R, K, W) instead of kind.
+        Parameters
+        ----------
+        value : ArrayLike
+            (R,).
+        group : ArrayLike
+            (R,).
+        time : ArrayLike
+            (G, J), seconds.
+        weight : ArrayLike
+            (R, J, A), by radian.
+        nuisance : ArrayLike
+            (R, P).
+        kind : ArrayLike | None
+            (R,) whole numbers from 0 on, of observations with independent errors; None for all alike.
+        mix : ArrayLike | None
+            (R, K, W) instead of kind.
 
-        Raises:
-            JitterError: shapes that do not match, values that are not finite, too few observations.
+        Raises
+        ------
+        JitterError
+            Shapes that do not match, values that are not finite, too few observations.
         """
         v, t, w, n = (np.array(a, np.float64) for a in (value, time, weight, nuisance))
         g = np.array(group, np.intp)
@@ -202,9 +219,10 @@ class Observations:
         Combinations of the kinds that have fewer than 30 degrees of freedom, such as the difference of two lines that
         are only seen against each other, keep their stated ratio.
 
-        Notes:
-            Minimum norm quadratic unbiased estimation (Rao, J. Multivariate Analysis 1, 1971), repeated with the
-            weights that it gives.
+        Notes
+        -----
+        Minimum norm quadratic unbiased estimation (Rao, J. Multivariate Analysis 1, 1971), repeated with the
+        weights that it gives.
         """
         factors = np.ones(self.mix.shape[1])
         for _ in range(_REWEIGHTED):
@@ -289,17 +307,28 @@ def _powers(time: Array, degree: int) -> Array:
 class Periodogram:
     """Power over frequency, and what it is worth.
 
-    Attributes:
-        frequency: (F,) hertz, evenly spaced.
-        power: (F,) sum of squares that an oscillation takes away.
-        amplitude: (F, A) that is fitted about each axis, radians.
-        sigma: (F, A) of an amplitude's components, radians, for noise of variance 1.
-        response: (F, A) to an oscillation, as against one sight of it; 2 for two sights in opposite phase.
-        blind: (F,) whether it is looked at no further.
-        turning: integral over the frequencies that are looked at of the plane's turning; see the module.
-        segments: of frequencies that are looked at.
-        total: sum of squares without any oscillation.
-        freedom: its degrees.
+    Attributes
+    ----------
+    frequency : Array
+        (F,) hertz, evenly spaced.
+    power : Array
+        (F,) sum of squares that an oscillation takes away.
+    amplitude : Array
+        (F, A) that is fitted about each axis, radians.
+    sigma : Array
+        (F, A) of an amplitude's components, radians, for noise of variance 1.
+    response : Array
+        (F, A) to an oscillation, as against one sight of it; 2 for two sights in opposite phase.
+    blind : NDArray[np.bool_]
+        (F,) whether it is looked at no further.
+    turning : float
+        Integral over the frequencies that are looked at of the plane's turning; see the module.
+    segments : int
+        Of frequencies that are looked at.
+    total : float
+        Sum of squares without any oscillation.
+    freedom : int
+        Its degrees.
     """
 
     frequency: Array
@@ -347,8 +376,10 @@ class Periodogram:
 def periodogram(given: Observations, lowest: float, highest: float) -> Periodogram:
     """Power between two frequencies, hertz.
 
-    Raises:
-        JitterError: no frequency between them is seen.
+    Raises
+    ------
+    JitterError
+        No frequency between them is seen.
     """
     if not given.span > 0.0:
         raise JitterError("all observations are of one moment")
@@ -398,11 +429,16 @@ def periodogram(given: Observations, lowest: float, highest: float) -> Periodogr
 class _Products:
     """Sums over the observations from which those of all waves follow, whatever the frequency.
 
-    Attributes:
-        time: (G, J) moments, from the middle.
-        columns: (G J, A C) of the observations' weights with the value and the known columns.
-        pairs: (G J J, A A) of the weights with one another.
-        axes: A.
+    Attributes
+    ----------
+    time : Array
+        (G, J) moments, from the middle.
+    columns : Array
+        (G J, A C) of the observations' weights with the value and the known columns.
+    pairs : Array
+        (G J J, A A) of the weights with one another.
+    axes : int
+        A.
     """
 
     time: Array
@@ -491,10 +527,14 @@ def farthest(given: Observations, highest: float) -> float:
 def peaks(given: Observations, lowest: float, highest: float) -> tuple[Array, Array]:
     """Return frequencies (K,), hertz, and approximate powers (K,) of all local maxima of the power, the highest first.
 
-    Args:
-        given: observations.
-        lowest: frequency, hertz.
-        highest: likewise; lowered to `farthest`.
+    Parameters
+    ----------
+    given : Observations
+        observations.
+    lowest : float
+        Frequency, hertz.
+    highest : float
+        Likewise; lowered to `farthest`.
     """
     highest = farthest(given, highest)
     step = 1.0 / (_FINE * highest)
@@ -555,15 +595,22 @@ class Lines:
 
     theta(t) = sum over lines of sine sin(2 pi f (t - origin)) + cosine cos(2 pi f (t - origin)).
 
-    Attributes:
-        frequency: (K,) hertz.
-        sine, cosine: (K, A) radians.
-        covariance: of frequency, sine and cosine of the first line, then of the next, (K (1 + 2 A), ...), with the
-            variance of the noise that the observations show.
-        chance: (K,) largest probability that noise alone would have shown one like it, anywhere in the search, when it
-            was found.
-        origin: moment from which phases count, seconds.
-        aliases: (K,) other frequencies, hertz, that explain the observations as well, but for the false-alarm rate.
+    Attributes
+    ----------
+    frequency : Array
+        (K,) hertz.
+    sine, cosine : Array
+        (K, A) radians.
+    covariance : Array
+        Of frequency, sine and cosine of the first line, then of the next, (K (1 + 2 A), ...), with the variance of the
+        noise that the observations show.
+    chance : Array
+        (K,) largest probability that noise alone would have shown one like it, anywhere in the search, when it was
+        found.
+    origin : float
+        Moment from which phases count, seconds.
+    aliases : tuple[tuple[float, ...], ...]
+        (K,) other frequencies, hertz, that explain the observations as well, but for the false-alarm rate.
     """
 
     frequency: Array
@@ -633,14 +680,22 @@ class Lines:
 class Found:
     """A search for jitter.
 
-    Attributes:
-        lines: that were found.
-        before: periodogram of the observations, with the variances of their kinds as they were found.
-        after: the same beside all lines that were found.
-        used: (R,) observations that were not left out as wrong.
-        factors: (K,) variance of the noise over that of the covariances, of each kind of errors.
-        threshold: power of ``after`` that noise alone exceeds with the stated probability.
-        beyond: frequency up to which aliases were looked for, hertz.
+    Attributes
+    ----------
+    lines : Lines
+        That were found.
+    before : Periodogram
+        Periodogram of the observations, with the variances of their kinds as they were found.
+    after : Periodogram
+        The same beside all lines that were found.
+    used : NDArray[np.bool_]
+        (R,) observations that were not left out as wrong.
+    factors : Array
+        (K,) variance of the noise over that of the covariances, of each kind of errors.
+    threshold : float
+        Power of ``after`` that noise alone exceeds with the stated probability.
+    beyond : float
+        Frequency up to which aliases were looked for, hertz.
     """
 
     lines: Lines
@@ -663,15 +718,23 @@ def search(
 ) -> Found:
     """Find oscillations.
 
-    Args:
-        given: what was observed.
-        lowest: frequency, hertz.
-        highest: likewise.
-        false_alarm: probability of finding any where there is none, over all frequencies looked at.
-        beyond: frequency up to which aliases of what is found are looked for, hertz; None for ``highest``.
+    Parameters
+    ----------
+    given : Observations
+        What was observed.
+    lowest : float
+        Frequency, hertz.
+    highest : float
+        likewise.
+    false_alarm : float
+        Probability of finding any where there is none, over all frequencies looked at.
+    beyond : float | None
+        Frequency up to which aliases of what is found are looked for, hertz; None for ``highest``.
 
-    Raises:
-        JitterError: observations that say nothing of jitter.
+    Raises
+    ------
+    JitterError
+        Observations that say nothing of jitter.
     """
     used = _good(given, None)
     used = _good(given.evened(given.taken(used).factors()), None)
@@ -725,12 +788,18 @@ def _unaliased(
     """Return all lines with the last one at the frequency that explains it best, and other frequencies that explain it
     as well.
 
-    Args:
-        kept: observations that are used.
-        lines: that were found before; None for none.
-        fitted: the same and the last.
-        reach: lowest and highest frequency of aliases, hertz.
-        false_alarm: likelihood, against the best, above which a frequency is an alias.
+    Parameters
+    ----------
+    kept : Observations
+        Observations that are used.
+    lines : Lines | None
+        That were found before; None for none.
+    fitted : Lines
+        The same and the last.
+    reach : tuple[float, float]
+        Lowest and highest frequency of aliases, hertz.
+    false_alarm : float
+        Likelihood, against the best, above which a frequency is an alias.
     """
     beside, at, cell = _beside(kept, lines), fitted.frequency[-1], _CELL / kept.span
     frequency, power = peaks(beside, *reach)
@@ -802,8 +871,10 @@ def _good(given: Observations, lines: Lines | None) -> NDArray[np.bool_]:
 def _fitted(given: Observations, frequency: Array, chance: Array) -> Lines:
     """All lines together, by Gauss and Newton from these frequencies (K,).
 
-    Raises:
-        JitterError: two of them cannot be told apart.
+    Raises
+    ------
+    JitterError
+        Two of them cannot be told apart.
     """
     axes, count, value = given.axes, len(frequency), given.rest(given.value)
     f = frequency.copy()
@@ -840,10 +911,14 @@ def _fitted(given: Observations, frequency: Array, chance: Array) -> Lines:
 class Course:
     """An attitude over time as a cubic spline, with the covariance of its coefficients.
 
-    Attributes:
-        knots: (K + 4,) seconds.
-        coefficients: (K, A) radians.
-        covariance: (K A, K A), of the coefficients of all axes of the first spline, then of the next.
+    Attributes
+    ----------
+    knots : Array
+        (K + 4,) seconds.
+    coefficients : Array
+        (K, A) radians.
+    covariance : Array
+        (K A, K A), of the coefficients of all axes of the first spline, then of the next.
     """
 
     knots: Array
@@ -867,13 +942,19 @@ def splined(given: Observations, interval: float, sigma: float) -> Course:
 
     What differences between moments do not tell, such as its mean and blind frequencies, keeps the prior's variance.
 
-    Args:
-        given: what was observed.
-        interval: of the knots, seconds; oscillations of a period below two of them are not in it.
-        sigma: standard deviation of a coefficient before the observations, radians.
+    Parameters
+    ----------
+    given : Observations
+        What was observed.
+    interval : float
+        Of the knots, seconds; oscillations of a period below two of them are not in it.
+    sigma : float
+        Standard deviation of a coefficient before the observations, radians.
 
-    Raises:
-        JitterError: no time between the first and the last moment.
+    Raises
+    ------
+    JitterError
+        No time between the first and the last moment.
     """
     first, last = given.ends
     if not last > first or not interval > 0.0:

@@ -490,12 +490,16 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
 
     Raises AngleError for bad tangents.
 
-    Args:
-        plane: fitted to the line.
-        tangent: (n,) tangent of the angle of each point from the line of sight along the CCD line, from its pixel
-            number and the interior orientation; either sense of counting.
-        bend: how far the ends of a line that the laboratory knows as straight may have bent out of its plane since, one
-            sigma, radians. The bend is estimated with this sigma as its prior, and the central ray follows it. 0: not.
+    Parameters
+    ----------
+    plane : PlaneFit
+        Fitted to the line.
+    tangent : ArrayLike
+        (n,) tangent of the angle of each point from the line of sight along the CCD line, from its pixel number and the
+        interior orientation; either sense of counting.
+    bend : float
+        How far the ends of a line that the laboratory knows as straight may have bent out of its plane since, one
+        sigma, radians. The bend is estimated with this sigma as its prior, and the central ray follows it. 0: not.
     """
     if plane.method == "printed":
         raise AngleError("central ray: the printed plane does not contain its points")
@@ -560,11 +564,16 @@ def along_track_angle(central_a: ArrayLike, side_a: ArrayLike, central_b: ArrayL
     Unit vectors (3,). Positive where the first looks ahead of the second, sides pointing to the right of the track.
     Raises AngleError for lines that run in opposite directions.
 
-    Args:
-        central_a: central ray of the first line, unit, (3,).
-        side_a: direction of the first line, unit, (3,).
-        central_b: of the second line, likewise.
-        side_b: likewise.
+    Parameters
+    ----------
+    central_a : ArrayLike
+        Central ray of the first line, unit, (3,).
+    side_a : ArrayLike
+        Direction of the first line, unit, (3,).
+    central_b : ArrayLike
+        Of the second line, likewise.
+    side_b : ArrayLike
+        likewise.
     """
     first, second = np.asarray(central_a, np.float64), np.asarray(central_b, np.float64)
     axis = np.asarray(side_a, np.float64) + np.asarray(side_b, np.float64)
@@ -608,11 +617,16 @@ def height_error(
     `convergence` on the ground, farther along by that over sin(convergence); `zenith`: zenith angle of the other ray.
     For a camera at height H over flat ground, against nadir: H * angle_error / (sin a cos a). Radians, metres.
 
-    Args:
-        angle_error: of the look angle, radians, any shape.
-        slant_range: to the ground point, metres.
-        convergence: angle between the rays on the ground, radians.
-        zenith: zenith angle of the other ray, radians.
+    Parameters
+    ----------
+    angle_error : ArrayLike
+        Of the look angle, radians, any shape.
+    slant_range : ArrayLike
+        To the ground point, metres.
+    convergence : ArrayLike
+        Angle between the rays on the ground, radians.
+    zenith : ArrayLike
+        Zenith angle of the other ray, radians.
     """
     along = np.asarray(slant_range) * np.asarray(angle_error) / np.sin(np.asarray(convergence, np.float64))
     return np.asarray(along * np.cos(np.asarray(zenith, np.float64)))
@@ -657,12 +671,18 @@ def sensitivity(
 
     Raises PlaneError and AngleError.
 
-    Args:
-        station: from which the strips are seen.
-        strips: line -> its points.
-        pairs: angle -> the two lines that it lies between.
-        method: of the planes' fit.
-        amounts: (k,) metres, first 0; 0 to 10 m in steps of 1 m by default.
+    Parameters
+    ----------
+    station : Station
+        From which the strips are seen.
+    strips : Mapping[str, Strip]
+        Line -> its points.
+    pairs : Mapping[str, tuple[str, str]]
+        Angle -> the two lines that it lies between.
+    method : Method
+        Of the planes' fit.
+    amounts : ArrayLike | None
+        (k,) metres, first 0; 0 to 10 m in steps of 1 m by default.
     """
     steps = np.linspace(0.0, 10.0, 11) if amounts is None else np.asarray(amounts, np.float64)
     if steps.ndim != 1 or len(steps) < 3 or steps[0] != 0 or not np.all(np.diff(steps) > 0):

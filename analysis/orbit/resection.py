@@ -79,12 +79,18 @@ class ObservedLine:
 
         Raises ResectionError for bad input.
 
-        Args:
-            strip: ground points that the line sees, n of them.
-            tangent: (n,) along the line, or (n, 2).
-            sigma: of the tangents.
-            look: the laboratory's look angle, radians; NaN where it is not known.
-            offset: (n, 3) or (3,).
+        Parameters
+        ----------
+        strip : Strip
+            Ground points that the line sees, n of them.
+        tangent : ArrayLike
+            (n,) along the line, or (n, 2).
+        sigma : float
+            Of the tangents.
+        look : float
+            The laboratory's look angle, radians; NaN where it is not known.
+        offset : ArrayLike
+            (n, 3) or (3,).
         """
         given = np.array(tangent, np.float64)
         if given.ndim == 1:

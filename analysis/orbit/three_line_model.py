@@ -43,14 +43,21 @@ _UNIT = np.eye(3)
 class LineModel:
     """One line camera: how it is mounted (known) and its interior orientation (to be calibrated).
 
-    Attributes:
-        to_body: (3, 3) rotation from the camera's axes to the body's.
-        interior: (3,) principal distance f and principal point x0, y0, metres.
-        position: (3,) projection centre in the body frame, metres.
-        k1, k2: radial distortion, 1/m^2 and 1/m^4.
-        drift: (4,) d_alpha, d_beta, d_gamma (radians) and d_f (metres) against that state; zero in the reference state.
-        half_length: metres from the middle of the line to its ends, where a change of f moves the image most; 0 where
-            it is not known.
+    Attributes
+    ----------
+    to_body : Array
+        (3, 3) rotation from the camera's axes to the body's.
+    interior : Array
+        (3,) principal distance f and principal point x0, y0, metres.
+    position : Array
+        (3,) projection centre in the body frame, metres.
+    k1, k2 : float
+        Radial distortion, 1/m^2 and 1/m^4.
+    drift : Array
+        (4,) d_alpha, d_beta, d_gamma (radians) and d_f (metres) against that state; zero in the reference state.
+    half_length : float
+        Metres from the middle of the line to its ends, where a change of f moves the image most; 0 where it is not
+        known.
     """
 
     to_body: Array
@@ -76,13 +83,20 @@ class LineModel:
         Raises ValueError for shapes, values that are not finite, f <= 0, a to_body that is no rotation, a length
         below zero.
 
-        Args:
-            to_body: rotation from the camera's axes to the body's, (3, 3).
-            interior: f, x0 and y0, (3,), metres.
-            position: projection centre in the body frame, (3,), metres.
-            k1: radial distortion, 1/m^2.
-            k2: likewise, 1/m^4.
-            half_length: from the middle of the line to its ends, metres; 0 where it is not known.
+        Parameters
+        ----------
+        to_body : ArrayLike
+            Rotation from the camera's axes to the body's, (3, 3).
+        interior : ArrayLike
+            f, x0 and y0, (3,), metres.
+        position : ArrayLike
+            Projection centre in the body frame, (3,), metres.
+        k1 : float
+            Radial distortion, 1/m^2.
+        k2 : float
+            Likewise, 1/m^4.
+        half_length : float
+            From the middle of the line to its ends, metres; 0 where it is not known.
         """
         turn, inner, place = (np.array(v, np.float64) for v in (to_body, interior, position))
         if turn.shape != (3, 3) or inner.shape != (3,) or place.shape != (3,):
@@ -133,12 +147,17 @@ class LineModel:
     def seen(self, body: Array, image: Array) -> Seen:
         """What image points see of places in the body frame.
 
-        Args:
-            body: ground points from the body's origin, in its true axes, (n, 3), metres.
-            image: x and y in the focal plane, (n, 2), metres.
+        Parameters
+        ----------
+        body : Array
+            Ground points from the body's origin, in its true axes, (n, 3), metres.
+        image : Array
+            x and y in the focal plane, (n, 2), metres.
 
-        Raises:
-            UndeterminedError: a ground point behind a camera.
+        Raises
+        ------
+        UndeterminedError
+            a ground point behind a camera.
         """
         f, mounted = self.principal_distance, (body - self.position) @ self.to_body
         a, b, c = np.ascontiguousarray((mounted @ self._turned).T)
@@ -190,14 +209,21 @@ class Seen:
 class Rays:
     """Image points of one line camera with the measured station and attitude of their exposure times.
 
-    Attributes:
-        point: (n,) which ground point each of them shows.
-        image: (n, 2) x and y in the focal plane, metres, counted from the line's centre.
-        station: (n, 3) of the body's origin, ITRS, metres.
-        attitude: (n, 3, 3) body to ITRS.
-        time: (n,) of the exposures, seconds, on the scale of the readings of attitude and station; None where unknown,
-            the rays' noise then counts as independent.
-        spread: (n, 2, 2) covariance of the image points in units of `Noise.image` squared; None for unit matrices.
+    Attributes
+    ----------
+    point : NDArray[np.intp]
+        (n,) which ground point each of them shows.
+    image : Array
+        (n, 2) x and y in the focal plane, metres, counted from the line's centre.
+    station : Array
+        (n, 3) of the body's origin, ITRS, metres.
+    attitude : Array
+        (n, 3, 3) body to ITRS.
+    time : Array | None
+        (n,) of the exposures, seconds, on the scale of the readings of attitude and station; None where unknown, the
+        rays' noise then counts as independent.
+    spread : Array | None
+        (n, 2, 2) covariance of the image points in units of `Noise.image` squared; None for unit matrices.
     """
 
     point: NDArray[np.intp]
@@ -215,12 +241,18 @@ class Rays:
 
         Raises ValueError for shapes that do not match, values that are not finite, points shown twice.
 
-        Args:
-            point: which ground point each of n rays shows, (n,).
-            image: x and y in the focal plane, (n, 2), metres.
-            station: of the body's origin, ITRS, (n, 3), metres.
-            attitude: body to ITRS, (n, 3, 3).
-            time: of the exposures, (n,), seconds; None where unknown.
+        Parameters
+        ----------
+        point : ArrayLike
+            Which ground point each of n rays shows, (n,).
+        image : ArrayLike
+            x and y in the focal plane, (n, 2), metres.
+        station : ArrayLike
+            Of the body's origin, ITRS, (n, 3), metres.
+        attitude : ArrayLike
+            Body to ITRS, (n, 3, 3).
+        time : ArrayLike | None
+            Of the exposures, (n,), seconds; None where unknown.
         """
         which = np.array(point)
         if which.ndim != 1 or (which.size and not np.issubdtype(which.dtype, np.integer)):
@@ -281,12 +313,18 @@ def _rotation_slopes(bias: Array) -> list[Array]:
 def misclosure(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: Array) -> Array:
     """Left sides of the two conditions, metres in the image: (n, 2), zero for perfect data.
 
-    Args:
-        camera: interior and mounting of the line.
-        rays: n image points.
-        ground: (n, 3) of each ray's point, ITRS.
-        bias: (3,) radians.
-        offset: (3,) of the station, ITRS, metres.
+    Parameters
+    ----------
+    camera : LineModel
+        Interior and mounting of the line.
+    rays : Rays
+        n image points.
+    ground : Array
+        (n, 3) of each ray's point, ITRS.
+    bias : Array
+        (3,) radians.
+    offset : Array
+        (3,) of the station, ITRS, metres.
     """
     f, (x0, y0) = camera.principal_distance, camera.interior[1:]
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
@@ -300,15 +338,23 @@ def misclosure(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset
 def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: Array) -> Partials:
     """Derivatives of `misclosure` in closed form.
 
-    Args:
-        camera: interior and mounting of the line.
-        rays: n image points.
-        ground: (n, 3) of each ray's point, ITRS, metres.
-        bias: of the attitude, (3,), radians.
-        offset: of the station, (3,), ITRS, metres.
+    Parameters
+    ----------
+    camera : LineModel
+        Interior and mounting of the line.
+    rays : Rays
+        n image points.
+    ground : Array
+        (n, 3) of each ray's point, ITRS, metres.
+    bias : Array
+        Of the attitude, (3,), radians.
+    offset : Array
+        Of the station, (3,), ITRS, metres.
 
-    Raises:
-        ValueError: a ground point behind a camera.
+    Raises
+    ------
+    ValueError
+        a ground point behind a camera.
     """
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
     turn = bias_rotation(bias)

@@ -132,11 +132,16 @@ def distortion(
 
     Raises OrientationError for bad readings.
 
-    Args:
-        position: (..., N), m.
-        angle: (..., N), rad.
-        principal_distance: (...) m, one per set.
-        principal_point: likewise.
+    Parameters
+    ----------
+    position : ArrayLike
+        (..., N), m.
+    angle : ArrayLike
+        (..., N), rad.
+    principal_distance : ArrayLike
+        (...) m, one per set.
+    principal_point : ArrayLike
+        likewise.
     """
     where, turned = readings(position, angle)
     t = np.tan(turned)
@@ -190,10 +195,14 @@ def principal_point(position: ArrayLike, angle: ArrayLike, principal_distance: A
 
     Raises OrientationError for bad readings and angles that are all zero.
 
-    Args:
-        position: (..., N), m.
-        angle: (..., N), rad.
-        principal_distance: (...), m, one per set.
+    Parameters
+    ----------
+    position : ArrayLike
+        (..., N), m.
+    angle : ArrayLike
+        (..., N), rad.
+    principal_distance : ArrayLike
+        (...), m, one per set.
     """
     where, turned = readings(position, angle)
     t = np.tan(turned)
@@ -216,10 +225,14 @@ def design(angle: ArrayLike, terms: Sequence[str]) -> Array:
 def slope(angle: ArrayLike, terms: Sequence[str], values: ArrayLike) -> Array:
     """dL/dW (...), m/rad, of the model with these terms and values (P,) at angles (...), rad.
 
-    Args:
-        angle: (...), rad.
-        terms: names out of `TERMS`.
-        values: of the terms, (P,), m.
+    Parameters
+    ----------
+    angle : ArrayLike
+        (...), rad.
+    terms : Sequence[str]
+        Names out of `TERMS`.
+    values : ArrayLike
+        Of the terms, (P,), m.
     """
     t = np.tan(np.asarray(angle, dtype=np.float64))
     powers = [_POWER[term] for term in terms]
@@ -243,10 +256,14 @@ _WORST_CONDITION = 1e3
 def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> None:
     """OrientationError, naming the terms that take part in the worst combination, where angles do not separate them.
 
-    Args:
-        columns: of the design, (N, P).
-        names: of the terms.
-        angle: (N,), rad.
+    Parameters
+    ----------
+    columns : Array
+        Of the design, (N, P).
+    names : tuple[str, ...]
+        Of the terms.
+    angle : Array
+        (N,), rad.
     """
     length = np.linalg.norm(columns, axis=0)
     _, values, vt = np.linalg.svd(columns / np.where(length > 0, length, 1.0))
@@ -269,10 +286,14 @@ def _noise_matrix(given: ArrayLike, count: int, name: str) -> Array:
 
     Raises OrientationError, with the given name, for another shape, values that are not finite, negative sigmas.
 
-    Args:
-        given: covariance (N, N), or sigmas (N,) or ().
-        count: N.
-        name: of what it is the noise, for messages.
+    Parameters
+    ----------
+    given : ArrayLike
+        Covariance (N, N), or sigmas (N,) or ().
+    count : int
+        N.
+    name : str
+        Of what it is the noise, for messages.
     """
     noise = np.asarray(given, dtype=np.float64)
     if not np.all(np.isfinite(noise)):
@@ -318,10 +339,13 @@ it.
 class PointReport:
     """What the test can say of the principal point p.
 
-    Attributes:
-        observable: whether the sigma of p, or of the p that could have been fitted beside the other terms, is no larger
-            than `POINT_TOLERANCE`.
-        statement: this in a sentence, with numbers.
+    Attributes
+    ----------
+    observable : bool
+        Whether the sigma of p, or of the p that could have been fitted beside the other terms, is no larger than
+        `POINT_TOLERANCE`.
+    statement : str
+        This in a sentence, with numbers.
     """
 
     observable: bool
@@ -331,11 +355,16 @@ class PointReport:
 def _point_report(names: tuple[str, ...], values: Array, angle: Array, noise: Array) -> PointReport:
     """What a fit of these terms says of p, or would say with p beside them.
 
-    Args:
-        names: of P terms.
-        values: of the terms, (P,), m.
-        angle: (N,) rad.
-        noise: (N, N) m^2.
+    Parameters
+    ----------
+    names : tuple[str, ...]
+        Of P terms.
+    values : Array
+        Of the terms, (P,), m.
+    angle : Array
+        (N,) rad.
+    noise : Array
+        (N, N) m^2.
     """
     fitted = "principal_point" in names
     asked = names if fitted else (*names, "principal_point")
@@ -445,17 +474,25 @@ def fit_interior_orientation(
 ) -> InteriorOrientation:
     """Least squares for the terms of the model, linear in all of them, all points alike.
 
-    Args:
-        position: (N,), m.
-        angle: (N,), rad.
-        covariance: noise of the positions: (N, N) m^2, or sigmas (N,) or one sigma, m.
-        terms: names out of `TERMS`, with principal_distance among them.
-        angle_covariance: the same of the angles, rad^2 or rad; it acts through dL/dW. Its effect on tan W itself
-            (attenuation) is of the order (sigma_W / W)^2, below 1e-8, and left out.
+    Parameters
+    ----------
+    position : ArrayLike
+        (N,), m.
+    angle : ArrayLike
+        (N,), rad.
+    covariance : ArrayLike
+        Noise of the positions: (N, N) m^2, or sigmas (N,) or one sigma, m.
+    terms : Sequence[str]
+        Names out of `TERMS`, with principal_distance among them.
+    angle_covariance : ArrayLike | None
+        The same of the angles, rad^2 or rad; it acts through dL/dW. Its effect on tan W itself (attenuation) is of the
+        order (sigma_W / W)^2, below 1e-8, and left out.
 
-    Raises:
-        OrientationError: bad readings or noise, fewer angles than terms, nearly constant angles, angles that count
-            against the positions, terms that these angles do not separate.
+    Raises
+    ------
+    OrientationError
+        Bad readings or noise, fewer angles than terms, nearly constant angles, angles that count against the positions,
+        terms that these angles do not separate.
     """
     where, turned = readings(position, angle)
     names = tuple(terms)
@@ -517,9 +554,12 @@ _STEPS = 20
 class LineOrientation:
     """Fit of `LINE_TERMS`.
 
-    Attributes:
-        values: (4,), rad, m, m, 1/m^2.
-        covariance: (4, 4) in these units.
+    Attributes
+    ----------
+    values : Array
+        (4,), rad, m, m, 1/m^2.
+    covariance : Array
+        (4, 4) in these units.
     """
 
     values: Array
@@ -546,11 +586,15 @@ def line_orientation(fit: InteriorOrientation) -> LineOrientation:
     """Convert an interior orientation to principal distance, principal point and k1 of a line, by least squares in the
     image at the same points with equal weights.
 
-    Args:
-        fit: with constant, principal_distance, principal_point and radial3 and no other terms, which it starts from.
+    Parameters
+    ----------
+    fit : InteriorOrientation
+        With constant, principal_distance, principal_point and radial3 and no other terms, which it starts from.
 
-    Raises:
-        OrientationError: other terms, or no convergence.
+    Raises
+    ------
+    OrientationError
+        Other terms, or no convergence.
     """
     if set(fit.terms) != {"constant", "principal_distance", "principal_point", "radial3"}:
         raise OrientationError(f"interior orientation: no line's orientation follows from the terms {fit.terms}")
@@ -582,11 +626,16 @@ SMOOTH = (*CALIBRATED, "radial3")
 class Spots:
     """Spots on the line CCD.
 
-    Attributes:
-        position: L, (N, S), metres.
-        temporal: sigma by noise that is new in each frame, (N, S), metres.
-        fixed: sigma by differences of the line's columns, which stay while the spot does, (N, S), metres.
-        row: of the spot in its image, (N, S), pixels.
+    Attributes
+    ----------
+    position : Array
+        L, (N, S), metres.
+    temporal : Array
+        Sigma by noise that is new in each frame, (N, S), metres.
+    fixed : Array
+        Sigma by differences of the line's columns, which stay while the spot does, (N, S), metres.
+    row : Array
+        Of the spot in its image, (N, S), pixels.
     """
 
     position: Array
@@ -606,17 +655,27 @@ def locate_spots(
 ) -> Spots:
     """Energy centroids.
 
-    Args:
-        frames: (N, S, frames, H, W).
-        column: of the line, where each image begins, (N, S).
-        middle: column of the line's middle, where L = 0.
-        pitch: metres.
-        noise: of one frame; its pattern is one of columns: every row of a TDI line is collected by the same pixels.
-        radius: of the centroid's window, pixels.
-        offset: energy centroid minus chief ray by the camera's design, (N,), metres; taken off.
+    Parameters
+    ----------
+    frames : NDArray[np.uint16]
+        (N, S, frames, H, W).
+    column : ArrayLike
+        Of the line, where each image begins, (N, S).
+    middle : float
+        Column of the line's middle, where L = 0.
+    pitch : float
+        metres.
+    noise : NoiseModel
+        Of one frame; its pattern is one of columns: every row of a TDI line is collected by the same pixels.
+    radius : float
+        Of the centroid's window, pixels.
+    offset : ArrayLike
+        Energy centroid minus chief ray by the camera's design, (N,), metres; taken off.
 
-    Raises:
-        SpotError: a spot is saturated, absent, or too near the edge of its image.
+    Raises
+    ------
+    SpotError
+        a spot is saturated, absent, or too near the edge of its image.
     """
     count, sets, number = frames.shape[:3]
     spots = energy_centroid(mean_frames(frames).reshape(count * sets, *frames.shape[3:]), number, noise, radius)
@@ -639,10 +698,14 @@ def locate_spots(
 class PointMeans:
     """Sets reduced to one measurement per point.
 
-    Attributes:
-        keep: exposures that Chauvenet's criterion keeps, (N, S).
-        scatter: sigma of one exposure by the scatter between the sets, or as given if there is one set only, metres.
-        sigma: of the mean of each point, without what is common to all sets, (N,), metres.
+    Attributes
+    ----------
+    keep : NDArray[np.bool_]
+        Exposures that Chauvenet's criterion keeps, (N, S).
+    scatter : float
+        Sigma of one exposure by the scatter between the sets, or as given if there is one set only, metres.
+    sigma : Array
+        Of the mean of each point, without what is common to all sets, (N,), metres.
     """
 
     keep: NDArray[np.bool_]
@@ -662,13 +725,18 @@ def reduce_sets(
     In each set, L - f tan W of a point differs from its mean over the sets by the repeatability of the table and by
     noise, whose sizes the sets themselves tell.
 
-    Args:
-        angle: W, (N, S), radians, by the readings.
-        spots: as located.
-        principal_distance: about, metres.
-        single: sigma of one exposure, metres, for a test of one set.
-        present: which exposures there are, (N, S), where sets lack points; the others hold any finite numbers. None
-            for all.
+    Parameters
+    ----------
+    angle : Array
+        W, (N, S), radians, by the readings.
+    spots : Spots
+        As located.
+    principal_distance : float
+        About, metres.
+    single : float
+        Sigma of one exposure, metres, for a test of one set.
+    present : NDArray[np.bool_] | None
+        Which exposures there are, (N, S), where sets lack points; the others hold any finite numbers. None for all.
     """
     rest = spots.position - principal_distance * np.tan(angle)
     # what does not average out while the spot stays on its pixels
@@ -705,13 +773,20 @@ def _white(fitted: Callable[[float], InteriorOrientation]) -> float:
 class Distortion:
     """Distortion with one kind of angles (as read, or compensated).
 
-    Attributes:
-        angle: W of each exposure, (N, S), radians.
-        position: L, (N, S), metres.
-        means: how sets were reduced.
-        fit: of the calibrated terms; its residual is the distortion D of the mean of the sets, (N,), metres.
-        smooth: the same with radial distortion; its residual is what is not smooth.
-        white: sigma of each point's position beyond the noise that was stated, metres; it is in the noise of both fits.
+    Attributes
+    ----------
+    angle : Array
+        W of each exposure, (N, S), radians.
+    position : Array
+        L, (N, S), metres.
+    means : PointMeans
+        How sets were reduced.
+    fit : InteriorOrientation
+        Of the calibrated terms; its residual is the distortion D of the mean of the sets, (N,), metres.
+    smooth : InteriorOrientation
+        The same with radial distortion; its residual is what is not smooth.
+    white : float
+        Sigma of each point's position beyond the noise that was stated, metres; it is in the noise of both fits.
     """
 
     angle: Array
@@ -727,15 +802,22 @@ class Distortion:
     ) -> Distortion:
         """Fit.
 
-        Args:
-            angle: (N, S), radians.
-            spots: as located.
-            means: how sets are reduced.
-            angle_covariance: of the mean angles, (N, N), rad^2: what is common to all sets of a point, without what is
-                independent from point to point.
+        Parameters
+        ----------
+        angle : Array
+            (N, S), radians.
+        spots : Spots
+            As located.
+        means : PointMeans
+            How sets are reduced.
+        angle_covariance : ArrayLike | None
+            Of the mean angles, (N, N), rad^2: what is common to all sets of a point, without what is independent from
+            point to point.
 
-        Raises:
-            OrientationError: fewer points than unknowns, or angles that do not determine them.
+        Raises
+        ------
+        OrientationError
+            Fewer points than unknowns, or angles that do not determine them.
         """
         where, turned = means.mean(spots.position), means.mean(angle)
 

@@ -22,10 +22,13 @@ if TYPE_CHECKING:
 class Centroid:
     """A method that finds the centres of spots.
 
-    Attributes:
-        title: for readers.
-        measure: mean frames of B spots, (B, H, W), grey values; number of frames of each mean; the detector's noise;
-            the calibrated shapes; number of threads -> their centres.
+    Attributes
+    ----------
+    title : str
+        For readers.
+    measure : Callable[[Array, int, NoiseModel, SpotTemplate, int], SpotPositions]
+        Mean frames of B spots, (B, H, W), grey values; number of frames of each mean; the detector's noise; the
+        calibrated shapes; number of threads -> their centres.
     """
 
     title: str

@@ -50,14 +50,21 @@ def energy_centroid(
 
     The window must stay inside the image.
 
-    Args:
-        mean: mean frames, (B, H, W), DN.
-        frames: of each mean.
-        noise: of the detector.
-        radius_px: of the circular window; default a quarter of the image's smaller side. Its edge is one pixel soft, so
-            that the result is a smooth function of the image.
-        border_px: width of the frame at the image's edge whose mean is the background.
-        keep_maps: keep the influence of every pixel, for covariances of differences.
+    Parameters
+    ----------
+    mean : ArrayLike
+        Mean frames, (B, H, W), DN.
+    frames : int
+        Of each mean.
+    noise : NoiseModel
+        Of the detector.
+    radius_px : float | None
+        Of the circular window; default a quarter of the image's smaller side. Its edge is one pixel soft, so that the
+        result is a smooth function of the image.
+    border_px : int
+        Width of the frame at the image's edge whose mean is the background.
+    keep_maps : bool
+        Keep the influence of every pixel, for covariances of differences.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
@@ -125,12 +132,18 @@ def gaussian_fit(
     not the inverse of the normal matrix. radius_px: default an eighth of the image's smaller side; about the first
     dark ring is best.
 
-    Args:
-        mean: mean frames, (B, H, W), DN.
-        frames: of each mean.
-        noise: of the detector.
-        radius_px: of the window; default an eighth of the image's smaller side; about the first dark ring is best.
-        elliptical: fit a, b and c.
+    Parameters
+    ----------
+    mean : ArrayLike
+        Mean frames, (B, H, W), DN.
+    frames : int
+        Of each mean.
+    noise : NoiseModel
+        Of the detector.
+    radius_px : float | None
+        Of the window; default an eighth of the image's smaller side; about the first dark ring is best.
+    elliptical : bool
+        Fit a, b and c.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape

@@ -49,11 +49,16 @@ def shown_pixels(middle: Array, noise: NoiseModel, count: int, follows: Mask) ->
     frames is noise where there is no light, and its slopes are, so that only those about the spot count; None where
     the slopes there are noise as well.
 
-    Args:
-        middle: (H, W) median of the frames, DN.
-        noise: of the detector.
-        count: number of frames.
-        follows: (H, W) pixels that follow the light.
+    Parameters
+    ----------
+    middle : Array
+        (H, W) median of the frames, DN.
+    noise : NoiseModel
+        Of the detector.
+    count : int
+        Number of frames.
+    follows : Mask
+        (H, W) pixels that follow the light.
     """
     slopes = sum(ndimage.gaussian_filter(middle, 1.0, one, mode="nearest") ** 2 for one in ((1, 0), (0, 1)))
     low = float(np.median(middle))
@@ -77,11 +82,16 @@ def aligned(
     """The median of frames that are moved to one place, and by how much (N, 2) each is off that; the plain median and
     zeros where they hardly move. Places are first moments of the light about the brightest pixel of the median.
 
-    Args:
-        each: gives the frames (H, W), DN, one after the other, and where they have a value.
-        count: number of frames.
-        middle: (H, W) their median, DN.
-        follows: (H, W) pixels that follow the light.
+    Parameters
+    ----------
+    each : Callable[[], Iterator[tuple[Array, Mask]]]
+        Gives the frames (H, W), DN, one after the other, and where they have a value.
+    count : int
+        Number of frames.
+    middle : Array
+        (H, W) their median, DN.
+    follows : Mask
+        (H, W) pixels that follow the light.
     """
     low = float(np.median(middle))
     bright = ndimage.gaussian_filter(np.where(follows, middle - low, 0.0), 2.0)
@@ -111,8 +121,10 @@ def aligned(
 def basis_of(reference: Array) -> Array:
     """(7, H, W): the reference over its median, its first and second derivatives, and 1.
 
-    Args:
-        reference: (H, W) DN.
+    Parameters
+    ----------
+    reference : Array
+        (H, W) DN.
     """
     order = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     smooth = [reference, *(ndimage.gaussian_filter(reference, 1.0, one, mode="nearest") for one in order[1:])]
@@ -122,10 +134,14 @@ def basis_of(reference: Array) -> Array:
 def robust_fit(basis: Array, frame: Array, weight: Array) -> tuple[Array, Array]:
     """Least squares that outliers do not pull: solution (K,) and inverse normal matrix (K, K).
 
-    Args:
-        basis: (K, H, W) terms.
-        frame: (H, W) that is fitted.
-        weight: (H, W) one over its variance.
+    Parameters
+    ----------
+    basis : Array
+        (K, H, W) terms.
+    frame : Array
+        (H, W) that is fitted.
+    weight : Array
+        (H, W) one over its variance.
     """
     flat, y = basis.reshape(len(basis), -1), frame.ravel()
     scale = np.sqrt(np.maximum((flat**2).mean(axis=1), 1e-300))
@@ -146,10 +162,14 @@ def robust_fit(basis: Array, frame: Array, weight: Array) -> tuple[Array, Array]
 def place_scatter(offset: Array, spread: Array, count: int) -> Array:
     """Covariance (2, 2) of the places beyond noise, px^2; zeros where noise explains them.
 
-    Args:
-        offset: (N, 2) places of the frames, px.
-        spread: (N, 2, 2) their covariances by noise, px^2.
-        count: number of frames.
+    Parameters
+    ----------
+    offset : Array
+        (N, 2) places of the frames, px.
+    spread : Array
+        (N, 2, 2) their covariances by noise, px^2.
+    count : int
+        Number of frames.
     """
     if count < 3:
         return np.zeros((2, 2))
@@ -192,8 +212,10 @@ _LEAST_LEVEL_DN = 1.0
 class FramesError(MeasurementError, ValueError):
     """Frames that cannot be used.
 
-    Attributes:
-        remedy: what to do about it.
+    Attributes
+    ----------
+    remedy
+        What to do about it.
     """
 
     def __init__(self, problem: str, remedy: str) -> None:
@@ -205,10 +227,14 @@ class FramesError(MeasurementError, ValueError):
 class Finding:
     """What was found, and what became of it.
 
-    Attributes:
-        kind: what it is, a few words.
-        text: how much and where, and what was done.
-        corrects: whether the measurement was changed for it.
+    Attributes
+    ----------
+    kind : str
+        What it is, a few words.
+    text : str
+        How much and where, and what was done.
+    corrects : bool
+        Whether the measurement was changed for it.
     """
 
     kind: str
@@ -220,14 +246,22 @@ class Finding:
 class ScreenedFrames:
     """What is used of the frames of one spot in one state.
 
-    Attributes:
-        mean: (H, W) DN.
-        counts: (H, W) frames that each pixel is the mean of.
-        good: (H, W) pixels that can be used.
-        frames: number of frames that are used.
-        recorded: number of frames that there are.
-        jitter: (2, 2) px^2, covariance of the spot's place over the frames beyond noise; zeros where none is seen.
-        findings: what was found.
+    Attributes
+    ----------
+    mean : Array
+        (H, W) DN.
+    counts : Array
+        (H, W) frames that each pixel is the mean of.
+    good : Mask
+        (H, W) pixels that can be used.
+    frames : int
+        Number of frames that are used.
+    recorded : int
+        Number of frames that there are.
+    jitter : Array
+        (2, 2) px^2, covariance of the spot's place over the frames beyond noise; zeros where none is seen.
+    findings : tuple[Finding, ...]
+        What was found.
     """
 
     mean: Array
@@ -252,12 +286,18 @@ def _kept(frames: NDArray[Any]) -> None:
 class _Stack:
     """Frames of one state of which a few at a time are in memory as real numbers.
 
-    Attributes:
-        frames: (N, H, W) grey values as recorded.
-        numbers: (K,) of the frames that are looked at.
-        bad: (H, W) pixels that are of no use in any frame.
-        released: is told when some frames have been gone over, which may lie in a file.
-        blank: whether bad pixels are taken as 0.
+    Attributes
+    ----------
+    frames : NDArray[Any]
+        (N, H, W) grey values as recorded.
+    numbers : NDArray[np.intp]
+        (K,) of the frames that are looked at.
+    bad : Mask
+        (H, W) pixels that are of no use in any frame.
+    released : Released
+        Is told when some frames have been gone over, which may lie in a file.
+    blank : bool
+        Whether bad pixels are taken as 0.
     """
 
     frames: NDArray[Any]
@@ -311,8 +351,10 @@ class _Stack:
     def median(self, filled: bool = False) -> Array:
         """(H, W) medians over the frames.
 
-        Args:
-            filled: where a frame has no value it has that median, instead of 0.
+        Parameters
+        ----------
+        filled : bool
+            Where a frame has no value it has that median, instead of 0.
         """
         out = np.empty(self.shape)
         rows = max(1, _HELD // (24 * len(self) * self.shape[1]))
@@ -338,14 +380,21 @@ def screen_frames(
 
     Few of the frames are in memory at a time as real numbers, so that there may be many of them in a file.
 
-    Args:
-        frames: (N, H, W) grey values as recorded, integers or real numbers; NaN for pixels without a value.
-        noise: of the detector.
-        bad: (H, W) pixels that are known to be bad; None for none.
-        released: is told when some frames have been gone over.
+    Parameters
+    ----------
+    frames : NDArray[Any]
+        (N, H, W) grey values as recorded, integers or real numbers; NaN for pixels without a value.
+    noise : NoiseModel
+        Of the detector.
+    bad : Mask | None
+        (H, W) pixels that are known to be bad; None for none.
+    released : Released
+        Is told when some frames have been gone over.
 
-    Raises:
-        FramesError: too few of the frames hold the light, or none of their pixels can be used.
+    Raises
+    ------
+    FramesError
+        Too few of the frames hold the light, or none of their pixels can be used.
     """
     stack = _Stack.of(frames, bad, released)
     known, (finite, defined) = stack.bad, stack.known()
@@ -548,12 +597,18 @@ def noise_ratio(
 
     Every pair of frames has a say, and the middle one counts, lest one spoilt frame is taken for noise.
 
-    Args:
-        frames: (N, H, W) grey values of one state; NaN for pixels without a value.
-        noise: of the detector, as stated.
-        bad: (H, W) pixels that are not to be used; None for none.
-        where: (H, W) pixels to look at; None for those beside the spot.
-        released: is told when some frames have been gone over.
+    Parameters
+    ----------
+    frames : NDArray[Any]
+        (N, H, W) grey values of one state; NaN for pixels without a value.
+    noise : NoiseModel
+        Of the detector, as stated.
+    bad : Mask | None
+        (H, W) pixels that are not to be used; None for none.
+    where : Mask | None
+        (H, W) pixels to look at; None for those beside the spot.
+    released : Released
+        Is told when some frames have been gone over.
     """
     stack = _Stack.of(frames, bad, released, blank=True)
     try:
@@ -599,12 +654,18 @@ def shown_noise(
     """The detector with the noise that its frames show, where that is more than stated: what is more is taken for read
     noise.
 
-    Args:
-        frames: (N, H, W) grey values.
-        noise: as stated.
-        ratio: see `noise_ratio`.
-        bad: as there.
-        released: as there.
+    Parameters
+    ----------
+    frames : NDArray[Any]
+        (N, H, W) grey values.
+    noise : NoiseModel
+        As stated.
+    ratio : float | None
+        See `noise_ratio`.
+    bad : Mask | None
+        As there.
+    released : Released
+        As there.
     """
     if ratio is None or ratio <= 1.0:
         return noise
@@ -623,11 +684,16 @@ def subtracted_level(
     Light only adds, so that a level of frames below that in the dark was subtracted from them. Their shot noise is that
     of the light above the level that is left.
 
-    Args:
-        frames: (N, H, W) grey values.
-        noise: of the detector.
-        bad: (H, W) pixels that are not to be used; None for none.
-        released: is told when some frames have been gone over.
+    Parameters
+    ----------
+    frames : NDArray[Any]
+        (N, H, W) grey values.
+    noise : NoiseModel
+        Of the detector.
+    bad : Mask | None
+        (H, W) pixels that are not to be used; None for none.
+    released : Released
+        Is told when some frames have been gone over.
     """
     stack = _Stack.of(frames, bad, released, blank=True)
     middle = stack.median()[~stack.bad]

@@ -58,9 +58,12 @@ def without_slopes(screened: ScreenedFrames, noise: NoiseModel) -> ScreenedFrame
     """Frames of which an uneven background is taken off, by a plane through the pixels at the edge, lest it is learnt
     as the spot's and goes with it; the same where there is none.
 
-    Args:
-        screened: frames of the state that the shape is learnt from.
-        noise: of the detector.
+    Parameters
+    ----------
+    screened : ScreenedFrames
+        Frames of the state that the shape is learnt from.
+    noise : NoiseModel
+        Of the detector.
     """
     mean = screened.mean
     edge = _edge(mean.shape) & screened.good
@@ -89,12 +92,18 @@ def _edge(shape: tuple[int, ...]) -> NDArray[np.bool_]:
 class LearntTemplate:
     """A shape, and what every pixel of the image that it is from has to do with it.
 
-    Attributes:
-        shape: of the spot.
-        light: DN, what the samples that the shape is made of sum to.
-        passed: (H, W) share of each frequency that is kept, in the order of the discrete Fourier transform.
-        good: (H, W) pixels that were used.
-        fills: (n, H, W) frequencies by which the others were filled, step by step.
+    Attributes
+    ----------
+    shape : SpotTemplate
+        Of the spot.
+    light : float
+        DN, what the samples that the shape is made of sum to.
+    passed : Array
+        (H, W) share of each frequency that is kept, in the order of the discrete Fourier transform.
+    good : NDArray[np.bool_]
+        (H, W) pixels that were used.
+    fills : tuple[NDArray[np.bool_], ...]
+        (n, H, W) frequencies by which the others were filled, step by step.
     """
 
     shape: SpotTemplate
@@ -106,8 +115,10 @@ class LearntTemplate:
     def impulse(self, pixel: tuple[int, int]) -> Array:
         """(H, W) what 1 DN in a pixel of the image adds to what is learnt, holes and edges aside.
 
-        Args:
-            pixel: row and column.
+        Parameters
+        ----------
+        pixel : tuple[int, int]
+            Row and column.
         """
         image = np.zeros(self.good.shape)
         image[pixel] = 1.0
@@ -116,8 +127,10 @@ class LearntTemplate:
     def returned(self, maps: Array) -> Array:
         """What pixels of the image do to numbers that the shape's samples make: the transpose of learning, (n, H, W).
 
-        Args:
-            maps: (n, M, N) derivatives of the numbers by the samples, which sum to `light`.
+        Parameters
+        ----------
+        maps : Array
+            (n, M, N) derivatives of the numbers by the samples, which sum to `light`.
         """
         inner = maps[:, MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX] * _taper(self.good.shape)
         out = _filtered(inner, self.passed)
@@ -136,12 +149,17 @@ class LearntTemplate:
 def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> LearntTemplate:
     """The shape of the spot in one state's frames.
 
-    Args:
-        screened: frames of the state.
-        noise: of the detector.
+    Parameters
+    ----------
+    screened : ScreenedFrames
+        Frames of the state.
+    noise : NoiseModel
+        Of the detector.
 
-    Raises:
-        SpotError: there is no spot, or one so narrow that pixels do not sample it.
+    Raises
+    ------
+    SpotError
+        There is no spot, or one so narrow that pixels do not sample it.
     """
     image = spot_image.filled(screened.mean, screened.good)
     frames = max(int(np.median(screened.counts)), 1)
@@ -226,13 +244,20 @@ that, ends."""
 class FittedSpot:
     """One spot in one state, to which the learnt shape was fitted.
 
-    Attributes:
-        positions: of the spot in its image, with their maps.
-        counts: (H, W) frames that each pixel is the mean of.
-        jitter: (2, 2) px^2, what movement between frames adds to the covariance of the place.
-        others: (G, 3) row, column (px) and share of the light of what else was fitted with the same shape.
-        smear: (2, 2) px^2 by which the shape was smeared.
-        offset: row and column of the detector at which the image begins.
+    Attributes
+    ----------
+    positions : SpotPositions
+        Of the spot in its image, with their maps.
+    counts : Array
+        (H, W) frames that each pixel is the mean of.
+    jitter : Array
+        (2, 2) px^2, what movement between frames adds to the covariance of the place.
+    others : Array
+        (G, 3) row, column (px) and share of the light of what else was fitted with the same shape.
+    smear : Array
+        (2, 2) px^2 by which the shape was smeared.
+    offset : tuple[int, int]
+        Row and column of the detector at which the image begins.
     """
 
     positions: SpotPositions
@@ -267,11 +292,15 @@ class FittedSpot:
 class LearntShift:
     """What noise does to after - before.
 
-    Attributes:
-        covariance: (2, 2) px^2.
-        lean: (2,) px, by which the fit is drawn, and which stands in the covariance.
-        parts: of images before and after, for the covariance of several shifts against the same image before. What this
-            one does differs from shift to shift, and stands in those after.
+    Attributes
+    ----------
+    covariance : Array
+        (2, 2) px^2.
+    lean : Array
+        (2,) px, by which the fit is drawn, and which stands in the covariance.
+    parts : tuple[NoiseParts, NoiseParts]
+        Of images before and after, for the covariance of several shifts against the same image before. What this one
+        does differs from shift to shift, and stands in those after.
     """
 
     covariance: Array
@@ -284,15 +313,23 @@ def learnt_shift(
 ) -> LearntShift:
     """Noise of one spot's shift.
 
-    Args:
-        learnt: the shape.
-        before: the spot in the image that it was learnt from.
-        after: the same spot in another one.
-        noise: of the detector.
-        ccd: (H, W) of the detector.
+    Parameters
+    ----------
+    learnt : LearntTemplate
+        The shape.
+    before : FittedSpot
+        The spot in the image that it was learnt from.
+    after : FittedSpot
+        The same spot in another one.
+    noise : NoiseModel
+        Of the detector.
+    ccd : tuple[int, int]
+        (H, W) of the detector.
 
-    Raises:
-        SpotError: the shape is mostly noise.
+    Raises
+    ------
+    SpotError
+        The shape is mostly noise.
     """
     more, lean = _second_order(learnt, before, after, noise)
     own = np.tensordot(more, after.maps, 1)

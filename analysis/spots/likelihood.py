@@ -69,15 +69,24 @@ def maximum_likelihood_fit(
     The variance of a pixel is temporal / frames + fixed pattern, at the model's grey value; the score is that of a
     normal likelihood with known variance, which for shot noise equals the Poisson score.
 
-    Args:
-        mean: mean frames, (B, H, W), DN.
-        frames: of each mean.
-        noise: of the detector.
-        template: T shapes; spot b has shape b modulo T.
-        edge_px: least distance of a centre from the image's outermost pixel centres.
-        keep_maps: keep the influence of every pixel, for covariances of differences.
-        threads: the batch is cut into small pieces that fit the cache; results do not depend on the number of threads.
-        max_iterations: of the scoring; a spot that needs more is marked.
+    Parameters
+    ----------
+    mean : ArrayLike
+        Mean frames, (B, H, W), DN.
+    frames : int
+        Of each mean.
+    noise : NoiseModel
+        Of the detector.
+    template : SpotTemplate
+        T shapes; spot b has shape b modulo T.
+    edge_px : float
+        Least distance of a centre from the image's outermost pixel centres.
+    keep_maps : bool
+        Keep the influence of every pixel, for covariances of differences.
+    threads : int
+        The batch is cut into small pieces that fit the cache; results do not depend on the number of threads.
+    max_iterations : int
+        Of the scoring; a spot that needs more is marked.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
@@ -235,8 +244,10 @@ def _second_start(
     other top as high as where the first fit ended, which is so for every sharp spot, both starts have the same end.
     None where that holds for all spots.
 
-    Raises:
-        SpotError: two places fit the image alike.
+    Raises
+    ------
+    SpotError
+        Two places fit the image alike.
     """
     _, height, width = image.shape
     shape = first.design[:, 2].reshape(image.shape)
@@ -330,13 +341,18 @@ def _step(
 def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: int) -> Array:
     """Cramer-Rao bound (B, 2, 2) px^2 of spots of which there is an image without noise, and no template.
 
-    Args:
-        light: (B, H + 4, W + 4) DN of the spots without background; two pixels more on every side than the detector,
-            for the slopes (differences of fourth order: the sigmas of a spot whose first dark ring is at 7 px come out
-            2e-3 too low, of wider ones less).
-        background: DN with black level.
-        noise: of the detector; the fixed pattern counts: the bound is for one image by itself.
-        frames: of which an image is the mean.
+    Parameters
+    ----------
+    light : ArrayLike
+        (B, H + 4, W + 4) DN of the spots without background; two pixels more on every side than the detector, for the
+        slopes (differences of fourth order: the sigmas of a spot whose first dark ring is at 7 px come out 2e-3 too
+        low, of wider ones less).
+    background : float
+        DN with black level.
+    noise : NoiseModel
+        Of the detector; the fixed pattern counts: the bound is for one image by itself.
+    frames : int
+        Of which an image is the mean.
     """
     image = np.asarray(light, np.float64)
     count, inner = len(image), image[:, 2:-2, 2:-2]
@@ -368,11 +384,16 @@ UNRESTED = "the fit does not come to rest from either of two starts; the spot ha
 class FitStates(OfStates):
     """Judgements of fits, arrays of one shape: (B,), or (S, C) as `reshaped` makes them.
 
-    Attributes:
-        whole, core: reduced chi-squares of all pixels and of the core's; NaN where no shape was fitted.
-        whole_limit, core_limit: of these; infinite where no shape was fitted.
-        whole_sigma, core_sigma: what the noise of the frames makes of them, one standard deviation.
-        noise: the noise of the frames over the stated one, squared, by the median of all pixels.
+    Attributes
+    ----------
+    whole, core : Array
+        Reduced chi-squares of all pixels and of the core's; NaN where no shape was fitted.
+    whole_limit, core_limit : Array
+        Of these; infinite where no shape was fitted.
+    whole_sigma, core_sigma : Array
+        What the noise of the frames makes of them, one standard deviation.
+    noise : Array
+        The noise of the frames over the stated one, squared, by the median of all pixels.
     """
 
     whole: Array
@@ -401,8 +422,10 @@ class FitStates(OfStates):
     def reshaped(self, spots: int) -> FitStates:
         """(S, C) from S states of C spots each.
 
-        Args:
-            spots: C.
+        Parameters
+        ----------
+        spots : int
+            C.
         """
         return FitStates(*(values.reshape(-1, spots) for values in vars(self).values()))
 
@@ -410,8 +433,10 @@ class FitStates(OfStates):
 def fit_states(positions: SpotPositions) -> FitStates:
     """Judge B fits.
 
-    Args:
-        positions: as measured.
+    Parameters
+    ----------
+    positions : SpotPositions
+        As measured.
     """
     count = positions.row.size
     if positions.degrees is None or positions.core_chi_square is None:
@@ -427,9 +452,12 @@ def fit_states(positions: SpotPositions) -> FitStates:
 def widened(positions: SpotPositions, factor: Array) -> SpotPositions:
     """Positions whose sigmas hold what their fits say.
 
-    Args:
-        positions: B of them.
-        factor: of the sigmas, (B,), as `FitStates.widening`.
+    Parameters
+    ----------
+    positions : SpotPositions
+        B of them.
+    factor : Array
+        Of the sigmas, (B,), as `FitStates.widening`.
     """
     if np.all(factor == 1.0):
         return positions
@@ -445,8 +473,10 @@ def widened(positions: SpotPositions, factor: Array) -> SpotPositions:
 def require_rest(positions: SpotPositions) -> SpotPositions:
     """Return the positions; raise SpotError for spots whose fit has not come to rest.
 
-    Args:
-        positions: as measured.
+    Parameters
+    ----------
+    positions : SpotPositions
+        As measured.
     """
     if not np.all(positions.converged):
         raise SpotError({int(n): UNRESTED for n in np.flatnonzero(~positions.converged)})

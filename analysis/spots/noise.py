@@ -61,10 +61,14 @@ _TERMS, _NOTHING = 60, 1e-12
 def systematic_variance(electrons: ArrayLike, read_e2: ArrayLike, gain: float) -> Any:
     """Variance over pixels of what rounding does to all frames of an image alike, DN^2, of the shape of ``electrons``.
 
-    Args:
-        electrons: mean of each pixel, of light and dark signal, >= 0: Poisson's law.
-        read_e2: variance of normal noise, electrons squared; a number, or of the shape of ``electrons``.
-        gain: DN per electron.
+    Parameters
+    ----------
+    electrons : ArrayLike
+        Mean of each pixel, of light and dark signal, >= 0: Poisson's law.
+    read_e2 : ArrayLike
+        Variance of normal noise, electrons squared; a number, or of the shape of ``electrons``.
+    gain : float
+        DN per electron.
     """
     mean, read = np.asarray(electrons, np.float64), np.asarray(read_e2, np.float64)
     out = np.zeros(np.broadcast_shapes(mean.shape, read.shape))
@@ -83,8 +87,10 @@ def temporal_part(variance: float) -> float:
     """Part of the variance of grey values over frames that rounding causes, DN^2. It is the mean over all places
     between two steps, for normal noise before rounding.
 
-    Args:
-        variance: DN^2.
+    Parameters
+    ----------
+    variance : float
+        DN^2.
     """
 
     def excess(own: float) -> float:
@@ -116,9 +122,12 @@ def noise_range(variance: float, doubt: float) -> tuple[float, float]:
     """Least and largest variance of normal noise before rounding, DN^2, that goes with a variance over frames of pixels
     that all stand at one place between two steps, wherever that is.
 
-    Args:
-        variance: of grey values over frames, DN^2.
-        doubt: by how much it may be wrong, DN^2.
+    Parameters
+    ----------
+    variance : float
+        Of grey values over frames, DN^2.
+    doubt : float
+        By how much it may be wrong, DN^2.
     """
     if variance > FINE**2 + WHOLE:
         return variance - WHOLE, variance - WHOLE

@@ -36,12 +36,18 @@ _LEAST_LIGHT = 10.0
 class PhotonTransfer:
     """What dark and flat frames say of a detector; <name>_sigma its standard deviation.
 
-    Attributes:
-        gain_dn_per_e: system gain K.
-        dark_noise_e: temporal noise in the dark, dark current's included, electrons rms.
-        dark_level_dn: mean grey value in the dark.
-        prnu: photo response non-uniformity, rms share.
-        dsnu_e: dark signal non-uniformity, electrons rms.
+    Attributes
+    ----------
+    gain_dn_per_e : float
+        System gain K.
+    dark_noise_e : float
+        Temporal noise in the dark, dark current's included, electrons rms.
+    dark_level_dn : float
+        Mean grey value in the dark.
+    prnu : float
+        Photo response non-uniformity, rms share.
+    dsnu_e : float
+        Dark signal non-uniformity, electrons rms.
     """
 
     gain_dn_per_e: float
@@ -57,8 +63,10 @@ class PhotonTransfer:
     def noise_model(self, sheet: NoiseModel) -> NoiseModel:
         """The detector's noise by these numbers; saturation is the data sheet's.
 
-        Args:
-            sheet: by the data sheet.
+        Parameters
+        ----------
+        sheet : NoiseModel
+            By the data sheet.
         """
         return replace(
             sheet,
@@ -76,11 +84,16 @@ class PhotonTransfer:
 class PixelCorrection:
     """How grey values of single pixels are made those of an even detector.
 
-    Attributes:
-        dark: (H, W) DN, taken off; its mean is kept.
-        response: (H, W) share of the mean response, divided by.
-        bad: (H, W) pixels that are not corrected but left out.
-        noise: of a corrected detector: its pattern is what the corrections leave.
+    Attributes
+    ----------
+    dark : Array
+        (H, W) DN, taken off; its mean is kept.
+    response : Array
+        (H, W) share of the mean response, divided by.
+    bad : Mask
+        (H, W) pixels that are not corrected but left out.
+    noise : NoiseModel
+        Of a corrected detector: its pattern is what the corrections leave.
     """
 
     dark: Array
@@ -91,8 +104,10 @@ class PixelCorrection:
     def corrected(self, mean: Array) -> Array:
         """Mean frame (H, W), DN, of an even detector.
 
-        Args:
-            mean: as recorded, (H, W) DN.
+        Parameters
+        ----------
+        mean : Array
+            As recorded, (H, W) DN.
         """
         level = self.noise.dark_level_dn
         return np.asarray(level + (mean - self.dark) / self.response)
@@ -139,12 +154,17 @@ def _usable(dark: Array, flat: Array) -> Mask:
 def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
     """Gain, noise and non-uniformities.
 
-    Args:
-        dark: (N, H, W) grey values without light, N >= 2.
-        flat: (M, H, W) of even light well above the dark, M >= 2.
+    Parameters
+    ----------
+    dark : NDArray[Any]
+        (N, H, W) grey values without light, N >= 2.
+    flat : NDArray[Any]
+        (M, H, W) of even light well above the dark, M >= 2.
 
-    Raises:
-        FramesError: too few frames, frames of different size, or no light in the flat ones.
+    Raises
+    ------
+    FramesError
+        Too few frames, frames of different size, or no light in the flat ones.
     """
     night, day = _stack(dark, "dark"), _stack(flat, "flat")
     if night.shape[1:] != day.shape[1:]:
@@ -233,13 +253,19 @@ def pixel_correction(noise: NoiseModel, dark: NDArray[Any] | None, flat: NDArray
     What is left of the pattern is the noise of the correction, which is the same in all frames that are corrected: it
     takes the place of the detector's own pattern.
 
-    Args:
-        noise: of the detector.
-        dark: (N, H, W) frames without light, of the exposure of those to be corrected.
-        flat: (M, H, W) of even light; None to leave the response as it is.
+    Parameters
+    ----------
+    noise : NoiseModel
+        Of the detector.
+    dark : NDArray[Any] | None
+        (N, H, W) frames without light, of the exposure of those to be corrected.
+    flat : NDArray[Any] | None
+        (M, H, W) of even light; None to leave the response as it is.
 
-    Raises:
-        FramesError: too few frames, or no light in the flat ones.
+    Raises
+    ------
+    FramesError
+        Too few frames, or no light in the flat ones.
     """
     night = _stack(dark if dark is not None else np.zeros((0,)), "dark")
     level = night.mean(axis=0)

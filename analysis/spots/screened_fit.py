@@ -45,12 +45,17 @@ CORE_SHARE = 0.02
 class FitTerms:
     """What is fitted beside place, flux and level.
 
-    Attributes:
-        background: 0 for an even background, 1 with slopes, 2 with curvature.
-        others: (row, column) where further spots are looked for, px.
-        smear: whether the shape is convolved with a normal distribution.
-        learnt: whether the shape was learnt from frames of the spot, and may have been smeared more itself: a smear
-            that is negative makes the shape sharper. Else the shape is the sharpest, and what is negative is noise.
+    Attributes
+    ----------
+    background : int
+        0 for an even background, 1 with slopes, 2 with curvature.
+    others : tuple[tuple[float, float], ...]
+        (row, column) where further spots are looked for, px.
+    smear : bool
+        Whether the shape is convolved with a normal distribution.
+    learnt : bool
+        Whether the shape was learnt from frames of the spot, and may have been smeared more itself: a smear that is
+        negative makes the shape sharper. Else the shape is the sharpest, and what is negative is noise.
     """
 
     background: int = 0
@@ -63,21 +68,35 @@ class FitTerms:
 class ScreenedFit:
     """A spot and what was fitted beside it.
 
-    Attributes:
-        positions: of the one spot.
-        terms: that were fitted.
-        others: (G, 3) row, column (px) and flux over that of the spot.
-        others_sigma: (G, 3) their standard deviations.
-        smear: (2, 2) px^2, second moments of the smear; zeros where none was fitted.
-        level: (H, W) DN, the fitted image.
-        variance: (H, W) DN^2 of the mean, also where a pixel is not used.
-        used: (H, W) pixels.
-        core: reduced chi-square of the pixels in the spot's core, and their number.
-        cost: sigma of the place over what it would be if nothing were missing, nothing else were fitted and the spot
-            stood still, minus 1.
-        missing: the same without what movement between frames does.
-        theta: (K,) all parameters: row, column, flux, level, then those of what else is fitted; px, DN, px^2.
-        inverse: (K, K) inverse of their information.
+    Attributes
+    ----------
+    positions : SpotPositions
+        Of the one spot.
+    terms : FitTerms
+        That were fitted.
+    others : Array
+        (G, 3) row, column (px) and flux over that of the spot.
+    others_sigma : Array
+        (G, 3) their standard deviations.
+    smear : Array
+        (2, 2) px^2, second moments of the smear; zeros where none was fitted.
+    level : Array
+        (H, W) DN, the fitted image.
+    variance : Array
+        (H, W) DN^2 of the mean, also where a pixel is not used.
+    used : Mask
+        (H, W) pixels.
+    core : tuple[float, int]
+        Reduced chi-square of the pixels in the spot's core, and their number.
+    cost : float
+        Sigma of the place over what it would be if nothing were missing, nothing else were fitted and the spot stood
+        still, minus 1.
+    missing : float
+        The same without what movement between frames does.
+    theta : Array
+        (K,) all parameters: row, column, flux, level, then those of what else is fitted; px, DN, px^2.
+    inverse : Array
+        (K, K) inverse of their information.
     """
 
     positions: SpotPositions
@@ -97,26 +116,33 @@ class ScreenedFit:
     def residual(self, mean: Array) -> Array:
         """(H, W) what the image has more than the model, in standard deviations; 0 where a pixel is not used.
 
-        Args:
-            mean: the image, (H, W) DN.
+        Parameters
+        ----------
+        mean : Array
+            The image, (H, W) DN.
         """
         return np.asarray(np.where(self.used, (mean - self.level) / np.sqrt(self.variance), 0.0))
 
     def explains(self, mean: Array) -> float:
         """Chi-square of the image.
 
-        Args:
-            mean: the image, (H, W) DN.
+        Parameters
+        ----------
+        mean : Array
+            The image, (H, W) DN.
         """
         return float(np.square(self.residual(mean)).sum())
 
     def core_fits(self, learnt_from: ScreenedFit | None = None, noisier: float = 1.0) -> bool:
         """Whether the core has the calibrated shape, at a false-alarm rate of 1e-6.
 
-        Args:
-            learnt_from: the fit to the image that the shape was learnt from, whose noise is in the shape, too; None for
-                a shape without noise.
-            noisier: by which factor the noise of the frames makes the variance in the core more than stated.
+        Parameters
+        ----------
+        learnt_from : ScreenedFit | None
+            The fit to the image that the shape was learnt from, whose noise is in the shape, too; None for a shape
+            without noise.
+        noisier : float
+            By which factor the noise of the frames makes the variance in the core more than stated.
         """
         return self.core_widening(learnt_from, noisier) == 1.0
 
@@ -124,9 +150,12 @@ class ScreenedFit:
         """Factor of sigma: 1 where the core has the calibrated shape, else the root of its reduced chi-square (as
         `analysis.spots.likelihood.FitStates.widening`).
 
-        Args:
-            learnt_from: as of `core_fits`.
-            noisier: likewise.
+        Parameters
+        ----------
+        learnt_from : ScreenedFit | None
+            As of `core_fits`.
+        noisier : float
+            likewise.
         """
         value, count = self.core
         spread = 1.0
@@ -142,10 +171,14 @@ class ScreenedFit:
 def one_shape(template: SpotTemplate, index: int, shape: tuple[int, int]) -> SpotTemplate:
     """One of the shapes of a template, for images of another size.
 
-    Args:
-        template: T shapes.
-        index: which.
-        shape: (H, W) of the images.
+    Parameters
+    ----------
+    template : SpotTemplate
+        T shapes.
+    index : int
+        which.
+    shape : tuple[int, int]
+        (H, W) of the images.
     """
     own = slice(index, index + 1)
     rows, columns = template.row_factors[own], template.column_factors[own]
@@ -177,19 +210,31 @@ def fit_screened(
 ) -> ScreenedFit:
     """Fit one spot.
 
-    Args:
-        mean: (H, W) DN.
-        counts: (H, W) frames that each pixel is the mean of.
-        good: (H, W) pixels that are used.
-        noise: of the detector.
-        template: the spot's one shape.
-        terms: what else is fitted; None for nothing.
-        near: a fit to begin at; None to look for the brightest spot.
-        jitter: (2, 2) px^2, covariance of the place over the frames; its share in the mean is added to sigma.
-        recorded: frames that there are, against which the cost is counted; None for the most that a pixel has.
+    Parameters
+    ----------
+    mean : Array
+        (H, W) DN.
+    counts : Array
+        (H, W) frames that each pixel is the mean of.
+    good : Mask
+        (H, W) pixels that are used.
+    noise : NoiseModel
+        Of the detector.
+    template : SpotTemplate
+        The spot's one shape.
+    terms : FitTerms | None
+        What else is fitted; None for nothing.
+    near : ScreenedFit | None
+        a fit to begin at; None to look for the brightest spot.
+    jitter : Array | None
+        (2, 2) px^2, covariance of the place over the frames; its share in the mean is added to sigma.
+    recorded : int | None
+        Frames that there are, against which the cost is counted; None for the most that a pixel has.
 
-    Raises:
-        SpotError: no spot, or it cannot be fitted.
+    Raises
+    ------
+    SpotError
+        No spot, or it cannot be fitted.
     """
     terms = FitTerms() if terms is None else terms
     model = _Model(template, terms, mean.shape[0], mean.shape[1])
@@ -262,9 +307,12 @@ def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array,
     """Parts of the fitted image: its derivatives (K, P) by all parameters; the part (P,), DN, that is neither the spot
     nor its level; and the derivatives (K, P) of that part.
 
-    Args:
-        fit: of a spot.
-        template: the spot's one shape.
+    Parameters
+    ----------
+    fit : ScreenedFit
+        Of a spot.
+    template : SpotTemplate
+        The spot's one shape.
     """
     model = _Model(template, fit.terms, *fit.level.shape)
     design, _ = model.design(fit.theta)

@@ -88,11 +88,16 @@ def reject(bad: NDArray[np.bool_], reason: str) -> None:
 def check_edge(place: Array, height: int, width: int, distance: float) -> None:
     """Raise SpotError for centres nearer than `distance` px to the outermost pixel centres.
 
-    Args:
-        place: row and column, (B, 2), px.
-        height: H, px.
-        width: W, px.
-        distance: least, px.
+    Parameters
+    ----------
+    place : Array
+        Row and column, (B, 2), px.
+    height : int
+        H, px.
+    width : int
+        W, px.
+    distance : float
+        Least, px.
     """
     high = np.array([height, width]) - 1 - distance
     bad = ~np.all((place >= distance) & (place <= high), axis=1)
@@ -115,10 +120,14 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
     Works on 4 x 4 bins, so that one hot pixel does not make a spot. Raises SpotError for saturated and for absent
     spots.
 
-    Args:
-        image: mean frames, (B, H, W), DN.
-        frames: of each mean.
-        noise: of the detector.
+    Parameters
+    ----------
+    image : Array
+        Mean frames, (B, H, W), DN.
+    frames : int
+        Of each mean.
+    noise : NoiseModel
+        Of the detector.
     """
     count, height, width = image.shape
     rows, columns = height // _BIN, width // _BIN
@@ -162,10 +171,14 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
 def arms(place: Array, height: int, width: int) -> Array:
     """(B, 2, H, W) px, each pixel's row and column minus the centre's.
 
-    Args:
-        place: row and column, (B, 2), px.
-        height: H, px.
-        width: W, px.
+    Parameters
+    ----------
+    place : Array
+        Row and column, (B, 2), px.
+    height : int
+        H, px.
+    width : int
+        W, px.
     """
     out = np.empty((place.shape[0], 2, height, width))
     out[:, 0] = (np.arange(height) - place[:, :1])[:, :, None]
@@ -177,11 +190,16 @@ def soft_window(place: Array, height: int, width: int, radius: float) -> tuple[A
     """Window about each centre, falling from 1 to 0 over one pixel at `radius`: (B, H, W), and d window / d centre (B,
     2, H, W).
 
-    Args:
-        place: row and column, (B, 2), px.
-        height: H, px.
-        width: W, px.
-        radius: of the circle, px.
+    Parameters
+    ----------
+    place : Array
+        Row and column, (B, 2), px.
+    height : int
+        H, px.
+    width : int
+        W, px.
+    radius : float
+        Of the circle, px.
     """
     arm = arms(place, height, width)
     distance = np.hypot(arm[:, 0], arm[:, 1])
@@ -206,13 +224,20 @@ def gaussian(
 
     The weight is the soft circular window over the model's total variance.
 
-    Args:
-        theta: the parameters, (B, 5) or (B, 7), px and DN.
-        height: H, px.
-        width: W, px.
-        radius: of the window, px.
-        noise: of the detector.
-        frames: of which an image is the mean.
+    Parameters
+    ----------
+    theta : Array
+        The parameters, (B, 5) or (B, 7), px and DN.
+    height : int
+        H, px.
+    width : int
+        W, px.
+    radius : float
+        Of the window, px.
+    noise : NoiseModel
+        Of the detector.
+    frames : int
+        Of which an image is the mean.
     """
     count, size = theta.shape
     arm = arms(theta[:, :2], height, width).reshape(count, 2, -1)
@@ -234,10 +259,14 @@ def gaussian(
 def variance(level: Array, noise: NoiseModel, frames: int) -> Array:
     """Variance of a mean of frames at grey value `level`, temporal and of the fixed pattern, DN^2.
 
-    Args:
-        level: grey values, any shape, DN.
-        noise: of the detector.
-        frames: of which an image is the mean.
+    Parameters
+    ----------
+    level : Array
+        Grey values, any shape, DN.
+    noise : NoiseModel
+        Of the detector.
+    frames : int
+        Of which an image is the mean.
     """
     out: Array = noise.temporal_variance_dn2(level, frames)
     out += noise.fixed_variance_dn2(level)
@@ -247,11 +276,16 @@ def variance(level: Array, noise: NoiseModel, frames: int) -> Array:
 def excess(level: Array, weight: Array, noise: NoiseModel, frames: int) -> Array:
     """Excess kurtosis of the noise of a mean of frames by its shot noise, without unit; 0 for a normal distribution.
 
-    Args:
-        level: grey values, any shape, DN.
-        weight: 1 / variance, likewise, 1/DN^2.
-        noise: of the detector.
-        frames: of which an image is the mean.
+    Parameters
+    ----------
+    level : Array
+        Grey values, any shape, DN.
+    weight : Array
+        1 / variance, likewise, 1/DN^2.
+    noise : NoiseModel
+        Of the detector.
+    frames : int
+        Of which an image is the mean.
     """
     # the fourth cumulant of Poisson numbers is their mean, of a mean of n of them 1/n^3 of it
     fourth = noise.gain_dn_per_e**3 * noise.light_signal_dn(level) / float(frames) ** 3
@@ -267,12 +301,18 @@ def template_model(
 ) -> tuple[Array, Array]:
     """Model of row, column, flux, background (B, 4): its design (B, 4, P) and grey values (B, P).
 
-    Args:
-        theta: row, column (px), flux and background (DN), (B, 4).
-        which: shape of each spot, (B,).
-        template: the shapes.
-        part: as for `SpotTemplate.evaluate`.
-        out: where the design goes, if given.
+    Parameters
+    ----------
+    theta : Array
+        Row, column (px), flux and background (DN), (B, 4).
+    which : NDArray[np.intp]
+        Shape of each spot, (B,).
+    template : SpotTemplate
+        The shapes.
+    part : tuple[NDArray[np.intp], tuple[int, int]] | None
+        As for `SpotTemplate.evaluate`.
+    out : Array | None
+        Where the design goes, if given.
     """
     count, (height, width) = theta.shape[0], template.shape if part is None else part[1]
     design = np.empty((count, 4, height * width)) if out is None else out
@@ -286,11 +326,16 @@ def propagate(maps: Array, level: Array, noise: NoiseModel, frames: int) -> tupl
     """Temporal and fixed covariance (B, 2, 2) px^2 of estimators with influence `maps` (B, 2, P) at grey values
     `level` (B, P).
 
-    Args:
-        maps: derivative of row and column by each pixel, (B, 2, P), px/DN.
-        level: grey values, (B, P), DN.
-        noise: of the detector.
-        frames: of which an image is the mean.
+    Parameters
+    ----------
+    maps : Array
+        Derivative of row and column by each pixel, (B, 2, P), px/DN.
+    level : Array
+        Grey values, (B, P), DN.
+    noise : NoiseModel
+        Of the detector.
+    frames : int
+        Of which an image is the mean.
     """
     turned = maps.transpose(0, 2, 1)
     temporal = (maps * noise.temporal_variance_dn2(level, frames)[:, None]) @ turned
@@ -316,18 +361,30 @@ def positions(
     The noise is taken at the measured image itself: the variance is nearly linear in the grey value, so pixel noise
     averages out, while smoothing would fill the dark rings, where a Gaussian fit puts much weight.
 
-    Args:
-        place: row and column, (B, 2), px.
-        maps: derivative of the place by each pixel, (B, 2, P), px/DN.
-        image: mean frames, (B, H, W), DN.
-        frames: of each mean.
-        noise: of the detector.
-        keep_maps: keep `maps` in the result.
-        flux: (B,), DN.
-        background: (B,), DN.
-        converged: (B,).
-        iterations: of the slowest spot.
-        chi: reduced chi-square of each fit, (B,).
+    Parameters
+    ----------
+    place : Array
+        Row and column, (B, 2), px.
+    maps : Array
+        Derivative of the place by each pixel, (B, 2, P), px/DN.
+    image : Array
+        Mean frames, (B, H, W), DN.
+    frames : int
+        Of each mean.
+    noise : NoiseModel
+        Of the detector.
+    keep_maps : bool
+        Keep `maps` in the result.
+    flux : Array
+        (B,), DN.
+    background : Array
+        (B,), DN.
+    converged : NDArray[np.bool_]
+        (B,).
+    iterations : int
+        Of the slowest spot.
+    chi : Array
+        Reduced chi-square of each fit, (B,).
     """
     count = place.shape[0]
     temporal, fixed = propagate(maps.reshape(count, 2, -1), image.reshape(count, -1), noise, frames)
@@ -349,9 +406,12 @@ def positions(
 def filled(mean: Array, good: NDArray[np.bool_]) -> Array:
     """An image (H, W) in which pixels that are not good have the value of those around them.
 
-    Args:
-        mean: grey values, (H, W), DN.
-        good: which of them can be used, (H, W).
+    Parameters
+    ----------
+    mean : Array
+        Grey values, (H, W), DN.
+    good : NDArray[np.bool_]
+        Which of them can be used, (H, W).
     """
     if np.all(good):
         return mean

@@ -99,10 +99,14 @@ def difference_covariance(before: SpotPositions, after: SpotPositions, noise: No
     modulo B0). Each result is for one difference; differences that share a `before` are correlated with one another.
     Raises ValueError when the maps were not kept, or the batches do not fit.
 
-    Args:
-        before: measured with maps.
-        after: likewise.
-        noise: of the detector.
+    Parameters
+    ----------
+    before : SpotPositions
+        Measured with maps.
+    after : SpotPositions
+        likewise.
+    noise : NoiseModel
+        Of the detector.
     """
     if before.gain_maps is None or after.gain_maps is None or before.light_dn is None or after.light_dn is None:
         raise ValueError("difference covariance: both positions need their gain maps; measure with keep_maps=True")
@@ -130,10 +134,13 @@ def difference_covariance(before: SpotPositions, after: SpotPositions, noise: No
 class NoiseParts:
     """What makes positions of B spots wrong, apart by what is new in every image and what is not.
 
-    Attributes:
-        temporal: (B, 2, 2) px^2.
-        pattern: (B, 2, Q) px by one standard deviation of each pixel's response and dark signal: products of two
-            images' are the covariance of their positions by the pattern. Single precision, for there are many.
+    Attributes
+    ----------
+    temporal : Array
+        (B, 2, 2) px^2.
+    pattern : NDArray[np.float32]
+        (B, 2, Q) px by one standard deviation of each pixel's response and dark signal: products of two images' are the
+        covariance of their positions by the pattern. Single precision, for there are many.
     """
 
     temporal: Array
@@ -143,9 +150,12 @@ class NoiseParts:
 def noise_parts(positions: SpotPositions, noise: NoiseModel) -> NoiseParts:
     """Noise of measured positions. Raises ValueError when their maps were not kept.
 
-    Args:
-        positions: measured with maps.
-        noise: of the detector.
+    Parameters
+    ----------
+    positions : SpotPositions
+        Measured with maps.
+    noise : NoiseModel
+        Of the detector.
     """
     if positions.gain_maps is None or positions.light_dn is None:
         raise ValueError("noise parts: positions need their gain maps; measure with keep_maps=True")
@@ -163,9 +173,12 @@ class SeriesNoise:
     """Covariance of the differences to one "before" over a series of images of C spots, which are added one after the
     other.
 
-    Args:
-        before: C spots.
-        reach: how many images apart two differences may be for their covariance to be kept, which bounds memory.
+    Parameters
+    ----------
+    before
+        C spots.
+    reach
+        How many images apart two differences may be for their covariance to be kept, which bounds memory.
     """
 
     def __init__(self, before: NoiseParts, reach: int) -> None:
@@ -181,8 +194,10 @@ class SeriesNoise:
     def add(self, after: NoiseParts) -> None:
         """Append images. Raises ValueError for another number of spots.
 
-        Args:
-            after: of S times C spots, image by image.
+        Parameters
+        ----------
+        after : NoiseParts
+            Of S times C spots, image by image.
         """
         count = len(self._before.temporal)
         if len(after.temporal) % count:
@@ -198,8 +213,10 @@ class SeriesNoise:
     def covariance(self, images: NDArray[np.int_]) -> Array:
         """(n 2 C, n 2 C) px^2 of some images' differences, image by image, spot by spot, row before column.
 
-        Args:
-            images: (n,) their numbers, each once. Raises ValueError for images farther apart than the reach.
+        Parameters
+        ----------
+        images : NDArray[np.int_]
+            (n,) their numbers, each once. Raises ValueError for images farther apart than the reach.
         """
         if np.ptp(images) > self._reach:
             raise ValueError(f"series noise: images {np.ptp(images)} apart, {self._reach} are kept")

@@ -86,16 +86,23 @@ class SpotTemplate:
 
         Raises ValueError for an image that is not finite, not larger than the detector, or holds no flux.
 
-        Args:
-            image: (M, N) samples at the detector's pitch / oversampling, larger than the detector by a margin on every
-                side that covers the shifts to be measured (16 to 32 px).
-            row: of the spot's centre in samples of `image`, as the user defines "centre"; shifts do not depend on it.
-            column: of the centre, likewise.
-            shape: (H, W) of the detector.
-            oversampling: samples of `image` per pixel of the detector.
-            background: constant level to be taken off the image.
-            tolerance: what the factorisation may drop, relative to the peak. For a measured image choose its relative
-                noise.
+        Parameters
+        ----------
+        image : ArrayLike
+            (M, N) samples at the detector's pitch / oversampling, larger than the detector by a margin on every side
+            that covers the shifts to be measured (16 to 32 px).
+        row : float
+            Of the spot's centre in samples of `image`, as the user defines "centre"; shifts do not depend on it.
+        column : float
+            Of the centre, likewise.
+        shape : tuple[int, int]
+            (H, W) of the detector.
+        oversampling : int
+            Samples of `image` per pixel of the detector.
+        background : float
+            Constant level to be taken off the image.
+        tolerance : float
+            What the factorisation may drop, relative to the peak. For a measured image choose its relative noise.
         """
         data = np.asarray(image, dtype=np.float64)
         if data.ndim != 2 or not np.all(np.isfinite(data)):
@@ -196,12 +203,17 @@ class SpotTemplate:
         Returns value, d value / d row, d value / d column, each (B, H, W) or (B, h, w); value is the fraction of the
         flux per pixel. Raises TemplateRangeError, naming the spots, for positions outside `supported`.
 
-        Args:
-            row: of the spots' centres, (B,), detector pixels.
-            column: likewise.
-            index: (B,) which of the T shapes; default: spot b has shape b modulo T.
-            part: first pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector that is wanted;
-                default: all of it.
+        Parameters
+        ----------
+        row : ArrayLike
+            Of the spots' centres, (B,), detector pixels.
+        column : ArrayLike
+            likewise.
+        index : NDArray[np.intp] | None
+            (B,) which of the T shapes; default: spot b has shape b modulo T.
+        part : tuple[NDArray[np.intp], tuple[int, int]] | None
+            First pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector that is wanted;
+            default: all of it.
         """
         rows = np.atleast_1d(np.asarray(row, dtype=np.float64))
         columns = np.atleast_1d(np.asarray(column, dtype=np.float64))
@@ -227,11 +239,16 @@ class SpotTemplate:
 
         Raises TemplateRangeError as `evaluate` does.
 
-        Args:
-            out: what is filled, (B, 4, H, W), or (B, 4, h, w) of a part; per px, without unit, and 1.
-            theta: row, column (px), flux and background (DN), (B, 4).
-            index: as for `evaluate`.
-            part: as for `evaluate`.
+        Parameters
+        ----------
+        out : Array
+            What is filled, (B, 4, H, W), or (B, 4, h, w) of a part; per px, without unit, and 1.
+        theta : Array
+            Row, column (px), flux and background (DN), (B, 4).
+        index : NDArray[np.intp]
+            As for `evaluate`.
+        part : tuple[NDArray[np.intp], tuple[int, int]] | None
+            As for `evaluate`.
         """
         self.check_range(theta[:, 0], theta[:, 1], index)
         place = theta[:, :2] - (0 if part is None else part[0])
@@ -284,10 +301,14 @@ class SpotTemplate:
     def check_range(self, rows: Array, columns: Array, which: NDArray[np.intp]) -> None:
         """Raise TemplateRangeError for positions outside `supported`.
 
-        Args:
-            rows: of the spots' centres, (B,), detector pixels.
-            columns: likewise.
-            which: shape of each, (B,).
+        Parameters
+        ----------
+        rows : Array
+            Of the spots' centres, (B,), detector pixels.
+        columns : Array
+            likewise.
+        which : NDArray[np.intp]
+            Shape of each, (B,).
         """
         limits = np.array([self.supported(t) for t in range(self.count)])[which]
         place = np.stack([rows, columns], axis=1)
@@ -311,8 +332,10 @@ class SmearedShape:
     The convolution multiplies the spectrum of the spline's coefficients, which is exact for a shape that is
     band-limited; the template's grid counts as one period, which its dark margins allow.
 
-    Args:
-        template: the shapes.
+    Parameters
+    ----------
+    template
+        The shapes.
     """
 
     def __init__(self, template: SpotTemplate) -> None:
@@ -326,9 +349,11 @@ class SmearedShape:
     def smeared(self, covariance: Array) -> Array:
         """Spline coefficients (M, N) of the smeared shape, for `evaluate`.
 
-        Args:
-            covariance: (2, 2) px^2 of the normal distribution, (row, column). Where it is negative the shape is made
-                sharper, by less than `SHARPEST` at any frequency.
+        Parameters
+        ----------
+        covariance : Array
+            (2, 2) px^2 of the normal distribution, (row, column). Where it is negative the shape is made sharper, by
+            less than `SHARPEST` at any frequency.
         """
         return np.asarray(fft.irfft2(self._spectrum * self._kernel(covariance), self._template.grid))
 
@@ -341,10 +366,14 @@ class SmearedShape:
         """The smeared shape at one place, (6, H, W): value, derivatives by row and by column (1/px), by row twice, by
         row and column, by column twice (1/px^2). Raises TemplateRangeError for places outside `supported`.
 
-        Args:
-            coefficients: as `smeared` has made them.
-            row: of the centre, detector pixels.
-            column: likewise.
+        Parameters
+        ----------
+        coefficients : Array
+            As `smeared` has made them.
+        row : float
+            Of the centre, detector pixels.
+        column : float
+            likewise.
         """
         template = self._template
         template.check_range(np.array([row]), np.array([column]), np.zeros(1, np.intp))
@@ -362,11 +391,16 @@ class SmearedShape:
         """What samples of the shape's image do to numbers that its pixels make at one place: the transpose of smearing,
         interpolating and evaluating, (n, M, N), the samples being those that the template was made of.
 
-        Args:
-            maps: (n, H, W) derivatives of the numbers by the pixels.
-            row: of the centre, detector pixels.
-            column: likewise.
-            covariance: as of `smeared`.
+        Parameters
+        ----------
+        maps : Array
+            (n, H, W) derivatives of the numbers by the pixels.
+        row : float
+            Of the centre, detector pixels.
+        column : float
+            likewise.
+        covariance : Array
+            As of `smeared`.
         """
         centre, (height, width) = self._template.centre[0], self._template.shape
         by_row, rows = self._splines(centre[0], row, height)

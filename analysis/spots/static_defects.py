@@ -48,15 +48,23 @@ def repaired_centroid(
     nothing had been repaired and all frames were used, minus 1. Less than 0 where what was put in has less noise than
     what was taken out, as at the edge of a window.
 
-    Args:
-        screened: frames of one state.
-        fit: of the spot in these.
-        noise: of the detector.
-        template: the spot's one shape.
-        measure: a centroid with its maps, of images (1, H, W) and their noise.
+    Parameters
+    ----------
+    screened : ScreenedFrames
+        Frames of one state.
+    fit : ScreenedFit
+        Of the spot in these.
+    noise : NoiseModel
+        Of the detector.
+    template : SpotTemplate
+        The spot's one shape.
+    measure : Callable[[Array, NoiseModel], SpotPositions]
+        a centroid with its maps, of images (1, H, W) and their noise.
 
-    Raises:
-        SpotError: of ``measure``.
+    Raises
+    ------
+    SpotError
+        Of ``measure``.
     """
     shape = screened.mean.shape
     design, extra, beside = model_parts(fit, template)
@@ -131,12 +139,18 @@ _ALONE = 0.4 * float(np.abs(_PREDICTION).sum())
 class Examined:
     """A spot in one state.
 
-    Attributes:
-        screened: its frames.
-        good: (H, W) pixels that are used.
-        static: (H, W) pixels that were found bad here, which are bad in all states.
-        fit: of the spot.
-        findings: of the frames and here.
+    Attributes
+    ----------
+    screened : ScreenedFrames
+        Its frames.
+    good : Mask
+        (H, W) pixels that are used.
+    static : Mask
+        (H, W) pixels that were found bad here, which are bad in all states.
+    fit : ScreenedFit
+        Of the spot.
+    findings : tuple[Finding, ...]
+        Of the frames and here.
     """
 
     screened: ScreenedFrames
@@ -163,19 +177,30 @@ def examine(
 ) -> Examined:
     """Find what is in an image beside the spot.
 
-    Args:
-        screened: frames of one state.
-        noise: of the detector.
-        template: the spot's one shape.
-        vibration: whether smear is fitted.
-        own: whether the shape was learnt from this very image, so that residuals of it say nothing.
-        searched: whether anything is looked for; else what is known already is left out and fitted.
-        first: row and column of the detector at which the image begins; findings tell places on the detector.
-        learnt: whether the shape was learnt from frames of this spot in another state: it may have been smeared more
-            there, and have held a reflection, which then is missing here.
+    Parameters
+    ----------
+    screened : ScreenedFrames
+        Frames of one state.
+    noise : NoiseModel
+        Of the detector.
+    template : SpotTemplate
+        The spot's one shape.
+    vibration : bool
+        Whether smear is fitted.
+    own : bool
+        Whether the shape was learnt from this very image, so that residuals of it say nothing.
+    searched : bool
+        Whether anything is looked for; else what is known already is left out and fitted.
+    first : tuple[int, int]
+        Row and column of the detector at which the image begins; findings tell places on the detector.
+    learnt : bool
+        Whether the shape was learnt from frames of this spot in another state: it may have been smeared more there, and
+        have held a reflection, which then is missing here.
 
-    Raises:
-        SpotError: no spot, or it cannot be measured.
+    Raises
+    ------
+    SpotError
+        No spot, or it cannot be measured.
     """
     mean = screened.mean
     rough = _rough(mean, screened, noise) if searched else np.zeros_like(screened.good)
@@ -219,9 +244,12 @@ def examine(
 def lone_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
     """Pixels (H, W) that are not as those about them say, where no shape is known that they could be held against.
 
-    Args:
-        screened: frames of one state.
-        noise: of the detector.
+    Parameters
+    ----------
+    screened : ScreenedFrames
+        Frames of one state.
+    noise : NoiseModel
+        Of the detector.
     """
     mean, good = screened.mean, screened.good & ~_rough(screened.mean, screened, noise)
     smooth = ndimage.median_filter(spot_image.filled(mean, good), 5)
@@ -240,15 +268,23 @@ def refit(
 ) -> Examined:
     """The fit with further pixels left out, which are bad in another state.
 
-    Args:
-        examined: a spot.
-        static: (H, W) pixels that are bad.
-        noise: of the detector.
-        template: the spot's one shape.
-        told: what is to be said of it.
+    Parameters
+    ----------
+    examined : Examined
+        a spot.
+    static : Mask
+        (H, W) pixels that are bad.
+    noise : NoiseModel
+        Of the detector.
+    template : SpotTemplate
+        The spot's one shape.
+    told : tuple[Finding, ...]
+        What is to be said of it.
 
-    Raises:
-        SpotError: too few pixels are left.
+    Raises
+    ------
+    SpotError
+        Too few pixels are left.
     """
     good = examined.good & ~static
     terms = replace(examined.fit.terms, others=tuple((float(r), float(c)) for r, c, _ in examined.fit.others))

@@ -36,17 +36,26 @@ class NotConvergedError(MeasurementError, RuntimeError):
 def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], Curve, Curve]:
     """Train; points (N,) each, checked by the caller.
 
-    Args:
-        x: angles.
-        y: values.
-        s: their standard deviations.
-        seed: of the random starts.
+    Parameters
+    ----------
+    x : Array
+        angles.
+    y : Array
+        values.
+    s : Array
+        Their standard deviations.
+    seed : int
+        Of the random starts.
 
-    Returns:
-        settings, curve (M,) -> (M,), and its derivative with respect to the values, (M,) -> (M, N).
+    Returns
+    -------
+    tuple[dict[str, float], Curve, Curve]
+        Settings, curve (M,) -> (M,), and its derivative with respect to the values, (M,) -> (M, N).
 
-    Raises:
-        NotConvergedError: no training came to a minimum.
+    Raises
+    ------
+    NotConvergedError
+        No training came to a minimum.
     """
     # a second for the import, and only this fit needs it
     from sklearn.exceptions import ConvergenceWarning
@@ -108,11 +117,16 @@ def response(net: Any, x: Array, y: Array, weight: Array) -> Array:
     """Derivative (3 H + 1, N) of the trained weights with respect to the values, by the implicit function theorem at
     the minimum of 1/2 sum weight (net - y)^2 + DECAY/2 (|w|^2 + |v|^2).
 
-    Args:
-        net: trained, as for `gradient`.
-        x: inputs of the net, (N,).
-        y: values that it was trained with, (N,).
-        weight: of the values, (N,).
+    Parameters
+    ----------
+    net : Any
+        Trained, as for `gradient`.
+    x : Array
+        Inputs of the net, (N,).
+    y : Array
+        Values that it was trained with, (N,).
+    weight : Array
+        Of the values, (N,).
     """
     w, b, v, c = net.coefs_[0][0], net.intercepts_[0], net.coefs_[1][:, 0], net.intercepts_[1][0]
     n = len(w)

@@ -77,12 +77,18 @@ others miss what they have no terms for, wherever the points are.
 class AngleFit:
     """A fitted curve.
 
-    Attributes:
-        name: one of `FITS`.
-        angle, value, sigma: the points, (N,) each; angles increase.
-        settings: what was selected, for people (order, period, smoothing, trainings).
-        curve: angles (M,) -> predictions (M,).
-        derivative: angles (M,) -> weights (M, N).
+    Attributes
+    ----------
+    name : str
+        One of `FITS`.
+    angle, value, sigma : Array
+        The points, (N,) each; angles increase.
+    settings : Mapping[str, float]
+        What was selected, for people (order, period, smoothing, trainings).
+    curve : Curve
+        Angles (M,) -> predictions (M,).
+    derivative : Curve
+        Angles (M,) -> weights (M, N).
     """
 
     name: str
@@ -144,11 +150,16 @@ class AngleFit:
 class CrossValidation:
     """How well a fit predicts points that it has not seen.
 
-    Attributes:
-        name: of the fit.
-        angle: of the left-out points, (K,), radians.
-        residual: left-out value - prediction from the others, (K,).
-        variance: of the residual by noise alone, (K,): the point's own and the prediction's.
+    Attributes
+    ----------
+    name : str
+        Of the fit.
+    angle : Array
+        Of the left-out points, (K,), radians.
+    residual : Array
+        Left-out value - prediction from the others, (K,).
+    variance : Array
+        Of the residual by noise alone, (K,): the point's own and the prediction's.
     """
 
     name: str
@@ -189,16 +200,25 @@ def widest_step(angle: ArrayLike) -> float:
 def fit(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike, seed: int = 0) -> AngleFit:
     """Fit a curve.
 
-    Args:
-        name: one of `FITS`.
-        angle: (N,) radians, increasing.
-        value: (N,).
-        sigma: standard deviations, (N,) or one number, greater than zero.
-        seed: of the network's random starts; the others do not use it.
+    Parameters
+    ----------
+    name : str
+        One of `FITS`.
+    angle : ArrayLike
+        (N,) radians, increasing.
+    value : ArrayLike
+        (N,).
+    sigma : ArrayLike
+        Standard deviations, (N,) or one number, greater than zero.
+    seed : int
+        Of the network's random starts; the others do not use it.
 
-    Raises:
-        ValueError: unknown name, wrong shapes, constant or repeated angles, fewer angles than the fit needs.
-        NotConvergedError: the network found no minimum.
+    Raises
+    ------
+    ValueError
+        Unknown name, wrong shapes, constant or repeated angles, fewer angles than the fit needs.
+    NotConvergedError
+        The network found no minimum.
     """
     if name not in FITS:
         raise ValueError(f"no fit is called {name!r}; there are {', '.join(FITS)}")
@@ -220,16 +240,25 @@ def cross_validate(
     Fold k leaves out the inner points k, k + folds, ...: the neighbours of a left-out point stay, and the gap that is
     bridged is two steps. The first and the last point are never left out, for no fit is used outside of its points.
 
-    Args:
-        name: of the fit.
-        angle: of the points, (N,).
-        value: there, (N,).
-        sigma: of the values, (N,) or a number, in their unit.
-        seed: of fits that draw.
-        folds: K.
+    Parameters
+    ----------
+    name : str
+        Of the fit.
+    angle : ArrayLike
+        Of the points, (N,).
+    value : ArrayLike
+        There, (N,).
+    sigma : ArrayLike
+        Of the values, (N,) or a number, in their unit.
+    seed : int
+        Of fits that draw.
+    folds : int
+        K.
 
-    Raises:
-        ValueError, NotConvergedError: as `fit`; the fit needs enough points without a fold.
+    Raises
+    ------
+    ValueError, NotConvergedError
+        As `fit`; the fit needs enough points without a fold.
     """
     x, y, s = _points(name, angle, value, sigma)
     if not 2 <= folds:
@@ -393,13 +422,18 @@ def limit(n: ArrayLike) -> Array:
 def chauvenet(readings: ArrayLike, present: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
     """Which readings to keep, (..., n) bool.
 
-    Args:
-        readings: (..., n); the last axis holds the repeats of one quantity, in any unit.
-        present: (..., n), which of them were taken, where quantities have different numbers of repeats; the others
-            hold any finite number and are not kept. None for all.
+    Parameters
+    ----------
+    readings : ArrayLike
+        (..., n); the last axis holds the repeats of one quantity, in any unit.
+    present : NDArray[np.bool_] | None
+        (..., n), which of them were taken, where quantities have different numbers of repeats; the others hold any
+        finite number and are not kept. None for all.
 
-    Raises:
-        ValueError: not finite.
+    Raises
+    ------
+    ValueError
+        Not finite.
     """
     x = np.asarray(readings, np.float64)
     if not np.all(np.isfinite(x)):
@@ -467,13 +501,18 @@ FALSE_ALARM = 1e-3
 class CalibrationSeries:
     """Repeated comparisons at N readings of the table.
 
-    Attributes:
-        angle: readings of the table, (N,), increasing, radians.
-        comparisons: reading - angle of the reference, (N, repeats), radians.
-        reference_sigma: standard deviation of the reference's own error at one position, as its certificate states,
-            radians. It is the same in all repeats.
-        present: which comparisons were made, (N, repeats), where angles have different numbers of them; the others
-            count for nothing. None for all.
+    Attributes
+    ----------
+    angle : Array
+        Readings of the table, (N,), increasing, radians.
+    comparisons : Array
+        Reading - angle of the reference, (N, repeats), radians.
+    reference_sigma : float
+        Standard deviation of the reference's own error at one position, as its certificate states, radians. It is the
+        same in all repeats.
+    present : NDArray[np.bool_] | None
+        Which comparisons were made, (N, repeats), where angles have different numbers of them; the others count for
+        nothing. None for all.
     """
 
     angle: Array
@@ -625,10 +664,14 @@ class Trial:
 class Choice:
     """The fits that were tried, and which of them is chosen.
 
-    Attributes:
-        trials: name of a fit -> its trial, in the order in which they were asked for.
-        failed: name of a fit -> why it failed.
-        chosen: name of the fit with the smallest cross-validation RMS.
+    Attributes
+    ----------
+    trials : Mapping[str, Trial]
+        Name of a fit -> its trial, in the order in which they were asked for.
+    failed : Mapping[str, str]
+        Name of a fit -> why it failed.
+    chosen : str
+        Name of the fit with the smallest cross-validation RMS.
     """
 
     trials: Mapping[str, Trial]
@@ -638,8 +681,10 @@ class Choice:
     def __getitem__(self, name: str) -> Trial:
         """The trial of a fit.
 
-        Raises:
-            KeyError: there is none of that name, or it failed.
+        Raises
+        ------
+        KeyError
+            There is none of that name, or it failed.
         """
         return self.trials[name]
 
@@ -656,8 +701,10 @@ def choose(
     Only the calibration points are used. The one-standard-error rule is not: the fits are of different families, so
     that none is "the simpler one". A network that does not converge is reported as failed.
 
-    Raises:
-        ValueError: fewer angles than a fit needs, or no fit succeeded.
+    Raises
+    ------
+    ValueError
+        Fewer angles than a fit needs, or no fit succeeded.
     """
     say = progress or (lambda text: None)
     trials: dict[str, Trial] = {}
@@ -691,14 +738,19 @@ class DividingCompensation:
 
     The repeatability of the readings in use is not in it: it is new in every reading, and averages out.
 
-    Attributes:
-        fit: of the dividing error.
-        step: of the calibration, radians.
-        common, smooth, white: standard deviations of the three misfits, radians.
-        repeatability: of one comparison, radians; an upper limit of that of one reading, as it holds the reference's
-            noise too.
-        bridged: step over which `smooth` holds, radians: one step of the calibration, two where no held-out angles were
-            there to judge single steps by.
+    Attributes
+    ----------
+    fit : AngleFit
+        Of the dividing error.
+    step : float
+        Of the calibration, radians.
+    common, smooth, white : float
+        Standard deviations of the three misfits, radians.
+    repeatability : float
+        Of one comparison, radians; an upper limit of that of one reading, as it holds the reference's noise too.
+    bridged : float
+        Step over which `smooth` holds, radians: one step of the calibration, two where no held-out angles were there to
+        judge single steps by.
     """
 
     fit: AngleFit
@@ -780,10 +832,14 @@ def step_kernel(first: Array, second: Array, step: float) -> Array:
     A model, not a measurement: the error between two points says little about that between the next two. The triangle
     is a valid correlation (its Fourier transform is not negative).
 
-    Args:
-        first: (M,).
-        second: (L,), in the same unit.
-        step: of the readings, in that unit.
+    Parameters
+    ----------
+    first : Array
+        (M,).
+    second : Array
+        (L,), in the same unit.
+    step : float
+        Of the readings, in that unit.
     """
     return np.asarray(np.maximum(0.0, 1.0 - np.abs(first[:, None] - second) / step))
 
@@ -802,13 +858,19 @@ def compensate(
 
     Without held-out angles common and white are zero, and the smooth part keeps its full excess.
 
-    Args:
-        series: calibration.
-        choice: what `choose` made of it.
-        held_out: a separate series at other angles within the region.
+    Parameters
+    ----------
+    series : CalibrationSeries
+        calibration.
+    choice : Choice
+        What `choose` made of it.
+    held_out : CalibrationSeries | None
+        a separate series at other angles within the region.
 
-    Raises:
-        ValueError: held-out angles outside of the region.
+    Raises
+    ------
+    ValueError
+        Held-out angles outside of the region.
     """
     trial = choice[choice.chosen]
     excess = trial.validation.excess

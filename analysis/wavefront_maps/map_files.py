@@ -61,17 +61,26 @@ class WavefrontMap:
     Rows and columns are those of a right-handed frame in which the program that wrote the file draws it: x grows with
     the column to the right, y with the row upwards, so that row 0 is the lowest one.
 
-    Attributes:
-        values: (rows, columns), optical path difference or height in metres with the sign of the file, NaN where
-            nothing was measured.
-        spacing: of the pixels, metres; NaN where the file does not say.
-        wavelength: metres; None where the file does not say.
-        what: ``wavefront`` or ``surface`` where the file says; None otherwise.
-        scale_factor: waves per fringe by which the file's program multiplied (0.5 for light that meets the surface
-            twice); it is in ``values``.
-        obliquity: factor of oblique light, likewise.
-        kind: of the file, as in ``Zygo MetroPro``.
-        notes: what a reader should know of how the file was understood, whole sentences.
+    Attributes
+    ----------
+    values : Array
+        (rows, columns), optical path difference or height in metres with the sign of the file, NaN where nothing was
+        measured.
+    spacing : float
+        Of the pixels, metres; NaN where the file does not say.
+    wavelength : float | None
+        Metres; None where the file does not say.
+    what : str | None
+        ``wavefront`` or ``surface`` where the file says; None otherwise.
+    scale_factor : float
+        Waves per fringe by which the file's program multiplied (0.5 for light that meets the surface twice); it is in
+        ``values``.
+    obliquity : float
+        Factor of oblique light, likewise.
+    kind : str
+        Of the file, as in ``Zygo MetroPro``.
+    notes : tuple[str, ...]
+        What a reader should know of how the file was understood, whole sentences.
     """
 
     values: Array
@@ -92,12 +101,17 @@ class WavefrontMap:
 def unit_named(path: Path, text: str) -> str:
     """The unit that a file or a user means: ``m``, ``mm``, ``um``, ``nm``, ``pm``, ``cm`` or ``waves``.
 
-    Args:
-        path: of the file, for the message.
-        text: its name.
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        Its name.
 
-    Raises:
-        MapError: no such unit.
+    Raises
+    ------
+    MapError
+        No such unit.
     """
     # both letters that stand for micro
     name = text.strip().strip("'\"").lower().replace("\N{MICRO SIGN}", "u").replace("\N{GREEK SMALL LETTER MU}", "u")
@@ -109,13 +123,19 @@ def unit_named(path: Path, text: str) -> str:
 def metres_per(path: Path, unit: str, wavelength: float | None) -> float:
     """Metres in one unit.
 
-    Args:
-        path: of the file, for the message.
-        unit: as ``unit_named`` gives it.
-        wavelength: metres, None where it is not known.
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    unit : str
+        As ``unit_named`` gives it.
+    wavelength : float | None
+        Metres, None where it is not known.
 
-    Raises:
-        MapError: waves of an unknown wavelength.
+    Raises
+    ------
+    MapError
+        Waves of an unknown wavelength.
     """
     if unit != WAVES:
         return _LENGTHS[unit]
@@ -127,13 +147,19 @@ def metres_per(path: Path, unit: str, wavelength: float | None) -> float:
 def length_from(path: Path, text: str, key: str) -> float:
     """A positive length with its unit, as in ``632.8 nm``, in metres.
 
-    Args:
-        path: of the file, for the message.
-        text: number and unit.
-        key: what it is the length of, for the message.
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    text : str
+        Number and unit.
+    key : str
+        What it is the length of, for the message.
 
-    Raises:
-        MapError: another text, or not a positive length.
+    Raises
+    ------
+    MapError
+        Another text, or not a positive length.
     """
     number, _, unit = text.strip().partition(" ")
     try:
@@ -151,14 +177,21 @@ def length_from(path: Path, text: str, key: str) -> float:
 def agreed(path: Path, key: str, stated: float | None, found: float | None) -> float | None:
     """The one value where file and user both give one.
 
-    Args:
-        path: of the file, for the message.
-        key: of the value, for the message.
-        stated: by the user, in SI units.
-        found: in the file.
+    Parameters
+    ----------
+    path : Path
+        Of the file, for the message.
+    key : str
+        Of the value, for the message.
+    stated : float | None
+        By the user, in SI units.
+    found : float | None
+        In the file.
 
-    Raises:
-        MapError: they differ by more than a millionth.
+    Raises
+    ------
+    MapError
+        They differ by more than a millionth.
     """
     if stated is None or found is None:
         return found if stated is None else stated
@@ -184,11 +217,15 @@ Line = tuple[int, str]
 def text_of(path: Path) -> str:
     """The text of a file in UTF-8, UTF-16 with its mark, or Latin-1.
 
-    Args:
-        path: of the file.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
 
-    Raises:
-        MapError: too large, or no text.
+    Raises
+    ------
+    MapError
+        Too large, or no text.
     """
     size = path.stat().st_size
     if size > MOST_BYTES:
@@ -210,9 +247,12 @@ def text_of(path: Path) -> str:
 def lines_of(text: str, comment: str) -> list[Line]:
     """Lines that say something, with their numbers.
 
-    Args:
-        text: of the file.
-        comment: how lines begin that are left out.
+    Parameters
+    ----------
+    text : str
+        Of the file.
+    comment : str
+        How lines begin that are left out.
     """
     numbered = enumerate(text.splitlines(), 1)
     return [(n, s) for n, s in ((n, line.strip()) for n, line in numbered) if s and not s.startswith(comment)]
@@ -221,8 +261,10 @@ def lines_of(text: str, comment: str) -> list[Line]:
 def is_codev(lines: list[Line]) -> bool:
     """Whether one of the first lines, which may be titles, says that a grid or Zernike terms follow.
 
-    Args:
-        lines: without comments.
+    Parameters
+    ----------
+    lines : list[Line]
+        Without comments.
     """
     return any(_CODEV_KEY.match(text) for _, text in lines[:4])
 
@@ -230,8 +272,10 @@ def is_codev(lines: list[Line]) -> bool:
 def is_zemax(lines: list[Line]) -> bool:
     """Whether the first line has the five or seven numbers of a Grid Sag file, two sizes before all.
 
-    Args:
-        lines: without comments.
+    Parameters
+    ----------
+    lines : list[Line]
+        Without comments.
     """
     first = lines[0][1].split() if lines else []
     if len(first) not in (5, 7) or not all(re.fullmatch(r"[0-9]{1,9}", one) for one in first[:2]):
@@ -259,12 +303,17 @@ def _numbers(path: Path, lines: Iterable[Line], split: str = r"\s+") -> tuple[Ar
 def read_codev(path: Path, lines: list[Line]) -> WavefrontMap:
     """An interferogram of CODE V with a grid: whole numbers of which SSZ make one wave of WVL micrometres.
 
-    Args:
-        path: of the file.
-        lines: of it, without comments.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    lines : list[Line]
+        Of it, without comments.
 
-    Raises:
-        MapError: Zernike terms, transmissions, a header that is not understood, or another number of points.
+    Raises
+    ------
+    MapError
+        Zernike terms, transmissions, a header that is not understood, or another number of points.
     """
     place = next(k for k, (_, text) in enumerate(lines) if _CODEV_KEY.match(text))
     number, header = lines[place]
@@ -324,12 +373,17 @@ def read_zemax(path: Path, lines: list[Line]) -> WavefrontMap:
 
     A Grid Phase file looks the same and holds radians; it cannot be told from one of sags.
 
-    Args:
-        path: of the file.
-        lines: of it, without comments.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    lines : list[Line]
+        Of it, without comments.
 
-    Raises:
-        MapError: a header or points that are not of this form.
+    Raises
+    ------
+    MapError
+        a header or points that are not of this form.
     """
     where = f"{path}, line {lines[0][0]}"
     nx, ny, step_x, step_y, flag, *shift = _numbers(path, [lines[0]])[0]
@@ -361,13 +415,19 @@ def read_table(path: Path, text: str, wavelength: float | None) -> WavefrontMap:
     Lines ``# unit: nm``, ``# spacing: 0.1 mm``, ``# wavelength: 632.8 nm`` and ``# what: surface`` before it say what
     it holds; the unit is needed.
 
-    Args:
-        path: of the file.
-        text: of it.
-        wavelength: metres, where the file does not say.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    text : str
+        Of it.
+    wavelength : float | None
+        Metres, where the file does not say.
 
-    Raises:
-        MapError: no table, no unit, or a statement that contradicts the file.
+    Raises
+    ------
+    MapError
+        No table, no unit, or a statement that contradicts the file.
     """
     found = statements(path, text, ("unit", "spacing", "wavelength", "what"))
     lines = lines_of(text, "#")
@@ -397,13 +457,19 @@ def read_table(path: Path, text: str, wavelength: float | None) -> WavefrontMap:
 def statements(path: Path, text: str, keys: tuple[str, ...]) -> dict[str, str]:
     """What lines ``# key: value`` of a table say; other comments may stand beside them.
 
-    Args:
-        path: of the file, for messages.
-        text: of it.
-        keys: that mean something.
+    Parameters
+    ----------
+    path : Path
+        Of the file, for messages.
+    text : str
+        Of it.
+    keys : tuple[str, ...]
+        That mean something.
 
-    Raises:
-        MapError: a key that is stated twice.
+    Raises
+    ------
+    MapError
+        a key that is stated twice.
     """
     out: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
@@ -419,13 +485,19 @@ def statements(path: Path, text: str, keys: tuple[str, ...]) -> dict[str, str]:
 def unit_written(path: Path, found: str | None, remedy: str) -> str:
     """Return the unit that a file gives.
 
-    Args:
-        path: of the file, for messages.
-        found: in the file.
-        remedy: how the file could say it, for the message.
+    Parameters
+    ----------
+    path : Path
+        Of the file, for messages.
+    found : str | None
+        In the file.
+    remedy : str
+        How the file could say it, for the message.
 
-    Raises:
-        MapError: none, or one that is not known.
+    Raises
+    ------
+    MapError
+        None, or one that is not known.
     """
     if found is None:
         raise MapError(f"{path} does not say its unit: add {remedy}")
@@ -481,11 +553,15 @@ def read_metropro(path: Path) -> WavefrontMap:
 
     A short file is not filled up with zeros, which would be measured values.
 
-    Args:
-        path: of the file.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
 
-    Raises:
-        MapError: no phase in it, a header that cannot be, or a file that is cut off.
+    Raises
+    ------
+    MapError
+        No phase in it, a header that cannot be, or a file that is cut off.
     """
     data = path.read_bytes()
     if len(data) < _HEADERS[data[3]]:
@@ -541,12 +617,17 @@ def _of_scale(scale: float) -> str:
 def read_datx(path: Path, wavelength: float | None = None) -> WavefrontMap:
     """A file of Mx, in its present layout (``Data/Surface``) or its first one (``Measurement/Surface``).
 
-    Args:
-        path: of the file.
-        wavelength: metres, where the file does not say.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    wavelength : float | None
+        Metres, where the file does not say.
 
-    Raises:
-        MapError: HDF5 of another kind, or damaged.
+    Raises
+    ------
+    MapError
+        HDF5 of another kind, or damaged.
     """
     try:
         return _datx(path, wavelength)
@@ -681,12 +762,17 @@ _LARGEST_PIXEL, _LARGEST = 1.0, 10.0
 def read_map(path: Path, *, wavelength: float | None = None) -> WavefrontMap:
     """The map in a file of MetroPro, Mx, CODE V, Zemax, FITS, or in a text table.
 
-    Args:
-        path: of the file.
-        wavelength: metres, for files in waves that do not say it.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    wavelength : float | None
+        Metres, for files in waves that do not say it.
 
-    Raises:
-        MapError: a file that is not read, with what is wrong and what to do.
+    Raises
+    ------
+    MapError
+        a file that is not read, with what is wrong and what to do.
     """
     path = Path(path)
     if path.is_dir():

@@ -41,10 +41,14 @@ _COSINE = (1, 0, -1, 0)
 class Orientation:
     """What has to be done to a map so that it lies as its user's pupil does: a mirror, then turns, and a sign.
 
-    Attributes:
-        mirrored: whether y is turned into -y first.
-        quarter_turns: by 90 degrees each, from x to y, 0 to 3.
-        sign: +1 or -1, by which the values are multiplied.
+    Attributes
+    ----------
+    mirrored : bool
+        Whether y is turned into -y first.
+    quarter_turns : int
+        By 90 degrees each, from x to y, 0 to 3.
+    sign : int
+        +1 or -1, by which the values are multiplied.
     """
 
     mirrored: bool = False
@@ -59,12 +63,17 @@ class Orientation:
     def named(cls, name: str, sign: int = 1) -> Orientation:
         """The orientation with a name.
 
-        Args:
-            name: one of ``ORIENTATIONS``, such as ``turned 90``.
-            sign: +1 or -1.
+        Parameters
+        ----------
+        name : str
+            One of ``ORIENTATIONS``, such as ``turned 90``.
+        sign : int
+            +1 or -1.
 
-        Raises:
-            MapError: no such name.
+        Raises
+        ------
+        MapError
+            No such name.
         """
         for key, known in _ORIENTATION_NAMES.items():
             if known == name.strip().lower():
@@ -94,8 +103,10 @@ class Orientation:
     def values(self, values: Array) -> Array:
         """A map's values as they lie after it.
 
-        Args:
-            values: (rows, columns), y growing with the row.
+        Parameters
+        ----------
+        values : Array
+            (rows, columns), y growing with the row.
         """
         flipped = values[::-1] if self.mirrored else values
         # rows grow upwards: what NumPy calls clockwise is from x to y
@@ -104,19 +115,25 @@ class Orientation:
     def apply(self, measured: WavefrontMap) -> WavefrontMap:
         """A map as it lies after it.
 
-        Args:
-            measured: as the file has it.
+        Parameters
+        ----------
+        measured : WavefrontMap
+            As the file has it.
         """
         return replace(measured, values=self.values(measured.values))
 
     def of_terms(self, terms: Sequence[int]) -> Array:
         """What it makes of Zernike coefficients: (Z, Z) with entries 0, 1 and -1.
 
-        Args:
-            terms: indices of Noll, (Z,), with both the cosine and the sine term of every one that turns.
+        Parameters
+        ----------
+        terms : Sequence[int]
+            Indices of Noll, (Z,), with both the cosine and the sine term of every one that turns.
 
-        Raises:
-            MapError: a term without its partner, into which it turns.
+        Raises
+        ------
+        MapError
+            a term without its partner, into which it turns.
         """
         place = {int(index): k for k, index in enumerate(terms)}
         orders = {noll_to_nm(index): k for index, k in place.items()}
@@ -139,9 +156,12 @@ class Orientation:
     def coefficients(self, coefficients: Array, terms: Sequence[int]) -> Array:
         """Zernike coefficients as they are after it, exactly.
 
-        Args:
-            coefficients: (..., Z).
-            terms: indices of Noll, (Z,).
+        Parameters
+        ----------
+        coefficients : Array
+            (..., Z).
+        terms : Sequence[int]
+            Indices of Noll, (Z,).
         """
         return np.asarray(coefficients) @ self.of_terms(terms).T
 
@@ -156,14 +176,22 @@ READINGS = tuple(Orientation(o.mirrored, o.quarter_turns, sign) for sign in (1, 
 class ReadingEvidence:
     """What measured coefficients say of the ways in which they may be read.
 
-    Attributes:
-        readings: the best one first, (K,).
-        chi_square: of each against the prediction, (K,).
-        log_evidence: logarithm of the probability density of the measured coefficients under each, (K,).
-        degrees: of freedom of each chi-square.
-        chance: of a larger chi-square if the reading is right, (K,).
-        allowed: those that the data do not reject at the false-alarm rate.
-        together: those that cannot be told from the best one, which is among them.
+    Attributes
+    ----------
+    readings : tuple[Orientation, ...]
+        The best one first, (K,).
+    chi_square : Array
+        Of each against the prediction, (K,).
+    log_evidence : Array
+        Logarithm of the probability density of the measured coefficients under each, (K,).
+    degrees : int
+        Of freedom of each chi-square.
+    chance : Array
+        Of a larger chi-square if the reading is right, (K,).
+    allowed : tuple[Orientation, ...]
+        Those that the data do not reject at the false-alarm rate.
+    together : tuple[Orientation, ...]
+        Those that cannot be told from the best one, which is among them.
     """
 
     readings: tuple[Orientation, ...]
@@ -192,15 +220,23 @@ def tellable(
     One reading holds for all fields. The covariance is that of prediction and noise together, for coefficients in the
     frame of the prediction; noise that is equal in both terms of each pair is the same in every reading.
 
-    Args:
-        measured: coefficients as the files have them, (F, Z), metres.
-        expected: coefficients that are predicted, (F, Z), metres.
-        covariance: of measured minus expected, (F*Z, F*Z), square metres, fields before terms.
-        terms: indices of Noll, (Z,); leave out what the measurement leaves free, such as piston and tilt.
-        false_alarm: probability with which the right reading may be rejected.
+    Parameters
+    ----------
+    measured : Array
+        Coefficients as the files have them, (F, Z), metres.
+    expected : Array
+        Coefficients that are predicted, (F, Z), metres.
+    covariance : Array
+        Of measured minus expected, (F*Z, F*Z), square metres, fields before terms.
+    terms : Sequence[int]
+        Indices of Noll, (Z,); leave out what the measurement leaves free, such as piston and tilt.
+    false_alarm : float
+        Probability with which the right reading may be rejected.
 
-    Raises:
-        UndeterminedError: a covariance that is none, or numbers that are not finite.
+    Raises
+    ------
+    UndeterminedError
+        a covariance that is none, or numbers that are not finite.
     """
     size = np.size(expected)
     if not (np.isfinite(measured).all() and np.isfinite(expected).all() and np.isfinite(covariance).all()):
@@ -250,10 +286,14 @@ _ROUND_SHARE = 0.5
 class Pupil:
     """Where the pupil lies in a map.
 
-    Attributes:
-        x: column of its centre, the first is 0.
-        y: row of its centre.
-        radius: pixels.
+    Attributes
+    ----------
+    x : float
+        Column of its centre, the first is 0.
+    y : float
+        Row of its centre.
+    radius : float
+        pixels.
     """
 
     x: float
@@ -267,9 +307,12 @@ class Pupil:
     def unit(self, columns: Array, rows: Array) -> tuple[Array, Array]:
         """Coordinates on the unit disk.
 
-        Args:
-            columns: of points, any shape.
-            rows: likewise.
+        Parameters
+        ----------
+        columns : Array
+            Of points, any shape.
+        rows : Array
+            likewise.
         """
         return (columns - self.x) / self.radius, (rows - self.y) / self.radius
 
@@ -278,9 +321,12 @@ class Pupil:
 class MapFit:
     """Zernike terms of a map.
 
-    Attributes:
-        coefficients: of the circle's terms, metres rms over the full disk each, (Z,).
-        parts: of the terms that are orthonormal over the light, metres rms over it each, (Z,).
+    Attributes
+    ----------
+    coefficients : Array
+        Of the circle's terms, metres rms over the full disk each, (Z,).
+    parts : Array
+        Of the terms that are orthonormal over the light, metres rms over it each, (Z,).
     """
 
     coefficients: Array
@@ -290,11 +336,15 @@ class MapFit:
 def find_pupil(measured: WavefrontMap) -> Pupil:
     """The circle about the lit areas, but for specks; holes, spiders and edges that are cut off do not move it.
 
-    Args:
-        measured: map.
+    Parameters
+    ----------
+    measured : WavefrontMap
+        map.
 
-    Raises:
-        UndeterminedError: no light, or an edge that is round in less than half of the full angle.
+    Raises
+    ------
+    UndeterminedError
+        No light, or an edge that is round in less than half of the full angle.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(measured.lit.astype(np.uint8), connectivity=8)
     if count < 2:
@@ -351,14 +401,21 @@ def _off(points: Array, circle: tuple[float, float, float]) -> Array:
 def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = None) -> MapFit:
     """Least squares of Zernike terms over the lit pixels of a pupil, all of the same weight.
 
-    Args:
-        measured: map, turned as its user wants it.
-        terms: indices of Noll in ascending order; piston and tilt belong to them unless the map has none.
-        pupil: where it lies; None to find it by the lit area.
+    Parameters
+    ----------
+    measured : WavefrontMap
+        Map, turned as its user wants it.
+    terms : Sequence[int]
+        Indices of Noll in ascending order; piston and tilt belong to them unless the map has none.
+    pupil : Pupil | None
+        Where it lies; None to find it by the lit area.
 
-    Raises:
-        UndeterminedError: no light in the pupil, or terms that the light does not tell apart.
-        MapError: terms that are not ascending.
+    Raises
+    ------
+    UndeterminedError
+        No light in the pupil, or terms that the light does not tell apart.
+    MapError
+        Terms that are not ascending.
     """
     terms = tuple(int(index) for index in terms)
     if not terms or any(b <= a for a, b in itertools.pairwise(terms)):

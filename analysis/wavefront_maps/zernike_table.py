@@ -40,8 +40,10 @@ LAST_FRINGE = 37
 def noll_to_nm(index: int) -> tuple[int, int]:
     """Radial order n and azimuthal order m, positive of cosine terms and negative of sine terms.
 
-    Args:
-        index: of Noll, 1 for piston.
+    Parameters
+    ----------
+    index : int
+        Of Noll, 1 for piston.
     """
     if not 1 <= index <= MOST_TERMS:
         raise ValueError(f"Noll's terms 1 to {MOST_TERMS} are known, not {index}")
@@ -54,9 +56,12 @@ def noll_to_nm(index: int) -> tuple[int, int]:
 def nm_to_noll(n: int, m: int) -> int:
     """Noll's index of a term.
 
-    Args:
-        n: radial order.
-        m: azimuthal order, negative of sine terms.
+    Parameters
+    ----------
+    n : int
+        Radial order.
+    m : int
+        Azimuthal order, negative of sine terms.
     """
     first = n * (n + 1) // 2 + 1
     return next(j for j in range(first, first + n + 1) if noll_to_nm(j) == (n, m))
@@ -65,8 +70,10 @@ def nm_to_noll(n: int, m: int) -> int:
 def fringe_to_nm(index: int) -> tuple[int, int]:
     """Orders of a term of the Fringe set of the University of Arizona.
 
-    Args:
-        index: 1 for piston, up to 37.
+    Parameters
+    ----------
+    index : int
+        1 for piston, up to 37.
     """
     if not 1 <= index <= LAST_FRINGE:
         raise ValueError(f"Fringe terms 1 to {LAST_FRINGE} are known, not {index}")
@@ -81,8 +88,10 @@ def fringe_to_nm(index: int) -> tuple[int, int]:
 def ansi_to_nm(index: int) -> tuple[int, int]:
     """Orders of a term of the American standard Z80.28, which is that of the Optical Society.
 
-    Args:
-        index: 0 for piston.
+    Parameters
+    ----------
+    index : int
+        0 for piston.
     """
     if not 0 <= index < MOST_TERMS:
         raise ValueError(f"ANSI terms 0 to {MOST_TERMS - 1} are known, not {index}")
@@ -97,9 +106,12 @@ ORDERS = {"noll": noll_to_nm, "fringe": fringe_to_nm, "ansi": ansi_to_nm}
 def edge_value(n: int, m: int) -> float:
     """What a term of unit rms reaches at the edge, where a term of unit peak reaches 1.
 
-    Args:
-        n: radial order.
-        m: azimuthal order, of either sign.
+    Parameters
+    ----------
+    n : int
+        Radial order.
+    m : int
+        Azimuthal order, of either sign.
     """
     return sqrt(n + 1) * (sqrt(2.0) if m else 1.0)
 
@@ -107,10 +119,14 @@ def edge_value(n: int, m: int) -> float:
 def circle_terms(terms: Any, x: Any, y: Any) -> Array:
     """Terms of unit rms over the disk at points, as columns (N, Z).
 
-    Args:
-        terms: indices of Noll, (Z,).
-        x: on the unit disk, (N,).
-        y: likewise.
+    Parameters
+    ----------
+    terms : Any
+        Indices of Noll, (Z,).
+    x : Any
+        On the unit disk, (N,).
+    y : Any
+        likewise.
     """
     point, square = np.asarray(x) + 1j * np.asarray(y), np.square(x) + np.square(y)
     columns = np.empty((*point.shape, len(terms)))
@@ -141,12 +157,18 @@ _MOST_CHARACTERS = 10_000_000
 class ZernikeTable:
     """Coefficients of one or more wavefronts.
 
-    Attributes:
-        terms: Noll's indices, ascending, (Z,).
-        coefficients: metres of terms of unit rms over the disk, (F, Z); the file's sign.
-        others: other columns of a wide table, name -> texts, (F,) each.
-        wavelength: metres, None where neither file nor user says.
-        notes: how the table was understood, whole sentences.
+    Attributes
+    ----------
+    terms : tuple[int, ...]
+        Noll's indices, ascending, (Z,).
+    coefficients : Array
+        Metres of terms of unit rms over the disk, (F, Z); the file's sign.
+    others : Mapping[str, tuple[str, ...]]
+        Other columns of a wide table, name -> texts, (F,) each.
+    wavelength : float | None
+        Metres, None where neither file nor user says.
+    notes : tuple[str, ...]
+        How the table was understood, whole sentences.
     """
 
     terms: tuple[int, ...]
@@ -159,12 +181,17 @@ class ZernikeTable:
 def read_zernikes(path: Path, *, wavelength: float | None = None) -> ZernikeTable:
     """Coefficients of a table.
 
-    Args:
-        path: of the file.
-        wavelength: metres, where the file does not say.
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    wavelength : float | None
+        Metres, where the file does not say.
 
-    Raises:
-        MapError: no such table, a meaning that is missing or stated in two ways, with what to write.
+    Raises
+    ------
+    MapError
+        No such table, a meaning that is missing or stated in two ways, with what to write.
     """
     path = Path(path)
     if not path.is_file():

@@ -50,8 +50,10 @@ def pages() -> list[Path]:
 def places(text: str, figures: Mapping[str, Figure]) -> Iterator[tuple[str, str, str]]:
     """Name of the figure, what stands there and what should, for each marked place of a page.
 
-    Raises:
-        ValueError: a mark without a number before it, or one that names no figure.
+    Raises
+    ------
+    ValueError
+        a mark without a number before it, or one that names no figure.
     """
     found = list(_PLACE.finditer(text))
     if len(found) != len(_MARK.findall(text)):

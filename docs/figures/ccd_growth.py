@@ -52,9 +52,12 @@ def _heated(instrument: str, perturb: Mapping[str, Mapping[str, Any]]) -> tuple[
     """True d_f with a line CCD that keeps its length, the same with one that expands, and the latter as (7) reads it
     from images without noise, micrometres.
 
-    Args:
-        instrument: name of the pair.
-        perturb: as of a job; ``*`` stands for each camera.
+    Parameters
+    ----------
+    instrument : str
+        Name of the pair.
+    perturb : Mapping[str, Mapping[str, Any]]
+        As of a job; ``*`` stands for each camera.
     """
     pair = twin.load(instrument)
     nodes = {key.replace("*", camera): what for key, what in perturb.items() for camera in (EXPANDS, KEEPS)}

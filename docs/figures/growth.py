@@ -28,9 +28,12 @@ TITLES = {
 def times(numbers: dict[str, float], key: str) -> tuple[np.ndarray, np.ndarray]:
     """Sizes and seconds of one growth.
 
-    Args:
-        numbers: of the benchmark.
-        key: of the growth.
+    Parameters
+    ----------
+    numbers : dict[str, float]
+        Of the benchmark.
+    key : str
+        Of the growth.
     """
     found = {int(m[1]): value for name, value in numbers.items() if (m := re.fullmatch(rf"{key}_(\d+)_s", name))}
     sizes = np.array(sorted(found))
@@ -40,8 +43,10 @@ def times(numbers: dict[str, float], key: str) -> tuple[np.ndarray, np.ndarray]:
 def drawn(numbers: dict[str, float]) -> str:
     """The picture as SVG.
 
-    Args:
-        numbers: of the benchmark ``growth``.
+    Parameters
+    ----------
+    numbers : dict[str, float]
+        Of the benchmark ``growth``.
     """
     with look("growth"):
         figure = new_figure(2.9)

@@ -58,8 +58,10 @@ _DIGITS = {
 def short(drawn: str) -> str:
     """A drawing whose long lines are told to a hundredth of a pixel: half of the bytes.
 
-    Args:
-        drawn: an SVG; letters and scales keep their digits.
+    Parameters
+    ----------
+    drawn : str
+        An SVG; letters and scales keep their digits.
     """
 
     def rounded(line: re.Match[str]) -> str:
@@ -71,10 +73,14 @@ def short(drawn: str) -> str:
 def judged(words: tuple[str, ...], place: Path, picture: bool) -> dict[str, Any]:
     """Simulate a life and judge it.
 
-    Args:
-        words: plan and further words.
-        place: folder for all of it.
-        picture: whether the page shows this one.
+    Parameters
+    ----------
+    words : tuple[str, ...]
+        Plan and further words.
+    place : Path
+        Folder for all of it.
+    picture : bool
+        Whether the page shows this one.
     """
     record, out = place / "life", place / "judged"
     plan, *more = words

@@ -29,13 +29,20 @@ _NUMBER = re.compile(r"(-?[\d.]+(?:e-?\d+)?)(?: ± ([\d.]+))?")
 class Figure:
     """A measured number.
 
-    Attributes:
-        value: in the unit.
-        sigma: one standard deviation in the unit, None where none is known.
-        unit: empty for a pure number.
-        digits: decimals with which pages quote it, if they do not say otherwise.
-        command: what measures it.
-        seed: of its random numbers, None where it has none.
+    Attributes
+    ----------
+    value : float
+        In the unit.
+    sigma : float | None
+        One standard deviation in the unit, None where none is known.
+    unit : str
+        Empty for a pure number.
+    digits : int
+        Decimals with which pages quote it, if they do not say otherwise.
+    command : str
+        What measures it.
+    seed : int | None
+        Of its random numbers, None where it has none.
     """
 
     value: float
@@ -175,8 +182,10 @@ RUNS: Mapping[tuple[str, ...], Mapping[str, tuple[int, str, Read]]] = {
 def of_validation(summary: str) -> dict[str, Figure]:
     """The figures that a full validation gives: the checks' measured values, and how many rows have which verdict.
 
-    Args:
-        summary: text of the page that it makes.
+    Parameters
+    ----------
+    summary : str
+        Text of the page that it makes.
     """
     command = re.findall(r"Made by `(python -m twin\.validate .*?)`", summary)[0]
     seed = int(re.findall(r"--seed (\d+)", command)[0])

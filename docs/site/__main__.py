@@ -57,15 +57,22 @@ def main(
 def build(out: Path, notebooks: bool = True) -> int:
     """Build the site.
 
-    Args:
-        out: folder for the pages; what a former build left there is replaced.
-        notebooks: whether to run the notebooks; otherwise they are shown as they are.
+    Parameters
+    ----------
+    out : Path
+        Folder for the pages; what a former build left there is replaced.
+    notebooks : bool
+        Whether to run the notebooks; otherwise they are shown as they are.
 
-    Returns:
+    Returns
+    -------
+    int
         Number of pages.
 
-    Raises:
-        BuildError: a package is missing, the reference cannot be made, Sphinx warns, or a page needs the network.
+    Raises
+    ------
+    BuildError
+        a package is missing, the reference cannot be made, Sphinx warns, or a page needs the network.
     """
     if missing := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
         raise BuildError(f"not installed: {', '.join(missing)}; install the extra `docs`: pip install -e .[docs]")
@@ -85,8 +92,10 @@ def build(out: Path, notebooks: bool = True) -> int:
 def stage(source: Path) -> None:
     """Put everything that the site is made of into a new folder.
 
-    Raises:
-        BuildError: a key has no example, or a file of a run folder no description.
+    Raises
+    ------
+    BuildError
+        a key has no example, or a file of a run folder no description.
     """
     # what the pages are made from takes seconds to import
     from docs.site.command_pages import command_page
@@ -111,14 +120,20 @@ def stage(source: Path) -> None:
 def run_sphinx(source: Path, made: Path, notebooks: str) -> int:
     """Make pages in a process that imports this checkout, and return their number.
 
-    Args:
-        source: folder with the pages' sources, of which index is the first.
-        made: folder for the site.
-        notebooks: ``nb_execution_mode`` of MyST-NB.
+    Parameters
+    ----------
+    source : Path
+        Folder with the pages' sources, of which index is the first.
+    made : Path
+        Folder for the site.
+    notebooks : str
+        ``nb_execution_mode`` of MyST-NB.
 
-    Raises:
-        BuildError: Sphinx warns: of a link or its place that is not there, a page that no other leads to, and more; or
-            a page needs the network.
+    Raises
+    ------
+    BuildError
+        Sphinx warns: of a link or its place that is not there, a page that no other leads to, and more; or a page needs
+        the network.
     """
     environment = os.environ | {"JUPYTER_PLATFORM_DIRS": "1"}
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
@@ -144,9 +159,11 @@ def with_policy(text: str) -> str:
     Scripts and style sheets that stand in the page are allowed by their checksums; all text is the project's own.
     ``style`` attributes are allowed, since figures and highlighted programs have them.
 
-    Raises:
-        ValueError: the page has no head, loads something from the network, or has attributes that hold programs, which
-            no checksum covers.
+    Raises
+    ------
+    ValueError
+        The page has no head, loads something from the network, or has attributes that hold programs, which no checksum
+        covers.
     """
     head = _HEAD.search(text)
     if head is None:

@@ -82,8 +82,10 @@ def golden_runs() -> dict[str, dict[str, list[Any]]]:
 def described(command: str) -> list[dict[str, str]]:
     """The files of a command's run folder as the reference lists them.
 
-    Raises:
-        LookupError: a golden run has a file that is not described.
+    Raises
+    ------
+    LookupError
+        a golden run has a file that is not described.
     """
     everywhere, there = DESCRIBED["everywhere"], []
     for name in golden_runs()[command]:

@@ -28,7 +28,8 @@ LONGEST = 70
 """Characters of an example in a table; of longer ones a shorter one is looked for."""
 BY_HAND = Path(__file__).with_name("examples.yaml")
 """Model -> mappings with keys that no shipped file has; what a mapping lacks a shipped one of its model adds."""
-_ATTRIBUTE = re.compile(r"^    (\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.MULTILINE)
+_ATTRIBUTE = re.compile(r"^(\w+(?:, \w+)*)(?: : .*)?\n((?:(?: {4}.*)?\n)*(?: {4}.*))", re.MULTILINE)
+"""One attribute of a class under NumPy's heading: its names, and the indented text below them."""
 _QUANTITY = re.compile(r"(?:an? |the )?(.*) with its unit \((.*)\), e\.g\. '[^']*'(?:; (.*))?")
 _SI_UNIT = re.compile(r",? (?:metres|radians|seconds|kelvin)\b")
 _PLAIN = re.compile(
@@ -49,12 +50,16 @@ _BOUNDS = {
 class Takes:
     """What may stand after a key.
 
-    Attributes:
-        what: in words: "angle", "3 × length", "one of traced, ignore".
-        units: that are suggested; others of the same dimension are read, too.
-        limits: in words, empty for none.
-        below: names of the specifications that it holds, each after what stands between in a key path: "", ".NAME",
-            "[]".
+    Attributes
+    ----------
+    what : str
+        In words: "angle", "3 × length", "one of traced, ignore".
+    units : tuple[str, ...]
+        That are suggested; others of the same dimension are read, too.
+    limits : str
+        In words, empty for none.
+    below : tuple[tuple[str, str], ...]
+        Names of the specifications that it holds, each after what stands between in a key path: "", ".NAME", "[]".
     """
 
     what: str
@@ -73,12 +78,18 @@ class Takes:
 class Key:
     """One key of a mapping.
 
-    Attributes:
-        name: of the key.
-        meaning: what the docstring says, without the SI unit that only the program knows.
-        takes: what may stand after it.
-        default: what holds where it is not written, as YAML; empty where it must be written.
-        below: models of what it holds, each after what stands between in a key path.
+    Attributes
+    ----------
+    name : str
+        Of the key.
+    meaning : str
+        What the docstring says, without the SI unit that only the program knows.
+    takes : Takes
+        What may stand after it.
+    default : str
+        What holds where it is not written, as YAML; empty where it must be written.
+    below : tuple[tuple[str, type[Spec]], ...]
+        Models of what it holds, each after what stands between in a key path.
     """
 
     name: str
@@ -142,17 +153,19 @@ def attributes(model: type[Any]) -> dict[str, str]:
     """What the docstrings of a class and of those it inherits from say of its attributes."""
     out: dict[str, str] = {}
     for base in reversed(model.__mro__):
-        text = inspect.cleandoc(base.__dict__.get("__doc__") or "").partition("Attributes:")[2]
-        for names, said in _ATTRIBUTE.findall(text):
-            out |= {name: " ".join(said.split()) for name in names.split(", ")}
+        text = inspect.cleandoc(base.__dict__.get("__doc__") or "").partition("Attributes\n----------\n")[2]
+        for names, meaning in _ATTRIBUTE.findall(text):
+            out |= {name: " ".join(meaning.split()) for name in names.split(", ")}
     return out
 
 
 def taken(schema: Mapping[str, Any]) -> Takes:
     """What a JSON Schema lets stand after a key.
 
-    Raises:
-        TypeError: a form that the reference cannot describe.
+    Raises
+    ------
+    TypeError
+        a form that the reference cannot describe.
     """
     if "$ref" in schema:
         return Takes("mapping", below=(("", re.split("__|/", schema["$ref"])[-1]),))
@@ -246,8 +259,10 @@ def flow(value: Any) -> str:
 def shipped() -> dict[str, tuple[Path, ...]]:
     """Sort of file -> the shipped files of that sort, in order.
 
-    Raises:
-        ValueError: a shipped file that is of no sort, or of several.
+    Raises
+    ------
+    ValueError
+        a shipped file that is of no sort, or of several.
     """
     out: dict[str, list[Path]] = {kind: [] for kind in MODELS}
     for path in sorted(SCENES.rglob("*.yaml")):
@@ -307,8 +322,10 @@ def _mappings(model: type[Spec], data: Any) -> Iterator[tuple[type[Spec], dict[s
 def example(kind: str, model: type[Spec], name: str) -> dict[str, Any]:
     """A mapping that a model takes, with the key in it: of a shipped file, of that sort if there is one, or `BY_HAND`.
 
-    Raises:
-        LookupError: there is none.
+    Raises
+    ------
+    LookupError
+        There is none.
     """
     (key,) = (one for one in keys(model) if one.name == name)
     shipped_ones = [data for other in (kind, *MODELS) for data in _instances(other).get(model, ())]

@@ -135,9 +135,10 @@ def audit(
 def findings(answer: str) -> tuple[int, list[str]]:
     """How many packages pip-audit's JSON answers for, and a line for each known vulnerability.
 
-    Raises:
-        SupplyError: it does not answer for all packages; pip-audit itself takes one that its service does not know for
-            a good one.
+    Raises
+    ------
+    SupplyError
+        It does not answer for all packages; pip-audit itself takes one that its service does not know for a good one.
     """
     packages = json.loads(answer)["dependencies"]
     skipped = [p["name"] for p in packages if "skip_reason" in p]

@@ -50,12 +50,18 @@ LEAVES = re.compile(r"GCC-exception|Bootloader-exception|Classpath-exception")
 class Row:
     """A line of the table.
 
-    Attributes:
-        package, version: as locked.
-        for_: layer of the lock for which it is there.
-        licence: SPDX expression.
-        copyleft: no, weak or strong.
-        said_by: where the licence was read.
+    Attributes
+    ----------
+    package, version : str
+        As locked.
+    for_ : str
+        Layer of the lock for which it is there.
+    licence : str
+        SPDX expression.
+    copyleft : str
+        No, weak or strong.
+    said_by : str
+        Where the licence was read.
     """
 
     package: str
@@ -106,8 +112,10 @@ def update(folder: Path = FOLDER, file: Path = TABLE) -> tuple[Row, ...]:
 
     The files of these packages are fetched by their checksums into a folder that goes afterwards; nothing is installed.
 
-    Raises:
-        SupplyError: what a package says is no licence that is known here; the index cannot be reached.
+    Raises
+    ------
+    SupplyError
+        What a package says is no licence that is known here; the index cannot be reached.
     """
     packages = unique(read_lock(folder))
     known = {(row.package, row.version): row for row in read_table(file)} if file.exists() else {}

@@ -36,15 +36,22 @@ class SupplyError(Exception):
 def make_lock(folder: Path = FOLDER, upgrade: bool = False) -> dict[str, tuple[Locked, ...]]:
     """Write all files anew. A version that they have stays where pyproject.toml allows it.
 
-    Args:
-        folder: with install.in and peers.in.
-        upgrade: take the newest versions of whatever pyproject.toml does not pin.
+    Parameters
+    ----------
+    folder : Path
+        With install.in and peers.in.
+    upgrade : bool
+        Take the newest versions of whatever pyproject.toml does not pin.
 
-    Returns:
+    Returns
+    -------
+    dict[str, tuple[Locked, ...]]
         The packages of every layer.
 
-    Raises:
-        SupplyError: no versions go together, a package has no wheel, or the index cannot be reached.
+    Raises
+    ------
+    SupplyError
+        No versions go together, a package has no wheel, or the index cannot be reached.
     """
     project = ROOT / "pyproject.toml"
     former = [folder / f"{layer}.txt" for layer in EXTRAS]
@@ -91,10 +98,14 @@ def blocks(text: str, layer: str) -> dict[tuple[str, str, str], str]:
 def compiled(source: Path, preferred: str, *options: str) -> str:
     """What uv makes of a list of requirements, with lines as pip reads them.
 
-    Args:
-        source: pyproject.toml or a list.
-        preferred: lines of a former lock, whose versions stay where they can.
-        options: further ones.
+    Parameters
+    ----------
+    source : Path
+        pyproject.toml or a list.
+    preferred : str
+        Lines of a former lock, whose versions stay where they can.
+    options : str
+        Further ones.
     """
     with tempfile.TemporaryDirectory(prefix="lock-") as place:
         out = Path(place, "lock.txt")

@@ -29,13 +29,19 @@ EPOCH = datetime(1980, 1, 1, tzinfo=UTC)
 def bill(layers: Iterable[str] = LAYERS, folder: Path = FOLDER) -> str:
     """The bill as JSON, valid against the schema of CycloneDX 1.6.
 
-    Args:
-        layers: files of the lock.
-        folder: of the lock.
+    Parameters
+    ----------
+    layers : Iterable[str]
+        Files of the lock.
+    folder : Path
+        Of the lock.
 
-    Raises:
-        SupplyError: a package is in no row of the licences, or the bill is not valid.
-        LockError: a lock file cannot be read.
+    Raises
+    ------
+    SupplyError
+        a package is in no row of the licences, or the bill is not valid.
+    LockError
+        a lock file cannot be read.
     """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     licences = {(row.package, row.version): row for row in read_table()}

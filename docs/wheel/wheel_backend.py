@@ -47,8 +47,10 @@ _COMMAND = re.compile(rf"\bpython -m (?=({'|'.join(PACKAGES)})\.|\{{)")
 def rewritten(source: str) -> str:
     """A module's text as it stands in a wheel.
 
-    Raises:
-        ValueError: ``import optics`` with a later ``optics.something``; the name would be another one.
+    Raises
+    ------
+    ValueError
+        ``import optics`` with a later ``optics.something``; the name would be another one.
     """
     lines = source.splitlines(keepends=True)
     nodes = list(ast.walk(ast.parse(source)))

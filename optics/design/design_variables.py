@@ -38,10 +38,14 @@ _NUMBERS: Mapping[str, Path] = FrozenMap(
 class Variable:
     """A number that may vary.
 
-    Attributes:
-        element: name of a surface; empty for the field bias.
-        quantity: one of ``SHAPE``, ``STAND`` or ``field_bias``.
-        low, high: its bounds, SI.
+    Attributes
+    ----------
+    element : str
+        Name of a surface; empty for the field bias.
+    quantity : str
+        One of ``SHAPE``, ``STAND`` or ``field_bias``.
+    low, high : float
+        Its bounds, SI.
     """
 
     element: str
@@ -68,11 +72,16 @@ class Stand:
 class Prescription:
     """Mirrors in the order of the light, and the image surface.
 
-    Attributes:
-        surfaces: name -> shape, the image last.
-        stands: name -> where it stands.
-        stop: name of the mirror whose vertex the chief rays meet.
-        field_bias: angle of the field's centre from the parent axis, radians.
+    Attributes
+    ----------
+    surfaces : Mapping[str, Surface]
+        Name -> shape, the image last.
+    stands : Mapping[str, Stand]
+        Name -> where it stands.
+    stop : str
+        Name of the mirror whose vertex the chief rays meet.
+    field_bias : float
+        Angle of the field's centre from the parent axis, radians.
     """
 
     surfaces: Mapping[str, Surface]
@@ -95,8 +104,10 @@ class Prescription:
     def value(self, variable: Variable) -> float:
         """A number of the prescription, SI.
 
-        Raises:
-            KeyError: there is no such number.
+        Raises
+        ------
+        KeyError
+            There is no such number.
         """
         if variable.quantity == BIAS:
             return self.field_bias

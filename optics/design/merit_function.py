@@ -32,11 +32,16 @@ LAUNCH_DISTANCE = 9.0
 class Beams:
     """The beams that a prescription is evaluated by.
 
-    Attributes:
-        fields: angles x, y about the field bias, radians, (F, 2).
-        diameter: of the entrance pupil, metres.
-        nodes: quadrature over the pupil.
-        rim: number of rays around the edge of each beam.
+    Attributes
+    ----------
+    fields : np.ndarray
+        Angles x, y about the field bias, radians, (F, 2).
+    diameter : float
+        Of the entrance pupil, metres.
+    nodes : PupilNodes
+        Quadrature over the pupil.
+    rim : int
+        Number of rays around the edge of each beam.
     """
 
     fields: np.ndarray
@@ -56,12 +61,18 @@ class Beams:
 class DesignRays:
     """Traced beams, F fields of N rays each, and derivatives by V variables (a first axis of that size).
 
-    Attributes:
-        position, direction: on the image in its own frame, (F, N, 3).
-        path: optical path from the incoming wavefront through the prescription's origin, (F, N), metres.
-        points: launch points, hits on each surface and the image, prescription frame, (K + 1, F, N, 3).
-        d_position, d_direction, d_path, d_points: derivatives, (V, ...) each; None if not asked for.
-        d_bias: of the field bias, (V,).
+    Attributes
+    ----------
+    position, direction : np.ndarray
+        On the image in its own frame, (F, N, 3).
+    path : np.ndarray
+        Optical path from the incoming wavefront through the prescription's origin, (F, N), metres.
+    points : np.ndarray
+        Launch points, hits on each surface and the image, prescription frame, (K + 1, F, N, 3).
+    d_position, d_direction, d_path, d_points : np.ndarray | None
+        Derivatives, (V, ...) each; None if not asked for.
+    d_bias : np.ndarray | None
+        Of the field bias, (V,).
     """
 
     position: np.ndarray
@@ -94,9 +105,12 @@ def trace_beams(
 ) -> DesignRays:
     """Trace all beams, and differentiate them if variables are given.
 
-    Raises:
-        AimError: a chief ray does not reach the stop.
-        BeamMissedError: a beam is lost.
+    Raises
+    ------
+    AimError
+        a chief ray does not reach the stop.
+    BeamMissedError
+        a beam is lost.
     """
     assembly = prescription.assembly
     along, axes = beam_axes(beams.fields, prescription.field_bias)
@@ -191,16 +205,25 @@ def _differentiated(
 class Operands:
     """Operands of the merit function and its constraints.
 
-    Attributes:
-        wavelength: metres.
-        principal_distance: along the line, f = sum(L tan W) / sum(tan^2 W) over the fields on it, metres; None: free.
-        envelope: largest extent along z over all surfaces that light meets, image included, metres; None: free.
-        clearance: least distance in y between a beam and the edge of a surface that it passes, metres; None: free.
-        edge_margin: by how much surfaces are wider than the light on them, metres.
-        measure: ``wavefront`` (rms waves, piston and tilt removed) or ``spot`` (rms about the mean, in units of the
-            wavelength times the focal ratio).
-        distortion: weight of the chief rays' departure from L = f tan W, residuals per relative departure; 0 for none.
-        anamorphism: largest departure of f along the line from f across it, as a share of f across; None: free.
+    Attributes
+    ----------
+    wavelength : float
+        metres.
+    principal_distance : float | None
+        Along the line, f = sum(L tan W) / sum(tan^2 W) over the fields on it, metres; None: free.
+    envelope : float | None
+        Largest extent along z over all surfaces that light meets, image included, metres; None: free.
+    clearance : float | None
+        Least distance in y between a beam and the edge of a surface that it passes, metres; None: free.
+    edge_margin : float
+        By how much surfaces are wider than the light on them, metres.
+    measure : str
+        ``wavefront`` (rms waves, piston and tilt removed) or ``spot`` (rms about the mean, in units of the wavelength
+        times the focal ratio).
+    distortion : float
+        Weight of the chief rays' departure from L = f tan W, residuals per relative departure; 0 for none.
+    anamorphism : float | None
+        Largest departure of f along the line from f across it, as a share of f across; None: free.
     """
 
     wavelength: float
@@ -226,15 +249,22 @@ class Passage:
 class Evaluation:
     """A prescription's merit.
 
-    Attributes:
-        residuals: their squares sum to the mean square error over the fields (waves^2), (P,).
-        errors: rms error per field in waves, (F,).
-        principal_distance: metres.
-        distance_across: the same across the line, of the fields in the plane of symmetry, metres.
-        extents: along z from the farthest point of one surface to that of another, for all pairs, (E,), metres.
-        clearances: of every passage, metres.
-        d_residuals, d_principal_distance, d_distance_across, d_extents, d_clearances: derivatives, variables first;
-            None if not wanted.
+    Attributes
+    ----------
+    residuals : np.ndarray
+        Their squares sum to the mean square error over the fields (waves^2), (P,).
+    errors : np.ndarray
+        Rms error per field in waves, (F,).
+    principal_distance : float
+        metres.
+    distance_across : float
+        The same across the line, of the fields in the plane of symmetry, metres.
+    extents : np.ndarray
+        Along z from the farthest point of one surface to that of another, for all pairs, (E,), metres.
+    clearances : np.ndarray
+        Of every passage, metres.
+    d_residuals, d_principal_distance, d_distance_across, d_extents, d_clearances : np.ndarray | None
+        Derivatives, variables first; None if not wanted.
     """
 
     residuals: np.ndarray
@@ -264,11 +294,16 @@ class Evaluation:
 class MeritFunction:
     """The merit function of a prescription, and what its constraints ask for.
 
-    Attributes:
-        backend: where to trace.
-        beams: the fields and pupils.
-        operands: what is asked for.
-        passages: which beams pass which surfaces.
+    Attributes
+    ----------
+    backend : Backend
+        Where to trace.
+    beams : Beams
+        The fields and pupils.
+    operands : Operands
+        What is asked for.
+    passages : tuple[Passage, ...]
+        Which beams pass which surfaces.
     """
 
     backend: Backend
@@ -280,8 +315,10 @@ class MeritFunction:
     def of(cls, backend: Backend, start: Prescription, beams: Beams, operands: Operands) -> MeritFunction:
         """A merit function that takes the sides on which beams pass surfaces from the prescription ``start``.
 
-        Raises:
-            ValueError: no field lies on the line (y = 0) beside its centre, or the measure is unknown.
+        Raises
+        ------
+        ValueError
+            No field lies on the line (y = 0) beside its centre, or the measure is unknown.
         """
         if not _on_line(beams).any() or operands.measure not in ("wavefront", "spot"):
             raise ValueError("a design needs fields on the line off its centre, and the measure wavefront or spot")
@@ -300,8 +337,10 @@ class MeritFunction:
     def evaluate(self, prescription: Prescription, variables: Sequence[Variable] | None = None) -> Evaluation:
         """Trace and evaluate a prescription, with derivatives by the variables if they are given.
 
-        Raises:
-            AimError, BeamMissedError: light does not get through.
+        Raises
+        ------
+        AimError, BeamMissedError
+            Light does not get through.
         """
         rays = trace_beams(self.backend, prescription, self.beams, variables)
         residuals, d_residuals, errors = self._errors(rays)

@@ -44,9 +44,11 @@ Advance = Callable[[int, int], None]
 class DesignError(PhysicalError, ValueError):
     """The constraints cannot be held together, or the start does not pass light.
 
-    Attributes:
-        violated: kinds of the constraints that are not held; the one that is broken by the
-            largest share of what it asks for first.
+    Attributes
+    ----------
+    violated
+        Kinds of the constraints that are not held; the one that is broken by the largest share of what it asks for
+        first.
     """
 
     def __init__(self, problem: str, violated: tuple[str, ...] = ()) -> None:
@@ -58,12 +60,17 @@ class DesignError(PhysicalError, ValueError):
 class Held:
     """A constraint at which an optimised prescription stands.
 
-    Attributes:
-        name: what it is about.
-        limit: what it asks for, metres; of the anamorphism, a share of f.
-        start: by how much the start broke it, metres; negative for room that the start had.
-        worth: by how much the rms error over the fields would fall per metre that the limit is eased, waves/m, from the
-            constraint's Lagrange multiplier.
+    Attributes
+    ----------
+    name : str
+        What it is about.
+    limit : float
+        What it asks for, metres; of the anamorphism, a share of f.
+    start : float
+        By how much the start broke it, metres; negative for room that the start had.
+    worth : float
+        By how much the rms error over the fields would fall per metre that the limit is eased, waves/m, from the
+        constraint's Lagrange multiplier.
     """
 
     name: str
@@ -76,15 +83,24 @@ class Held:
 class Design:
     """An optimised prescription.
 
-    Attributes:
-        begun: what it is compared with.
-        prescription: what came out.
-        before, after: judgements of both.
-        variables: what was varied.
-        merit: evaluated both; it names the passages.
-        evaluations: traces with derivatives that it took.
-        converged: whether the search ended because nothing near is better.
-        held: the constraints that keep it from being better, the dearest first.
+    Attributes
+    ----------
+    begun : Prescription
+        What it is compared with.
+    prescription : Prescription
+        What came out.
+    before, after : Evaluation
+        Judgements of both.
+    variables : tuple[Variable, ...]
+        What was varied.
+    merit : MeritFunction
+        Evaluated both; it names the passages.
+    evaluations : int
+        Traces with derivatives that it took.
+    converged : bool
+        Whether the search ended because nothing near is better.
+    held : tuple[Held, ...]
+        The constraints that keep it from being better, the dearest first.
     """
 
     begun: Prescription
@@ -108,14 +124,21 @@ def _violations(
 ) -> np.ndarray:
     """Violations (C,), metres, positive when violated (the first, of the principal distance, in both directions).
 
-    Args:
-        operands: what is asked for.
-        along: principal distance, metres.
-        across: the same across the line, metres.
-        extents: (E,), metres.
-        clearances: (P,), metres.
-        share: of the limits. With 0 and derivatives in place of the numbers, variables last, it gives those of the
-            violations, (C, V).
+    Parameters
+    ----------
+    operands : Operands
+        What is asked for.
+    along : Any
+        Principal distance, metres.
+    across : Any
+        The same across the line, metres.
+    extents : np.ndarray
+        (E,), metres.
+    clearances : np.ndarray
+        (P,), metres.
+    share : float
+        Of the limits. With 0 and derivatives in place of the numbers, variables last, it gives those of the violations,
+        (C, V).
     """
     out: list[Any] = []
     if operands.principal_distance is not None:
@@ -167,8 +190,10 @@ def judged(
 ) -> tuple[MeritFunction, Evaluation]:
     """The merit function of a design that begins at a prescription, and that prescription's evaluation.
 
-    Raises:
-        DesignError: the start passes no light or breaks a bound.
+    Raises
+    ------
+    DesignError
+        The start passes no light or breaks a bound.
     """
     for variable, value in zip(variables, start.values(variables), strict=True):
         if not variable.low <= value <= variable.high:
@@ -192,18 +217,29 @@ def descend(
 ) -> Design:
     """The local optimum that is reached from a start, which need not be what ``merit`` took the passages from.
 
-    Args:
-        merit: with the constraints.
-        begun: what the result is compared with.
-        before: its evaluation.
-        start: where to begin; it passes all light and keeps the bounds.
-        variables: what may vary.
-        steps: of the envelope from the start's to the goal's.
-        iterations: of least squares, at most, at the last step.
-        advance: told (done, total) after each step.
+    Parameters
+    ----------
+    merit : MeritFunction
+        With the constraints.
+    begun : Prescription
+        What the result is compared with.
+    before : Evaluation
+        Its evaluation.
+    start : Prescription
+        Where to begin; it passes all light and keeps the bounds.
+    variables : Sequence[Variable]
+        What may vary.
+    steps : int
+        Of the envelope from the start's to the goal's.
+    iterations : int
+        Of least squares, at most, at the last step.
+    advance : Advance | None
+        Told (done, total) after each step.
 
-    Raises:
-        DesignError: constraints cannot be held together.
+    Raises
+    ------
+    DesignError
+        Constraints cannot be held together.
     """
     variables, operands = tuple(variables), merit.operands
     current, evaluations, converged = start, 0, False
@@ -260,11 +296,16 @@ def held_by(
     At an optimum the slope of the mean square error is a sum of the slopes of the constraints at their limits, with
     weights that are not negative; each weight is what the error falls by when its limit is eased.
 
-    Args:
-        merit: with the constraints.
-        prescription: optimised.
-        variables: what was varied.
-        before: the start.
+    Parameters
+    ----------
+    merit : MeritFunction
+        With the constraints.
+    prescription : Prescription
+        optimised.
+    variables : tuple[Variable, ...]
+        What was varied.
+    before : Evaluation
+        The start.
     """
     there = merit.evaluate(prescription, variables)
     g, asked = _values(there, merit.operands), _asked(there, merit.operands)
@@ -378,11 +419,16 @@ _PLACE = 0.01
 class Attempt:
     """What came of one start.
 
-    Attributes:
-        drawn: whether the start was drawn at random; else it is the prescription itself.
-        steps: of the envelope.
-        design: None where the constraints could not be held.
-        problem: why not; empty where they are held.
+    Attributes
+    ----------
+    drawn : bool
+        Whether the start was drawn at random; else it is the prescription itself.
+    steps : int
+        Of the envelope.
+    design : Design | None
+        None where the constraints could not be held.
+    problem : str
+        Why not; empty where they are held.
     """
 
     drawn: bool
@@ -400,8 +446,10 @@ class Attempt:
 class Search:
     """The best of several starts.
 
-    Attributes:
-        attempts: one for each start, in their order.
+    Attributes
+    ----------
+    attempts : tuple[Attempt, ...]
+        One for each start, in their order.
     """
 
     attempts: tuple[Attempt, ...]
@@ -439,20 +487,33 @@ def search(
 ) -> Search:
     """Optimise a prescription from several starts.
 
-    Args:
-        backend: where to trace.
-        start: the first start; beams keep to the sides of surfaces on which they pass there.
-        variables: what may vary, and within which bounds.
-        beams: fields and pupil.
-        operands: merit and constraints.
-        steps: of the envelope from the start's to the goal's, for every other start.
-        starts: how many.
-        seed: of those that are drawn at random; the n-th is the same however many there are.
-        iterations: of least squares, at most, at the last step of each start.
-        advance: told (done, total) after each step.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    start : Prescription
+        The first start; beams keep to the sides of surfaces on which they pass there.
+    variables : Sequence[Variable]
+        What may vary, and within which bounds.
+    beams : Beams
+        Fields and pupil.
+    operands : Operands
+        Merit and constraints.
+    steps : int
+        Of the envelope from the start's to the goal's, for every other start.
+    starts : int
+        How many.
+    seed : int
+        Of those that are drawn at random; the n-th is the same however many there are.
+    iterations : int
+        Of least squares, at most, at the last step of each start.
+    advance : Advance | None
+        Told (done, total) after each step.
 
-    Raises:
-        DesignError: the start passes no light or breaks a bound, or from no start the constraints can be held together.
+    Raises
+    ------
+    DesignError
+        The start passes no light or breaks a bound, or from no start the constraints can be held together.
     """
     variables = tuple(variables)
     merit, before = judged(backend, start, variables, beams, operands)
@@ -487,11 +548,16 @@ def drawn_start(
 
     Its spread is halved whenever ``TURNS`` draws in a row pass none.
 
-    Args:
-        merit: whose beams have to come through.
-        nominal: what to draw about.
-        variables: what is drawn; their bounds are kept.
-        rng: normal numbers.
+    Parameters
+    ----------
+    merit : MeritFunction
+        Whose beams have to come through.
+    nominal : Prescription
+        What to draw about.
+    variables : Sequence[Variable]
+        What is drawn; their bounds are kept.
+    rng : np.random.Generator
+        Normal numbers.
     """
     values = nominal.values(variables)
     envelope = merit.evaluate(nominal).envelope

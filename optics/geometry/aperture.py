@@ -223,9 +223,12 @@ Aperture = Circle | Rectangle | Ellipse
 class Ray:
     """A strip of a width that begins at a point and runs without end along +x: the vane of a spider.
 
-    Attributes:
-        width: metres.
-        centre: middle of its beginning, metres.
+    Attributes
+    ----------
+    width : float
+        metres.
+    centre : tuple[float, float]
+        Middle of its beginning, metres.
     """
 
     width: float
@@ -245,9 +248,12 @@ class Ray:
 class Polygon:
     """A polygon whose sides do not cross.
 
-    Attributes:
-        corners: (x, y) one after the other, metres; the last is joined to the first.
-        centre: about which it may be turned.
+    Attributes
+    ----------
+    corners : tuple[tuple[float, float], ...]
+        (x, y) one after the other, metres; the last is joined to the first.
+    centre : tuple[float, float]
+        About which it may be turned.
     """
 
     corners: tuple[tuple[float, float], ...]
@@ -278,10 +284,14 @@ EdgeShape = Circle | Rectangle | Ellipse | Ray | Polygon
 class Edge:
     """What lets light through inside of a shape, or stops it there.
 
-    Attributes:
-        shape: before its turn.
-        blocks: light is stopped inside of it; else outside.
-        turn: of the shape about its own centre, right-handed about the surface's z, radians.
+    Attributes
+    ----------
+    shape : EdgeShape
+        Before its turn.
+    blocks : bool
+        Light is stopped inside of it; else outside.
+    turn : float
+        Of the shape about its own centre, right-handed about the surface's z, radians.
     """
 
     shape: EdgeShape
@@ -291,9 +301,12 @@ class Edge:
     def passes(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Whether light comes through at points of the surface, of their shape.
 
-        Args:
-            x: of the points in the surface's own frame, metres.
-            y: likewise, of the same shape.
+        Parameters
+        ----------
+        x : np.ndarray
+            Of the points in the surface's own frame, metres.
+        y : np.ndarray
+            Likewise, of the same shape.
         """
         if self.turn:
             cx, cy = self.shape.centre

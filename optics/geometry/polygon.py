@@ -50,10 +50,14 @@ def area_in_disk(polygons: np.ndarray) -> np.ndarray:
 def covered(polygons: np.ndarray, points: np.ndarray, smallest: float = 0.0) -> np.ndarray:
     """Which points (N, 2) lie in any of the convex counterclockwise polygons (B, K, V, 2), (B, N).
 
-    Args:
-        polygons: some may be empty, all their corners alike.
-        points: the same for all B.
-        smallest: area up to which a polygon is nothing.
+    Parameters
+    ----------
+    polygons : np.ndarray
+        Some may be empty, all their corners alike.
+    points : np.ndarray
+        The same for all B.
+    smallest : float
+        Area up to which a polygon is nothing.
     """
     out = np.zeros((len(polygons), len(points)), bool)
     full = area(polygons) > smallest
@@ -94,12 +98,18 @@ def hull(points: np.ndarray) -> np.ndarray:
 def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndarray:
     """The part of each polygon where normal . (x, y) <= limit (Sutherland and Hodgman, Commun. ACM 17, 32 (1974)).
 
-    Args:
-        polygons: (N, V, D).
-        normal: (N, 2).
-        limit: (N,).
+    Parameters
+    ----------
+    polygons : np.ndarray
+        (N, V, D).
+    normal : np.ndarray
+        (N, 2).
+    limit : np.ndarray
+        (N,).
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (N, W, D), corners in the order they had.
     """
     depth = limit[:, None] - polygons[..., 0] * normal[:, :1] - polygons[..., 1] * normal[:, 1:]
@@ -156,12 +166,18 @@ def sides(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndarray:
     """Cut each polygon by W half-planes.
 
-    Args:
-        polygons: (N, V, D).
-        normal: (N, W, 2).
-        limit: (N, W).
+    Parameters
+    ----------
+    polygons : np.ndarray
+        (N, V, D).
+    normal : np.ndarray
+        (N, W, 2).
+    limit : np.ndarray
+        (N, W).
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (N, U, D).
     """
     height = np.einsum("nvx,nwx->nwv", polygons[..., :2], normal)
@@ -183,10 +199,14 @@ def difference(polygons: np.ndarray, holes: np.ndarray, order: Iterable[int] | N
     """What is left of each convex polygon (N, V, D) outside of a counterclockwise convex one (N, W, D): some convex
     pieces, (N, ., D) each, many of them empty.
 
-    Args:
-        polygons: convex.
-        holes: counterclockwise, convex.
-        order: in which the holes' sides are cut along, one piece for each; from the first to the last if not given.
+    Parameters
+    ----------
+    polygons : np.ndarray
+        convex.
+    holes : np.ndarray
+        Counterclockwise, convex.
+    order : Iterable[int] | None
+        In which the holes' sides are cut along, one piece for each; from the first to the last if not given.
     """
     normal, limit = sides(holes)
     out = []
@@ -202,11 +222,16 @@ def quadrature(polygons: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray
     They are Gauss' in the polygon's bounding box; the weights are the integrals of Lagrange's polynomials, by Green's
     theorem along the sides.
 
-    Args:
-        polygons: (N, V, D), of either sense.
-        count: nodes along each side of the box.
+    Parameters
+    ----------
+    polygons : np.ndarray
+        (N, V, D), of either sense.
+    count : int
+        Nodes along each side of the box.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray]
         Points x + iy and weights of the area, (N, count^2) each.
     """
     place = polygons[..., :2]
@@ -224,12 +249,18 @@ def from_boundary(
 ) -> tuple[np.ndarray, np.ndarray]:
     """``quadrature`` over regions whose boundary is given by nodes of integrals along it.
 
-    Args:
-        place: nodes on the boundary, (N, P, 2).
-        rise: their weights in integrals over dy, (N, P).
-        low: corners of boxes about the regions, (N, 2).
-        high: the opposite ones.
-        count: nodes along each side of the box.
+    Parameters
+    ----------
+    place : np.ndarray
+        Nodes on the boundary, (N, P, 2).
+    rise : np.ndarray
+        Their weights in integrals over dy, (N, P).
+    low : np.ndarray
+        Corners of boxes about the regions, (N, 2).
+    high : np.ndarray
+        The opposite ones.
+    count : int
+        Nodes along each side of the box.
     """
     rows = len(place)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -251,10 +282,14 @@ def from_boundary(
 def _moments(at: np.ndarray, rise: np.ndarray, count: int) -> np.ndarray:
     """Integrals of Legendre's P_i(x) P_j(y) over N regions with nodes (N, P, 2) on their boundaries, (N, count, count).
 
-    Args:
-        at: the nodes.
-        rise: their weights in integrals over dy, (N, P).
-        count: of polynomials.
+    Parameters
+    ----------
+    at : np.ndarray
+        The nodes.
+    rise : np.ndarray
+        Their weights in integrals over dy, (N, P).
+    count : int
+        Of polynomials.
     """
     x, y = _legendre(at[..., 0], count + 1), _legendre(at[..., 1], count)
     primitive = np.empty((count, *rise.shape))  # of P_0, P_1, ... along x

@@ -16,11 +16,15 @@ _SERIES_TERMS = 12
 def rotation_matrix(vector: Any) -> np.ndarray:
     """Matrix of a rotation vector (right-hand rule), Rodrigues' formula.
 
-    Args:
-        vector: rotation vectors, radians, shape (..., 3); complex input is differentiated analytically, so that a
-            complex step gives exact derivatives (no conjugation or modulus is taken).
+    Parameters
+    ----------
+    vector : Any
+        Rotation vectors, radians, shape (..., 3); complex input is differentiated analytically, so that a complex step
+        gives exact derivatives (no conjugation or modulus is taken).
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         Shape (..., 3, 3).
     """
     v = np.asarray(vector)
@@ -89,9 +93,12 @@ their lengths are those of a matrix that a file gives in a few digits."""
 class Pose:
     """Rigid transform x_parent = rotation @ x_body + translation.
 
-    Attributes:
-        rotation: shape (3, 3), proper orthogonal.
-        translation: shape (3,), metres.
+    Attributes
+    ----------
+    rotation : np.ndarray
+        Shape (3, 3), proper orthogonal.
+    translation : np.ndarray
+        Shape (3,), metres.
     """
 
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))

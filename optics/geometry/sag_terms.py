@@ -22,9 +22,11 @@ from optics.numerics.number_tree import FrozenMap
 class SagTerm(Protocol):
     """What a kind has to be, beside a frozen dataclass of numbers without a ``__post_init__``.
 
-    Attributes:
-        POWERS: name of each field, in their order -> power of the metre of its unit, -3 for 1/m^3. Files are read by
-            it, and a body that grows takes the number along.
+    Attributes
+    ----------
+    POWERS : Mapping[str, int]
+        Name of each field, in their order -> power of the metre of its unit, -3 for 1/m^3. Files are read by it, and a
+        body that grows takes the number along.
     """
 
     POWERS: ClassVar[Mapping[str, int]]

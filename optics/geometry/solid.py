@@ -61,10 +61,13 @@ class EmptyBodyError(PhysicalError, ValueError):
 class Polyhedron:
     """A convex body.
 
-    Attributes:
-        vertices: its corners, (V, 3), metres.
-        rings: for each half-space the corners of its face, counterclockwise from outside; empty when the half-space
-            leaves no face, or none wider than ``MERGED``. Every edge is in two of them, once each way.
+    Attributes
+    ----------
+    vertices : np.ndarray
+        Its corners, (V, 3), metres.
+    rings : tuple[tuple[int, ...], ...]
+        For each half-space the corners of its face, counterclockwise from outside; empty when the half-space leaves no
+        face, or none wider than ``MERGED``. Every edge is in two of them, once each way.
     """
 
     vertices: np.ndarray
@@ -74,12 +77,17 @@ class Polyhedron:
 def enclosed(normals: np.ndarray, offsets: np.ndarray) -> Polyhedron:
     """The body of all x with normals . x <= offsets.
 
-    Args:
-        normals: outward unit vectors, (F, 3).
-        offsets: along them from the origin, (F,), metres.
+    Parameters
+    ----------
+    normals : np.ndarray
+        Outward unit vectors, (F, 3).
+    offsets : np.ndarray
+        Along them from the origin, (F,), metres.
 
-    Raises:
-        OpenBodyError, EmptyBodyError: there is no such body.
+    Raises
+    ------
+    OpenBodyError, EmptyBodyError
+        There is no such body.
     """
     count = len(offsets)
     planes = [_integers((*n, d)) for n, d in zip(normals.tolist(), offsets.tolist(), strict=True)]
@@ -228,12 +236,17 @@ class SolidError(PhysicalError, ValueError):
 class Face:
     """One face.
 
-    Attributes:
-        name: within the solid, e.g. ``window``, ``roof_a``.
-        body: path of the tree's body that carries it (the solid's own, or a child of it when the face can have an
-            error of its own).
-        coating: what it does.
-        pose: of the face in that body's frame, +z outward.
+    Attributes
+    ----------
+    name : str
+        Within the solid, e.g. ``window``, ``roof_a``.
+    body : str
+        Path of the tree's body that carries it (the solid's own, or a child of it when the face can have an error of
+        its own).
+    coating : Coating
+        What it does.
+    pose : Pose
+        Of the face in that body's frame, +z outward.
     """
 
     name: str
@@ -246,11 +259,16 @@ class Face:
 class Solid:
     """A glass body.
 
-    Attributes:
-        path: path of its body in the tree.
-        material: name in the catalogues ``optics.materials.glass`` and ``optics.materials.material``.
-        faces: all faces; their inner half-spaces meet in the body.
-        transparent: False for a body of which only the outer faces are used (light never goes inside).
+    Attributes
+    ----------
+    path : str
+        Path of its body in the tree.
+    material : str
+        Name in the catalogues ``optics.materials.glass`` and ``optics.materials.material``.
+    faces : tuple[Face, ...]
+        All faces; their inner half-spaces meet in the body.
+    transparent : bool
+        False for a body of which only the outer faces are used (light never goes inside).
     """
 
     path: str
@@ -263,12 +281,17 @@ class Solid:
 class SolidMesh:
     """The body as a triangle mesh in the frame of the solid's body, metres.
 
-    Attributes:
-        vertices: corners, (V, 3).
-        triangles: closed, with outward winding, (T, 3).
-        face_of: (T,) index into ``Solid.faces``.
-        polygons: face by face, its corners in order, (K, 3), counterclockwise from outside; (0, 3) for a ground face
-            that the other faces cut off.
+    Attributes
+    ----------
+    vertices : np.ndarray
+        Corners, (V, 3).
+    triangles : np.ndarray
+        Closed, with outward winding, (T, 3).
+    face_of : np.ndarray
+        (T,) index into ``Solid.faces``.
+    polygons : tuple[np.ndarray, ...]
+        Face by face, its corners in order, (K, 3), counterclockwise from outside; (0, 3) for a ground face that the
+        other faces cut off.
     """
 
     vertices: np.ndarray
@@ -287,10 +310,14 @@ class SolidMesh:
 def face_plane(face: Face, placed: PlacedBodies, state: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Point and outward unit normal of a face in the world, (3,) each.
 
-    Args:
-        face: of a solid.
-        placed: bodies of S states.
-        state: which of them.
+    Parameters
+    ----------
+    face : Face
+        Of a solid.
+    placed : PlacedBodies
+        Bodies of S states.
+    state : int
+        Which of them.
     """
     pose = placed.pose(face.body, state)
     scale = float(placed.scale[state, placed.index[face.body]].real)
@@ -300,9 +327,10 @@ def face_plane(face: Face, placed: PlacedBodies, state: int = 0) -> tuple[np.nda
 def solid_mesh(solid: Solid, placed: PlacedBodies) -> SolidMesh:
     """Mesh of the body that the faces enclose.
 
-    Raises:
-        SolidError: the faces leave no room, leave the body open, or cut off one of them that is more than a ground
-            surface.
+    Raises
+    ------
+    SolidError
+        The faces leave no room, leave the body open, or cut off one of them that is more than a ground surface.
     """
     own = placed.pose(solid.path).inverse()
     planes = [face_plane(face, placed, 0) for face in solid.faces]

@@ -53,11 +53,14 @@ class ZernikeFigure:
 class GridFigure:
     """Sag error on a regular grid, interpolated by a cubic B-spline (twice continuously differentiable).
 
-    Attributes:
-        values: sag error in metres, shape (rows along y, columns along x), at least 4 x 4.
-        bounds: x_min, x_max, y_min, y_max of the first and last samples, metres. The spline arrives at its edges with
-            zero slope (mirror condition) and stays at the edge's value outside: give a grid that reaches a few samples
-            beyond the clear aperture.
+    Attributes
+    ----------
+    values : np.ndarray
+        Sag error in metres, shape (rows along y, columns along x), at least 4 x 4.
+    bounds : tuple[float, float, float, float]
+        x_min, x_max, y_min, y_max of the first and last samples, metres. The spline arrives at its edges with zero
+        slope (mirror condition) and stays at the edge's value outside: give a grid that reaches a few samples beyond
+        the clear aperture.
     """
 
     values: np.ndarray
@@ -93,8 +96,10 @@ class GridFigure:
     def plus(self, other: GridFigure) -> GridFigure:
         """The sum of two figures on the same samples; exact.
 
-        Raises:
-            ValueError: they have other samples.
+        Raises
+        ------
+        ValueError
+            They have other samples.
         """
         if self.bounds != other.bounds or self.values.shape != other.values.shape:
             raise ValueError("two grid figures of one surface stand on different samples; put them on the same ones")
@@ -176,11 +181,16 @@ class SurfaceNumbers:
 
     What is None or empty is no part of the code that ``level`` makes.
 
-    Attributes:
-        curvature, conic: c, 1/m, and k; None for a plane.
-        even: A4, A6, ..., m^-3, m^-5, ...
-        terms: further terms of the sag, at most one of a kind.
-        figure, grid: departures from that shape.
+    Attributes
+    ----------
+    curvature, conic : Any
+        c, 1/m, and k; None for a plane.
+    even : tuple[Any, ...]
+        A4, A6, ..., m^-3, m^-5, ...
+    terms : tuple[SagTerm, ...]
+        Further terms of the sag, at most one of a kind.
+    figure, grid : FigureNumbers | None
+        Departures from that shape.
     """
 
     curvature: Any = None
@@ -208,13 +218,20 @@ def level(
     the conic's own equation in w: no square root and no division. G > 0 on the +z side; dG/dw = 1 - (1 + k) c w is
     positive on the sheet of the vertex.
 
-    Args:
-        x: where, in the surface's frame, metres.
-        y: likewise.
-        z: likewise.
-        surface: its numbers.
-        table: coefficients of grid figures.
-        active: points that matter; elsewhere the table is not read.
+    Parameters
+    ----------
+    x : Any
+        Where, in the surface's frame, metres.
+    y : Any
+        likewise.
+    z : Any
+        likewise.
+    surface : SurfaceNumbers
+        Its numbers.
+    table : Any
+        Coefficients of grid figures.
+    active : Any
+        Points that matter; elsewhere the table is not read.
     """
     import drjit as dr
 
@@ -319,13 +336,19 @@ def _weights(f: Any) -> tuple[list[Any], list[Any]]:
 class Surface:
     """Surface z = c r^2 / (1 + sqrt(1 - (1+k) c^2 r^2)) + A4 r^4 + A6 r^6 + ... + further terms + figure.
 
-    Attributes:
-        curvature: c = 1/R in 1/m; 0 is a plane. Positive: centre of curvature on the +z side.
-        conic: k, Schwarzschild's constant (0 sphere, -1 paraboloid).
-        even: (A4, A6, A8, ...) in m^-3, m^-5, m^-7, ...
-        figure: departure from that shape.
-        terms: further terms of the sag (``optics.geometry.sag_terms``), at most one of a kind; without them the ideal
-            shape is one of revolution.
+    Attributes
+    ----------
+    curvature : float
+        c = 1/R in 1/m; 0 is a plane. Positive: centre of curvature on the +z side.
+    conic : float
+        k, Schwarzschild's constant (0 sphere, -1 paraboloid).
+    even : tuple[float, ...]
+        (A4, A6, A8, ...) in m^-3, m^-5, m^-7, ...
+    figure : Figure | None
+        Departure from that shape.
+    terms : tuple[SagTerm, ...]
+        Further terms of the sag (``optics.geometry.sag_terms``), at most one of a kind; without them the ideal shape is
+        one of revolution.
     """
 
     curvature: float = 0.0
@@ -374,8 +397,10 @@ class Surface:
         """Return the Zernike figure that terms are added to: the surface's own, or one without terms over the smallest
         circle round the aperture.
 
-        Raises:
-            ValueError: neither a Zernike figure nor an aperture sets the disk.
+        Raises
+        ------
+        ValueError
+            Neither a Zernike figure nor an aperture sets the disk.
         """
         if self.zernike_figure is not None:
             return self.zernike_figure

@@ -21,12 +21,17 @@ ORIGIN = "origin"
 class Body:
     """One node of the tree.
 
-    Attributes:
-        path: full name, parts joined by ``/``; the parent is the path without its last part.
-        pose: pose relative to the parent.
-        pivots: named points in the body's own frame, metres; ``origin`` always exists.
-        scales: whether a scale applied to an ancestor also scales the interior of this body (a focal plane moves with
-            the structure that carries it but its detectors keep their size).
+    Attributes
+    ----------
+    path : str
+        Full name, parts joined by ``/``; the parent is the path without its last part.
+    pose : Pose
+        Pose relative to the parent.
+    pivots : Mapping[str, tuple[float, float, float]]
+        Named points in the body's own frame, metres; ``origin`` always exists.
+    scales : bool
+        Whether a scale applied to an ancestor also scales the interior of this body (a focal plane moves with the
+        structure that carries it but its detectors keep their size).
     """
 
     path: str
@@ -58,22 +63,34 @@ class Body:
 class Motion:
     """A small motion of one body about a pivot, in its own frame: first the rotation vector, then the shift.
 
-    Attributes:
-        rotate: rotation vector, radians.
-        shift: metres.
-        pivot: name of one of the body's pivots.
-        scale: relative growth of the body and all it carries about the pivot (isotropic expansion), e.g. 20e-6.
-        figure: surface error of a mirror or face, Noll index -> amplitude in metres of sag (see
-            ``optics.geometry.surface``).
-        stretch: relative growth of the body itself about the pivot: its surface, and the distances to what it carries;
-            unlike ``scale`` it does not enlarge the bodies that it carries (each has a temperature of its own).
-        index: change of the refractive index of a glass body.
-        index_gradient: gradient of that change in the body's frame, zero at its origin, 1/m.
-        grid: surface error of a mirror or face beyond ``figure``, on a grid.
-        radius: relative change of the vertex radius of curvature of a mirror or face, e.g. 100e-6.
-        conic: change of its conic constant.
-        abbe: relative change of the Abbe number of a glass body. Its index at the d line stays, and what the index
-            differs from that at any other wavelength goes with the inverse of the Abbe number.
+    Attributes
+    ----------
+    rotate : tuple[float, float, float]
+        Rotation vector, radians.
+    shift : tuple[float, float, float]
+        metres.
+    pivot : str
+        Name of one of the body's pivots.
+    scale : float
+        Relative growth of the body and all it carries about the pivot (isotropic expansion), e.g. 20e-6.
+    figure : Mapping[int, float]
+        Surface error of a mirror or face, Noll index -> amplitude in metres of sag (see ``optics.geometry.surface``).
+    stretch : float
+        Relative growth of the body itself about the pivot: its surface, and the distances to what it carries; unlike
+        ``scale`` it does not enlarge the bodies that it carries (each has a temperature of its own).
+    index : float
+        Change of the refractive index of a glass body.
+    index_gradient : tuple[float, float, float]
+        Gradient of that change in the body's frame, zero at its origin, 1/m.
+    grid : GridFigure | None
+        Surface error of a mirror or face beyond ``figure``, on a grid.
+    radius : float
+        Relative change of the vertex radius of curvature of a mirror or face, e.g. 100e-6.
+    conic : float
+        Change of its conic constant.
+    abbe : float
+        Relative change of the Abbe number of a glass body. Its index at the d line stays, and what the index differs
+        from that at any other wavelength goes with the inverse of the Abbe number.
     """
 
     rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -102,8 +119,10 @@ class Motion:
         """One number of the motion, SI: ``rotate`` or ``shift`` by an axis, a ``figure`` term, or one of ``scale``,
         ``radius``, ``conic``, ``index`` and ``abbe``.
 
-        Raises:
-            ValueError: there is no such kind of motion.
+        Raises
+        ------
+        ValueError
+            There is no such kind of motion.
         """
         match kind:
             case "rotate":
@@ -130,10 +149,14 @@ State = Mapping[str, Motion]
 class PlacedBodies:
     """World poses of every body for a batch of S states (complex when a complex-step derivative is taken).
 
-    Attributes:
-        index: body path -> position along the second axis.
-        rotation: (S, bodies, 3, 3); translation: (S, bodies, 3), metres.
-        scale: (S, bodies), size of the body itself relative to nominal.
+    Attributes
+    ----------
+    index : Mapping[str, int]
+        Body path -> position along the second axis.
+    rotation : np.ndarray
+        (S, bodies, 3, 3); translation: (S, bodies, 3), metres.
+    scale : np.ndarray
+        (S, bodies), size of the body itself relative to nominal.
     """
 
     index: Mapping[str, int]
@@ -185,12 +208,17 @@ class RigidTree:
         A state of that tree is one on top of this: ``compose(state, then, bodies)`` places the bodies here where
         ``then`` places them there.
 
-        Args:
-            state: body path -> rigid motion.
+        Parameters
+        ----------
+        state : State
+            Body path -> rigid motion.
 
-        Raises:
-            KeyError: it names an unknown body or pivot.
-            ValueError: it lets a body grow.
+        Raises
+        ------
+        KeyError
+            It names an unknown body or pivot.
+        ValueError
+            It lets a body grow.
         """
         for path, motion in state.items():
             if path not in self._index:
@@ -206,14 +234,19 @@ class RigidTree:
     ) -> PlacedBodies:
         """World poses for each state.
 
-        Args:
-            states: S perturbed states.
-            step: optional, one (path, kind, axis) per state with kind ``rotate``, ``shift``, ``scale`` or ``figure``
-                (the axis is then the Noll index): adds an imaginary step of ``COMPLEX_STEP`` to that component, so that
-                imag/COMPLEX_STEP is the exact derivative.
+        Parameters
+        ----------
+        states : Sequence[State]
+            S perturbed states.
+        step : Sequence[tuple[str, str, int]] | None
+            Optional, one (path, kind, axis) per state with kind ``rotate``, ``shift``, ``scale`` or ``figure`` (the
+            axis is then the Noll index): adds an imaginary step of ``COMPLEX_STEP`` to that component, so that
+            imag/COMPLEX_STEP is the exact derivative.
 
-        Raises:
-            KeyError: a state names an unknown body or pivot.
+        Raises
+        ------
+        KeyError
+            a state names an unknown body or pivot.
         """
         index, nominal = self._index, self._nominal if step is None else self._nominal_complex
         moved = {path for state in states for path in state}
@@ -361,8 +394,10 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
 
     Exact for the rigid parts; figures, conic constants and indices add.
 
-    Raises:
-        ValueError: both have a grid figure of the same body, on different samples.
+    Raises
+    ------
+    ValueError
+        Both have a grid figure of the same body, on different samples.
     """
     return composed((first, then), bodies)
 

@@ -35,11 +35,15 @@ _BLOCK = 1 << 14
 class Polygon:
     """A simple polygon (no self-intersection; not checked), of either orientation.
 
-    Attributes:
-        vertices: (V, 2), metres.
+    Attributes
+    ----------
+    vertices : np.ndarray
+        (V, 2), metres.
 
-    Raises:
-        ValueError: fewer than three vertices, vertices that are not finite, or no area.
+    Raises
+    ------
+    ValueError
+        Fewer than three vertices, vertices that are not finite, or no area.
     """
 
     vertices: np.ndarray
@@ -74,12 +78,17 @@ class Polygon:
         this is done (with all differences in closed form), and the loss stays at eps * perimeter * radius / area down
         to f = 0.
 
-        Args:
-            fx: frequencies along x, cycles/m, of at most two axes.
-            fy: the same along y; they broadcast. A product grid, fx (C,) and fy (R, 1), is fast: its complex
-                exponentials are worked out per axis.
+        Parameters
+        ----------
+        fx : np.ndarray
+            Frequencies along x, cycles/m, of at most two axes.
+        fy : np.ndarray
+            The same along y; they broadcast. A product grid, fx (C,) and fy (R, 1), is fast: its complex exponentials
+            are worked out per axis.
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             Complex, of the broadcast shape.
         """
         kx, ky, shape = _wave_numbers(fx, fy)
@@ -109,12 +118,17 @@ class Polygon:
     def mapped(self, point_map: PointMap, tolerance: float = BEND_TOLERANCE) -> Polygon:
         """The polygon under a smooth map; edges are divided only where the map bends them by more than the tolerance.
 
-        Args:
-            point_map: (N, 2) -> (N, 2), metres.
-            tolerance: largest distance of the new edges from the mapped ones, metres.
+        Parameters
+        ----------
+        point_map : PointMap
+            (N, 2) -> (N, 2), metres.
+        tolerance : float
+            Largest distance of the new edges from the mapped ones, metres.
 
-        Raises:
-            ValueError: the map is not finite on the outline, or too rough for the tolerance.
+        Raises
+        ------
+        ValueError
+            The map is not finite on the outline, or too rough for the tolerance.
         """
         edge = np.roll(self.vertices, -1, axis=0) - self.vertices
 
@@ -134,13 +148,19 @@ class Polygon:
 class Disk:
     """A disk, or an ellipse: the points centre + radius * stretch @ p with |p| <= 1.
 
-    Attributes:
-        centre: (2,), metres.
-        radius: metres.
-        stretch: (2, 2); the unit matrix for a circle.
+    Attributes
+    ----------
+    centre : np.ndarray
+        (2,), metres.
+    radius : float
+        metres.
+    stretch : np.ndarray
+        (2, 2); the unit matrix for a circle.
 
-    Raises:
-        ValueError: the radius is not positive, or the stretch has no inverse.
+    Raises
+    ------
+    ValueError
+        The radius is not positive, or the stretch has no inverse.
     """
 
     centre: np.ndarray
@@ -209,12 +229,17 @@ _RIM_POINTS = 32
 class HalfPlane:
     """All points x with normal . (x - point) > 0.
 
-    Attributes:
-        point: on the edge, (2,), metres; where the edge keeps its place and direction under a map.
-        normal: toward the inside, (2,); made a unit vector.
+    Attributes
+    ----------
+    point : np.ndarray
+        On the edge, (2,), metres; where the edge keeps its place and direction under a map.
+    normal : np.ndarray
+        Toward the inside, (2,); made a unit vector.
 
-    Raises:
-        ValueError: no normal.
+    Raises
+    ------
+    ValueError
+        No normal.
     """
 
     point: np.ndarray
@@ -236,12 +261,17 @@ class HalfPlane:
     def mapped(self, point_map: PointMap, step: float = 1e-5) -> HalfPlane:
         """The half plane whose edge touches the mapped edge at the mapped point.
 
-        Args:
-            point_map: (N, 2) -> (N, 2), metres.
-            step: metres along the edge and its normal over which the map is differentiated (central differences).
+        Parameters
+        ----------
+        point_map : PointMap
+            (N, 2) -> (N, 2), metres.
+        step : float
+            Metres along the edge and its normal over which the map is differentiated (central differences).
 
-        Raises:
-            ValueError: the map is not finite or not invertible at the point.
+        Raises
+        ------
+        ValueError
+            The map is not finite or not invertible at the point.
         """
         along = np.array([-self.normal[1], self.normal[0]])
         steps = step * np.array([np.zeros(2), along, -along, self.normal, -self.normal])

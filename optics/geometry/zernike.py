@@ -83,10 +83,14 @@ def cartesian_terms(index: int) -> tuple[tuple[int, int, float], ...]:
 def zernike(index: int, x: Any, y: Any) -> np.ndarray:
     """Value of Z_j at unit-disk coordinates x, y (same shape).
 
-    Args:
-        index: Noll's j.
-        x: on the unit disk, any shape.
-        y: of the same shape.
+    Parameters
+    ----------
+    index : int
+        Noll's j.
+    x : Any
+        On the unit disk, any shape.
+    y : Any
+        Of the same shape.
     """
     x, y = np.asarray(x), np.asarray(y)
     return np.asarray(sum(c * x**a * y**b for a, b, c in cartesian_terms(index)))
@@ -95,10 +99,14 @@ def zernike(index: int, x: Any, y: Any) -> np.ndarray:
 def basis(last: int, x: Any, y: Any) -> np.ndarray:
     """Z_1..Z_last at points (N,) as columns, shape (N, last).
 
-    Args:
-        last: highest Noll index.
-        x: on the unit disk, (N,).
-        y: likewise.
+    Parameters
+    ----------
+    last : int
+        Highest Noll index.
+    x : Any
+        On the unit disk, (N,).
+    y : Any
+        likewise.
     """
     return np.stack([zernike(j, x, y) * np.ones_like(x) for j in range(1, last + 1)], axis=-1)
 
@@ -106,11 +114,16 @@ def basis(last: int, x: Any, y: Any) -> np.ndarray:
 def gradient_basis(last: int, x: Any, y: Any, axis: int) -> np.ndarray:
     """Derivatives of Z_1..Z_last along x (axis 0) or y (axis 1) at points (N,), shape (N, last).
 
-    Args:
-        last: highest Noll index.
-        x: on the unit disk, (N,).
-        y: likewise.
-        axis: 0: by x, 1: by y.
+    Parameters
+    ----------
+    last : int
+        Highest Noll index.
+    x : Any
+        On the unit disk, (N,).
+    y : Any
+        likewise.
+    axis : int
+        0: by x, 1: by y.
     """
     columns = []
     for j in range(1, last + 1):
@@ -127,14 +140,22 @@ def gradient_basis(last: int, x: Any, y: Any, axis: int) -> np.ndarray:
 def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> np.ndarray:
     """Weighted least-squares coefficients of Z_1..Z_last.
 
-    Args:
-        last: highest Noll index.
-        x: unit-disk coordinates, shape (N,).
-        y: likewise.
-        values: shape (..., N), e.g. optical path differences in metres.
-        weights: quadrature weights, shape (N,).
+    Parameters
+    ----------
+    last : int
+        Highest Noll index.
+    x : Any
+        Unit-disk coordinates, shape (N,).
+    y : Any
+        likewise.
+    values : Any
+        Shape (..., N), e.g. optical path differences in metres.
+    weights : Any | None
+        Quadrature weights, shape (N,).
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         Shape (..., last), unit of ``values`` (each coefficient is an rms).
     """
     root = np.sqrt(np.ones_like(x) if weights is None else weights)
@@ -164,13 +185,20 @@ def triangle_index(a: int, b: int) -> int:
 def triangle_polynomial(x: Any, y: Any, coefficients: Sequence[Any], order: int) -> tuple[Any, Any, Any]:
     """Sum of c_ab x^a y^b with a + b <= order, and its two slopes, by nested Horner schemes.
 
-    Args:
-        x: where, metres, arrays of NumPy or Dr.Jit.
-        y: likewise.
-        coefficients: m^(1-a-b), ordered by ``triangle_index``.
-        order: highest degree a + b.
+    Parameters
+    ----------
+    x : Any
+        Where, metres, arrays of NumPy or Dr.Jit.
+    y : Any
+        likewise.
+    coefficients : Sequence[Any]
+        m^(1-a-b), ordered by ``triangle_index``.
+    order : int
+        Highest degree a + b.
 
-    Returns:
+    Returns
+    -------
+    tuple[Any, Any, Any]
         Height, metres, and its derivatives by x and y.
     """
     height: Any = 0.0 * x
@@ -192,10 +220,14 @@ def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.
     """Coefficients of x^a y^b (metres from the centre) of sum a_j Z_j(x/radius, y/radius); shape
     (triangle_size(order),).
 
-    Args:
-        coefficients: Noll index j -> a_j, metres rms; complex ones, too.
-        order: highest degree a + b, at least that of the terms.
-        radius: of the disk, metres.
+    Parameters
+    ----------
+    coefficients : Mapping[int, Any]
+        Noll index j -> a_j, metres rms; complex ones, too.
+    order : int
+        Highest degree a + b, at least that of the terms.
+    radius : float
+        Of the disk, metres.
     """
     out = np.zeros(triangle_size(order), np.result_type(float, *coefficients.values()))
     for j, amplitude in coefficients.items():
@@ -208,10 +240,14 @@ def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.
 def unit_monomials(last: int, order: int, radius: float) -> np.ndarray:
     """``monomials`` of each of Z_1..Z_last with amplitude 1, (last, triangle_size(order)); terms beyond the order: 0.
 
-    Args:
-        last: highest Noll index.
-        order: highest degree a + b.
-        radius: of the disk, metres.
+    Parameters
+    ----------
+    last : int
+        Highest Noll index.
+    order : int
+        Highest degree a + b.
+    radius : float
+        Of the disk, metres.
     """
     table = np.zeros((last, triangle_size(order)))
     for j in range(1, last + 1):

@@ -57,11 +57,16 @@ _FLAT = 1e-9
 class Lobe:
     """A lobe as the sampler uses it.
 
-    Attributes:
-        share: of the specular power for which a direction is drawn: the integral of the upper bound over d < 2.
-        scale: l, in direction cosines.
-        exponent: g.
-        abg: whether draws are thinned to ABg (else Harvey-Shack as drawn).
+    Attributes
+    ----------
+    share : float
+        Of the specular power for which a direction is drawn: the integral of the upper bound over d < 2.
+    scale : float
+        l, in direction cosines.
+    exponent : float
+        g.
+    abg : bool
+        Whether draws are thinned to ABg (else Harvey-Shack as drawn).
     """
 
     share: float
@@ -79,8 +84,10 @@ class Lobe:
 class ABg:
     """f(d) = A / (B + d^g).
 
-    Raises:
-        ValueError: an impossible number, or more than all of the light would be scattered.
+    Raises
+    ------
+    ValueError
+        An impossible number, or more than all of the light would be scattered.
     """
 
     a: float
@@ -101,8 +108,10 @@ class ABg:
     def lobe(self) -> Lobe:
         """What the sampler uses.
 
-        Raises:
-            ValueError: the upper bound holds more than all of the light.
+        Raises
+        ------
+        ValueError
+            The upper bound holds more than all of the light.
         """
         return _checked(Lobe(self._upper(WIDEST), self._scale, self.g, self.g > 0.0))
 
@@ -120,8 +129,10 @@ class ABg:
 class HarveyShack:
     """f(d) = b0 (1 + (d / l)^2)^(s/2), s < 0.
 
-    Raises:
-        ValueError: an impossible number, or more than all of the light would be scattered.
+    Raises
+    ------
+    ValueError
+        An impossible number, or more than all of the light would be scattered.
     """
 
     b0: float
@@ -173,10 +184,14 @@ def total_scatter(scatter: Scatter, sine: float = 0.0) -> float:
 def sample_distance(u: Any, scale: Any, exponent: Any) -> Any:
     """Distance d < 2 whose density in the plane is proportional to (1 + (d/l)^2)^(-g/2).
 
-    Args:
-        u: uniform in [0, 1), NumPy or Dr.Jit array, as the others.
-        scale: l, in direction cosines.
-        exponent: g.
+    Parameters
+    ----------
+    u : Any
+        Uniform in [0, 1), NumPy or Dr.Jit array, as the others.
+    scale : Any
+        l, in direction cosines.
+    exponent : Any
+        g.
     """
     q = 1.0 - 0.5 * exponent
     level = log(1.0 + (WIDEST / scale) * (WIDEST / scale))
@@ -191,9 +206,12 @@ def lobe_area(scale: float, exponent: float) -> float:
     """Integral of (1 + (d/l)^2)^(-g/2) over d^2 < WIDEST^2; the function over it is the density of d^2 that
     ``sample_distance`` draws.
 
-    Args:
-        scale: l, in direction cosines.
-        exponent: g.
+    Parameters
+    ----------
+    scale : float
+        l, in direction cosines.
+    exponent : float
+        g.
     """
     return _harvey_integral(scale, exponent, WIDEST) / float(np.pi)
 
@@ -249,16 +267,23 @@ _GAUSS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
 class ScatterTable:
     """BSDF in specular-relative angles.
 
-    Attributes:
-        incidence: ascending, radians, (I,).
-        azimuth: ascending, radians, (A,): a single one for a lobe that is round, 0 to pi for one that is the same on
-            both sides of the plane of incidence, else 0 to 2 pi.
-        radial: ascending from 0, radians, (R,).
-        values: 1/sr, (I, A, R).
+    Attributes
+    ----------
+    incidence : np.ndarray
+        Ascending, radians, (I,).
+    azimuth : np.ndarray
+        Ascending, radians, (A,): a single one for a lobe that is round, 0 to pi for one that is the same on both sides
+        of the plane of incidence, else 0 to 2 pi.
+    radial : np.ndarray
+        Ascending from 0, radians, (R,).
+    values : np.ndarray
+        1/sr, (I, A, R).
 
-    Raises:
-        ValueError: angles that do not ascend or do not span what they must, negative values, or more than all of the
-            light scattered.
+    Raises
+    ------
+    ValueError
+        Angles that do not ascend or do not span what they must, negative values, or more than all of the light
+        scattered.
     """
 
     incidence: np.ndarray
@@ -315,10 +340,14 @@ class ScatterTable:
     def bsdf(self, incidence: float, azimuth: np.ndarray, radial: np.ndarray) -> np.ndarray:
         """BSDF at one angle of incidence, 1/sr.
 
-        Args:
-            incidence: radians.
-            azimuth: radians, any; shape S.
-            radial: radians, 0 to pi; shape S.
+        Parameters
+        ----------
+        incidence : float
+            radians.
+        azimuth : np.ndarray
+            Radians, any; shape S.
+        radial : np.ndarray
+            Radians, 0 to pi; shape S.
         """
         table = self._at(incidence)
         turn = np.mod(azimuth, 2.0 * np.pi)
@@ -423,13 +452,20 @@ class ScatterTable:
 class DrawnScatter:
     """What directions are drawn from, for angles of incidence from 0 to 90 degrees in ``STEPS`` intervals.
 
-    Attributes:
-        share: TIS, (STEPS + 1,).
-        rings: cumulative shares of the rings, from 0 to 1, (STEPS + 1, rings + 1).
-        sectors: in each ring those of its sectors, (STEPS + 1, rings, sectors + 1).
-        cosines: of the rings' edges, descending, (rings + 1,).
-        azimuths: the sectors' edges, radians, (sectors + 1,).
-        mirrored: whether half of the draws go to the other side of the plane of incidence.
+    Attributes
+    ----------
+    share : np.ndarray
+        TIS, (STEPS + 1,).
+    rings : np.ndarray
+        Cumulative shares of the rings, from 0 to 1, (STEPS + 1, rings + 1).
+    sectors : np.ndarray
+        In each ring those of its sectors, (STEPS + 1, rings, sectors + 1).
+    cosines : np.ndarray
+        Of the rings' edges, descending, (rings + 1,).
+    azimuths : np.ndarray
+        The sectors' edges, radians, (sectors + 1,).
+    mirrored : bool
+        Whether half of the draws go to the other side of the plane of incidence.
     """
 
     share: np.ndarray
@@ -467,10 +503,14 @@ GRAZING = 1e-12
 def cosine_after(cosine: Any, before: Any, after: Any) -> Any:
     """Cosine of the angle of refraction by Snell's law, 0 where the light is totally reflected.
 
-    Args:
-        cosine: of the angle of incidence, 0 to 1; float, NumPy or Dr.Jit array, as the others.
-        before: refractive index on the side of the incident light.
-        after: on the side of the refracted light.
+    Parameters
+    ----------
+    cosine : Any
+        Of the angle of incidence, 0 to 1; float, NumPy or Dr.Jit array, as the others.
+    before : Any
+        Refractive index on the side of the incident light.
+    after : Any
+        On the side of the refracted light.
     """
     ratio = before / after
     square = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
@@ -493,20 +533,32 @@ def reflectance(cosine: Any, before: Any, after: Any) -> Any:
 class Finish:
     """Optical finish of one side of a surface.
 
-    Attributes:
-        reflectance: share reflected, specular or into the scatter lobe around the specular direction.
-        transmission: share that goes through (refracted); beyond the critical angle all of it is reflected instead.
-        diffuse: share diffused by Lambert's law to the side the light came from.
-        scatter: lobe around the specular and the refracted direction, which takes its share out of them.
-        bare: bare glass: reflectance and transmission are Fresnel's and must be given as 0.
-        records: whether the light that is absorbed counts as detected.
-        coating: measured, in place of reflectance and transmission; light goes through where transmission is not 0.
-        table: measured scattering about the specular direction, in place of ``scatter``: what it scatters comes out of
-            what is reflected.
-        scattered_only: whether nothing is reflected but what the table scatters; reflectance is then given as 0.
+    Attributes
+    ----------
+    reflectance : float
+        Share reflected, specular or into the scatter lobe around the specular direction.
+    transmission : float
+        Share that goes through (refracted); beyond the critical angle all of it is reflected instead.
+    diffuse : float
+        Share diffused by Lambert's law to the side the light came from.
+    scatter : Scatter | None
+        Lobe around the specular and the refracted direction, which takes its share out of them.
+    bare : bool
+        Bare glass: reflectance and transmission are Fresnel's and must be given as 0.
+    records : bool
+        Whether the light that is absorbed counts as detected.
+    coating : CoatingTable | None
+        Measured, in place of reflectance and transmission; light goes through where transmission is not 0.
+    table : ScatterTable | None
+        Measured scattering about the specular direction, in place of ``scatter``: what it scatters comes out of what is
+        reflected.
+    scattered_only : bool
+        Whether nothing is reflected but what the table scatters; reflectance is then given as 0.
 
-    Raises:
-        ValueError: the shares are impossible.
+    Raises
+    ------
+    ValueError
+        The shares are impossible.
     """
 
     reflectance: float = 0.0
@@ -594,15 +646,21 @@ COATING_STEPS = 360
 class CoatingTable:
     """A coating at one wavelength, for unpolarised light.
 
-    Attributes:
-        angles: of incidence on the side of air, ascending from 0, radians, (K,).
-        reflectance: 0 to 1, (K,).
-        transmittance: 0 to 1, (K,); None where it is not told.
+    Attributes
+    ----------
+    angles : np.ndarray
+        Of incidence on the side of air, ascending from 0, radians, (K,).
+    reflectance : np.ndarray
+        0 to 1, (K,).
+    transmittance : np.ndarray | None
+        0 to 1, (K,); None where it is not told.
 
     Linear between the angles; constant beyond the last one.
 
-    Raises:
-        ValueError: angles that do not ascend, shares that are impossible.
+    Raises
+    ------
+    ValueError
+        Angles that do not ascend, shares that are impossible.
     """
 
     angles: np.ndarray
@@ -627,9 +685,12 @@ class CoatingTable:
     def at(self, angle: float, through: bool) -> tuple[float, float]:
         """Reflectance and transmittance at an angle of incidence in radians.
 
-        Args:
-            angle: radians.
-            through: whether light goes through, where no transmittance is told all that is not reflected.
+        Parameters
+        ----------
+        angle : float
+            radians.
+        through : bool
+            Whether light goes through, where no transmittance is told all that is not reflected.
         """
         reflected = float(np.interp(angle, self.angles, self.reflectance))
         if not through:

@@ -34,11 +34,16 @@ SCHOTT_RANGE = TemperatureRange.celsius(
 class ThermalDispersion:
     """Constants of Schott's formula for dn/dT, in the units of its data sheets.
 
-    Attributes:
-        d0, d1, d2: 1/K, 1/K^2, 1/K^3.
-        e0, e1: um^2/K, um^2/K^2.
-        lambda_tk: um.
-        known: temperatures at which the formula holds.
+    Attributes
+    ----------
+    d0, d1, d2 : float
+        1/K, 1/K^2, 1/K^3.
+    e0, e1 : float
+        Um^2/K, um^2/K^2.
+    lambda_tk : float
+        um.
+    known : TemperatureRange
+        Temperatures at which the formula holds.
     """
 
     d0: float
@@ -52,10 +57,14 @@ class ThermalDispersion:
     def change(self, index: float, wavelength_m: float, temperature_k: float) -> float:
         """Change of the absolute index from 20 C to a temperature.
 
-        Args:
-            index: at 20 C.
-            wavelength_m: metres.
-            temperature_k: of the glass, kelvin; at which the formula holds, see ``known``.
+        Parameters
+        ----------
+        index : float
+            At 20 C.
+        wavelength_m : float
+            metres.
+        temperature_k : float
+            Of the glass, kelvin; at which the formula holds, see ``known``.
         """
         t, w2 = temperature_k - REFERENCE_TEMPERATURE, (wavelength_m * 1e6) ** 2
         polynomial = self.d0 * t + self.d1 * t**2 + self.d2 * t**3
@@ -74,13 +83,20 @@ class ThermalDispersion:
 class Glass:
     """One glass.
 
-    Attributes:
-        name: as in the catalogue.
-        b: Sellmeier's B1, B2, B3.
-        c: C1, C2, C3, um^2.
-        shortest, longest: wavelengths between which the formula holds, metres.
-        source: where the numbers come from.
-        thermal: dn/dT, None when no constants are published.
+    Attributes
+    ----------
+    name : str
+        As in the catalogue.
+    b : tuple[float, float, float]
+        Sellmeier's B1, B2, B3.
+    c : tuple[float, float, float]
+        C1, C2, C3, um^2.
+    shortest, longest : float
+        Wavelengths between which the formula holds, metres.
+    source : str
+        Where the numbers come from.
+    thermal : ThermalDispersion | None
+        dn/dT, None when no constants are published.
     """
 
     name: str
@@ -96,13 +112,18 @@ class Glass:
 
         The change with temperature is that of the absolute index (the air of reference does not change).
 
-        Args:
-            wavelength_m: in air, metres.
-            temperature_k: of the glass, kelvin.
+        Parameters
+        ----------
+        wavelength_m : float
+            In air, metres.
+        temperature_k : float
+            Of the glass, kelvin.
 
-        Raises:
-            ValueError: the wavelength or the temperature is outside the formula's range, the temperature is not above
-                0 K, or the glass has no temperature constants and another temperature than 293.15 K is asked for.
+        Raises
+        ------
+        ValueError
+            The wavelength or the temperature is outside the formula's range, the temperature is not above 0 K, or the
+            glass has no temperature constants and another temperature than 293.15 K is asked for.
         """
         if not self.shortest <= wavelength_m <= self.longest:
             raise UnphysicalError(
@@ -141,13 +162,20 @@ class Glass:
 class WarmGlass:
     """What heat does to the glass of a lens.
 
-    Attributes:
-        name: of the glass.
-        expansion: linear thermal expansion (CTE), 1/K.
-        known: temperatures at which expansion and index may be used.
-        index: at 20 C and the wavelength in question.
-        wavelength: metres.
-        thermal: dn/dT.
+    Attributes
+    ----------
+    name : str
+        Of the glass.
+    expansion : float
+        Linear thermal expansion (CTE), 1/K.
+    known : TemperatureRange
+        Temperatures at which expansion and index may be used.
+    index : float
+        At 20 C and the wavelength in question.
+    wavelength : float
+        metres.
+    thermal : ThermalDispersion
+        dn/dT.
     """
 
     name: str
@@ -208,8 +236,10 @@ GLASSES: Mapping[str, Glass] = FrozenMap({g.name: g for g in (FUSED_SILICA, N_BK
 def glass(name: str) -> Glass:
     """The catalogue's glass of that name; a case-insensitive match is enough.
 
-    Raises:
-        KeyError: unknown, with the nearest name.
+    Raises
+    ------
+    KeyError
+        Unknown, with the nearest name.
     """
     for known, entry in GLASSES.items():
         if known.lower() == name.lower():
@@ -266,14 +296,22 @@ FORMULAS: FrozenMap[int, tuple[str, Callable[[Sequence[float], float], float]]] 
 class CatalogueGlass:
     """A glass of a catalogue; called with a wavelength (metres) it gives its index.
 
-    Attributes:
-        name: as in the catalogue.
-        formula: number of its dispersion formula.
-        coefficients: of it, for micrometres.
-        shortest, longest: between which it holds, metres.
-        expansion: linear thermal expansion, 1/K, mean of -30..70 C; None where the catalogue does not say it.
-        thermal: Schott's constants of dn/dT, D0, D1, D2, E0, E1 and Lambda_TK, likewise.
-        source: where a common glass is from, its maker first; empty for one of a user's catalogue.
+    Attributes
+    ----------
+    name : str
+        As in the catalogue.
+    formula : int
+        Number of its dispersion formula.
+    coefficients : tuple[float, ...]
+        Of it, for micrometres.
+    shortest, longest : float
+        Between which it holds, metres.
+    expansion : float | None
+        Linear thermal expansion, 1/K, mean of -30..70 C; None where the catalogue does not say it.
+    thermal : tuple[float, ...] | None
+        Schott's constants of dn/dT, D0, D1, D2, E0, E1 and Lambda_TK, likewise.
+    source : str
+        Where a common glass is from, its maker first; empty for one of a user's catalogue.
     """
 
     name: str
@@ -288,8 +326,10 @@ class CatalogueGlass:
     def __call__(self, wavelength: float) -> float:
         """Index against air.
 
-        Raises:
-            ValueError: the formula does not hold at that wavelength.
+        Raises
+        ------
+        ValueError
+            The formula does not hold at that wavelength.
         """
         if not self.shortest <= wavelength <= self.longest:
             raise UnphysicalError(

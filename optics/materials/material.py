@@ -29,9 +29,12 @@ ZERO_CELSIUS = 273.15
 class TemperatureRange:
     """Where a material's data may be used.
 
-    Attributes:
-        coldest, hottest: kelvin.
-        source: why from there and up to there.
+    Attributes
+    ----------
+    coldest, hottest : float
+        kelvin.
+    source : str
+        Why from there and up to there.
     """
 
     coldest: float
@@ -58,16 +61,25 @@ class TemperatureRange:
 class Material:
     """An isotropic material near 20 C.
 
-    Attributes:
-        name: as in the catalogue.
-        expansion: linear thermal expansion (CTE), 1/K.
-        density: kg/m^3.
-        youngs_modulus: Pa.
-        poisson_ratio: 1.
-        conductivity: thermal, W/(m K).
-        source: where the numbers come from.
-        known: temperatures at which the one number of its expansion stands for it: within some tenth of it, or within
-            what makers' sheets differ by.
+    Attributes
+    ----------
+    name : str
+        As in the catalogue.
+    expansion : float
+        Linear thermal expansion (CTE), 1/K.
+    density : float
+        kg/m^3.
+    youngs_modulus : float
+        Pa.
+    poisson_ratio : float
+        1.
+    conductivity : float
+        Thermal, W/(m K).
+    source : str
+        Where the numbers come from.
+    known : TemperatureRange
+        Temperatures at which the one number of its expansion stands for it: within some tenth of it, or within what
+        makers' sheets differ by.
     """
 
     name: str
@@ -212,8 +224,10 @@ _OTHER_NAMES: Mapping[str, str] = FrozenMap(
 def material(name: str) -> Material:
     """The catalogue's material of that name; a case-insensitive match is enough, and BK7 is N-BK7.
 
-    Raises:
-        KeyError: unknown, with the nearest name.
+    Raises
+    ------
+    KeyError
+        Unknown, with the nearest name.
     """
     wanted = _OTHER_NAMES.get(name.lower(), name.lower())
     for known, entry in MATERIALS.items():

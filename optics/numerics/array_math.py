@@ -108,12 +108,18 @@ _DIGITS = 1e-15
 def in_span(value: ArrayLike, first: ArrayLike, last: ArrayLike) -> NDArray[np.bool_]:
     """Return whether values lie between two ends, to rounding; both ends belong to the span.
 
-    Args:
-        value: seconds, lines or pixels, shape (...); NaN lies in no span.
-        first: lower end, broadcastable to (...); may be infinite.
-        last: upper end, likewise.
+    Parameters
+    ----------
+    value : ArrayLike
+        Seconds, lines or pixels, shape (...); NaN lies in no span.
+    first : ArrayLike
+        Lower end, broadcastable to (...); may be infinite.
+    last : ArrayLike
+        Upper end, likewise.
 
-    Returns:
+    Returns
+    -------
+    NDArray[np.bool_]
         Shape (...).
     """
     v, a, b = (np.asarray(one, np.float64) for one in (value, first, last))
@@ -141,15 +147,23 @@ class UnphysicalError(PhysicalError, ValueError):
 def hold_within(what: str, values: np.ndarray | float, low: float, high: float, rounding: float) -> None:
     """Hold values between bounds.
 
-    Args:
-        what: they are, for the message.
-        values: any shape; NaN where nothing is known.
-        low: smallest.
-        high: largest.
-        rounding: by which they may leave the bounds.
+    Parameters
+    ----------
+    what : str
+        They are, for the message.
+    values : np.ndarray | float
+        Any shape; NaN where nothing is known.
+    low : float
+        smallest.
+    high : float
+        largest.
+    rounding : float
+        By which they may leave the bounds.
 
-    Raises:
-        UnphysicalError: one lies outside, or is infinite.
+    Raises
+    ------
+    UnphysicalError
+        One lies outside, or is infinite.
     """
     every = np.asarray(values, dtype=np.float64)
     known = every[~np.isnan(every)]
@@ -164,15 +178,23 @@ def hold_within(what: str, values: np.ndarray | float, low: float, high: float, 
 def hold_below(what: str, values: np.ndarray | float, bounds: np.ndarray | float, than: str, rounding: float) -> None:
     """Hold values below others.
 
-    Args:
-        what: they are, for the message.
-        values: any shape; NaN where nothing is known.
-        bounds: of a shape that broadcasts.
-        than: what the bounds are.
-        rounding: by which values may exceed them.
+    Parameters
+    ----------
+    what : str
+        They are, for the message.
+    values : np.ndarray | float
+        Any shape; NaN where nothing is known.
+    bounds : np.ndarray | float
+        Of a shape that broadcasts.
+    than : str
+        What the bounds are.
+    rounding : float
+        By which values may exceed them.
 
-    Raises:
-        UnphysicalError: one exceeds its bound.
+    Raises
+    ------
+    UnphysicalError
+        One exceeds its bound.
     """
     if (worst := _worst_beyond(values, bounds, rounding, lambda apart: apart)) is not None:
         own, most = worst
@@ -184,15 +206,23 @@ def hold_below(what: str, values: np.ndarray | float, bounds: np.ndarray | float
 def hold_equal(what: str, values: np.ndarray | float, others: np.ndarray | float, to: str, apart: float) -> None:
     """Hold values to what another way tells.
 
-    Args:
-        what: they are, for the message.
-        values: any shape; NaN where nothing is known.
-        others: of a shape that broadcasts.
-        to: what the others are.
-        apart: by which the two may differ.
+    Parameters
+    ----------
+    what : str
+        They are, for the message.
+    values : np.ndarray | float
+        Any shape; NaN where nothing is known.
+    others : np.ndarray | float
+        Of a shape that broadcasts.
+    to : str
+        What the others are.
+    apart : float
+        By which the two may differ.
 
-    Raises:
-        UnphysicalError: two differ by more.
+    Raises
+    ------
+    UnphysicalError
+        Two differ by more.
     """
     if (worst := _worst_beyond(values, others, apart, np.abs)) is not None:
         own, second = worst

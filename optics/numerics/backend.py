@@ -63,12 +63,18 @@ class BackendUnavailable(RuntimeError):
 class Backend:
     """Float64 array types of one Dr.Jit backend; the same code runs on either.
 
-    Attributes:
-        name: ``llvm`` or ``cuda``.
-        Float: differentiable float64 array.
-        UInt: 32-bit unsigned index array.
-        Bool: mask array.
-        Vector3: three ``Float`` components.
+    Attributes
+    ----------
+    name : str
+        ``llvm`` or ``cuda``.
+    Float : Any
+        Differentiable float64 array.
+    UInt : Any
+        32-bit unsigned index array.
+    Bool : Any
+        Mask array.
+    Vector3 : Any
+        Three ``Float`` components.
     """
 
     name: str
@@ -93,8 +99,10 @@ class Backend:
     def opaque_each(self, values: Sequence[np.ndarray]) -> list[Any]:
         """Upload many arrays of one size, each as `opaque` does; much less work than one by one.
 
-        Args:
-            values: arrays of n numbers each, of any shape.
+        Parameters
+        ----------
+        values : Sequence[np.ndarray]
+            Arrays of n numbers each, of any shape.
         """
         import drjit as dr
 
@@ -136,8 +144,10 @@ def _aligned(values: np.ndarray) -> np.ndarray:
 def load_backend(name: str = "llvm") -> Backend:
     """Return the backend of that name.
 
-    Raises:
-        BackendUnavailable: when this machine cannot run it, with the reason and the remedy.
+    Raises
+    ------
+    BackendUnavailable
+        When this machine cannot run it, with the reason and the remedy.
     """
     if name not in NAMES:
         raise BackendUnavailable(f"unknown backend {name!r}; choose one of {', '.join(NAMES)}")
@@ -178,8 +188,10 @@ def kernel_threads(count: int) -> None:
     Small ones are faster on one: threads that wait for the next kernel do so actively, and take their cores from all
     else.
 
-    Args:
-        count: number of threads, at least 1.
+    Parameters
+    ----------
+    count : int
+        Number of threads, at least 1.
     """
     import drjit as dr
 

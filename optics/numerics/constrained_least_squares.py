@@ -31,10 +31,14 @@ _ACCEPTED = 1e-3
 class Sample:
     """Residuals and constraints at one place, R and C of them.
 
-    Attributes:
-        residuals: (R,).
-        constraints: (C,), each zero (equations) or not above zero (inequalities) where it is held.
-        d_residuals, d_constraints: derivatives (R, V), (C, V); None where they were not asked for.
+    Attributes
+    ----------
+    residuals : np.ndarray
+        (R,).
+    constraints : np.ndarray
+        (C,), each zero (equations) or not above zero (inequalities) where it is held.
+    d_residuals, d_constraints : np.ndarray | None
+        Derivatives (R, V), (C, V); None where they were not asked for.
     """
 
     residuals: np.ndarray
@@ -52,13 +56,19 @@ class Sample:
 class Solution:
     """Where a search ended.
 
-    Attributes:
-        x: (V,).
-        sample: there, with derivatives.
-        multipliers: of the constraints (C,), not negative for inequalities: by how much the cost falls per unit by
-            which the constraint is eased.
-        converged: whether it ended because no step is worth taking, not for want of iterations.
-        jacobians: samples with derivatives that it took.
+    Attributes
+    ----------
+    x : np.ndarray
+        (V,).
+    sample : Sample
+        There, with derivatives.
+    multipliers : np.ndarray
+        Of the constraints (C,), not negative for inequalities: by how much the cost falls per unit by which the
+        constraint is eased.
+    converged : bool
+        Whether it ended because no step is worth taking, not for want of iterations.
+    jacobians : int
+        Samples with derivatives that it took.
     """
 
     x: np.ndarray
@@ -89,18 +99,29 @@ def constrained_least_squares(
 ) -> Solution:
     """Least sum of squares under constraints, near a start.
 
-    Args:
-        evaluate: residuals and constraints.
-        start: (V,), between the bounds.
-        equal: which constraints are equations, (C,).
-        low: least x, (V,), held at every step; None for none.
-        high: largest x, likewise.
-        iterations: at most, one Jacobian each.
-        tolerance: ends where two steps after each other promise, or bring, less than this share of the cost.
-        held: violation that counts as none.
+    Parameters
+    ----------
+    evaluate : Evaluate
+        Residuals and constraints.
+    start : np.ndarray
+        (V,), between the bounds.
+    equal : np.ndarray
+        Which constraints are equations, (C,).
+    low : np.ndarray | None
+        Least x, (V,), held at every step; None for none.
+    high : np.ndarray | None
+        Largest x, likewise.
+    iterations : int
+        At most, one Jacobian each.
+    tolerance : float
+        Ends where two steps after each other promise, or bring, less than this share of the cost.
+    held : float
+        Violation that counts as none.
 
-    Raises:
-        ValueError: there is nothing at the start.
+    Raises
+    ------
+    ValueError
+        There is nothing at the start.
     """
     here = evaluate(start, True)
     if here is None:
@@ -162,12 +183,18 @@ def _merit(sample: Sample | None, equal: np.ndarray, price: float) -> float:
 class _Model:
     """A step's problem: least squares damped by D, min |J p + r|^2 + |D p|^2, under linearised constraints.
 
-    Attributes:
-        sample: where the step begins.
-        triangle: R of the QR decomposition of J above D, (V, V).
-        basis: its Q, (R, V), of the rows of J.
-        equal: which constraints are equations.
-        room: lower and upper bounds of the step, (V,) each.
+    Attributes
+    ----------
+    sample : Sample
+        Where the step begins.
+    triangle : np.ndarray
+        R of the QR decomposition of J above D, (V, V).
+    basis : np.ndarray
+        Its Q, (R, V), of the rows of J.
+    equal : np.ndarray
+        Which constraints are equations.
+    room : tuple[np.ndarray, np.ndarray]
+        Lower and upper bounds of the step, (V,) each.
     """
 
     sample: Sample

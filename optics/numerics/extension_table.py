@@ -53,10 +53,14 @@ class ExtensionTable(UserDict[str, Value]):
     Other distributions are looked for when the table is read first, and an entry is imported when its value is asked
     for: neither a program's start nor a broken entry that nobody asks for costs anything.
 
-    Args:
-        name: of the group of entry points, without ``PREFIX``.
-        own: entries of this program, by name.
-        kind: class of the values. An entry may also be a class whose instance without arguments is of that kind.
+    Parameters
+    ----------
+    name
+        Of the group of entry points, without ``PREFIX``.
+    own
+        Entries of this program, by name.
+    kind
+        Class of the values. An entry may also be a class whose instance without arguments is of that kind.
     """
 
     def __init__(self, name: str, own: Mapping[str, Value], kind: Any = Callable) -> None:

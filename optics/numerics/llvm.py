@@ -31,12 +31,16 @@ def ensure_llvm() -> Path | None:
     A value of `DRJIT_LIBLLVM_PATH` that the user set is respected. On systems for which there is no wheel of LLVM
     (other than Linux on x86-64) nothing is set and Dr.Jit's own search decides.
 
-    Returns:
+    Returns
+    -------
+    Path | None
         The library that Dr.Jit will load, or None where Dr.Jit searches by itself.
 
-    Raises:
-        LibraryMissing: libatomic.so.1 cannot be loaded; or the LLVM wheel is not installed; or the library that the
-            user named does not exist; or drjit was imported before this and has found an LLVM that is too old.
+    Raises
+    ------
+    LibraryMissing
+        libatomic.so.1 cannot be loaded; or the LLVM wheel is not installed; or the library that the user named does not
+        exist; or drjit was imported before this and has found an LLVM that is too old.
     """
     check_libatomic()
     named = os.environ.get(VARIABLE)
@@ -75,8 +79,10 @@ def find_llvm() -> Path | None:
 def check_libatomic() -> None:
     """Check that libatomic.so.1 loads. Without it `import mitsuba` fails with a misleading "NameError: _drjit_ext".
 
-    Raises:
-        LibraryMissing: it does not load.
+    Raises
+    ------
+    LibraryMissing
+        It does not load.
     """
     if sys.platform != "linux":
         return

@@ -140,8 +140,10 @@ def _all(branches: tuple[Any, ...] | None, count: int) -> tuple[Any, ...]:
 def with_leaf(tree: Tree, path: Path, value: Any) -> Tree:
     """A copy in which the number at ``path`` is another one.
 
-    Raises:
-        KeyError: there is no number at that path.
+    Raises
+    ------
+    KeyError
+        There is no number at that path.
     """
     known = leaves(tree)
     if path not in known:

@@ -12,9 +12,12 @@ import numpy as np
 class PupilNodes:
     """Quadrature over the unit disk or the square [-1, 1]^2.
 
-    Attributes:
-        x, y: node coordinates, shape (N,).
-        weight: area weights, shape (N,), summing to the area (pi or 4).
+    Attributes
+    ----------
+    x, y : np.ndarray
+        Node coordinates, shape (N,).
+    weight : np.ndarray
+        Area weights, shape (N,), summing to the area (pi or 4).
     """
 
     x: np.ndarray
@@ -39,12 +42,17 @@ def disk(rings: int, arms: int | None = None, inner: float = 0.0, turn: float = 
     Exact for polynomials of degree below min(4 * rings, arms); integrals of smooth wavefronts converge exponentially,
     with no error from a jagged edge.
 
-    Args:
-        rings: radial nodes.
-        arms: azimuthal nodes, default 4 * rings.
-        inner: radius of a central hole.
-        turn: of all arms, steps from one arm to the next. With half a step an integrand that has too fine a structure
-            in azimuth gets the opposite error.
+    Parameters
+    ----------
+    rings : int
+        Radial nodes.
+    arms : int | None
+        Azimuthal nodes, default 4 * rings.
+    inner : float
+        Radius of a central hole.
+    turn : float
+        Of all arms, steps from one arm to the next. With half a step an integrand that has too fine a structure in
+        azimuth gets the opposite error.
     """
     arms = 4 * rings if arms is None else arms
     s, w = gauss(rings)
@@ -72,11 +80,15 @@ def even_disk(count: int) -> PupilNodes:
 def disk_for(phase: float) -> PupilNodes:
     """Quadrature over the disk for images of a smooth wavefront.
 
-    Args:
-        phase: largest phase, radians, from the middle to the edge of the pupil at any image point that matters:
-            2 pi NA r / wavelength for points up to r from the spot's centre.
+    Parameters
+    ----------
+    phase : float
+        Largest phase, radians, from the middle to the edge of the pupil at any image point that matters: 2 pi NA r /
+        wavelength for points up to r from the spot's centre.
 
-    Returns:
+    Returns
+    -------
+    PupilNodes
         The smallest rule that keeps the image of a clear disk within 1e-6 of its peak at all these points (found by
         comparison with the Airy pattern for phases from 12 to 80).
     """
@@ -89,8 +101,10 @@ def second_disk_for(phase: float) -> PupilNodes:
     Two rings more, so that all stand at other radii, and arms that stand between: what is too fine in azimuth gets the
     opposite error, what is too fine along the radius another one.
 
-    Args:
-        phase: as of ``disk_for``.
+    Parameters
+    ----------
+    phase : float
+        As of ``disk_for``.
     """
     rings, arms = disk_size(phase)
     return disk(rings + 2, arms, turn=0.5)
@@ -99,8 +113,10 @@ def second_disk_for(phase: float) -> PupilNodes:
 def disk_size(phase: float) -> tuple[int, int]:
     """Rings and arms of ``disk_for``.
 
-    Args:
-        phase: as there.
+    Parameters
+    ----------
+    phase : float
+        As there.
     """
     arms = int(np.ceil(phase)) + 10
     return int(np.ceil(0.25 * phase)) + 3, arms + arms % 2
@@ -128,12 +144,18 @@ def gauss_of(points: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.nd
     With n points it is exact for polynomials of degree below 2 n, however rough the weights are (Golub and Welsch,
     Mathematics of Computation 23, 221 (1969); the recurrence by Lanczos' steps, each made orthogonal to all before).
 
-    Args:
-        points: (N,), N different ones.
-        weights: (N,), positive.
-        count: n; at most N are given.
+    Parameters
+    ----------
+    points : np.ndarray
+        (N,), N different ones.
+    weights : np.ndarray
+        (N,), positive.
+    count : int
+        n; at most N are given.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray]
         The rule's points, ascending, and weights, which sum to those given, (n,) each.
     """
     points, weights = np.asarray(points, float), np.asarray(weights, float)

@@ -26,12 +26,17 @@ class AimError(PhysicalError, RuntimeError):
 class RayFan:
     """A two-parameter family of rays per ray to be aimed: q = (a, b) moves the direction or the launch point.
 
-    Attributes:
-        position: launch points, world, (B, N, 3), metres.
-        direction: unit directions, world, (B, N, 3).
-        axes: two vectors per ray or per system, broadcastable to (B, N, 2, 3).
-        moves_position: True: launch point = position + a e1 + b e2 (a collimated beam); False: direction =
-            normalised (direction + a e1 + b e2) (a point source).
+    Attributes
+    ----------
+    position : np.ndarray
+        Launch points, world, (B, N, 3), metres.
+    direction : np.ndarray
+        Unit directions, world, (B, N, 3).
+    axes : np.ndarray
+        Two vectors per ray or per system, broadcastable to (B, N, 2, 3).
+    moves_position : bool
+        True: launch point = position + a e1 + b e2 (a collimated beam); False: direction = normalised (direction + a e1
+        + b e2) (a point source).
     """
 
     position: np.ndarray
@@ -79,22 +84,35 @@ def aim(
     Newton's method with one difference Jacobian per ray, improved by Broyden's rank-one update. A ray that has arrived
     stays, so that its numbers do not depend on what else is aimed with it.
 
-    Args:
-        backend: where to trace.
-        systems: B systems that end at the element to be hit; apertures are not looked at.
-        fan: the families of rays.
-        target: x, y on that element, metres of its nominal size, broadcastable to (B, N, 2): points of an aperture,
-            which grows with its body.
-        start: parameters to start from, broadcastable to (B, N, 2); default 0.
-        jacobian: d(hit)/dq to start from, broadcastable to (B, N, 2, 2); default by differences of size ``step``.
-        tolerance: largest distance from the target there, metres.
-        step: difference step of the parameters (metres or radians).
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    systems : SystemBatch
+        B systems that end at the element to be hit; apertures are not looked at.
+    fan : RayFan
+        The families of rays.
+    target : np.ndarray
+        x, y on that element, metres of its nominal size, broadcastable to (B, N, 2): points of an aperture, which grows
+        with its body.
+    start : np.ndarray | None
+        Parameters to start from, broadcastable to (B, N, 2); default 0.
+    jacobian : np.ndarray | None
+        d(hit)/dq to start from, broadcastable to (B, N, 2, 2); default by differences of size ``step``.
+    tolerance : float
+        Largest distance from the target there, metres.
+    step : float
+        Difference step of the parameters (metres or radians).
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray]
         Parameters (B, N, 2) and the Jacobian (B, N, 2, 2).
 
-    Raises:
-        AimError: not converged.
+    Raises
+    ------
+    AimError
+        Not converged.
     """
     uploaded = systems.upload(backend)
 
@@ -154,15 +172,24 @@ def alive_along(
 ) -> Iterator[tuple[Element, np.ndarray]]:
     """Which rays are still alive after each element of a sequence, to tell where they get lost; traced step by step.
 
-    Args:
-        backend: where to trace.
-        assembly: the instrument.
-        names: elements in the order in which light meets them.
-        position: of the rays, world, metres, broadcastable to (N, 3).
-        direction: unit vectors, likewise.
-        state: what is perturbed.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    assembly : Assembly
+        The instrument.
+    names : Sequence[str]
+        Elements in the order in which light meets them.
+    position : np.ndarray
+        Of the rays, world, metres, broadcastable to (N, 3).
+    direction : np.ndarray
+        Unit vectors, likewise.
+    state : State | None
+        What is perturbed.
 
-    Yields:
+    Yields
+    ------
+    tuple[Element, np.ndarray]
         The element and a mask (N,).
     """
     rays = make_rays(backend, position, direction)

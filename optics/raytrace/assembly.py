@@ -34,18 +34,27 @@ class Interaction(Enum):
 class Element:
     """One surface in the assembly.
 
-    Attributes:
-        name: unique name, e.g. ``forward/M1``.
-        body: path of the rigid body that carries it; the surface's frame is the body's frame.
-        surface: its shape.
-        interaction: reflect, refract or pass.
-        aperture: clear aperture in the surface's x, y, outside of which rays are lost; None is unlimited.
-        edges: what the surface's file states of its clear aperture. The trace lets rays pass them, and images cut them
-            out of the pupil; figures are over what they leave.
-        index_after: refractive index on the side the light goes to (the index before is that of the element before
-            it); for surfaces that are not faces of a solid.
-        solid: path of the glass body whose face this is, behind it (on its -z side). A refracted ray enters it when it
-            comes from outside and leaves it when it comes from inside; the index is the assembly's for that solid.
+    Attributes
+    ----------
+    name : str
+        Unique name, e.g. ``forward/M1``.
+    body : str
+        Path of the rigid body that carries it; the surface's frame is the body's frame.
+    surface : Surface
+        Its shape.
+    interaction : Interaction
+        Reflect, refract or pass.
+    aperture : Aperture | None
+        Clear aperture in the surface's x, y, outside of which rays are lost; None is unlimited.
+    edges : tuple[Edge, ...]
+        What the surface's file states of its clear aperture. The trace lets rays pass them, and images cut them out of
+        the pupil; figures are over what they leave.
+    index_after : float
+        Refractive index on the side the light goes to (the index before is that of the element before it); for surfaces
+        that are not faces of a solid.
+    solid : str | None
+        Path of the glass body whose face this is, behind it (on its -z side). A refracted ray enters it when it comes
+        from outside and leaves it when it comes from inside; the index is the assembly's for that solid.
     """
 
     name: str
@@ -72,8 +81,10 @@ class Element:
     def figure_disk(self) -> ZernikeFigure:
         """Return what the terms of a state's figure are added to: ``Surface.figure_disk`` over the clear aperture.
 
-        Raises:
-            ValueError: neither a Zernike figure nor an aperture sets the disk.
+        Raises
+        ------
+        ValueError
+            Neither a Zernike figure nor an aperture sets the disk.
         """
         outer = self.outer_edge
         if outer is None and self.surface.zernike_figure is None:
@@ -83,8 +94,10 @@ class Element:
     def figured(self, motion: Motion) -> Surface:
         """The surface with what a motion does to its radius and conic constant and adds to its figure.
 
-        Raises:
-            ValueError: nothing sets the disk of that figure, or two grids stand on different samples.
+        Raises
+        ------
+        ValueError
+            Nothing sets the disk of that figure, or two grids stand on different samples.
         """
         own = self.surface
         if motion.radius or motion.conic:
@@ -104,8 +117,10 @@ class Element:
     def grid_in(self, motion: Motion) -> GridFigure | None:
         """The grid figure of the surface with the one that a motion adds to it.
 
-        Raises:
-            ValueError: they stand on different samples.
+        Raises
+        ------
+        ValueError
+            They stand on different samples.
         """
         own = self.surface.grid_figure
         if own is None or motion.grid is None:
@@ -120,12 +135,18 @@ class Element:
 class Assembly:
     """Optical elements on a tree of rigid bodies; immutable, "with" methods return a changed copy.
 
-    Attributes:
-        tree: where everything stands.
-        elements: name -> element.
-        sequences: name -> element names in the order in which light meets them (an element may come twice).
-        media: path of a glass body -> its refractive index in vacuum.
-        above_d: path of a glass body whose dispersion is known -> that index less the one at the d line.
+    Attributes
+    ----------
+    tree : RigidTree
+        Where everything stands.
+    elements : Mapping[str, Element]
+        Name -> element.
+    sequences : Mapping[str, tuple[str, ...]]
+        Name -> element names in the order in which light meets them (an element may come twice).
+    media : Mapping[str, float]
+        Path of a glass body -> its refractive index in vacuum.
+    above_d : Mapping[str, float]
+        Path of a glass body whose dispersion is known -> that index less the one at the d line.
     """
 
     tree: RigidTree
@@ -168,16 +189,20 @@ class Assembly:
     def sequence(self, name: str) -> tuple[Element, ...]:
         """The elements of a named sequence.
 
-        Raises:
-            KeyError: unknown sequence.
+        Raises
+        ------
+        KeyError
+            Unknown sequence.
         """
         return tuple(self.elements[n] for n in self.sequences[name])
 
     def face(self, body: str) -> Element:
         """Return the optical surface of a body, the widest where several elements use it.
 
-        Raises:
-            ValueError: the body has none with a clear aperture.
+        Raises
+        ------
+        ValueError
+            The body has none with a clear aperture.
         """
         own = [e for e in self.elements.values() if e.body == body and e.interaction is not Interaction.PASS]
         sizes = [(e.aperture.enclosing.radius, e) for e in own if e.aperture is not None]
@@ -193,12 +218,17 @@ class Assembly:
 
         States of it come on top, as ``optics.geometry.tree.compose`` has it.
 
-        Args:
-            state: body path -> motion without growth and without gradients of an index.
+        Parameters
+        ----------
+        state : State
+            Body path -> motion without growth and without gradients of an index.
 
-        Raises:
-            KeyError: it names an unknown body or pivot.
-            ValueError: a motion that no assembly can have by itself, or a figure on a surface that cannot carry it.
+        Raises
+        ------
+        KeyError
+            It names an unknown body or pivot.
+        ValueError
+            a motion that no assembly can have by itself, or a figure on a surface that cannot carry it.
         """
         for path, motion in state.items():
             if any(motion.index_gradient):
@@ -229,11 +259,15 @@ class Assembly:
 def points_to_world(placed: PlacedBodies, body: str, points: np.ndarray) -> np.ndarray:
     """Where points of a body are in each state, world, (S, P, 3), metres; complex where ``placed`` is.
 
-    Args:
-        placed: the bodies.
-        body: its path.
-        points: of its material, named by their places on the nominal body, (P, 3), metres in its frame: they move apart
-            as the body grows. A place in space that is told in the body's frame, as a ray's hit, takes its ``pose``.
+    Parameters
+    ----------
+    placed : PlacedBodies
+        The bodies.
+    body : str
+        Its path.
+    points : np.ndarray
+        Of its material, named by their places on the nominal body, (P, 3), metres in its frame: they move apart as the
+        body grows. A place in space that is told in the body's frame, as a ray's hit, takes its ``pose``.
     """
     i = placed.index[body]
     grown = placed.scale[:, i, None, None] * points

@@ -81,10 +81,14 @@ class IndexNumbers:
 class ElementNumbers:
     """All that the trace reads of one element.
 
-    Attributes:
-        frame: from the frame of the element before (the world for the first) into this element's.
-        surface: its shape; aperture: its clear aperture, None for an unlimited one.
-        before, after: refractive index on the side that light comes from and on the one that it goes to.
+    Attributes
+    ----------
+    frame : FrameNumbers
+        From the frame of the element before (the world for the first) into this element's.
+    surface : SurfaceNumbers
+        Its shape; aperture: its clear aperture, None for an unlimited one.
+    before, after : IndexNumbers
+        Refractive index on the side that light comes from and on the one that it goes to.
     """
 
     frame: FrameNumbers

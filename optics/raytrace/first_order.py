@@ -20,11 +20,16 @@ from optics.raytrace.trace import jvp, make_rays, require_some, trace
 class RayMatrix:
     """Derivatives of one ray of each of B systems with respect to its launch, in transverse coordinates.
 
-    Attributes:
-        image_by_position, image_by_angle: d(x, y on the last element)/d(launch), (B, 2, 2), 1 and m/rad.
-        direction_by_position, direction_by_angle: d(direction x, y on the last element)/d(launch), (B, 2, 2).
-        stop_by_position, stop_by_angle: the same for the hit on the stop, (B, 2, 2).
-        direction: unit direction of the ray at the last element, in its frame, (B, 3).
+    Attributes
+    ----------
+    image_by_position, image_by_angle : np.ndarray
+        d(x, y on the last element)/d(launch), (B, 2, 2), 1 and m/rad.
+    direction_by_position, direction_by_angle : np.ndarray
+        d(direction x, y on the last element)/d(launch), (B, 2, 2).
+    stop_by_position, stop_by_angle : np.ndarray
+        The same for the hit on the stop, (B, 2, 2).
+    direction : np.ndarray
+        Unit direction of the ray at the last element, in its frame, (B, 3).
     """
 
     image_by_position: np.ndarray
@@ -40,14 +45,19 @@ class RayMatrix:
 class FirstOrder:
     """First-order quantities of B systems about their chief rays.
 
-    Attributes:
-        scale: d(image x, y)/d(object angle about the two launch axes) with the stop point held, (B, 2, 2), metres per
-            radian: the local principal distance along each axis, which is that of the plane where the image is taken;
-            off-diagonal terms are rotation and anamorphism.
-        principal_distance: sqrt|det scale|, (B,), metres.
-        entrance_magnification: d(stop x, y)/d(launch x, y), (B, 2, 2).
-        exit_pupil_distance: from the image upstream along the chief ray, mean over both axes, (B,), metres; negative
-            when the pupil lies downstream, large when the image space is telecentric.
+    Attributes
+    ----------
+    scale : np.ndarray
+        d(image x, y)/d(object angle about the two launch axes) with the stop point held, (B, 2, 2), metres per radian:
+        the local principal distance along each axis, which is that of the plane where the image is taken; off-diagonal
+        terms are rotation and anamorphism.
+    principal_distance : np.ndarray
+        Sqrt|det scale|, (B,), metres.
+    entrance_magnification : np.ndarray
+        d(stop x, y)/d(launch x, y), (B, 2, 2).
+    exit_pupil_distance : np.ndarray
+        From the image upstream along the chief ray, mean over both axes, (B,), metres; negative when the pupil lies
+        downstream, large when the image space is telecentric.
     """
 
     scale: np.ndarray
@@ -61,13 +71,20 @@ def ray_matrix(
 ) -> RayMatrix:
     """Differentiate one ray per system by forward-mode AD.
 
-    Args:
-        backend: where to trace.
-        systems: B systems.
-        stop: index of the stop in the sequence.
-        position: launch points, world, (B, 3).
-        direction: unit directions, (B, 3).
-        axes: two launch axes square to the direction, (B, 2, 3).
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    systems : SystemBatch
+        B systems.
+    stop : int
+        Index of the stop in the sequence.
+    position : np.ndarray
+        Launch points, world, (B, 3).
+    direction : np.ndarray
+        Unit directions, (B, 3).
+    axes : np.ndarray
+        Two launch axes square to the direction, (B, 2, 3).
     """
     zero = np.zeros_like(axes)
     out = jvp(
@@ -100,15 +117,22 @@ def first_order(matrix: RayMatrix) -> FirstOrder:
 class Paraxial:
     """Paraxial data of one system about a ray along its axis; lengths in metres, angles in radians.
 
-    Attributes:
-        focal_length: effective focal length, the magnitude 1 / sqrt|det d(direction)/d(launch)|; it does not depend on
-            where the image plane stands, and is infinite without power.
-        back_focal_length: distance of the paraxial focus from the last surface, downstream; infinite without power.
-        entrance_pupil: distance of the entrance pupil from the first surface, positive toward the scene.
-        exit_pupil: distance of the exit pupil from the image plane, upstream; infinite where chief rays leave parallel.
-        exit_magnification: diameter of the exit pupil over that of the entrance pupil.
-        angular_magnification: angle between two collimated beams after the system over that before it; it is what a
-            system without power has in place of a focal length.
+    Attributes
+    ----------
+    focal_length : float
+        Effective focal length, the magnitude 1 / sqrt|det d(direction)/d(launch)|; it does not depend on where the
+        image plane stands, and is infinite without power.
+    back_focal_length : float
+        Distance of the paraxial focus from the last surface, downstream; infinite without power.
+    entrance_pupil : float
+        Distance of the entrance pupil from the first surface, positive toward the scene.
+    exit_pupil : float
+        Distance of the exit pupil from the image plane, upstream; infinite where chief rays leave parallel.
+    exit_magnification : float
+        Diameter of the exit pupil over that of the entrance pupil.
+    angular_magnification : float
+        Angle between two collimated beams after the system over that before it; it is what a system without power has
+        in place of a focal length.
     """
 
     focal_length: float
@@ -125,10 +149,14 @@ def paraxial(matrix: RayMatrix, before: float, behind: float) -> Paraxial:
 
     Steps of the ray at the image are taken square to the ray, so that a turned image plane has no part in them.
 
-    Args:
-        matrix: derivatives about the ray along the axis, by ``ray_matrix``.
-        before: distance along the ray from its launch point to the first surface, metres.
-        behind: distance along the ray from the last surface to the image, metres.
+    Parameters
+    ----------
+    matrix : RayMatrix
+        Derivatives about the ray along the axis, by ``ray_matrix``.
+    before : float
+        Distance along the ray from its launch point to the first surface, metres.
+    behind : float
+        Distance along the ray from the last surface to the image, metres.
     """
     ray = matrix.direction[0]
     square = transverse_axes(ray, np.array([1.0, 0.0, 0.0]))
@@ -177,19 +205,30 @@ def aim_chief_rays(
 ) -> tuple[RayFan, np.ndarray, np.ndarray]:
     """Aim rays of image points at the centre of the stop.
 
-    Args:
-        backend: where to trace.
-        to_stop: B systems from the image side to the stop (last element).
-        points: image points, world, (B, M, 3).
-        guess: rough direction from the image to the last mirror, broadcastable to (B, M, 3).
-        transverse: direction near which the first transverse axis is taken, (3,).
-        start: parameters (B, M, 2) and their Jacobian (B, M, 2, 2) of rays that are near, as this returns them.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    to_stop : SystemBatch
+        B systems from the image side to the stop (last element).
+    points : np.ndarray
+        Image points, world, (B, M, 3).
+    guess : np.ndarray
+        Rough direction from the image to the last mirror, broadcastable to (B, M, 3).
+    transverse : np.ndarray
+        Direction near which the first transverse axis is taken, (3,).
+    start : tuple[np.ndarray, np.ndarray] | None
+        Parameters (B, M, 2) and their Jacobian (B, M, 2, 2) of rays that are near, as this returns them.
 
-    Returns:
+    Returns
+    -------
+    tuple[RayFan, np.ndarray, np.ndarray]
         The family of the rays, their parameters (B, M, 2) and Jacobian (B, M, 2, 2).
 
-    Raises:
-        AimError: no ray gets there.
+    Raises
+    ------
+    AimError
+        No ray gets there.
     """
     direction = np.broadcast_to(guess, points.shape)
     fan = RayFan(points, direction, transverse_axes(direction, np.broadcast_to(transverse, direction.shape)))
@@ -208,20 +247,32 @@ def chief_rays(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chief rays of image points, traced backward from the image through the centre of the stop.
 
-    Args:
-        backend: where to trace.
-        to_stop: B systems from the image side to the stop (last element).
-        to_object: the same systems on to the first mirror.
-        points: image points, world, (B, M, 3).
-        guess: rough direction from the image to the last mirror, broadcastable to (B, M, 3).
-        transverse: direction near which the first transverse axis is taken, (3,).
-        start: as of `aim_chief_rays`.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    to_stop : SystemBatch
+        B systems from the image side to the stop (last element).
+    to_object : SystemBatch
+        The same systems on to the first mirror.
+    points : np.ndarray
+        Image points, world, (B, M, 3).
+    guess : np.ndarray
+        Rough direction from the image to the last mirror, broadcastable to (B, M, 3).
+    transverse : np.ndarray
+        Direction near which the first transverse axis is taken, (3,).
+    start : tuple[np.ndarray, np.ndarray] | None
+        As of `aim_chief_rays`.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray]
         Points on the rays after the first mirror, and object-space directions toward the scene, world, (B, M, 3) each.
 
-    Raises:
-        AimError, BeamMissedError: light is lost.
+    Raises
+    ------
+    AimError, BeamMissedError
+        Light is lost.
     """
     fan, q, _ = aim_chief_rays(backend, to_stop, points, guess, transverse, start)
     position, direction = fan.at(q)
@@ -236,14 +287,20 @@ def chief_rays(
 class LineChange:
     """True change of a line camera against its nominal state, for B states.
 
-    Attributes:
-        d_alpha, d_beta: rotation of the line of sight about the nominal camera's Y and X, radians (right-hand rule).
-        d_gamma: rotation of the imaged line about the line of sight, radians.
-        principal_distance: f = sum(L tan W)/sum(tan^2 W) over the line (paper 004, eq. 3), (B,), metres. L is counted
-            in pixels times their nominal pitch, so that f is what the pixels see: a camera that grows with its line
-            CCD keeps the angle of a pixel, and so f.
-        d_f: its change, metres.
-        nominal_distance: principal distance of the nominal state, metres.
+    Attributes
+    ----------
+    d_alpha, d_beta : np.ndarray
+        Rotation of the line of sight about the nominal camera's Y and X, radians (right-hand rule).
+    d_gamma : np.ndarray
+        Rotation of the imaged line about the line of sight, radians.
+    principal_distance : np.ndarray
+        f = sum(L tan W)/sum(tan^2 W) over the line (paper 004, eq. 3), (B,), metres. L is counted in pixels times their
+        nominal pitch, so that f is what the pixels see: a camera that grows with its line CCD keeps the angle of a
+        pixel, and so f.
+    d_f : np.ndarray
+        Its change, metres.
+    nominal_distance : float
+        Principal distance of the nominal state, metres.
     """
 
     d_alpha: np.ndarray
@@ -264,13 +321,18 @@ def line_tangents(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where the points of a line look, in the tangent plane about each state's own line of sight.
 
-    Args:
-        sight: object-space directions of the line's points, world, (S, M, 3); M odd, the middle point is the line's
-            centre.
-        position: as of `line_change`, (M,), metres.
-        camera: as of `line_change`, (3, 3).
+    Parameters
+    ----------
+    sight : np.ndarray
+        Object-space directions of the line's points, world, (S, M, 3); M odd, the middle point is the line's centre.
+    position : np.ndarray
+        As of `line_change`, (M,), metres.
+    camera : np.ndarray
+        As of `line_change`, (3, 3).
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray, np.ndarray]
         Lines of sight in the camera's axes (S, 3), roll of the imaged line about them (S,), radians, and tangents along
         the imaged line, (S, M), positive as ``position``.
     """
@@ -294,12 +356,15 @@ def line_tangents(
 def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> LineChange:
     """Compare perturbed states with the nominal one.
 
-    Args:
-        sight: object-space directions of the line's points, world, (1 + B, M, 3); entry 0 is the nominal state; M
-        odd, the
-            middle point is the line's centre.
-        position: coordinate of the points along camera Y on the nominal line CCD, (M,), metres.
-        camera: columns = nominal camera axes X, Y, Z in the world, (3, 3); Z is the nominal line of sight.
+    Parameters
+    ----------
+    sight : np.ndarray
+        Object-space directions of the line's points, world, (1 + B, M, 3); entry 0 is the nominal state; M odd, the
+        middle point is the line's centre.
+    position : np.ndarray
+        Coordinate of the points along camera Y on the nominal line CCD, (M,), metres.
+    camera : np.ndarray
+        Columns = nominal camera axes X, Y, Z in the world, (3, 3); Z is the nominal line of sight.
     """
     axis, roll, tangent = line_tangents(sight, position, camera)
     distance = inner(tangent, position) / np.sum(tangent**2, axis=-1)

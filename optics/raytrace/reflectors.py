@@ -47,12 +47,18 @@ BOND = 1e-4
 class Passage:
     """What the beam does at one optical face.
 
-    Attributes:
-        name: of the element within the prism, e.g. ``entry``.
-        face: which face (its body is ``<solid>/<face>``, with a child for each passage if there are several).
-        interaction: refract, reflect or total.
-        place: of the beam's middle on the face, in the solid's frame, metres.
-        direction: of the beam when it arrives, in the solid's frame.
+    Attributes
+    ----------
+    name : str
+        Of the element within the prism, e.g. ``entry``.
+    face : str
+        Which face (its body is ``<solid>/<face>``, with a child for each passage if there are several).
+    interaction : Interaction
+        Refract, reflect or total.
+    place : np.ndarray
+        Of the beam's middle on the face, in the solid's frame, metres.
+    direction : np.ndarray
+        Of the beam when it arrives, in the solid's frame.
     """
 
     name: str
@@ -67,15 +73,24 @@ class Mount:
     """Where a reflector stands and what it is to do; its frame has z along the beam that enters, x along the way on
     which the beam is displaced.
 
-    Attributes:
-        path: of its body; all other bodies stand below it.
-        pose: of that body in the one that carries it.
-        key: prefix of its elements' names.
-        material: of its glass, or of the frame and the mirrors that it holds.
-        length: from the middle of the entering to that of the leaving beam along x, metres.
-        width: of the clear apertures, metres.
-        hand: of a reflector that returns the beam, +1: the beam enters at +y of the middle; -1: the mirror image.
-        errors: face -> tilt about its x and y, as made, radians.
+    Attributes
+    ----------
+    path : str
+        Of its body; all other bodies stand below it.
+    pose : Pose
+        Of that body in the one that carries it.
+    key : str
+        Prefix of its elements' names.
+    material : str
+        Of its glass, or of the frame and the mirrors that it holds.
+    length : float
+        From the middle of the entering to that of the leaving beam along x, metres.
+    width : float
+        Of the clear apertures, metres.
+    hand : float
+        Of a reflector that returns the beam, +1: the beam enters at +y of the middle; -1: the mirror image.
+    errors : Mapping[str, tuple[float, float]]
+        Face -> tilt about its x and y, as made, radians.
     """
 
     path: str
@@ -92,13 +107,18 @@ class Mount:
 class ReflectorParts:
     """A reflector ready for the assembly.
 
-    Attributes:
-        bodies: its own and its faces'; the first has the pivots ``apex`` and ``centre``.
-        elements: in the order in which the beam that leaves the camera meets them, with clear apertures.
-        solids: its glass, or its frame and mirrors: those whose bodies another one's carries are one piece with it.
-        path_length: of the beam's middle inside the glass, metres.
-        apex: of a reflector that returns the beam the point about which it may turn, else its middle, in its frame,
-            metres.
+    Attributes
+    ----------
+    bodies : tuple[Body, ...]
+        Its own and its faces'; the first has the pivots ``apex`` and ``centre``.
+    elements : tuple[Element, ...]
+        In the order in which the beam that leaves the camera meets them, with clear apertures.
+    solids : tuple[Solid, ...]
+        Its glass, or its frame and mirrors: those whose bodies another one's carries are one piece with it.
+    path_length : float
+        Of the beam's middle inside the glass, metres.
+    apex : tuple[float, float, float]
+        Of a reflector that returns the beam the point about which it may turn, else its middle, in its frame, metres.
     """
 
     bodies: tuple[Body, ...]
@@ -120,14 +140,21 @@ def _middle(length: float, width: float) -> tuple[float, float, float]:
 class Reflector:
     """A kind of reflector, as the monitor of an instrument's file may name it.
 
-    Attributes:
-        returns: the beam goes back antiparallel, from (x, y) to (-x, -y) (what stands for the 180-deg prism); else on
-            in its direction, displaced by ``Mount.length`` along x (the 0-deg prism).
-        faces: those that may be tilted as made.
-        parts: makes it; ValueError where it cannot be made for its mount.
-        sideways: width -> how far from the middle along y the beam passes, metres.
-        null_point: length and width -> where it may turn without turning the beam, in its frame, metres.
-        transparent: it is made of glass that the beam goes through, whose index has to be known; else of any material.
+    Attributes
+    ----------
+    returns : bool
+        The beam goes back antiparallel, from (x, y) to (-x, -y) (what stands for the 180-deg prism); else on in its
+        direction, displaced by ``Mount.length`` along x (the 0-deg prism).
+    faces : tuple[str, ...]
+        Those that may be tilted as made.
+    parts : Callable[[Mount], ReflectorParts]
+        Makes it; ValueError where it cannot be made for its mount.
+    sideways : Callable[[float], float]
+        Width -> how far from the middle along y the beam passes, metres.
+    null_point : Callable[[float, float], tuple[float, float, float]]
+        Length and width -> where it may turn without turning the beam, in its frame, metres.
+    transparent : bool
+        It is made of glass that the beam goes through, whose index has to be known; else of any material.
     """
 
     returns: bool
@@ -194,8 +221,10 @@ def roof_offset(width: float) -> float:
 def prism_0(mount: Mount) -> ReflectorParts:
     """The rhomboid.
 
-    Raises:
-        ValueError: the displacement is too small for the width, so that the rhomboid would cut the beam.
+    Raises
+    ------
+    ValueError
+        The displacement is too small for the width, so that the rhomboid would cut the beam.
     """
     shift, width = mount.length, mount.width
     half = 0.5 * width + EDGE
@@ -222,8 +251,10 @@ def prism_0(mount: Mount) -> ReflectorParts:
 def hollow_transfer(mount: Mount) -> ReflectorParts:
     """Three mirrors square to each other: a slice of a hollow corner cube.
 
-    Raises:
-        ValueError: they stand so near to each other that one is in the other's beam.
+    Raises
+    ------
+    ValueError
+        They stand so near to each other that one is in the other's beam.
     """
     length, width, hand = mount.length, mount.width, mount.hand
     off, half, apex = hollow_offset(width), 0.5 * width, hollow_null_point(length, width)
@@ -256,8 +287,10 @@ def hollow_null_point(length: float, width: float) -> tuple[float, float, float]
 def periscope(mount: Mount) -> ReflectorParts:
     """Two parallel mirrors.
 
-    Raises:
-        ValueError: the displacement is so small that one stands in the other's beam.
+    Raises
+    ------
+    ValueError
+        The displacement is so small that one stands in the other's beam.
     """
     shift, width = mount.length, mount.width
     _require_length(mount, "mirrors", "displace", width + 2.0 * (EDGE + _thickness(width)))

@@ -48,9 +48,12 @@ def frames_of(placed: PlacedBodies, bodies: np.ndarray) -> np.ndarray:
     """Per element of chains, the transform into its frame from that of the element before: numbers of
     ``FrameNumbers``, (K, 12, C * S), chain by chain.
 
-    Args:
-        placed: the bodies of S states.
-        bodies: numbers of those of the elements, (C, K).
+    Parameters
+    ----------
+    placed : PlacedBodies
+        The bodies of S states.
+    bodies : np.ndarray
+        Numbers of those of the elements, (C, K).
     """
     rotation, translation = placed.rotation[:, bodies], placed.translation[:, bodies]
     turn, offset = np.empty_like(rotation), np.empty_like(translation)
@@ -67,16 +70,26 @@ def frames_of(placed: PlacedBodies, bodies: np.ndarray) -> np.ndarray:
 class SystemBatch:
     """Numbers of B systems.
 
-    Attributes:
-        structure: per element.
-        form: per element what the trace reads, and the pose of the last element, with the row of each number.
-        numbers: (L, B).
-        world: poses of the elements in the world.
-        tangents: ``values`` for the derivative that was asked for (None for a number that has none), or None.
-        world_tangents: likewise of ``world``.
-        size: of the last element's body relative to nominal, (B,).
-        grids: per element, the spline tables of all systems' grid figures, one after the other; None without any.
-        states: number of states S; systems are ordered sequence by sequence, B = sequences * S.
+    Attributes
+    ----------
+    structure : tuple[Structure, ...]
+        Per element.
+    form : tuple[tuple[ElementNumbers, ...], FrameNumbers]
+        Per element what the trace reads, and the pose of the last element, with the row of each number.
+    numbers : np.ndarray
+        (L, B).
+    world : Poses
+        Poses of the elements in the world.
+    tangents : tuple[ElementNumbers, ...] | None
+        ``values`` for the derivative that was asked for (None for a number that has none), or None.
+    world_tangents : Poses | None
+        Likewise of ``world``.
+    size : np.ndarray
+        Of the last element's body relative to nominal, (B,).
+    grids : tuple[np.ndarray | None, ...]
+        Per element, the spline tables of all systems' grid figures, one after the other; None without any.
+    states : int
+        Number of states S; systems are ordered sequence by sequence, B = sequences * S.
     """
 
     structure: tuple[Structure, ...]
@@ -102,10 +115,13 @@ class SystemBatch:
     def upload(self, backend: Backend, own: bool = False) -> UploadedSystems:
         """Copy to the backend's memory as kernel inputs; derivatives, if any, become forward-mode gradients.
 
-        Args:
-            backend: where to.
-            own: each number of the systems is an array of its own, so that it may be differentiated by; else those of
-                several systems lie in one.
+        Parameters
+        ----------
+        backend : Backend
+            Where to.
+        own : bool
+            Each number of the systems is an array of its own, so that it may be differentiated by; else those of
+            several systems lie in one.
         """
         grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
         if self.tangents is None:
@@ -151,8 +167,10 @@ class SystemBatch:
 class Poses:
     """Poses of the K elements of B systems in the world.
 
-    Attributes:
-        rotation: element frame to world, (B, K, 3, 3); translation: its origin, metres, (B, K, 3).
+    Attributes
+    ----------
+    rotation : np.ndarray
+        Element frame to world, (B, K, 3, 3); translation: its origin, metres, (B, K, 3).
     """
 
     rotation: np.ndarray
@@ -172,15 +190,24 @@ class Poses:
 class UploadedSystems:
     """A ``SystemBatch`` in the memory of a backend.
 
-    Attributes:
-        backend: whose arrays they are.
-        structure: per element.
-        form: as of ``SystemBatch``.
-        numbers: L Dr.Jit arrays (B,); or one of all of them, (L * B,), number by number.
-        grids: as of ``SystemBatch``.
-        count: B.
-        differentiable: whether numbers carry derivatives.
-        first: row of the first element's first number, where the elements are part of a longer sequence; else None.
+    Attributes
+    ----------
+    backend : Backend
+        Whose arrays they are.
+    structure : tuple[Structure, ...]
+        Per element.
+    form : tuple[tuple[ElementNumbers, ...], FrameNumbers]
+        As of ``SystemBatch``.
+    numbers : Any
+        L Dr.Jit arrays (B,); or one of all of them, (L * B,), number by number.
+    grids : tuple[Any, ...]
+        As of ``SystemBatch``.
+    count : int
+        B.
+    differentiable : bool
+        Whether numbers carry derivatives.
+    first : int | None
+        Row of the first element's first number, where the elements are part of a longer sequence; else None.
     """
 
     backend: Backend
@@ -218,10 +245,14 @@ class UploadedSystems:
 class _Shapes:
     """What some states do to shapes, in so far as it decides the code of a kernel.
 
-    Attributes:
-        orders: body -> highest radial order of its figures.
-        gridded: bodies with a figure on a grid.
-        graded: glass bodies with a gradient of their index.
+    Attributes
+    ----------
+    orders : Mapping[str, int]
+        Body -> highest radial order of its figures.
+    gridded : frozenset[str]
+        Bodies with a figure on a grid.
+    graded : frozenset[str]
+        Glass bodies with a gradient of their index.
     """
 
     orders: Mapping[str, int]
@@ -248,11 +279,16 @@ class _Shapes:
 class _Chains:
     """Sequences of C chains of K elements each.
 
-    Attributes:
-        elements, media: of each chain: the elements, and what light travels in before, between and after them.
-        bodies: numbers of the elements' bodies, (C, K).
-        depends: per element of the chains, the bodies whose shape or index it may have to do with.
-        designed: structure of the elements as designed.
+    Attributes
+    ----------
+    elements, media : tuple[tuple[Element, ...], ...]
+        Of each chain: the elements, and what light travels in before, between and after them.
+    bodies : np.ndarray
+        Numbers of the elements' bodies, (C, K).
+    depends : tuple[frozenset[str], ...]
+        Per element of the chains, the bodies whose shape or index it may have to do with.
+    designed : tuple[Structure, ...]
+        Structure of the elements as designed.
     """
 
     elements: tuple[tuple[Element, ...], ...]
@@ -343,9 +379,12 @@ class _Chains:
 class _Sides:
     """Sides of elements on which one glass body lies.
 
-    Attributes:
-        rows, chains, bodies: row of the index on each, its chain, and the number of the element's body, (N,).
-        gradient: which sides have a gradient of the index; slopes: its rows, (3, of these).
+    Attributes
+    ----------
+    rows, chains, bodies : np.ndarray
+        Row of the index on each, its chain, and the number of the element's body, (N,).
+    gradient : np.ndarray
+        Which sides have a gradient of the index; slopes: its rows, (3, of these).
     """
 
     rows: np.ndarray
@@ -359,15 +398,23 @@ class _Sides:
 class _Design:
     """Numbers of C chains of one structure as designed, and what a state does to them.
 
-    Attributes:
-        chains: whose they are.
-        structure, form: as of ``SystemBatch``.
-        numbers: (L, C); those of frames are left open.
-        grids: as of ``SystemBatch``.
-        grown: power -> rows and chains of the numbers that grow with that power of their bodies' sizes, and these
-            bodies' numbers.
-        glass: glass body -> the sides of elements that it lies on.
-        frame_rows: rows of the elements' frames and of the last pose, (K + 1, 12).
+    Attributes
+    ----------
+    chains : _Chains
+        Whose they are.
+    structure, form : tuple[Structure, ...]
+        As of ``SystemBatch``.
+    numbers : np.ndarray
+        (L, C); those of frames are left open.
+    grids : tuple[np.ndarray | None, ...]
+        As of ``SystemBatch``.
+    grown : Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
+        Power -> rows and chains of the numbers that grow with that power of their bodies' sizes, and these bodies'
+        numbers.
+    glass : Mapping[str, _Sides]
+        Glass body -> the sides of elements that it lies on.
+    frame_rows : np.ndarray
+        Rows of the elements' frames and of the last pose, (K + 1, 12).
     """
 
     chains: _Chains
@@ -509,19 +556,29 @@ def assemble(
 ) -> SystemBatch:
     """Work out the numbers of every sequence in every state.
 
-    Args:
-        assembly: the instrument.
-        sequences: names of sequences, or element-name tuples, all of the same structure.
-        states: S perturbed states.
-        step: optional derivative: one (body, kind, axis) per state; kind ``rotate``, ``shift``, ``scale`` or ``figure``
-            (the axis is then a Noll index that the state's figure names, with 0 if there is none).
-        placed: the bodies of these states, when already placed.
+    Parameters
+    ----------
+    assembly : Assembly
+        The instrument.
+    sequences : Sequence[str | Sequence[str]]
+        Names of sequences, or element-name tuples, all of the same structure.
+    states : Sequence[State]
+        S perturbed states.
+    step : Sequence[tuple[str, str, int]] | None
+        Optional derivative: one (body, kind, axis) per state; kind ``rotate``, ``shift``, ``scale`` or ``figure`` (the
+        axis is then a Noll index that the state's figure names, with 0 if there is none).
+    placed : PlacedBodies | None
+        The bodies of these states, when already placed.
 
-    Returns:
+    Returns
+    -------
+    SystemBatch
         A batch of len(sequences) * S systems, sequence by sequence.
 
-    Raises:
-        ValueError: the sequences differ in structure.
+    Raises
+    ------
+    ValueError
+        The sequences differ in structure.
     """
     placed = assembly.place(states, step) if placed is None else placed
     known = assembly.worked_out

@@ -41,13 +41,20 @@ from optics.raytrace.system import SystemBatch, UploadedSystems
 class GradedRay:
     """A curved ray, as Dr.Jit arrays in the frame of the element that it goes to.
 
-    Attributes:
-        origin: r0, metres.
-        tangent: T0 = n0 d0, d0 a unit vector.
-        index: n0 at the origin.
-        gradient: components of g, 1/m.
-        along: a = g . T0.
-        square: |g|^2.
+    Attributes
+    ----------
+    origin : Any
+        r0, metres.
+    tangent : Any
+        T0 = n0 d0, d0 a unit vector.
+    index : Any
+        n0 at the origin.
+    gradient : tuple[Any, Any, Any]
+        Components of g, 1/m.
+    along : Any
+        a = g . T0.
+    square : Any
+        |g|^2.
     """
 
     origin: Any
@@ -173,9 +180,12 @@ class BeamMissedError(PhysicalError, RuntimeError):
 class Rays:
     """Rays in Dr.Jit arrays: positions and unit directions, optical path, and whether each is still alive.
 
-    Attributes:
-        position, direction, path, valid: of width systems * N; a direction that all rays share is of width 1.
-        systems: number of systems that the rays are for, system by system; 1: every system gets all of them.
+    Attributes
+    ----------
+    position, direction, path, valid : Any
+        Of width systems * N; a direction that all rays share is of width 1.
+    systems : int
+        Number of systems that the rays are for, system by system; 1: every system gets all of them.
     """
 
     position: Any
@@ -189,11 +199,16 @@ class Rays:
 class Traced:
     """Rays at the last element of a sequence.
 
-    Attributes:
-        local: rays in the last element's own frame, after the interaction.
-        world: the same rays in the world frame (position and direction), None unless asked for.
-        hits: element index -> local position on that element, for those asked to be kept.
-        count: B systems.
+    Attributes
+    ----------
+    local : Rays
+        Rays in the last element's own frame, after the interaction.
+    world : Rays | None
+        The same rays in the world frame (position and direction), None unless asked for.
+    hits : Mapping[int, Any]
+        Element index -> local position on that element, for those asked to be kept.
+    count : int
+        B systems.
     """
 
     local: Rays
@@ -232,11 +247,16 @@ def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, pat
     Shape (N, 3) or (3,) makes rays that every system gets; (B, N, 3) makes each of B systems its own. A direction (3,)
     is kept as one vector: a trace through conics is held up by the memory that it reads.
 
-    Args:
-        backend: where to.
-        position: (3,), (N, 3) or (B, N, 3), metres.
-        direction: unit vectors, likewise.
-        path: optical path so far, metres, one for each ray; 0 by default.
+    Parameters
+    ----------
+    backend : Backend
+        Where to.
+    position : np.ndarray
+        (3,), (N, 3) or (B, N, 3), metres.
+    direction : np.ndarray
+        Unit vectors, likewise.
+    path : np.ndarray | None
+        Optical path so far, metres, one for each ray; 0 by default.
     """
     import drjit as dr
 
@@ -262,20 +282,31 @@ def trace(
 ) -> Traced:
     """Send rays, given in the world frame, through each system.
 
-    Args:
-        backend: where to compute.
-        systems: B systems.
-        rays: for these systems, or rays that every system gets.
-        keep: indices of elements whose hit points are wanted.
-        world: also return the final rays in the world frame.
-        evaluate: launch the kernel now (False leaves a graph to build on).
+    Parameters
+    ----------
+    backend : Backend
+        Where to compute.
+    systems : SystemBatch | UploadedSystems
+        B systems.
+    rays : Rays
+        For these systems, or rays that every system gets.
+    keep : Collection[int]
+        Indices of elements whose hit points are wanted.
+    world : bool
+        Also return the final rays in the world frame.
+    evaluate : bool
+        Launch the kernel now (False leaves a graph to build on).
 
-    Returns:
+    Returns
+    -------
+    Traced
         The rays at the last element. Rays that miss a surface or an aperture, or are totally reflected at a refracting
         surface, are marked invalid; their numbers stay finite but mean nothing.
 
-    Raises:
-        ValueError: the rays are for another number of systems.
+    Raises
+    ------
+    ValueError
+        The rays are for another number of systems.
     """
     import drjit as dr
 
@@ -306,15 +337,24 @@ def trace(
 class _Way:
     """What the instructions of a trace depend on; all else is numbers that they read.
 
-    Attributes:
-        backend: where to compute.
-        structure: of the elements.
-        keep: elements whose hit points are wanted, ascending.
-        world: whether the final rays in the world frame are.
-        differentiable: whether numbers or rays carry derivatives.
-        evaluate: whether kernels are launched.
-        section: elements of a kernel.
-        alone: whether all elements of one structure share a kernel; ``section`` is 1.
+    Attributes
+    ----------
+    backend : Backend
+        Where to compute.
+    structure : tuple[Structure, ...]
+        Of the elements.
+    keep : tuple[int, ...]
+        Elements whose hit points are wanted, ascending.
+    world : bool
+        Whether the final rays in the world frame are.
+    differentiable : bool
+        Whether numbers or rays carry derivatives.
+    evaluate : bool
+        Whether kernels are launched.
+    section : int
+        Elements of a kernel.
+    alone : bool
+        Whether all elements of one structure share a kernel; ``section`` is 1.
     """
 
     backend: Backend
@@ -329,14 +369,19 @@ class _Way:
     def through(self, form: Any, numbers: Any, rays: Any, shared: Any) -> Any:
         """Rays after the last element, hit points, and the former in the world frame.
 
-        Args:
-            form: as of ``UploadedSystems``.
-            numbers: likewise, the grids, how many systems there are, as an array of width 1 or None for one; where the
-                numbers begin, likewise or None for the beginning; and the systems' own places, (B,), where each takes
-                its rays one after the other, else None.
-            rays: position, direction, path and whether they are alive.
-            shared: rays of each system, as an array of width 1; the system of each ray where elements are ``alone``;
-                None for a single system.
+        Parameters
+        ----------
+        form : Any
+            As of ``UploadedSystems``.
+        numbers : Any
+            Likewise, the grids, how many systems there are, as an array of width 1 or None for one; where the numbers
+            begin, likewise or None for the beginning; and the systems' own places, (B,), where each takes its rays one
+            after the other, else None.
+        rays : Any
+            Position, direction, path and whether they are alive.
+        shared : Any
+            Rays of each system, as an array of width 1; the system of each ray where elements are ``alone``; None for a
+            single system.
         """
         table, grids, stride, start, systems = numbers
         own = self._system(rays[0], shared) if systems is None else systems
@@ -436,15 +481,24 @@ class _Way:
         It reads the system's numbers once. Where each lane has a ray of its own, it looks up all of them, which takes
         more time than the rays.
 
-        Args:
-            leg: of the elements.
-            elements: their numbers, each (B,).
-            pose: of the last element where rays in the world are wanted at its end, likewise.
-            grids: as of ``through``.
-            rays: likewise.
-            owned: the systems' own places, and the rays of each.
-            hits: to which hit points are added.
-            outside: likewise rays in the world.
+        Parameters
+        ----------
+        leg : range
+            Of the elements.
+        elements : Sequence[ElementNumbers]
+            Their numbers, each (B,).
+        pose : FrameNumbers | None
+            Of the last element where rays in the world are wanted at its end, likewise.
+        grids : Any
+            As of ``through``.
+        rays : Any
+            likewise.
+        owned : tuple[Any, Any]
+            The systems' own places, and the rays of each.
+        hits : list[Any]
+            To which hit points are added.
+        outside : list[Any]
+            Likewise rays in the world.
         """
         import drjit as dr
 
@@ -562,13 +616,20 @@ class _Lookup:
     The row at which they begin goes along with the rays from kernel to kernel. Were it written into a kernel, no two
     elements could share one.
 
-    Args:
-        backend: of the rays.
-        numbers: as of ``UploadedSystems``.
-        stride: how many systems there are, as an array of width 1; None for a single one.
-        start: where the first element's numbers begin, likewise; None for the beginning.
-        system: of each ray, or of each lane; None for a single one.
-        row: at which the numbers of the first element begin.
+    Parameters
+    ----------
+    backend
+        Of the rays.
+    numbers
+        As of ``UploadedSystems``.
+    stride
+        How many systems there are, as an array of width 1; None for a single one.
+    start
+        Where the first element's numbers begin, likewise; None for the beginning.
+    system
+        Of each ray, or of each lane; None for a single one.
+    row
+        At which the numbers of the first element begin.
     """
 
     def __init__(self, backend: Backend, numbers: Any, stride: Any, start: Any, system: Any, row: int) -> None:
@@ -713,11 +774,16 @@ compile as one by one, and those of derivatives no less to run."""
 class RayTangents:
     """Derivatives of rays at the last element of a sequence, in its own frame.
 
-    Attributes:
-        position, direction: (B, N, 3), metres and 1 per unit of the parameter.
-        path: optical path, (B, N).
-        hits: element index -> derivative of the local hit there, (B, N, 3), for those asked to be kept.
-        traced: the rays themselves.
+    Attributes
+    ----------
+    position, direction : np.ndarray
+        (B, N, 3), metres and 1 per unit of the parameter.
+    path : np.ndarray
+        Optical path, (B, N).
+    hits : Mapping[int, np.ndarray]
+        Element index -> derivative of the local hit there, (B, N, 3), for those asked to be kept.
+    traced : Traced
+        The rays themselves.
     """
 
     position: np.ndarray
@@ -738,14 +804,22 @@ def jvp(
 ) -> RayTangents:
     """Trace rays and differentiate them by one parameter each.
 
-    Args:
-        backend: where to trace.
-        systems: B systems; derivatives that they carry (``assemble(..., step=...)``) are added.
-        position: launch points, world, (B, N, 3), metres.
-        direction: unit directions, (B, N, 3).
-        position_step: derivative of the launch points, broadcastable to (B, N, 3).
-        direction_step: derivative of the directions, square to them, broadcastable to (B, N, 3).
-        keep: indices of elements whose hits are differentiated too.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    systems : SystemBatch
+        B systems; derivatives that they carry (``assemble(..., step=...)``) are added.
+    position : np.ndarray
+        Launch points, world, (B, N, 3), metres.
+    direction : np.ndarray
+        Unit directions, (B, N, 3).
+    position_step : np.ndarray | float
+        Derivative of the launch points, broadcastable to (B, N, 3).
+    direction_step : np.ndarray | float
+        Derivative of the directions, square to them, broadcastable to (B, N, 3).
+    keep : Collection[int]
+        Indices of elements whose hits are differentiated too.
     """
     import drjit as dr
 
@@ -792,10 +866,14 @@ def jvp(
 class RayCotangents:
     """Derivatives of S_b = sum_n w_bn . r_bn, with r the rays at the last element of system b and w given weights.
 
-    Attributes:
-        values: per element, path of a number -> dS_b/d(number of system b), (B,), for those that were asked for.
-        position: dS_b/d(launch point), (B, N, 3), per metre.
-        direction: dS_b/d(launch direction), (B, N, 3); its part along the ray means nothing by itself.
+    Attributes
+    ----------
+    values : tuple[Mapping[Path, np.ndarray], ...]
+        Per element, path of a number -> dS_b/d(number of system b), (B,), for those that were asked for.
+    position : np.ndarray
+        dS_b/d(launch point), (B, N, 3), per metre.
+    direction : np.ndarray
+        dS_b/d(launch direction), (B, N, 3); its part along the ray means nothing by itself.
     """
 
     values: tuple[Mapping[Path, np.ndarray], ...]
@@ -813,15 +891,24 @@ def vjp(
 ) -> RayCotangents:
     """Trace rays and differentiate a weighted sum of where they end by everything they depend on.
 
-    Args:
-        backend: where to trace.
-        systems: B systems; derivatives that they carry are left aside.
-        position: launch points, world, (B, N, 3), metres.
-        direction: unit directions, (B, N, 3).
-        weight: of the positions at the last element, in its own frame, broadcastable to (B, N, 3).
-        names: per element, paths of the numbers in ``systems.values`` to differentiate by.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    systems : SystemBatch
+        B systems; derivatives that they carry are left aside.
+    position : np.ndarray
+        Launch points, world, (B, N, 3), metres.
+    direction : np.ndarray
+        Unit directions, (B, N, 3).
+    weight : np.ndarray
+        Of the positions at the last element, in its own frame, broadcastable to (B, N, 3).
+    names : Sequence[Collection[Path]]
+        Per element, paths of the numbers in ``systems.values`` to differentiate by.
 
-    Returns:
+    Returns
+    -------
+    RayCotangents
         Derivatives; rays that are stopped or lost count as if they went on.
     """
     import drjit as dr

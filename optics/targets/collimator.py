@@ -20,10 +20,14 @@ class TooNarrowError(PhysicalError, ValueError):
 class Collimator:
     """A collimator with a target at its focus.
 
-    Attributes:
-        focal_length: metres.
-        radius: of its aperture, metres.
-        wavefront: Noll index -> wavefront error over the aperture, metres rms, positive where the wave is ahead.
+    Attributes
+    ----------
+    focal_length : float
+        metres.
+    radius : float
+        Of its aperture, metres.
+    wavefront : Mapping[int, float]
+        Noll index -> wavefront error over the aperture, metres rms, positive where the wave is ahead.
     """
 
     focal_length: float
@@ -37,17 +41,24 @@ class Collimator:
     def path(self, point: np.ndarray, target_shift: float = 0.0) -> np.ndarray:
         """Optical path that the beam brings along, beyond that of a plane wave.
 
-        Args:
-            point: transverse coordinates from the collimator's axis, (..., 2), metres.
-            target_shift: of the target out of the focus, along the light's travel (toward the collimator's optics, so
-                that the beam diverges), metres. The camera's image then moves along the light's travel by
-                ``target_shift * (f / focal_length)**2`` (Newton's equation).
+        Parameters
+        ----------
+        point : np.ndarray
+            Transverse coordinates from the collimator's axis, (..., 2), metres.
+        target_shift : float
+            Of the target out of the focus, along the light's travel (toward the collimator's optics, so that the beam
+            diverges), metres. The camera's image then moves along the light's travel by ``target_shift * (f /
+            focal_length)**2`` (Newton's equation).
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             (...,) metres.
 
-        Raises:
-            TooNarrowError: a point outside the aperture.
+        Raises
+        ------
+        TooNarrowError
+            a point outside the aperture.
         """
         square = np.sum(point**2, axis=-1)
         if np.max(square) > self.radius**2:

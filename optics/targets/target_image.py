@@ -60,11 +60,16 @@ _BLOCK = 1 << 17
 class EdgeProfile:
     """Image of a half plane as a function of the distance from its edge.
 
-    Attributes:
-        normal: of the half plane, unit, (2,).
-        reach: largest distance from the edge, metres.
-        level: H(0), the image far inside.
-        spline: irradiance over distance.
+    Attributes
+    ----------
+    normal : np.ndarray
+        Of the half plane, unit, (2,).
+    reach : float
+        Largest distance from the edge, metres.
+    level : float
+        H(0), the image far inside.
+    spline : BSpline
+        Irradiance over distance.
     """
 
     normal: np.ndarray
@@ -80,11 +85,16 @@ class EdgeProfile:
         image the two halves of the axis make E(d) = H(0)/2 + integral from 0 to the cut-off of
         Im[H(f n) exp(2 pi i f d)]/(pi f) df, whose integrand is finite at f = 0: no singularity is left.
 
-        Args:
-            transfer: H.
-            normal: toward the bright side, (2,).
-            cutoff: frequency above which H is 0, cycles/m.
-            reach: largest distance from the edge that will be asked for, metres.
+        Parameters
+        ----------
+        transfer : Transfer
+            H.
+        normal : np.ndarray
+            Toward the bright side, (2,).
+        cutoff : float
+            Frequency above which H is 0, cycles/m.
+        reach : float
+            Largest distance from the edge that will be asked for, metres.
         """
         _check_positive(cutoff=cutoff, reach=reach)
         normal = np.asarray(normal, float) / np.hypot(*normal)
@@ -102,8 +112,10 @@ class EdgeProfile:
     def __call__(self, distance: np.ndarray) -> np.ndarray:
         """Irradiance at distances from the edge, metres, positive on the bright side; bright is 1 where H(0) = 1.
 
-        Raises:
-            ValueError: a distance beyond the reach.
+        Raises
+        ------
+        ValueError
+            a distance beyond the reach.
         """
         distance = np.asarray(distance, float)
         if distance.size and np.max(np.abs(distance)) > self.reach * (1.0 + 1e-12):
@@ -115,13 +127,19 @@ class EdgeProfile:
     def image(self, edge: HalfPlane, x: Grid, y: Grid) -> np.ndarray:
         """Irradiance at pixel centres, (R, C), for any edge with the profile's normal.
 
-        Args:
-            edge: half plane with the profile's normal.
-            x: pixel centres along columns, (C,), metres.
-            y: along rows, (R,), metres.
+        Parameters
+        ----------
+        edge : HalfPlane
+            Half plane with the profile's normal.
+        x : Grid
+            Pixel centres along columns, (C,), metres.
+        y : Grid
+            Along rows, (R,), metres.
 
-        Raises:
-            ValueError: an edge with another normal, or pixels beyond the reach.
+        Raises
+        ------
+        ValueError
+            An edge with another normal, or pixels beyond the reach.
         """
         if np.max(np.abs(edge.normal - self.normal)) > 1e-12:
             raise ValueError(f"the profile belongs to the normal {self.normal}, the edge has {edge.normal}")
@@ -132,11 +150,15 @@ class EdgeProfile:
 class _EdgeSampling:
     """What the integral of an edge profile needs and the transfer function does not change.
 
-    Attributes:
-        frequency, share: Gauss' nodes (N,) and their weights over pi f.
-        distance: (D,) knots of the profile, metres.
-        coarse, fine: exp(2 pi i f d) of distances taken apart into coarse + fine steps, (A, N) and (N, B), A B >= D, so
-            that the sum over frequencies becomes one matrix product.
+    Attributes
+    ----------
+    frequency, share : np.ndarray
+        Gauss' nodes (N,) and their weights over pi f.
+    distance : np.ndarray
+        (D,) knots of the profile, metres.
+    coarse, fine : np.ndarray
+        exp(2 pi i f d) of distances taken apart into coarse + fine steps, (A, N) and (N, B), A B >= D, so that the sum
+        over frequencies becomes one matrix product.
     """
 
     frequency: np.ndarray
@@ -176,20 +198,31 @@ def target_image(
     (as in ``optics.waves.diffraction``), so that coarse pixels need no fine grid. Its cost goes with the square of
     period times cut-off, so keep shapes near the window.
 
-    Args:
-        target: in the image plane.
-        transfer: H; called with arrays (N,) of frequencies inside the cut-off.
-        cutoff: frequency above which H is 0, cycles/m.
-        x: pixel centres of the C columns, metres.
-        y: pixel centres of the R rows.
-        guard: metres added to the window's sides to make the period; default: so much that every copy of a shape is at
-            least 64/cutoff away from the window.
+    Parameters
+    ----------
+    target : Target
+        In the image plane.
+    transfer : Transfer
+        H; called with arrays (N,) of frequencies inside the cut-off.
+    cutoff : float
+        Frequency above which H is 0, cycles/m.
+    x : Grid
+        Pixel centres of the C columns, metres.
+    y : Grid
+        Pixel centres of the R rows.
+    guard : float | None
+        Metres added to the window's sides to make the period; default: so much that every copy of a shape is at least
+        64/cutoff away from the window.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (R, C); where H(0) = 1, a wide bright area is 1.
 
-    Raises:
-        ValueError: a shape that comes nearer than half of the guard to the copies of the window, or a bad argument.
+    Raises
+    ------
+    ValueError
+        a shape that comes nearer than half of the guard to the copies of the window, or a bad argument.
     """
     _check_positive(cutoff=cutoff, column_step=x.step, row_step=y.step)
     level = float(_ask(transfer, np.zeros(1), np.zeros(1))[0].real)

@@ -20,12 +20,17 @@ from optics.numerics.extension_table import ExtensionTable
 class Target:
     """A plane of even transmittance with shapes on it.
 
-    Attributes:
-        background: transmittance where no shape is, 0 to 1.
-        parts: (what the shape adds to the background, shape); shapes must not overlap (not checked).
+    Attributes
+    ----------
+    background : float
+        Transmittance where no shape is, 0 to 1.
+    parts : tuple[tuple[float, Shape], ...]
+        (what the shape adds to the background, shape); shapes must not overlap (not checked).
 
-    Raises:
-        ValueError: a transmittance outside 0 to 1.
+    Raises
+    ------
+    ValueError
+        a transmittance outside 0 to 1.
     """
 
     background: float
@@ -41,13 +46,18 @@ class Target:
     def mapped(self, point_map: PointMap, tolerance: float = BEND_TOLERANCE) -> Target:
         """The target seen through a smooth map of points (N, 2) -> (N, 2), metres, such as a camera's chief rays.
 
-        Args:
-            point_map: the map.
-            tolerance: largest distance of a new outline from the mapped one, metres; half planes keep straight edges,
-                the tangents at their points.
+        Parameters
+        ----------
+        point_map : PointMap
+            The map.
+        tolerance : float
+            Largest distance of a new outline from the mapped one, metres; half planes keep straight edges, the tangents
+            at their points.
 
-        Raises:
-            ValueError: the map is not finite at a shape, or too rough for the tolerance.
+        Raises
+        ------
+        ValueError
+            The map is not finite at a shape, or too rough for the tolerance.
         """
         shapes = (
             shape.mapped(point_map) if isinstance(shape, HalfPlane) else shape.mapped(point_map, tolerance)
@@ -59,10 +69,13 @@ class Target:
 def slanted_edge(angle: float, direction: Literal["x", "y"] = "y") -> Target:
     """A knife edge through the origin, bright on one side, for the slanted-edge method (ISO 12233).
 
-    Args:
-        angle: by which the edge is turned from its axis, from +x toward +y, radians, below 45 degrees either way.
-        direction: the axis that the edge follows at angle 0: "y" for a profile along x (bright toward +x), "x" for a
-            profile along y (bright toward +y).
+    Parameters
+    ----------
+    angle : float
+        By which the edge is turned from its axis, from +x toward +y, radians, below 45 degrees either way.
+    direction : Literal['x', 'y']
+        The axis that the edge follows at angle 0: "y" for a profile along x (bright toward +x), "x" for a profile along
+        y (bright toward +y).
     """
     if not abs(angle) < 0.25 * np.pi:
         raise ValueError(f"a slanted edge needs an angle below 45 degrees, found {np.degrees(angle):g}")
@@ -73,11 +86,16 @@ def slanted_edge(angle: float, direction: Literal["x", "y"] = "y") -> Target:
 def bar_group(frequency: float, bars: int, length: float, angle: float = 0.0) -> Target:
     """Bright bars on dark, each half a period wide, about the origin.
 
-    Args:
-        frequency: along the bars' normal, cycles/m.
-        bars: number of bright bars.
-        length: of a bar, metres.
-        angle: of the bars' normal from +x toward +y, radians.
+    Parameters
+    ----------
+    frequency : float
+        Along the bars' normal, cycles/m.
+    bars : int
+        Number of bright bars.
+    length : float
+        Of a bar, metres.
+    angle : float
+        Of the bars' normal from +x toward +y, radians.
     """
     if not (np.isfinite(frequency) and frequency > 0.0):
         raise ValueError(f"bars need a positive frequency in cycles/m, found {frequency}")
@@ -98,10 +116,14 @@ def siemens_star(spokes: int, radius: float, inner: float = 0.0) -> Target:
 
     At the distance r from the middle the star has the frequency spokes / (2 pi r). The ends of the spokes are chords.
 
-    Args:
-        spokes: number of bright spokes, 2 or more.
-        radius: of the corners, metres.
-        inner: radius at which the spokes begin, metres; 0: they meet in the middle.
+    Parameters
+    ----------
+    spokes : int
+        Number of bright spokes, 2 or more.
+    radius : float
+        Of the corners, metres.
+    inner : float
+        Radius at which the spokes begin, metres; 0: they meet in the middle.
     """
     if spokes < 2:
         raise ValueError(f"a Siemens star needs two spokes or more, found {spokes}")

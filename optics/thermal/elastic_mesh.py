@@ -28,15 +28,23 @@ def mirror_mesh(surface: Surface, aperture: Aperture, thickness: float, behind: 
     A rectangle is a grid; a disk is a square block with four blocks around it, so that no cell has a straight angle;
     a disk with a hole is a ring of blocks.
 
-    Args:
-        surface: the optical face, in its own frame (metres), with its figure.
-        aperture: the outline of the substrate (its edge is a cylinder or, also about an ellipse, a box along z).
-        thickness: least distance along z from the face to the back, metres.
-        behind: side of the face where the substrate lies: +1 toward +z, -1 toward -z.
-        cells: number of cells across the longer width; the layers through the thickness follow from it (at least 2).
+    Parameters
+    ----------
+    surface : Surface
+        The optical face, in its own frame (metres), with its figure.
+    aperture : Aperture
+        The outline of the substrate (its edge is a cylinder or, also about an ellipse, a box along z).
+    thickness : float
+        Least distance along z from the face to the back, metres.
+    behind : float
+        Side of the face where the substrate lies: +1 toward +z, -1 toward -z.
+    cells : int
+        Number of cells across the longer width; the layers through the thickness follow from it (at least 2).
 
-    Raises:
-        ValueError: an impossible size, or the aperture reaches beyond the surface's domain.
+    Raises
+    ------
+    ValueError
+        An impossible size, or the aperture reaches beyond the surface's domain.
     """
     if behind not in (1.0, -1.0):
         raise ValueError(f"a substrate lies on side +1 or -1 of its face, found behind = {behind}")
@@ -153,13 +161,18 @@ def polyhedron_mesh(vertices: Any, spacing: float) -> MeshTet1:
     ``spacing`` is halved, the longest of each tetrahedron first (Rivara, Int. J. Numer. Meth. Eng. 20, 745 (1984)).
     Halving keeps volumes positive and faces plane, needs no repair and drives long thin pieces to compact ones.
 
-    Args:
-        vertices: corners of the polyhedron in any order, metres, shape (V, 3).
-        spacing: length of the longest edge of the mesh, metres.
+    Parameters
+    ----------
+    vertices : Any
+        Corners of the polyhedron in any order, metres, shape (V, 3).
+    spacing : float
+        Length of the longest edge of the mesh, metres.
 
-    Raises:
-        ValueError: the points do not span a body, or one of them lies inside the hull of the others, so that the body
-            meant cannot be convex.
+    Raises
+    ------
+    ValueError
+        The points do not span a body, or one of them lies inside the hull of the others, so that the body meant cannot
+        be convex.
     """
     points = np.asarray(vertices, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4 or not np.all(np.isfinite(points)):

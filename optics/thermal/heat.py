@@ -15,9 +15,12 @@ from optics.numerics.array_math import inner, turned
 class Temperature:
     """A change of temperature in a body's frame: change + gradient . r.
 
-    Attributes:
-        change: at the body's origin, kelvin.
-        gradient: in the body's frame, K/m.
+    Attributes
+    ----------
+    change : float
+        At the body's origin, kelvin.
+    gradient : tuple[float, float, float]
+        In the body's frame, K/m.
     """
 
     change: float = 0.0
@@ -40,9 +43,12 @@ class Temperature:
 class Temperatures:
     """Changes of temperature of one body in S states.
 
-    Attributes:
-        change: at the body's origin, kelvin, (S,).
-        gradient: in the body's frame, K/m, (S, 3).
+    Attributes
+    ----------
+    change : np.ndarray
+        At the body's origin, kelvin, (S,).
+    gradient : np.ndarray
+        In the body's frame, K/m, (S, 3).
     """
 
     change: np.ndarray
@@ -75,10 +81,14 @@ def carried_motion(expansion: float, gradient: np.ndarray, arm: np.ndarray) -> t
     The stress-free displacement of a linear field, u = a ((g . q) q - q^2 g / 2), and its rotation a (g x q); see
     ``optics.thermal.thermo_elastic.free_linear_field``. The uniform part, a dT q, is the body's ``Motion.stretch``.
 
-    Args:
-        expansion: a, 1/K.
-        gradient: g, K/m, in the body's frame, (..., 3).
-        arm: q, metres, likewise, (..., 3).
+    Parameters
+    ----------
+    expansion : float
+        a, 1/K.
+    gradient : np.ndarray
+        g, K/m, in the body's frame, (..., 3).
+    arm : np.ndarray
+        q, metres, likewise, (..., 3).
     """
     g, q = np.asarray(gradient, np.float64), np.asarray(arm, np.float64)
     turn = np.empty(np.broadcast_shapes(g.shape, q.shape))

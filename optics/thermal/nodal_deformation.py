@@ -61,8 +61,10 @@ _ROUNDING = 1e-14  # metres rms: a residual below is rounding and gets no grid
 class NodesError(PhysicalError, ValueError):
     """Nodes that do not describe the face.
 
-    Attributes:
-        allowed: what to do, in words.
+    Attributes
+    ----------
+    allowed
+        What to do, in words.
     """
 
     def __init__(self, problem: str, allowed: str) -> None:
@@ -74,21 +76,35 @@ class NodesError(PhysicalError, ValueError):
 class NodalDeformation:
     """What the nodes' displacements are for the face, in its own nominal frame.
 
-    Attributes:
-        rotate: exact rotation vector about the frame's origin, radians.
-        shift: of the frame's origin, metres.
-        growth: relative, of the surface about the origin.
-        figure: Noll index -> metres rms over the disk, of sag along +z; from Z1 on.
-        grid: the rest on a grid, None where it is below rounding.
-        places: x, y of the nodes that were used, where they stand on the moved face, metres, (K, 2).
-        weight: of these nodes, share of the clear aperture, (K,).
-        change: of sag at the nodes beyond the rigid motion and growth, metres, (K,).
-        residual: what the Zernike terms leave of it, (K,).
-        lost: what the grid leaves of that, (K,).
-        between: rms of the error at nodes that are left out, every second one, metres: what the mesh does not know
-            between its nodes is less.
-        spacing: mean distance of the nodes, metres.
-        others: how many nodes are not used, off the surface or outside of the aperture.
+    Attributes
+    ----------
+    rotate : tuple[float, float, float]
+        Exact rotation vector about the frame's origin, radians.
+    shift : tuple[float, float, float]
+        Of the frame's origin, metres.
+    growth : float
+        Relative, of the surface about the origin.
+    figure : FrozenMap[int, float]
+        Noll index -> metres rms over the disk, of sag along +z; from Z1 on.
+    grid : GridFigure | None
+        The rest on a grid, None where it is below rounding.
+    places : np.ndarray
+        x, y of the nodes that were used, where they stand on the moved face, metres, (K, 2).
+    weight : np.ndarray
+        Of these nodes, share of the clear aperture, (K,).
+    change : np.ndarray
+        Of sag at the nodes beyond the rigid motion and growth, metres, (K,).
+    residual : np.ndarray
+        What the Zernike terms leave of it, (K,).
+    lost : np.ndarray
+        What the grid leaves of that, (K,).
+    between : float
+        Rms of the error at nodes that are left out, every second one, metres: what the mesh does not know between its
+        nodes is less.
+    spacing : float
+        Mean distance of the nodes, metres.
+    others : int
+        How many nodes are not used, off the surface or outside of the aperture.
     """
 
     rotate: tuple[float, float, float]
@@ -131,15 +147,23 @@ def nodal_deformation(
 
     Nodes off the surface, as those inside of the body, are left out. The order of the nodes is of no effect.
 
-    Args:
-        nodes: where they stand in the face's nominal frame, metres, (N, 3).
-        displacements: metres, (N, 3).
-        surface: the face's nominal shape.
-        aperture: the clear aperture, which the nodes have to cover.
-        terms: highest Noll index, 3 or more.
+    Parameters
+    ----------
+    nodes : Any
+        Where they stand in the face's nominal frame, metres, (N, 3).
+    displacements : Any
+        Metres, (N, 3).
+    surface : Surface
+        The face's nominal shape.
+    aperture : Aperture
+        The clear aperture, which the nodes have to cover.
+    terms : int
+        Highest Noll index, 3 or more.
 
-    Raises:
-        NodesError: too few nodes on the surface, a gap between them, or displacements of another unit.
+    Raises
+    ------
+    NodesError
+        Too few nodes on the surface, a gap between them, or displacements of another unit.
     """
     if not 3 <= terms <= zernike.MAX_NOLL:
         raise ValueError(f"the terms must end between Z3 and Z{zernike.MAX_NOLL}, found {terms}")
@@ -243,8 +267,10 @@ def _filled(aperture: Aperture) -> float:
 def _cells(places: np.ndarray, aperture: Aperture, spacing: float) -> np.ndarray:
     """Share of the aperture that is nearer to each place than to the others, (K,).
 
-    Raises:
-        NodesError: a part of the aperture is far from all.
+    Raises
+    ------
+    NodesError
+        a part of the aperture is far from all.
     """
     from scipy.spatial import cKDTree
 
@@ -300,10 +326,14 @@ def _gridded(
 class _Spline:
     """Least squares of a bicubic spline to values at scattered places, with a little weight on its bending.
 
-    Args:
-        places: (K, 2), metres, inside of the bounds.
-        bounds: x_min, x_max, y_min, y_max of the first and last samples, metres.
-        shape: samples along y and x.
+    Parameters
+    ----------
+    places
+        (K, 2), metres, inside of the bounds.
+    bounds
+        x_min, x_max, y_min, y_max of the first and last samples, metres.
+    shape
+        Samples along y and x.
     """
 
     def __init__(self, places: np.ndarray, bounds: tuple[float, float, float, float], shape: tuple[int, int]) -> None:

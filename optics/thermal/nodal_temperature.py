@@ -33,12 +33,17 @@ _MOST_STEPS = 2000
 class _Between:
     """Values at nodes, linear in Delaunay's tetrahedra.
 
-    Args:
-        nodes: (N, 3), with extents of about 1.
-        values: at them, (N,).
+    Parameters
+    ----------
+    nodes
+        (N, 3), with extents of about 1.
+    values
+        At them, (N,).
 
-    Raises:
-        QhullError: the nodes lie in a plane.
+    Raises
+    ------
+    QhullError
+        The nodes lie in a plane.
     """
 
     def __init__(self, nodes: np.ndarray, values: np.ndarray) -> None:
@@ -76,9 +81,12 @@ class _Between:
 class Coverage:
     """How well nodes cover places of a body.
 
-    Attributes:
-        outside: share of the body's volume that lies beyond the outermost nodes by more than their spacing.
-        farthest: distance of the body's place that is farthest from any node, metres.
+    Attributes
+    ----------
+    outside : float
+        Share of the body's volume that lies beyond the outermost nodes by more than their spacing.
+    farthest : float
+        Distance of the body's place that is farthest from any node, metres.
     """
 
     outside: float
@@ -88,23 +96,34 @@ class Coverage:
 class NodalTemperature:
     """A change of temperature that is known at nodes.
 
-    Attributes:
-        points: nodes without repetitions, metres, (N, 3).
-        values: change of temperature there, kelvin, (N,).
-        linear: their least-squares linear field, every node with the same weight.
-        spacing: edge of a cube that has as many nodes as the volume that they span, metres; 0 for nodes in a plane.
-        flat: whether the nodes lie in a plane or on a line; they then have a linear fit only.
+    Attributes
+    ----------
+    points
+        Nodes without repetitions, metres, (N, 3).
+    values
+        Change of temperature there, kelvin, (N,).
+    linear
+        Their least-squares linear field, every node with the same weight.
+    spacing
+        Edge of a cube that has as many nodes as the volume that they span, metres; 0 for nodes in a plane.
+    flat
+        Whether the nodes lie in a plane or on a line; they then have a linear fit only.
     """
 
     def __init__(self, points: Any, values: Any) -> None:
         """Sort and triangulate the nodes; their order is of no effect.
 
-        Args:
-            points: nodes, metres, (N, 3).
-            values: change of temperature there, kelvin, (N,).
+        Parameters
+        ----------
+        points : Any
+            Nodes, metres, (N, 3).
+        values : Any
+            Change of temperature there, kelvin, (N,).
 
-        Raises:
-            NodesError: too few nodes, or too many.
+        Raises
+        ------
+        NodesError
+            Too few nodes, or too many.
         """
         given, heat = np.asarray(points, np.float64), np.asarray(values, np.float64)
         if given.ndim != 2 or given.shape[1] != 3 or heat.shape != given.shape[:1]:
@@ -159,8 +178,10 @@ class NodalTemperature:
     def at(self, points: Any) -> np.ndarray:
         """Change of temperature at places (P, 3), kelvin, (P,).
 
-        Args:
-            points: metres, in the frame of the nodes.
+        Parameters
+        ----------
+        points : Any
+            Metres, in the frame of the nodes.
         """
         places = np.asarray(points, np.float64)
         rest = self._inside_rest(places)
@@ -178,9 +199,12 @@ class NodalTemperature:
     def coverage(self, points: Any, weights: Any) -> Coverage:
         """How well the nodes cover places (P, 3) of a body, metres, that stand for parts (P,) of its volume.
 
-        Args:
-            points: metres, (P, 3).
-            weights: volumes, (P,).
+        Parameters
+        ----------
+        points : Any
+            Metres, (P, 3).
+        weights : Any
+            Volumes, (P,).
         """
         places, share = np.asarray(points, np.float64), np.asarray(weights, np.float64)
         distance = self._tree.query(places)[0]
@@ -210,12 +234,18 @@ class NodalTemperature:
 def linear_part(points: Any, values: Any, weights: Any) -> tuple[Temperature, np.ndarray]:
     """The linear field nearest to temperatures by weighted least squares, and what it leaves.
 
-    Args:
-        points: metres, (P, 3), not in a plane.
-        values: kelvin, (P,).
-        weights: of the squares, (P,).
+    Parameters
+    ----------
+    points : Any
+        Metres, (P, 3), not in a plane.
+    values : Any
+        Kelvin, (P,).
+    weights : Any
+        Of the squares, (P,).
 
-    Returns:
+    Returns
+    -------
+    tuple[Temperature, np.ndarray]
         The field, and values less the field, kelvin, (P,).
     """
     places, heat, root = np.asarray(points), np.asarray(values), np.sqrt(np.asarray(weights))

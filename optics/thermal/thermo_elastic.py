@@ -41,10 +41,14 @@ _CANDIDATES = ((12, _INSIDE), (150, _NEAR))  # how many cells to try, by distanc
 class Displacement:
     """Displacement field of a body.
 
-    Attributes:
-        nodes: metres, shape (N, 3).
-        values: at the nodes, metres, shape (N, 3).
-        finder: the cells.
+    Attributes
+    ----------
+    nodes : np.ndarray
+        Metres, shape (N, 3).
+    values : np.ndarray
+        At the nodes, metres, shape (N, 3).
+    finder : Finder
+        The cells.
     """
 
     nodes: np.ndarray
@@ -56,8 +60,10 @@ class Displacement:
 
         Points outside of the mesh by up to 2 % of a cell are continued, as a curved face departs from its cells.
 
-        Raises:
-            ValueError: a point lies farther outside.
+        Raises
+        ------
+        ValueError
+            a point lies farther outside.
         """
         dofs, shape = self.finder.shapes(np.asarray(points, np.float64))
         return np.asarray(np.einsum("pi,pix->px", shape, self.values[dofs]))
@@ -75,8 +81,10 @@ class Displaced(Protocol):
 class Formula:
     """A displacement that a formula gives everywhere.
 
-    Attributes:
-        field: points (P, 3) in metres -> displacements (P, 3) in metres.
+    Attributes
+    ----------
+    field : Callable[[np.ndarray], np.ndarray]
+        Points (P, 3) in metres -> displacements (P, 3) in metres.
     """
 
     field: Callable[[np.ndarray], np.ndarray]
@@ -161,11 +169,16 @@ def rigid_modes(points: np.ndarray) -> np.ndarray:
 class FaceChange:
     """How an optical face moved and changed, in the face's own nominal frame.
 
-    Attributes:
-        rotate: small rotation vector about the frame's origin, radians.
-        shift: of the frame's origin, metres.
-        figure: Noll index -> metres rms over the disk, change of sag along +z; from Z4 on.
-        residual_rms: what rotate, shift and figure leave of the change of sag, rms over the aperture, metres.
+    Attributes
+    ----------
+    rotate : tuple[float, float, float]
+        Small rotation vector about the frame's origin, radians.
+    shift : tuple[float, float, float]
+        Of the frame's origin, metres.
+    figure : Mapping[int, float]
+        Noll index -> metres rms over the disk, change of sag along +z; from Z4 on.
+    residual_rms : float
+        What rotate, shift and figure leave of the change of sag, rms over the aperture, metres.
     """
 
     rotate: tuple[float, float, float]
@@ -188,15 +201,23 @@ def face_change(
     the rectangle, as in the ray trace. On a narrow rectangle some combinations of terms hardly differ; those that
     show on the aperture by less than 1e-6 of their coefficients are left out, and the others serve only inside of it.
 
-    Args:
-        displacement: of the body.
-        surface: the face's nominal shape.
-        aperture: the part of it to look at, which must lie on the body.
-        pose: of the face's frame in the mesh's.
-        terms: highest Noll index, 3 for none.
+    Parameters
+    ----------
+    displacement : Displaced
+        Of the body.
+    surface : Surface
+        The face's nominal shape.
+    aperture : Aperture
+        The part of it to look at, which must lie on the body.
+    pose : Pose
+        Of the face's frame in the mesh's.
+    terms : int
+        Highest Noll index, 3 for none.
 
-    Raises:
-        ValueError: the aperture reaches beyond the body, or ``terms`` is below 3.
+    Raises
+    ------
+    ValueError
+        The aperture reaches beyond the body, or ``terms`` is below 3.
     """
     if not 3 <= terms <= zernike.MAX_NOLL:
         raise ValueError(f"a face's terms must end between Z3 and Z{zernike.MAX_NOLL}, found {terms}")
@@ -264,8 +285,10 @@ class Kinematic:
 
     Point 0 stays where it is, point 1 moves only along the line from 0 to 1, point 2 only in the plane of the three.
 
-    Attributes:
-        points: in or on the body, metres, shape (3, 3); they need not be nodes.
+    Attributes
+    ----------
+    points : np.ndarray
+        In or on the body, metres, shape (3, 3); they need not be nodes.
     """
 
     points: np.ndarray
@@ -296,11 +319,16 @@ class Bonded:
 
     The glued nodes move by expansion * change * (r - about).
 
-    Attributes:
-        where: nodes (N, 3) in metres -> which of them are glued, (N,) bool.
-        expansion: of the foundation, 1/K.
-        change: of the foundation's temperature, kelvin.
-        about: the point of the foundation that stays, metres, shape (3,).
+    Attributes
+    ----------
+    where : Field
+        Nodes (N, 3) in metres -> which of them are glued, (N,) bool.
+    expansion : float
+        Of the foundation, 1/K.
+    change : float
+        Of the foundation's temperature, kelvin.
+    about : tuple[float, float, float]
+        The point of the foundation that stays, metres, shape (3,).
     """
 
     where: Field
@@ -320,9 +348,12 @@ Support = Kinematic | Bonded
 class ElasticBody:
     """A mesh of one material with its stiffness; factorisations are kept for further load cases.
 
-    Attributes:
-        nodes: all nodes of the quadratic elements, metres, shape (N, 3).
-        places: at which loads are taken, metres, (P, 3); volumes: that they stand for, m^3, (P,).
+    Attributes
+    ----------
+    nodes
+        All nodes of the quadratic elements, metres, shape (N, 3).
+    places
+        At which loads are taken, metres, (P, 3); volumes: that they stand for, m^3, (P,).
     """
 
     def __init__(self, mesh: MeshHex2 | MeshTet1, material: Material):
@@ -363,13 +394,18 @@ class ElasticBody:
 
         Load cases on supports that hold the same nodes share one factorisation, and so do all kinematic supports.
 
-        Args:
-            temperatures: changes of temperature in kelvin, points (P, 3) -> (P,).
-            support: one for all, or one for each load case.
+        Parameters
+        ----------
+        temperatures : Sequence[Field]
+            Changes of temperature in kelvin, points (P, 3) -> (P,).
+        support : Support | Sequence[Support]
+            One for all, or one for each load case.
 
-        Raises:
-            ValueError: a temperature is not finite or of another shape, a bond holds too few nodes, or a kinematic
-                point lies outside of the body.
+        Raises
+        ------
+        ValueError
+            a temperature is not finite or of another shape, a bond holds too few nodes, or a kinematic point lies
+            outside of the body.
         """
         supports = [support] * len(temperatures) if isinstance(support, Kinematic | Bonded) else list(support)
         out = []
@@ -448,13 +484,20 @@ def free_linear_field(
     stress in any shape of body. Of all rigid motions the one is chosen that leaves ``about`` in place and unturned;
     elsewhere the body turns by the rotation a (g x q).
 
-    Args:
-        expansion: a, 1/K.
-        change: kelvin at ``about``.
-        gradient: g, K/m, shape (3,).
-        about: metres, shape (3,).
+    Parameters
+    ----------
+    expansion : float
+        a, 1/K.
+    change : float
+        Kelvin at ``about``.
+    gradient : Any
+        g, K/m, shape (3,).
+    about : Any
+        Metres, shape (3,).
 
-    Returns:
+    Returns
+    -------
+    Callable[[np.ndarray], np.ndarray]
         Points (P, 3) in metres -> displacements (P, 3) in metres.
     """
     g, origin = np.asarray(gradient, np.float64), np.asarray(about, np.float64)

@@ -62,9 +62,12 @@ _STEEPEST = 2.5
 class FieldSamples:
     """Samples of a field along one axis, even and symmetric about the middle of the points.
 
-    Attributes:
-        step: between two samples, in steps of the points.
-        weights: of the samples (an even number M) in each of the N points, (N, M).
+    Attributes
+    ----------
+    step : float
+        Between two samples, in steps of the points.
+    weights : np.ndarray
+        Of the samples (an even number M) in each of the N points, (N, M).
     """
 
     step: float
@@ -79,10 +82,14 @@ class FieldSamples:
     def of(cls, points: int, band: float, loose: bool) -> FieldSamples | None:
         """Samples for a grid of points, or None where they would not be fewer than the points.
 
-        Args:
-            points: N of the grid, at most ``LONGEST``.
-            band: largest |q|, radians from one point to the next.
-            loose: right to 1e-8 of the sum of all waves' amplitudes, else to 2e-12.
+        Parameters
+        ----------
+        points : int
+            N of the grid, at most ``LONGEST``.
+        band : float
+            Largest |q|, radians from one point to the next.
+        loose : bool
+            Right to 1e-8 of the sum of all waves' amplitudes, else to 2e-12.
         """
         if not 0.0 < band < _STEEPEST:
             return None
@@ -122,11 +129,16 @@ def _plane_waves(points: int, count: int, step: float, q: np.ndarray) -> tuple[n
 class PupilField:
     """Plane waves that make B images, N nodes each.
 
-    Attributes:
-        u, v: direction cosines along the detector's x and y, (B, N).
-        eikonal: optical path to the plane wave through the image's origin, metres, (B, N), common piston removed.
-        amplitude: a_j * w_j * du dv, such that the formula above holds with unit total power, (B, N); 0 = blocked.
-        wavelength: metres.
+    Attributes
+    ----------
+    u, v : np.ndarray
+        Direction cosines along the detector's x and y, (B, N).
+    eikonal : np.ndarray
+        Optical path to the plane wave through the image's origin, metres, (B, N), common piston removed.
+    amplitude : np.ndarray
+        a_j * w_j * du dv, such that the formula above holds with unit total power, (B, N); 0 = blocked.
+    wavelength : float
+        metres.
     """
 
     u: np.ndarray
@@ -166,13 +178,20 @@ def image(field: PupilField, x: Grid, y: Grid, single: bool = False) -> np.ndarr
 
     Where the pixels sample the field well, it is summed at fewer places and interpolated (``FieldSamples``).
 
-    Args:
-        field: B pupils.
-        x: detector x of the C columns.
-        y: detector y of the R rows.
-        single: right to some 1e-7 of the peak, as in single precision, for less time; else to 1e-12.
+    Parameters
+    ----------
+    field : PupilField
+        B pupils.
+    x : Grid
+        Detector x of the C columns.
+    y : Grid
+        Detector y of the R rows.
+    single : bool
+        Right to some 1e-7 of the peak, as in single precision, for less time; else to 1e-12.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         Shape (B, R, C), 1/m^2 for unit power through the pupil.
     """
     k = 2.0 * np.pi / field.wavelength
@@ -316,10 +335,14 @@ def at_crossings(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
     Phases are worked out in double, waves in single precision: right to some 1e-6 of the peak.
 
-    Args:
-        field: B pupils.
-        x: of the columns, (B, C), metres.
-        y: of the rows, (B, R), metres.
+    Parameters
+    ----------
+    field : PupilField
+        B pupils.
+    x : np.ndarray
+        Of the columns, (B, C), metres.
+    y : np.ndarray
+        Of the rows, (B, R), metres.
     """
     turns = 1.0 / field.wavelength
 
@@ -369,10 +392,14 @@ def _waves(frequency: np.ndarray, grid: Grid, factor: np.ndarray | float, kind: 
 def airy(radius: np.ndarray, wavelength: float, f_number: float) -> np.ndarray:
     """Airy pattern of a clear circular pupil, 1 at the centre; ``radius`` in metres.
 
-    Args:
-        radius: from the middle of the image, any shape, metres.
-        wavelength: metres.
-        f_number: of the beam.
+    Parameters
+    ----------
+    radius : np.ndarray
+        From the middle of the image, any shape, metres.
+    wavelength : float
+        metres.
+    f_number : float
+        Of the beam.
     """
     return _jinc(np.pi * np.asarray(radius) / (wavelength * f_number)) ** 2
 
@@ -387,9 +414,12 @@ MAX_REACH = 10
 class UnsampledImageError(PhysicalError, ValueError):
     """An image is too fine for its pixels, or the source's image too wide for the filter.
 
-    Attributes:
-        remedy: what would do.
-        of_source: whether that is a smaller source.
+    Attributes
+    ----------
+    remedy
+        What would do.
+    of_source
+        Whether that is a smaller source.
     """
 
     def __init__(self, text: str, remedy: str, of_source: bool) -> None:
@@ -406,8 +436,10 @@ class PixelResponse:
     disk is matched by a small symmetric kernel, so that no oversampling is needed; above half the sampling frequency
     it is not possible and the fit says so.
 
-    Attributes:
-        kernel: (2 reach + 1, 2 reach + 1).
+    Attributes
+    ----------
+    kernel : np.ndarray
+        (2 reach + 1, 2 reach + 1).
     """
 
     kernel: np.ndarray
@@ -421,13 +453,19 @@ class PixelResponse:
     def fit(cls, pitch: float, disk: float, cutoff: float) -> PixelResponse:
         """Fit the kernel.
 
-        Args:
-            pitch: pixel pitch, metres (the whole pixel is sensitive).
-            disk: diameter of the source's image, metres; 0 for a point.
-            cutoff: highest spatial frequency of the irradiance, cycles/m.
+        Parameters
+        ----------
+        pitch : float
+            Pixel pitch, metres (the whole pixel is sensitive).
+        disk : float
+            Diameter of the source's image, metres; 0 for a point.
+        cutoff : float
+            Highest spatial frequency of the irradiance, cycles/m.
 
-        Raises:
-            UnsampledImageError: the image is not well enough sampled by the pixels.
+        Raises
+        ------
+        UnsampledImageError
+            The image is not well enough sampled by the pixels.
         """
         limit = cutoff * pitch  # cycles per pixel
         if limit > 0.45:

@@ -54,9 +54,12 @@ WORST_FIT = 3e-4
 class StopOutlines:
     """Outlines of edges as the images see them on the stop's unit disk: convex polygons, counterclockwise.
 
-    Attributes:
-        clear: light comes through inside of all of them only, (B, V, 2) each.
-        blocked: light is stopped in any of them, (B, V, 2) each; some are empty.
+    Attributes
+    ----------
+    clear : tuple[np.ndarray, ...]
+        Light comes through inside of all of them only, (B, V, 2) each.
+    blocked : tuple[np.ndarray, ...]
+        Light is stopped in any of them, (B, V, 2) each; some are empty.
     """
 
     clear: tuple[np.ndarray, ...] = ()
@@ -73,11 +76,16 @@ class StopOutlines:
     def shadows(self, count: int, further: Sequence[np.ndarray] = ()) -> np.ndarray:
         """What edges and other shadows take of ``count`` pupils.
 
-        Args:
-            count: B.
-            further: convex polygons of other shadows, counterclockwise, (B, V, 2) each.
+        Parameters
+        ----------
+        count : int
+            B.
+        further : Sequence[np.ndarray]
+            Convex polygons of other shadows, counterclockwise, (B, V, 2) each.
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             Convex polygons that do not overlap, (B, K, W, 2); some are empty.
         """
         # each image by itself: what is one piece in one of them may be many in another
@@ -109,16 +117,24 @@ def settled_shadows(
 ) -> tuple[np.ndarray, float]:
     """Shadows of ``count`` pupils with as many sides of round edges as they need.
 
-    Args:
-        outlines: of the edges, by the number of sides that stand for a round one.
-        count: B.
-        further: as of ``StopOutlines.shadows``.
+    Parameters
+    ----------
+    outlines : Callable[[int], StopOutlines]
+        Of the edges, by the number of sides that stand for a round one.
+    count : int
+        B.
+    further : Sequence[np.ndarray]
+        As of ``StopOutlines.shadows``.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, float]
         Pieces as of ``StopOutlines.shadows``, and how much of the stop their shares are right to.
 
-    Raises:
-        UnphysicalError: as of ``StopOutlines.shadows``, or edges that all sides are too few for.
+    Raises
+    ------
+    UnphysicalError
+        As of ``StopOutlines.shadows``, or edges that all sides are too few for.
     """
     few, *more = ROUND_SIDES
     pieces = _few_enough(outlines(few).shadows(count, further))
@@ -156,11 +172,16 @@ def shares_of_stop(pieces: np.ndarray) -> np.ndarray:
 def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Quadrature over the part within the stop of pieces of shadows, with ``count`` nodes along each side of a box.
 
-    Args:
-        pieces: convex polygons that do not overlap, counterclockwise, (B, K, V, 2); K may be 0.
-        count: nodes.
+    Parameters
+    ----------
+    pieces : np.ndarray
+        Convex polygons that do not overlap, counterclockwise, (B, K, V, 2); K may be 0.
+    count : int
+        nodes.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray, np.ndarray]
         Points, complex, (B, Q), weights of the area, (B, Q), and the areas of the pieces, (B, K).
     """
     images, number = pieces.shape[:2]
@@ -183,17 +204,25 @@ def outlines_on_stop(
 ) -> StopOutlines:
     """The edges of one surface as B images see them.
 
-    Args:
-        places: where the rays through ``nodes`` meet the surface, in its own x and y, (B, N, 2), metres; of rays that
-            edges stop, too.
-        edges: of the surface; light comes through where all let it.
-        nodes: quadrature over the stop's unit disk.
-        round_sides: of the polygon that stands for a round edge.
-        lit: which rays no edge before the surface stops, (B, N); None for all. Where light is stopped already, nothing
-            is left to be cut, and the polynomials go on smoothly.
+    Parameters
+    ----------
+    places : np.ndarray
+        Where the rays through ``nodes`` meet the surface, in its own x and y, (B, N, 2), metres; of rays that edges
+        stop, too.
+    edges : Sequence[Edge]
+        Of the surface; light comes through where all let it.
+    nodes : PupilNodes
+        Quadrature over the stop's unit disk.
+    round_sides : int
+        Of the polygon that stands for a round edge.
+    lit : np.ndarray | None
+        Which rays no edge before the surface stops, (B, N); None for all. Where light is stopped already, nothing is
+        left to be cut, and the polynomials go on smoothly.
 
-    Raises:
-        UnphysicalError: places that no polynomials follow, as of a surface near a focus.
+    Raises
+    ------
+    UnphysicalError
+        Places that no polynomials follow, as of a surface near a focus.
     """
     known = np.all(np.isfinite(places), axis=-1)
     lit = known if lit is None else lit & known
@@ -418,9 +447,12 @@ shapes it has the least."""
 class LitStop:
     """Quadratures over the light of F beams.
 
-    Attributes:
-        x, y: nodes, in units of the stop's radius, (F, N).
-        weight: of the area, (F, N); negative in shadows, 0 for what only fills the rows.
+    Attributes
+    ----------
+    x, y : np.ndarray
+        Nodes, in units of the stop's radius, (F, N).
+    weight : np.ndarray
+        Of the area, (F, N); negative in shadows, 0 for what only fills the rows.
     """
 
     x: np.ndarray
@@ -431,10 +463,14 @@ class LitStop:
     def of(cls, pieces: np.ndarray, rings: int, count: int) -> LitStop:
         """The stop without shadows.
 
-        Args:
-            pieces: convex polygons on the unit disk that do not overlap, (F, K, V, 2).
-            rings: of the rule over the whole stop.
-            count: nodes along each side of a shadow's box.
+        Parameters
+        ----------
+        pieces : np.ndarray
+            Convex polygons on the unit disk that do not overlap, (F, K, V, 2).
+        rings : int
+            Of the rule over the whole stop.
+        count : int
+            Nodes along each side of a shadow's box.
         """
         nodes = quadrature.disk(rings)
         points, dark, _ = nodes_in_shadows(pieces, count)
@@ -455,8 +491,10 @@ def holes(pieces: np.ndarray) -> np.ndarray:
     """Radius of the hole of each stop whose shadow is one disk about its middle, in units of the stop's, (F,); 0 where
     there is no shadow, NaN where it is another.
 
-    Args:
-        pieces: convex polygons that do not overlap, (F, K, V, 2).
+    Parameters
+    ----------
+    pieces : np.ndarray
+        Convex polygons that do not overlap, (F, K, V, 2).
     """
     points, weight, _ = nodes_in_shadows(pieces, 4)
     taken = np.sum(weight, axis=1)

@@ -32,13 +32,20 @@ from optics.waves.diffraction import PupilField
 def eikonal(position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """Optical path of each ray's plane wave through ``origin``: path - d . (position - origin).
 
-    Args:
-        position: where the path was measured, (..., N, 3), metres (image space, index 1).
-        direction: unit directions, (..., N, 3).
-        path: optical paths, (..., N).
-        origin: the image point, broadcastable to (..., 1, 3).
+    Parameters
+    ----------
+    position : np.ndarray
+        Where the path was measured, (..., N, 3), metres (image space, index 1).
+    direction : np.ndarray
+        Unit directions, (..., N, 3).
+    path : np.ndarray
+        Optical paths, (..., N).
+    origin : np.ndarray
+        The image point, broadcastable to (..., 1, 3).
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (..., N), metres.
     """
     return np.asarray(path - np.sum(direction * (position - origin), axis=-1))
@@ -49,15 +56,22 @@ def path_to_sphere(
 ) -> np.ndarray:
     """Optical path of each ray to the sphere of a radius about ``origin``, plus that radius.
 
-    Args:
-        position: rays near the image, (..., N, 3), metres.
-        direction: unit directions there.
-        path: optical paths to ``position``, (..., N).
-        origin: the image point, broadcastable to (..., 1, 3).
-        radius: of the sphere, metres, positive when the exit pupil lies upstream; for an infinite one this is the
-            ``eikonal``.
+    Parameters
+    ----------
+    position : np.ndarray
+        Rays near the image, (..., N, 3), metres.
+    direction : np.ndarray
+        Unit directions there.
+    path : np.ndarray
+        Optical paths to ``position``, (..., N).
+    origin : np.ndarray
+        The image point, broadcastable to (..., 1, 3).
+    radius : float
+        Of the sphere, metres, positive when the exit pupil lies upstream; for an infinite one this is the ``eikonal``.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (..., N) metres.
     """
     offset = position - origin
@@ -72,10 +86,14 @@ def path_to_sphere(
 class WavefrontFit:
     """Zernike coefficients of a wavefront (Noll order, index 0 = Z1), metres rms each, and the rms that remains.
 
-    Attributes:
-        coefficients: (..., last).
-        rms: (...,) rms wavefront error after piston and tilt are taken out, metres.
-        residual_rms: (...,) rms left by the fit.
+    Attributes
+    ----------
+    coefficients : np.ndarray
+        (..., last).
+    rms : np.ndarray
+        (...,) rms wavefront error after piston and tilt are taken out, metres.
+    residual_rms : np.ndarray
+        (...,) rms left by the fit.
     """
 
     coefficients: np.ndarray
@@ -90,12 +108,18 @@ def fit_wavefront(
 
     Piston and tilt are removed from ``rms`` (they move the image, they do not blur it); defocus is kept.
 
-    Args:
-        x: on the unit disk, (N,).
-        y: likewise.
-        weight: of a quadrature, (N,).
-        difference: of optical paths, (..., N), metres.
-        last: highest Noll index.
+    Parameters
+    ----------
+    x : np.ndarray
+        On the unit disk, (N,).
+    y : np.ndarray
+        likewise.
+    weight : np.ndarray
+        Of a quadrature, (N,).
+    difference : np.ndarray
+        Of optical paths, (..., N), metres.
+    last : int
+        Highest Noll index.
     """
     coefficients = zernike.fit(last, x, y, difference, weight)
     share = weight / np.sum(weight)
@@ -117,14 +141,22 @@ def orthonormal_parts(
     J. Opt. Soc. Am. 71, 75, 1981). Over the whole disk they are themselves; over a part of it fitted coefficients are
     no parts of the rms: two terms that are alike there may each be larger than the whole.
 
-    Args:
-        x: on the unit disk, (N,).
-        y: likewise.
-        weight: of a quadrature over what is lit, (N,); 0 where no light is.
-        difference: of optical paths, (N,).
-        last: highest Noll index.
+    Parameters
+    ----------
+    x : np.ndarray
+        On the unit disk, (N,).
+    y : np.ndarray
+        likewise.
+    weight : np.ndarray
+        Of a quadrature over what is lit, (N,); 0 where no light is.
+    difference : np.ndarray
+        Of optical paths, (N,).
+    last : int
+        Highest Noll index.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (last,), in the unit of ``difference``, with the signs of the terms.
     """
     lit = weight > 0.0
@@ -137,14 +169,20 @@ def orthonormal_parts(
 class PartFit:
     """A wavefront over a part of the unit disk, piston and tilt taken out.
 
-    Attributes:
-        level: piston and the two tilts that were taken out, coefficients of Z1 to Z3, (3,).
-        coefficients: of Zernike terms in Noll's order, (last,), by least squares; they share among them what is alike
-            over the part.
-        parts: as of ``orthonormal_parts``, (last,).
-        rms: of the path differences.
-        residual_rms: that the terms leave.
-        strehl: square of the mean phasor, for path differences in waves.
+    Attributes
+    ----------
+    level : np.ndarray
+        Piston and the two tilts that were taken out, coefficients of Z1 to Z3, (3,).
+    coefficients : np.ndarray
+        Of Zernike terms in Noll's order, (last,), by least squares; they share among them what is alike over the part.
+    parts : np.ndarray
+        As of ``orthonormal_parts``, (last,).
+    rms : float
+        Of the path differences.
+    residual_rms : float
+        That the terms leave.
+    strehl : float
+        Square of the mean phasor, for path differences in waves.
     """
 
     level: np.ndarray
@@ -159,16 +197,23 @@ def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.nd
     """Fit Z1..Z_last to a wavefront over a part of the unit disk by a quadrature whose weights may be negative, as of
     what shadows take off again.
 
-    Args:
-        x: near the unit disk, (N,).
-        y: likewise.
-        weight: of the area, (N,), with a positive sum.
-        difference: of optical paths, waves, (N,).
-        last: highest Noll index.
+    Parameters
+    ----------
+    x : np.ndarray
+        Near the unit disk, (N,).
+    y : np.ndarray
+        likewise.
+    weight : np.ndarray
+        Of the area, (N,), with a positive sum.
+    difference : np.ndarray
+        Of optical paths, waves, (N,).
+    last : int
+        Highest Noll index.
 
-    Raises:
-        UnphysicalError: a quadrature over which the terms have no squares above zero: too few nodes, or next to no
-            area.
+    Raises
+    ------
+    UnphysicalError
+        a quadrature over which the terms have no squares above zero: too few nodes, or next to no area.
     """
     share = weight / np.sum(weight)
     basis = zernike.basis(last, x, y)
@@ -214,21 +259,32 @@ def aim_collimated(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rays of collimated beams that meet given points of the stop.
 
-    Args:
-        backend: where to trace.
-        to_stop: B systems from the scene to the stop, their last element.
-        direction: of the light, world, unit, (3,) or (B, 3).
-        launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres; rays start on the plane
-            wavefront through it.
-        target: stop coordinates, (N, 2) or of each system (B, N, 2), metres of its nominal size.
-        first: world vector (3,) near which the first axis of the wavefront lies, not along the beam; by default the
-            coordinate axis least along it, which is not the same for all directions.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    to_stop : SystemBatch
+        B systems from the scene to the stop, their last element.
+    direction : np.ndarray
+        Of the light, world, unit, (3,) or (B, 3).
+    launch : np.ndarray
+        a world point of the beam before the first mirror, (3,) or (B, 3), metres; rays start on the plane wavefront
+        through it.
+    target : np.ndarray
+        Stop coordinates, (N, 2) or of each system (B, N, 2), metres of its nominal size.
+    first : np.ndarray | None
+        World vector (3,) near which the first axis of the wavefront lies, not along the beam; by default the coordinate
+        axis least along it, which is not the same for all directions.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray]
         Launch points (B, N, 3) and the two axes of the wavefront (B, 2, 3).
 
-    Raises:
-        AimError: the beam does not reach the stop.
+    Raises
+    ------
+    AimError
+        The beam does not reach the stop.
     """
     count = to_stop.count
     along = np.broadcast_to(direction, (count, 3))[:, None]
@@ -249,13 +305,20 @@ def aim_collimated(
 class ImagingRays:
     """Rays of collimated beams at the detector of B systems, N nodes of the stop each.
 
-    Attributes:
-        position, direction: in the detector's frame, (B, N, 3), metres and unit.
-        path: optical path from the incoming wavefront, (B, N), metres.
-        amplitude: a du dv of the module's formula, (B, N); 0 where another aperture stops the ray.
-        launched: points of the incoming wavefront, world, (B, N, 3), metres.
-        launch_area: |dp/ds| ds, area of the wavefront that belongs to each node, (B, N), m^2.
-        axes: of the wavefront, world, (B, 2, 3).
+    Attributes
+    ----------
+    position, direction : np.ndarray
+        In the detector's frame, (B, N, 3), metres and unit.
+    path : np.ndarray
+        Optical path from the incoming wavefront, (B, N), metres.
+    amplitude : np.ndarray
+        a du dv of the module's formula, (B, N); 0 where another aperture stops the ray.
+    launched : np.ndarray
+        Points of the incoming wavefront, world, (B, N, 3), metres.
+    launch_area : np.ndarray
+        |dp/ds| ds, area of the wavefront that belongs to each node, (B, N), m^2.
+    axes : np.ndarray
+        Of the wavefront, world, (B, 2, 3).
     """
 
     position: np.ndarray
@@ -279,19 +342,31 @@ def imaging_rays(
 ) -> ImagingRays:
     """Trace the beams of B systems that image a far point.
 
-    Args:
-        backend: where to trace.
-        systems: B systems from the scene to the detector.
-        to_stop: the same systems, only as far as the stop.
-        direction: of the light, world, unit, (3,) or (B, 3).
-        launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres.
-        stop: clear aperture of the stop.
-        nodes: N nodes of a quadrature over the unit disk.
-        first: as for ``aim_collimated``.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    systems : SystemBatch
+        B systems from the scene to the detector.
+    to_stop : SystemBatch
+        The same systems, only as far as the stop.
+    direction : np.ndarray
+        Of the light, world, unit, (3,) or (B, 3).
+    launch : np.ndarray
+        a world point of the beam before the first mirror, (3,) or (B, 3), metres.
+    stop : Circle
+        Clear aperture of the stop.
+    nodes : PupilNodes
+        N nodes of a quadrature over the unit disk.
+    first : np.ndarray | None
+        As for ``aim_collimated``.
 
-    Raises:
-        AimError: the beam does not reach the stop.
-        BeamMissedError: no ray reaches the detector.
+    Raises
+    ------
+    AimError
+        The beam does not reach the stop.
+    BeamMissedError
+        No ray reaches the detector.
     """
     target = stop.radius * np.stack([nodes.x, nodes.y], axis=-1) + np.array(stop.centre)
     launched, axes = aim_collimated(backend, to_stop, direction, launch, target, first)
@@ -321,14 +396,21 @@ def pupil_field(
 ) -> PupilField:
     """Return the plane waves at the detector of traced beams.
 
-    Args:
-        rays: B traced beams.
-        wavelength: metres.
-        origin: image point about which the field is wanted, in the detector's frame, (3,) or (B, 3), metres; default 0.
-        incoming: optical path that the beam brings along beyond that of a plane wave, (B, N) metres, at transverse
-            coordinates (B, N, 2) from the middle of the entrance pupil along the two axes of ``aim_collimated``.
+    Parameters
+    ----------
+    rays : ImagingRays
+        B traced beams.
+    wavelength : float
+        metres.
+    origin : np.ndarray | None
+        Image point about which the field is wanted, in the detector's frame, (3,) or (B, 3), metres; default 0.
+    incoming : Callable[[np.ndarray], np.ndarray] | None
+        Optical path that the beam brings along beyond that of a plane wave, (B, N) metres, at transverse coordinates
+        (B, N, 2) from the middle of the entrance pupil along the two axes of ``aim_collimated``.
 
-    Returns:
+    Returns
+    -------
+    PupilField
         Unit power through the stop if no other aperture cuts the beam; nodes that another aperture stops carry nothing.
     """
     centre = np.zeros((1, 1, 3)) if origin is None else np.broadcast_to(origin, (len(rays.path), 3))[:, None]

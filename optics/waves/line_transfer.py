@@ -78,10 +78,14 @@ _LONGEST_CELL = 0.06
 class CutPupil:
     """Exit pupil that edges cut.
 
-    Attributes:
-        pupil: its wavefront and its own edge, without shadows.
-        clear: light comes through inside of all of these only, convex polygons in p, complex, counterclockwise, (V,).
-        blocked: light is stopped in any of these, likewise.
+    Attributes
+    ----------
+    pupil : PupilFunction
+        Its wavefront and its own edge, without shadows.
+    clear : tuple[np.ndarray, ...]
+        Light comes through inside of all of these only, convex polygons in p, complex, counterclockwise, (V,).
+    blocked : tuple[np.ndarray, ...]
+        Light is stopped in any of these, likewise.
     """
 
     pupil: PupilFunction
@@ -93,10 +97,14 @@ class CutPupil:
 class LineTransfer:
     """Transfer function at even steps of frequency.
 
-    Attributes:
-        values: complex, (M,), 1 at zero frequency.
-        perfect: of the same light with a perfect wavefront, (M,).
-        error: largest change of either from a third of the lines and other nodes on the cells.
+    Attributes
+    ----------
+    values : np.ndarray
+        Complex, (M,), 1 at zero frequency.
+    perfect : np.ndarray
+        Of the same light with a perfect wavefront, (M,).
+    error : float
+        Largest change of either from a third of the lines and other nodes on the cells.
     """
 
     values: np.ndarray
@@ -114,13 +122,20 @@ def cut_pupils(
 ) -> tuple[CutPupil, ...]:
     """Pupils with the outlines of edges in them.
 
-    Args:
-        pupils: B, without shadows.
-        u: direction cosines along the detector's first axis at nodes of the stop, (B, N).
-        v: likewise along the second.
-        nodes: of the stop.
-        outlines: of the edges on the stop's unit disk, as B images see them.
-        lit: which nodes carry light, (B, N); those alone tell where the edges are seen.
+    Parameters
+    ----------
+    pupils : Sequence[PupilFunction]
+        B, without shadows.
+    u : np.ndarray
+        Direction cosines along the detector's first axis at nodes of the stop, (B, N).
+    v : np.ndarray
+        Likewise along the second.
+    nodes : PupilNodes
+        Of the stop.
+    outlines : StopOutlines
+        Of the edges on the stop's unit disk, as B images see them.
+    lit : np.ndarray
+        Which nodes carry light, (B, N); those alone tell where the edges are seen.
     """
     degree = pupils[0].eikonal_terms.shape[-1] - 1
     on_stop = products(nodes.x, nodes.y, degree)
@@ -161,19 +176,30 @@ def line_transfers(
 ) -> list[list[LineTransfer]]:
     """Transfer functions at the frequencies 0, step .. (count - 1) step along some directions.
 
-    Args:
-        cut: pupils of B images.
-        wavelengths: of their light, metres, B.
-        directions: unit vectors in detector x, y, (A, 2).
-        step: of the frequency, cycles/m, positive.
-        count: M.
-        lines: across the pupil, tried one after the other; by default those of LINES that this kind of pupil needs.
+    Parameters
+    ----------
+    cut : Sequence[CutPupil]
+        Pupils of B images.
+    wavelengths : Sequence[float]
+        Of their light, metres, B.
+    directions : np.ndarray
+        Unit vectors in detector x, y, (A, 2).
+    step : float
+        Of the frequency, cycles/m, positive.
+    count : int
+        M.
+    lines : Sequence[int]
+        Across the pupil, tried one after the other; by default those of LINES that this kind of pupil needs.
 
-    Returns:
+    Returns
+    -------
+    list[list[LineTransfer]]
         Of every image those along every direction.
 
-    Raises:
-        UnphysicalError: even the most lines tell another value than a third of them.
+    Raises
+    ------
+    UnphysicalError
+        Even the most lines tell another value than a third of them.
     """
     tasks = [(one, wave, way) for one, wave in zip(cut, wavelengths, strict=True) for way in np.asarray(directions)]
 
@@ -282,13 +308,20 @@ def _chords(polygon: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 class _Lines:
     """N lines along the shift, and where light begins and ends on them.
 
-    Attributes:
-        y: of the lines, (N,).
-        weight: of the rule across them, (N,).
-        coarse: of that on a third of the lines, 0 for the others, (N,).
-        begins, ends: of the light, (N, K) each; places alike where there is none.
-        lit: whether there is some, (N, K).
-        low, high: between which all lines lie along x.
+    Attributes
+    ----------
+    y : np.ndarray
+        Of the lines, (N,).
+    weight : np.ndarray
+        Of the rule across them, (N,).
+    coarse : np.ndarray
+        Of that on a third of the lines, 0 for the others, (N,).
+    begins, ends : np.ndarray
+        Of the light, (N, K) each; places alike where there is none.
+    lit : np.ndarray
+        Whether there is some, (N, K).
+    low, high : float
+        Between which all lines lie along x.
     """
 
     y: np.ndarray
@@ -386,13 +419,20 @@ def _autocorrelation(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Autocorrelations at shifts 0 .. (count - 1) ``pitch`` along x with the wavefront and without, of 1 at 0.
 
-    Args:
-        rows: lines.
-        tables: eikonal and amplitude in their coordinates.
-        wave: number, 1/m.
-        pitch: length of a cell.
-        count: of shifts.
-        nodes: on a cell.
+    Parameters
+    ----------
+    rows : _Lines
+        lines.
+    tables : tuple[np.ndarray, np.ndarray]
+        Eikonal and amplitude in their coordinates.
+    wave : float
+        Number, 1/m.
+    pitch : float
+        Length of a cell.
+    count : int
+        Of shifts.
+    nodes : int
+        On a cell.
     """
     place, weight, rest = _cell_weights(nodes)
     cells = int((rows.high - rows.low) / pitch) + 2
@@ -434,13 +474,20 @@ def _autocorrelation(
 class _Edges:
     """Edges of light on lines, P of them, line by line.
 
-    Attributes:
-        row: their lines.
-        cell: in which they stand.
-        bent: where in the cell, from 0 to 1.
-        sign: 1 where light begins, -1 where it ends.
-        behind: weights of the cell's nodes behind them, (I, P).
-        rest: from which ``behind`` comes, as ``_cell_weights`` gives it.
+    Attributes
+    ----------
+    row : np.ndarray
+        Their lines.
+    cell : np.ndarray
+        In which they stand.
+    bent : np.ndarray
+        Where in the cell, from 0 to 1.
+    sign : np.ndarray
+        1 where light begins, -1 where it ends.
+    behind : np.ndarray
+        Weights of the cell's nodes behind them, (I, P).
+    rest : np.ndarray
+        From which ``behind`` comes, as ``_cell_weights`` gives it.
     """
 
     row: np.ndarray
@@ -479,12 +526,18 @@ class _Edges:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Two edges of a line whose cells meet at a shift: what both leave is not the product of their shares.
 
-        Args:
-            lines: weights of the lines.
-            count: of shifts, in cells.
-            weight: of the nodes of a cell.
+        Parameters
+        ----------
+        lines : np.ndarray
+            Weights of the lines.
+        count : int
+            Of shifts, in cells.
+        weight : np.ndarray
+            Of the nodes of a cell.
 
-        Returns:
+        Returns
+        -------
+        tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             Numbers of both and the shift, (Q,) each, and what the nodes of the cells weigh more, (I, Q).
         """
         first, second = _same_rows(self.row)

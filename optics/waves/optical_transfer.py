@@ -52,18 +52,27 @@ _PROBED = _NODES_AT_ONCE // len(_PROBE) ** 2
 def transfer(pupil: PupilFunction, frequency: np.ndarray, wavelength: float, defocus: np.ndarray) -> np.ndarray:
     """Optical transfer function of one wavelength.
 
-    Args:
-        pupil: of the image.
-        frequency: (M, 2) along the detector's x and y, cycles/m.
-        wavelength: metres.
-        defocus: (Z,) shift of the detector along its normal, metres, positive downstream.
+    Parameters
+    ----------
+    pupil : PupilFunction
+        Of the image.
+    frequency : np.ndarray
+        (M, 2) along the detector's x and y, cycles/m.
+    wavelength : float
+        metres.
+    defocus : np.ndarray
+        (Z,) shift of the detector along its normal, metres, positive downstream.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         Complex (Z, M): transform of the irradiance with kernel exp(-2 pi i f.x), 1 at f = 0, 0 beyond the cut-off. An
         image centred at x0 has the phase -2 pi f.x0.
 
-    Raises:
-        ValueError: shapes other than these, or numbers that are not finite.
+    Raises
+    ------
+    ValueError
+        Shapes other than these, or numbers that are not finite.
     """
     return polychromatic_transfer(pupil, frequency, np.array([wavelength]), np.ones(1), defocus)
 
@@ -77,21 +86,32 @@ def polychromatic_transfer(
 ) -> np.ndarray:
     """Optical transfer function of a band: mean over K wavelengths, as ``transfer``.
 
-    Args:
-        pupil: of the image, the same at all wavelengths; or one for each of them, all about one point of the image, so
-            that the colours of an image that stand apart blur it.
-        frequency: (M, 2), cycles/m.
-        wavelengths: (K,), metres.
-        weights: (K,) share of the signal (power x response) at each; they need not sum to 1.
-        defocus: (Z,), metres.
+    Parameters
+    ----------
+    pupil : PupilFunction | Sequence[PupilFunction]
+        Of the image, the same at all wavelengths; or one for each of them, all about one point of the image, so that
+        the colours of an image that stand apart blur it.
+    frequency : np.ndarray
+        (M, 2), cycles/m.
+    wavelengths : np.ndarray
+        (K,), metres.
+    weights : np.ndarray
+        (K,) share of the signal (power x response) at each; they need not sum to 1.
+    defocus : np.ndarray
+        (Z,), metres.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         Complex (Z, M).
 
-    Raises:
-        ValueError: other shapes, numbers that are not finite, weights that are negative or all zero, wavelengths that
-            are not positive, or other numbers of pupils and wavelengths.
-        UnphysicalError: an image so blurred that it takes more than ``MOST_NODES``.
+    Raises
+    ------
+    ValueError
+        Other shapes, numbers that are not finite, weights that are negative or all zero, wavelengths that are not
+        positive, or other numbers of pupils and wavelengths.
+    UnphysicalError
+        An image so blurred that it takes more than ``MOST_NODES``.
     """
     frequency, defocus = np.asarray(frequency, float), np.asarray(defocus, float)
     if frequency.ndim != 2 or frequency.shape[1] != 2 or defocus.ndim != 1:
@@ -240,15 +260,22 @@ def with_nodes_enough(pupil: PupilFunction, wavelength: float) -> PupilFunction:
     What edges leave of a wavefront may be smooth where its continuation into the dark is not, and the clear pupil is
     integrated over both. Nodes are added until that changes nothing.
 
-    Args:
-        pupil: of an image.
-        wavelength: metres.
+    Parameters
+    ----------
+    pupil : PupilFunction
+        Of an image.
+    wavelength : float
+        metres.
 
-    Returns:
+    Returns
+    -------
+    PupilFunction
         The pupil with ``finer`` and ``transfer_error``, the change from fewer nodes.
 
-    Raises:
-        UnphysicalError: the most nodes are too few.
+    Raises
+    ------
+    UnphysicalError
+        The most nodes are too few.
     """
     if pupil.shadow is None:
         return pupil
@@ -303,11 +330,16 @@ class TransferTable:
     where it ends like the power 3/2 of the distance. The phase of the image's centroid is kept apart. The band's mean
     is then a cubic spline, fine enough for the cut-offs of the single wavelengths inside: right to 1e-5.
 
-    Attributes:
-        centroid: (x, y) of the image from its origin, metres, (2,); its phase multiplies the spline.
-        to_shift: (2, 2), from cycles/m to normalised shifts at the shortest wavelength.
-        reach: Fourier terms of the longest normalised shift over exp(2 i direction), complex.
-        spline: coefficients over shift / longest shift and direction, complex.
+    Attributes
+    ----------
+    centroid : np.ndarray
+        (x, y) of the image from its origin, metres, (2,); its phase multiplies the spline.
+    to_shift : np.ndarray
+        (2, 2), from cycles/m to normalised shifts at the shortest wavelength.
+    reach : np.ndarray
+        Fourier terms of the longest normalised shift over exp(2 i direction), complex.
+    spline : np.ndarray
+        Coefficients over shift / longest shift and direction, complex.
     """
 
     centroid: np.ndarray
@@ -321,14 +353,21 @@ class TransferTable:
     ) -> TransferTable:
         """Table of one image; arguments as ``polychromatic_transfer``, with one defocus (metres).
 
-        Args:
-            pupil: of the image.
-            wavelengths: (K,), metres.
-            weights: (K,) share of the signal at each.
-            defocus: of the detector along its normal, metres, positive downstream.
+        Parameters
+        ----------
+        pupil : PupilFunction
+            Of the image.
+        wavelengths : np.ndarray
+            (K,), metres.
+        weights : np.ndarray
+            (K,) share of the signal at each.
+        defocus : float
+            Of the detector along its normal, metres, positive downstream.
 
-        Raises:
-            ValueError: as there, or a wavefront of so many waves that the table would grow out of hand.
+        Raises
+        ------
+        ValueError
+            As there, or a wavefront of so many waves that the table would grow out of hand.
         """
         wavelengths, share = _band(wavelengths, weights)
         wavelengths, share = wavelengths[share > 0.0], share[share > 0.0]
@@ -471,12 +510,16 @@ edge of the pupil the MTF is right to 1e-6."""
 class _Colour:
     """One wavelength of a varied transfer function.
 
-    Attributes:
-        phasors: of the known pupil at the nodes of the overlap with their weights, complex (Q,); their sum is its
-            transfer function, times the wavelength's share.
-        turns: from optical paths at the traced nodes of the stop to what they add to the phases at the nodes of the
-            overlap, by polynomials over the pupil, (Q, N), radians per metre.
-        own: which of the paths of all traced wavelengths are its own.
+    Attributes
+    ----------
+    phasors : np.ndarray
+        Of the known pupil at the nodes of the overlap with their weights, complex (Q,); their sum is its transfer
+        function, times the wavelength's share.
+    turns : np.ndarray
+        From optical paths at the traced nodes of the stop to what they add to the phases at the nodes of the overlap,
+        by polynomials over the pupil, (Q, N), radians per metre.
+    own : slice
+        Which of the paths of all traced wavelengths are its own.
     """
 
     phasors: np.ndarray
@@ -491,8 +534,10 @@ class VariedTransfer:
     Its paths are those of the traced wavelengths, one after the other, (..., K N), metres; of mirrors, which image all
     wavelengths alike, one is traced for all.
 
-    Attributes:
-        colours: its wavelengths below the cut-off.
+    Attributes
+    ----------
+    colours : tuple[_Colour, ...]
+        Its wavelengths below the cut-off.
     """
 
     colours: tuple[_Colour, ...]
@@ -509,15 +554,24 @@ class VariedTransfer:
     ) -> VariedTransfer | None:
         """Work out what does not vary.
 
-        Args:
-            pupils: the known ones, all about one point of the image: of every wavelength, or one for all.
-            frequency: along the detector's axes, (2,), cycles/m.
-            wavelengths: metres, (C,).
-            shares: of the wavelengths in the light, which sum to 1, (C,).
-            cosines: direction cosines along these axes of the rays whose wavefront varies, (C, N, 2), or (1, N, 2).
-            degree: of the polynomials of its variation.
+        Parameters
+        ----------
+        pupils : Sequence[PupilFunction]
+            The known ones, all about one point of the image: of every wavelength, or one for all.
+        frequency : np.ndarray
+            Along the detector's axes, (2,), cycles/m.
+        wavelengths : np.ndarray
+            Metres, (C,).
+        shares : np.ndarray
+            Of the wavelengths in the light, which sum to 1, (C,).
+        cosines : np.ndarray
+            Direction cosines along these axes of the rays whose wavefront varies, (C, N, 2), or (1, N, 2).
+        degree : int
+            Of the polynomials of its variation.
 
-        Returns:
+        Returns
+        -------
+        VariedTransfer | None
             None beyond the cut-off of all wavelengths.
         """
         out, rays = [], cosines.shape[1]
@@ -545,8 +599,10 @@ class VariedTransfer:
     def curvature(self, slopes: np.ndarray) -> np.ndarray:
         """Second derivatives of the MTF by pairs of numbers, (L, L), at the known pupil.
 
-        Args:
-            slopes: of the rays' optical paths by the numbers, (L, K N), metres.
+        Parameters
+        ----------
+        slopes : np.ndarray
+            Of the rays' optical paths by the numbers, (L, K N), metres.
         """
         whole, first, second = 0j, 0j, 0j
         for one in self.colours:

@@ -63,9 +63,12 @@ SMALLEST = 1e-9
 class PupilShadow:
     """Shadows in B pupils.
 
-    Attributes:
-        pieces: convex polygons that do not overlap, in the pupil, (B, K, V, 2), counterclockwise; some are empty.
-        radius: of the pupils' edges as Fourier terms over the angle about p = 0, complex, (B, H).
+    Attributes
+    ----------
+    pieces : np.ndarray
+        Convex polygons that do not overlap, in the pupil, (B, K, V, 2), counterclockwise; some are empty.
+    radius : np.ndarray
+        Of the pupils' edges as Fourier terms over the angle about p = 0, complex, (B, H).
     """
 
     pieces: np.ndarray
@@ -75,10 +78,14 @@ class PupilShadow:
     def within(cls, polygons: np.ndarray, harmonics: np.ndarray, rim_sides: int = RIM_SIDES) -> PupilShadow:
         """What polygons (B, K, V, 2), which do not overlap, take of pupils with edges of ``harmonics`` (2H + 1, B).
 
-        Args:
-            polygons: in the pupils, which do not overlap, (B, K, V, 2).
-            harmonics: of the pupils' edges, complex (2H + 1, B).
-            rim_sides: of the polygon that stands for an edge.
+        Parameters
+        ----------
+        polygons : np.ndarray
+            In the pupils, which do not overlap, (B, K, V, 2).
+        harmonics : np.ndarray
+            Of the pupils' edges, complex (2H + 1, B).
+        rim_sides : int
+            Of the polygon that stands for an edge.
         """
         radius = edge_radius(harmonics)
         return cls(tiled(cut(polygons, radius, rim_sides))[0], radius)
@@ -109,11 +116,16 @@ class PupilShadow:
     def overlap(self, shift: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Quadrature over what the shadows take of the overlap of pupils shifted by -s/2 and +s/2.
 
-        Args:
-            shift: s, complex, (B, S).
-            count: nodes along each side of a region's bounding box.
+        Parameters
+        ----------
+        shift : np.ndarray
+            s, complex, (B, S).
+        count : int
+            Nodes along each side of a region's bounding box.
 
-        Returns:
+        Returns
+        -------
+        tuple[np.ndarray, np.ndarray]
             Points c, complex, (B, S, Q), and weights of the area, negative where light is taken once and positive where
             two shadows have taken it twice: to be added to ``PupilEdge.overlap``.
         """
@@ -209,13 +221,20 @@ class ShadowParts:
     A region is told where it lies in a shadow: for light that goes through q there and, in the other pupil, through
     q - sign s.
 
-    Attributes:
-        pupil, step: which pupil and which of its shifts, (F,).
-        sign: of the shift of the pupil that the shadow belongs to, (F,).
-        piece: of the first W regions, which are whole pieces: their number, (W,).
-        whole: nodes of all pieces, complex, (B, K, Q).
-        points: q, complex, (F, Q).
-        weights: of the area, as in ``PupilShadow.overlap``, (F, Q).
+    Attributes
+    ----------
+    pupil, step : np.ndarray
+        Which pupil and which of its shifts, (F,).
+    sign : np.ndarray
+        Of the shift of the pupil that the shadow belongs to, (F,).
+    piece : np.ndarray
+        Of the first W regions, which are whole pieces: their number, (W,).
+    whole : np.ndarray
+        Nodes of all pieces, complex, (B, K, Q).
+    points : np.ndarray
+        q, complex, (F, Q).
+    weights : np.ndarray
+        Of the area, as in ``PupilShadow.overlap``, (F, Q).
     """
 
     pupil: np.ndarray
@@ -230,12 +249,17 @@ class ShadowParts:
 def separate(polygons: list[np.ndarray], fewest: bool = False) -> tuple[np.ndarray, list[int]]:
     """Pieces that do not overlap.
 
-    Args:
-        polygons: convex, counterclockwise, (B, V, 2) each.
-        fewest: take the largest polygons first and cut each other one along the sides that cut off most, which leaves
-            few pieces of polygons with many sides.
+    Parameters
+    ----------
+    polygons : list[np.ndarray]
+        Convex, counterclockwise, (B, V, 2) each.
+    fewest : bool
+        Take the largest polygons first and cut each other one along the sides that cut off most, which leaves few
+        pieces of polygons with many sides.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, list[int]]
         Pieces (B, K, W, 2), and of which polygon each is; what several share belongs to the first.
     """
     done: list[np.ndarray] = []
@@ -257,10 +281,14 @@ def separate(polygons: list[np.ndarray], fewest: bool = False) -> tuple[np.ndarr
 def without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list[np.ndarray]:
     """Pieces of ``part`` outside of ``before``; itself if they do not meet in any of the pupils.
 
-    Args:
-        part: convex, (B, V, 2).
-        before: convex, counterclockwise, (B, W, 2); some may be empty.
-        fewest: as in `separate`.
+    Parameters
+    ----------
+    part : np.ndarray
+        Convex, (B, V, 2).
+    before : np.ndarray
+        Convex, counterclockwise, (B, W, 2); some may be empty.
+    fewest : bool
+        As in `separate`.
     """
     empty = area(before) < SMALLEST
     if np.all(empty | (area(intersect(part, *sides(before))) < SMALLEST)):
@@ -339,10 +367,14 @@ def cut(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
     """The part of each polygon (B, K, V, 2) inside of edges with Fourier terms ``radius`` (B, H), for which polygons of
     the same area with so many sides stand; counterclockwise.
 
-    Args:
-        polygons: (B, K, V, 2), in p.
-        radius: of the edges as Fourier terms over the angle, complex (B, H).
-        rim_sides: of the polygon of the same area that stands for an edge.
+    Parameters
+    ----------
+    polygons : np.ndarray
+        (B, K, V, 2), in p.
+    radius : np.ndarray
+        Of the edges as Fourier terms over the angle, complex (B, H).
+    rim_sides : int
+        Of the polygon of the same area that stands for an edge.
     """
     number = polygons.shape[1]
     flat = polygons.reshape(-1, *polygons.shape[2:])
@@ -378,10 +410,14 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
     number of a point inside of the edge, so that the new boundary goes once around the intersection and around nothing
     else. Each side becomes an arc, a straight piece and an arc; most of them are of no length.
 
-    Args:
-        polygons: (F, V, 2), in p.
-        radius: of the edge of each as Fourier terms over the angle, complex (F, H).
-        count: nodes along each of the two directions.
+    Parameters
+    ----------
+    polygons : np.ndarray
+        (F, V, 2), in p.
+    radius : np.ndarray
+        Of the edge of each as Fourier terms over the angle, complex (F, H).
+    count : int
+        Nodes along each of the two directions.
     """
     start = polygons[..., 0] + 1j * polygons[..., 1]
     after = np.roll(start, -1, axis=1)

@@ -72,16 +72,25 @@ _SHADOWS_AT_ONCE = 2**16
 class PupilStack:
     """B exit pupils, in normalised coordinates p as complex numbers x + iy.
 
-    Attributes:
-        centre: direction cosines (u, v) of p = 0, (B, 2).
-        axes: d(u, v)/dp, (B, 2, 2).
-        harmonics: of the edges in p, complex (2H + 1, B).
-        eikonal_terms, amplitude_terms: coefficients of T_i(x) T_j(y), (B, D + 1, D + 1); metres, and of the amplitude
-            density (unit power: its square integrates to 1 over du dv).
-        span: how far the eikonal runs over each pupil, a plane taken out, (B,), metres.
-        residual: rms eikonal that the fit leaves, (B,), metres.
-        amplitude_residual: rms of what it leaves of the amplitude, share of its mean, (B,).
-        shadow: what bodies in the beams take, None if nothing stands there.
+    Attributes
+    ----------
+    centre : np.ndarray
+        Direction cosines (u, v) of p = 0, (B, 2).
+    axes : np.ndarray
+        d(u, v)/dp, (B, 2, 2).
+    harmonics : np.ndarray
+        Of the edges in p, complex (2H + 1, B).
+    eikonal_terms, amplitude_terms : np.ndarray
+        Coefficients of T_i(x) T_j(y), (B, D + 1, D + 1); metres, and of the amplitude density (unit power: its square
+        integrates to 1 over du dv).
+    span : np.ndarray
+        How far the eikonal runs over each pupil, a plane taken out, (B,), metres.
+    residual : np.ndarray
+        Rms eikonal that the fit leaves, (B,), metres.
+    amplitude_residual : np.ndarray
+        Rms of what it leaves of the amplitude, share of its mean, (B,).
+    shadow : PupilShadow | None
+        What bodies in the beams take, None if nothing stands there.
     """
 
     centre: np.ndarray
@@ -109,20 +118,32 @@ class PupilStack:
     ) -> PupilStack:
         """Fit pupils traced at nodes of the stop, all of which carry light.
 
-        Args:
-            u: direction cosines along the detector's first axis, (B, N).
-            v: likewise along the second.
-            eikonal: (B, N), metres.
-            amplitude: of the nodes as in ``optics.waves.diffraction.PupilField``, (B, N), positive.
-            nodes: N nodes of a quadrature over the stop's unit disk.
-            degree: of the polynomials.
-            shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for free beams.
-            rim_sides: of the polygon that stands for the edge where a shadow reaches over it.
-            lit: which nodes lie outside of the shadows, (B, N); None for all. What the others hold, NaN too, is not
-                looked at: what the polynomials say there is taken off again, see ``smooth_terms``.
+        Parameters
+        ----------
+        u : np.ndarray
+            Direction cosines along the detector's first axis, (B, N).
+        v : np.ndarray
+            Likewise along the second.
+        eikonal : np.ndarray
+            (B, N), metres.
+        amplitude : np.ndarray
+            Of the nodes as in ``optics.waves.diffraction.PupilField``, (B, N), positive.
+        nodes : PupilNodes
+            N nodes of a quadrature over the stop's unit disk.
+        degree : int
+            Of the polynomials.
+        shadows : np.ndarray | None
+            Polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for free beams.
+        rim_sides : int
+            Of the polygon that stands for the edge where a shadow reaches over it.
+        lit : np.ndarray | None
+            Which nodes lie outside of the shadows, (B, N); None for all. What the others hold, NaN too, is not looked
+            at: what the polynomials say there is taken off again, see ``smooth_terms``.
 
-        Raises:
-            ValueError: too few nodes for the degree.
+        Raises
+        ------
+        ValueError
+            Too few nodes for the degree.
         """
         root = np.sqrt(nodes.weight)
         i, j = orders(degree)
@@ -182,15 +203,24 @@ class PupilStack:
         """``fit`` to pupils that edges cut, by polynomials of the first degree that follows all of them, or of that
         which leaves the least.
 
-        Args:
-            u: as of ``fit``, and so are those below.
-            v: as of ``fit``.
-            eikonal: as of ``fit``.
-            amplitude: as of ``fit``.
-            nodes: as of ``fit``.
-            wavelength: of the light, metres.
-            shadows: as of ``fit``.
-            lit: as of ``fit``.
+        Parameters
+        ----------
+        u : np.ndarray
+            As of ``fit``, and so are those below.
+        v : np.ndarray
+            As of ``fit``.
+        eikonal : np.ndarray
+            As of ``fit``.
+        amplitude : np.ndarray
+            As of ``fit``.
+        nodes : PupilNodes
+            As of ``fit``.
+        wavelength : float
+            Of the light, metres.
+        shadows : np.ndarray | None
+            As of ``fit``.
+        lit : np.ndarray
+            As of ``fit``.
         """
         best: PupilStack | None = None
         for degree in CUT_DEGREES + (() if shadows is not None and shadows.shape[1] else MORE_DEGREES):
@@ -245,16 +275,24 @@ class PupilStack:
     def transfer(self, frequency: np.ndarray, wavelengths: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Polychromatic transfer functions in the plane of the traced detector.
 
-        Args:
-            frequency: (M, 2) along the detector's two axes, cycles/m.
-            wavelengths: (K,), metres.
-            weights: (K,) share of the signal at each; they need not sum to 1.
+        Parameters
+        ----------
+        frequency : np.ndarray
+            (M, 2) along the detector's two axes, cycles/m.
+        wavelengths : np.ndarray
+            (K,), metres.
+        weights : np.ndarray
+            (K,) share of the signal at each; they need not sum to 1.
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             Complex (B, M), 0 beyond the cut-off.
 
-        Raises:
-            ValueError: an edge that is far from an ellipse.
+        Raises
+        ------
+        ValueError
+            An edge that is far from an ellipse.
         """
         total = self._clear(frequency, wavelengths, weights / np.sum(weights))
         if self.shadow is not None:
@@ -370,9 +408,12 @@ class PupilStack:
 def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarray:
     """Integral of the amplitude's square over pupils in p, no shadows in them, (B,).
 
-    Args:
-        harmonics: of their edges, complex (2H + 1, B).
-        amplitude_terms: as in ``PupilStack``, (B, D + 1, D + 1).
+    Parameters
+    ----------
+    harmonics : np.ndarray
+        Of their edges, complex (2H + 1, B).
+    amplitude_terms : np.ndarray
+        As in ``PupilStack``, (B, D + 1, D + 1).
     """
     edges, nothing = PupilEdge(harmonics), np.zeros(len(amplitude_terms), complex)
     right, left, _ = edges.corners(nothing)
@@ -405,17 +446,28 @@ SHADOW_NODES = 8
 class PupilFunction:
     """Exit pupil of one image, in normalised coordinates p as complex numbers x + iy.
 
-    Attributes:
-        centre: direction cosines (u, v) of p = 0, (2,).
-        axes: d(u, v)/dp, (2, 2).
-        edge: of the pupil in p.
-        eikonal_terms: coefficients of T_i(x) T_j(y), metres, (D + 1, D + 1).
-        amplitude_terms: likewise of the amplitude density (unit power: its square integrates to 1 over du dv).
-        eikonal_residual: rms eikonal that the fit leaves, metres.
-        amplitude_residual: rms of what the fit leaves of the amplitude, share of its mean.
-        shadow: what bodies in the beam take of the pupil (one pupil's), None if nothing stands there.
-        finer: further nodes along each direction that its transfer function takes.
-        transfer_error: change of that from fewer nodes; NaN where nobody has looked.
+    Attributes
+    ----------
+    centre : np.ndarray
+        Direction cosines (u, v) of p = 0, (2,).
+    axes : np.ndarray
+        d(u, v)/dp, (2, 2).
+    edge : PupilEdge
+        Of the pupil in p.
+    eikonal_terms : np.ndarray
+        Coefficients of T_i(x) T_j(y), metres, (D + 1, D + 1).
+    amplitude_terms : np.ndarray
+        Likewise of the amplitude density (unit power: its square integrates to 1 over du dv).
+    eikonal_residual : float
+        Rms eikonal that the fit leaves, metres.
+    amplitude_residual : float
+        Rms of what the fit leaves of the amplitude, share of its mean.
+    shadow : PupilShadow | None
+        What bodies in the beam take of the pupil (one pupil's), None if nothing stands there.
+    finer : int
+        Further nodes along each direction that its transfer function takes.
+    transfer_error : float
+        Change of that from fewer nodes; NaN where nobody has looked.
     """
 
     centre: np.ndarray
@@ -484,20 +536,30 @@ def fit_pupils(
 ) -> tuple[PupilFunction, ...]:
     """Smooth pupils of B images.
 
-    Args:
-        field: traced at ``nodes`` of the stop.
-        nodes: quadrature over the stop's unit disk, without a hole.
-        degree: of the polynomials for the map from the stop, the eikonal and the amplitude; with ``lit`` that of the
-            first of ``CUT_DEGREES`` that follows the light is taken.
-        shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for a free beam.
-        lit: which nodes lie outside of the shadows of edges, (B, N), as of ``PupilStack.fit``.
+    Parameters
+    ----------
+    field : PupilField
+        Traced at ``nodes`` of the stop.
+    nodes : PupilNodes
+        Quadrature over the stop's unit disk, without a hole.
+    degree : int
+        Of the polynomials for the map from the stop, the eikonal and the amplitude; with ``lit`` that of the first of
+        ``CUT_DEGREES`` that follows the light is taken.
+    shadows : np.ndarray | None
+        Polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for a free beam.
+    lit : np.ndarray | None
+        Which nodes lie outside of the shadows of edges, (B, N), as of ``PupilStack.fit``.
 
-    Returns:
+    Returns
+    -------
+    tuple[PupilFunction, ...]
         B pupils.
 
-    Raises:
-        ValueError: a node carries no light (a beam cut by another aperture than the stop is not modelled), too few
-            nodes for the degree, an edge far from an ellipse, or a wavefront that the polynomials do not follow.
+    Raises
+    ------
+    ValueError
+        a node carries no light (a beam cut by another aperture than the stop is not modelled), too few nodes for the
+        degree, an edge far from an ellipse, or a wavefront that the polynomials do not follow.
     """
     stopped = ~(field.amplitude > 0.0) & (True if lit is None else lit)
     dark = np.any(stopped, axis=-1)
@@ -532,9 +594,12 @@ def fit_pupils(
 def circular_pupil(f_number: float, eikonal_terms: np.ndarray | None = None) -> PupilFunction:
     """Evenly lit circular pupil of a telecentric image: its edge is at sqrt(u^2 + v^2) = 1 / (2 f_number).
 
-    Args:
-        f_number: of the beam.
-        eikonal_terms: wavefront over the unit disk as in ``PupilFunction``, metres; default none.
+    Parameters
+    ----------
+    f_number : float
+        Of the beam.
+    eikonal_terms : np.ndarray | None
+        Wavefront over the unit disk as in ``PupilFunction``, metres; default none.
     """
     aperture = 0.5 / f_number
     flat = np.zeros((1, 1)) if eikonal_terms is None else np.asarray(eikonal_terms, float)

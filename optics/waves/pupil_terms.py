@@ -45,11 +45,16 @@ def _series(x: np.ndarray, degree: int) -> np.ndarray:
 def polynomials(tables: Iterable[np.ndarray], p: np.ndarray) -> list[np.ndarray]:
     """Sums of T_i(x) T_j(y) at the same points.
 
-    Args:
-        tables: their coefficients, each (B, D + 1, D + 1).
-        p: points x + iy, complex (B, P).
+    Parameters
+    ----------
+    tables : Iterable[np.ndarray]
+        Their coefficients, each (B, D + 1, D + 1).
+    p : np.ndarray
+        Points x + iy, complex (B, P).
 
-    Returns:
+    Returns
+    -------
+    list[np.ndarray]
         For each table the sums, (B, P).
     """
     tables = tuple(tables)
@@ -60,10 +65,14 @@ def polynomials(tables: Iterable[np.ndarray], p: np.ndarray) -> list[np.ndarray]
 def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
     """Products T_i(x) T_j(y) of Chebyshev's polynomials with i + j <= degree at points of any shape, (..., K).
 
-    Args:
-        x: in [-1, 1], any shape.
-        y: of the same shape.
-        degree: highest i + j.
+    Parameters
+    ----------
+    x : np.ndarray
+        In [-1, 1], any shape.
+    y : np.ndarray
+        Of the same shape.
+    degree : int
+        Highest i + j.
     """
     tx, ty = chebyshev.chebvander(x, degree), chebyshev.chebvander(y, degree)
     out = np.empty((*np.shape(x), (degree + 1) * (degree + 2) // 2))
@@ -79,8 +88,10 @@ def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
 def to_terms(nodes: PupilNodes, degree: int) -> np.ndarray:
     """From values at nodes of the stop to coefficients of ``products``, by least squares, (K, N).
 
-    Raises:
-        ValueError: too few nodes for the degree.
+    Raises
+    ------
+    ValueError
+        Too few nodes for the degree.
     """
     root = np.sqrt(nodes.weight)
     stop = products(nodes.x, nodes.y, degree) * root[:, None]
@@ -105,14 +116,22 @@ def smooth_terms(
     Polynomials of a low degree that do not run away are fitted to the light first. All others add what these leave of
     it, and nothing in the dark. Rays there, of which some pass the rims of lenses far outside, have no part in it.
 
-    Args:
-        design: ``products`` at the nodes, (N, K) or (B, N, K).
-        weight: of the nodes, (N,).
-        lit: where there is light, (B, N).
-        values: (B, N, C); whatever stands where there is no light.
-        faintly: weight of nodes in the dark; the larger it is the less the polynomials add there.
+    Parameters
+    ----------
+    design : np.ndarray
+        ``products`` at the nodes, (N, K) or (B, N, K).
+    weight : np.ndarray
+        Of the nodes, (N,).
+    lit : np.ndarray
+        Where there is light, (B, N).
+    values : np.ndarray
+        (B, N, C); whatever stands where there is no light.
+    faintly : float
+        Weight of nodes in the dark; the larger it is the less the polynomials add there.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (B, K, C).
     """
     i, j = orders(round(np.sqrt(2.0 * design.shape[-1] + 0.25) - 1.5))
@@ -150,11 +169,15 @@ _CLOSE = 1e-13
 class PupilEdge:
     """Smooth convex edge that is nearly the unit circle; or S such edges, one for each of S shifts.
 
-    Attributes:
-        harmonics: c_-H .. c_H, complex, (2H + 1,) or (2H + 1, S), with c_1 = 1 and c_0 = c_-1 = 0.
+    Attributes
+    ----------
+    harmonics : np.ndarray
+        c_-H .. c_H, complex, (2H + 1,) or (2H + 1, S), with c_1 = 1 and c_0 = c_-1 = 0.
 
-    Raises:
-        ValueError: the edge is too far from the unit circle.
+    Raises
+    ------
+    ValueError
+        The edge is too far from the unit circle.
     """
 
     harmonics: np.ndarray
@@ -207,12 +230,18 @@ class PupilEdge:
         given d in [0, pi] (from the tangent chord on one side to that on the other) has one m with real H; it is well
         conditioned also where the chord shrinks to a point.
 
-        Args:
-            direction: (S,).
-            mean: start, (S,).
-            half: (S,).
+        Parameters
+        ----------
+        direction : np.ndarray
+            (S,).
+        mean : np.ndarray
+            Start, (S,).
+        half : np.ndarray
+            (S,).
 
-        Returns:
+        Returns
+        -------
+        tuple[np.ndarray, np.ndarray]
             Mean angle and length, negative for negative ``half``, (S,) each.
         """
         last = len(self.harmonics) // 2
@@ -238,10 +267,14 @@ class PupilEdge:
     def corners(self, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where the edges of two copies of the pupil, shifted by s, cross.
 
-        Args:
-            shift: normalised shifts s, complex, (S,).
+        Parameters
+        ----------
+        shift : np.ndarray
+            Normalised shifts s, complex, (S,).
 
-        Returns:
+        Returns
+        -------
+        tuple[np.ndarray, np.ndarray, np.ndarray]
             Angles a (2, S) and b (2, S) with B(a) - B(b) = s at both crossings, and whether there is an overlap, (S,).
         """
         direction, size = np.angle(shift), np.abs(shift)
@@ -273,14 +306,22 @@ class PupilEdge:
         The region lies between two arcs of the edge that meet in the corners. Straight lines between points of equal
         parameter t on the arcs sweep it smoothly, so that Gauss' rules in t and along the lines converge exponentially.
 
-        Args:
-            shift: (S,) normalised.
-            right: angles a of ``corners``, (2, S).
-            left: angles b, (2, S).
-            across: points and weights in t over [-1, 1], (I,) each.
-            along: likewise on the lines, (J,) each.
+        Parameters
+        ----------
+        shift : np.ndarray
+            (S,) normalised.
+        right : np.ndarray
+            Angles a of ``corners``, (2, S).
+        left : np.ndarray
+            Angles b, (2, S).
+        across : tuple[np.ndarray, np.ndarray]
+            Points and weights in t over [-1, 1], (I,) each.
+        along : tuple[np.ndarray, np.ndarray]
+            Likewise on the lines, (J,) each.
 
-        Returns:
+        Returns
+        -------
+        tuple[np.ndarray, np.ndarray]
             Points c, complex, (S, I * J), such that c - s/2 and c + s/2 are in the pupil, and area weights in p.
         """
         t = across[0]

@@ -92,13 +92,19 @@ def _write(out: Path, content: bytes) -> None:
 def read_prescription(path: Path, glasses: Sequence[Path] = (), wavelength: float | None = None) -> Prescription:
     """A foreign file by its ending.
 
-    Args:
-        path: of a .zmx, .seq or .yaml file.
-        glasses: AGF catalogues.
-        wavelength: for a file of batoid, which names none, metres.
+    Parameters
+    ----------
+    path : Path
+        Of a .zmx, .seq or .yaml file.
+    glasses : Sequence[Path]
+        AGF catalogues.
+    wavelength : float | None
+        For a file of batoid, which names none, metres.
 
-    Raises:
-        InputError: the file cannot be read as what it is.
+    Raises
+    ------
+    InputError
+        The file cannot be read as what it is.
     """
     from scenes.lens.statements import read_catalogues
 

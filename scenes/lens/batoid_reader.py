@@ -372,12 +372,17 @@ def _air(um: float, pressure: float, temperature: float, water: float) -> float:
 def read_batoid(path: str | Path, wavelength: float) -> Prescription:
     """Read a telescope of batoid.
 
-    Args:
-        path: of its YAML file.
-        wavelength: at which light goes through its glasses, metres; its files name none.
+    Parameters
+    ----------
+    path : str | Path
+        Of its YAML file.
+    wavelength : float
+        At which light goes through its glasses, metres; its files name none.
 
-    Raises:
-        InputError: the file is damaged, or has what is not known here; with the line.
+    Raises
+    ------
+    InputError
+        The file is damaged, or has what is not known here; with the line.
     """
     reader = _Reader(str(path), _loaded(path), wavelength)
     system = reader.mapping(reader.mapping(reader.data, ()).get("opticalSystem"), ("opticalSystem",))

@@ -48,11 +48,15 @@ def unfolded(lens: Prescription) -> Prescription:
     Rays go the same ways in length and in angles; an odd number of mirrors turns the image's y round. A flat that is
     the stop or has edges stays as a plane that light passes.
 
-    Args:
-        lens: the prescription.
+    Parameters
+    ----------
+    lens : Prescription
+        The prescription.
 
-    Raises:
-        InputError: a surface behind a fold is not of revolution.
+    Raises
+    ------
+    InputError
+        a surface behind a fold is not of revolution.
     """
     turn, shift, stop, notes = np.eye(3), np.zeros(3), lens.surfaces[lens.stop].name, []
     kept: list[LensSurface] = []
@@ -114,9 +118,12 @@ _LETTER = {Interaction.REFLECT: "M", Interaction.REFRACT: "L", Interaction.PASS:
 class Width(NamedTuple):
     """What a user says in place of the file.
 
-    Attributes:
-        pupil: diameter of the entrance pupil, metres.
-        pitch: of the line CCD's pixels, metres.
+    Attributes
+    ----------
+    pupil : float | None
+        Diameter of the entrance pupil, metres.
+    pitch : float
+        Of the line CCD's pixels, metres.
     """
 
     pupil: float | None = None
@@ -130,12 +137,18 @@ AS_IN_FILE = Width()
 class ReadCamera:
     """A camera made of a prescription.
 
-    Attributes:
-        camera: what its file says.
-        names: surface of the camera -> surface of the prescription.
-        notes: what did not come along, and what was put in.
-        difference: farthest distance at the image between rays of both, metres.
-        rays: that were compared.
+    Attributes
+    ----------
+    camera : CameraSpec
+        What its file says.
+    names : dict[str, str]
+        Surface of the camera -> surface of the prescription.
+    notes : tuple[Note, ...]
+        What did not come along, and what was put in.
+    difference : float
+        Farthest distance at the image between rays of both, metres.
+    rays : int
+        That were compared.
     """
 
     camera: CameraSpec
@@ -162,14 +175,21 @@ class ReadCamera:
 def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS_IN_FILE) -> ReadCamera:
     """Make a camera of a prescription.
 
-    Args:
-        lens: the prescription.
-        name: of the camera.
-        backend: where to trace.
-        width: what the user says of the beam and the pixels.
+    Parameters
+    ----------
+    lens : Prescription
+        The prescription.
+    name : str
+        Of the camera.
+    backend : Backend
+        Where to trace.
+    width : Width
+        What the user says of the beam and the pixels.
 
-    Raises:
-        InputError: the prescription has what a camera's file cannot hold, or light does not come through.
+    Raises
+    ------
+    InputError
+        The prescription has what a camera's file cannot hold, or light does not come through.
     """
     if abs(lens.image.pose.rotation[0, 2]) > TURNED or abs(_image(lens)[1]) > LARGEST_TILT:
         lens = unfolded(lens)
@@ -244,8 +264,10 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
 def _round_field(lens: Prescription) -> Prescription:
     """The prescription with a round field in place of one whose corners edges leave dark.
 
-    Raises:
-        InputError: its field is round already.
+    Raises
+    ------
+    InputError
+        Its field is round already.
     """
     x, y = np.array(lens.fields).T
     if lens.round_field:

@@ -94,13 +94,19 @@ def perturbed_prescription(instrument: Instrument, camera: str, state: State) ->
     Motions of all that carries its mirrors are in their poses, growth in their shapes, figures on their surfaces. What
     is no part of the camera, as prisms, is left out, and said in the notes.
 
-    Args:
-        instrument: in which it stands.
-        camera: its name there.
-        state: body path -> motion.
+    Parameters
+    ----------
+    instrument : Instrument
+        In which it stands.
+    camera : str
+        Its name there.
+    state : State
+        Body path -> motion.
 
-    Raises:
-        ValueError: a figure that no surface can carry.
+    Raises
+    ------
+    ValueError
+        a figure that no surface can carry.
     """
     model, assembly = instrument.cameras[camera], instrument.assembly
     root = f"{BASE}/{camera}"
@@ -152,8 +158,10 @@ LAST_EVEN = 16
 def zemax_text(lens: Prescription) -> str:
     """The file's text; write it as UTF-16 with a mark, or as UTF-8.
 
-    Raises:
-        InputError: a surface that the format cannot hold exactly.
+    Raises
+    ------
+    InputError
+        a surface that the format cannot hold exactly.
     """
     lines = [
         "VERS 161019 0 0",
@@ -314,8 +322,10 @@ def _cannot(lens: Prescription, given: LensSurface, what: str, allowed: str) -> 
 def batoid_text(lens: prescription.Prescription) -> tuple[str, tuple[prescription.Note, ...]]:
     """The file's text, and what of the prescription is not in it.
 
-    Raises:
-        InputError: a surface that batoid does not know.
+    Raises
+    ------
+    InputError
+        a surface that batoid does not know.
     """
     notes: list[prescription.Note] = []
     items: list[dict[str, Any]] = []

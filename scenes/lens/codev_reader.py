@@ -339,12 +339,17 @@ def _edge(system: CodevSystem, surface: CodevSurface, s: Statement) -> bool:
 def read_codev(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
     """Read a .seq file.
 
-    Args:
-        path: of the file, UTF-8, UTF-16 or ISO 8859-1.
-        glasses: that its surfaces may name.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file, UTF-8, UTF-16 or ISO 8859-1.
+    glasses : Glasses
+        That its surfaces may name.
 
-    Raises:
-        InputError: the file is damaged, or says something that would be taken wrongly; with the line.
+    Raises
+    ------
+    InputError
+        The file is damaged, or says something that would be taken wrongly; with the line.
     """
     source = Source(str(path))
     lines = read_lines(source)

@@ -30,10 +30,14 @@ _POLYNOMIAL = {(a, n - a): (f"x{a}" if a > 1 else "x" * a) + (f"y{n - a}" if n -
 def even_asphere(curvature: float, conic: float, powers: Mapping[int, float]) -> Surface:
     """A conic with even powers of the radius, the second one among them.
 
-    Args:
-        curvature: 1/m.
-        conic: Schwarzschild's constant.
-        powers: power n -> coefficient of r^n, m^(1-n); n even, 2 to 20.
+    Parameters
+    ----------
+    curvature : float
+        1/m.
+    conic : float
+        Schwarzschild's constant.
+    powers : Mapping[int, float]
+        Power n -> coefficient of r^n, m^(1-n); n even, 2 to 20.
     """
     last = max((n for n, a in powers.items() if a != 0.0 and n > 2), default=2)
     even = tuple(float(powers.get(n, 0.0)) for n in range(4, last + 1, 2))
@@ -46,13 +50,19 @@ def even_asphere(curvature: float, conic: float, powers: Mapping[int, float]) ->
 def polynomial(surface: Surface, coefficients: Mapping[tuple[int, int], float], radius: float) -> Surface:
     """The surface with a polynomial in x and y on top.
 
-    Args:
-        surface: without a figure or polynomial of its own.
-        coefficients: (a, b) -> c_ab of (x/radius)^a (y/radius)^b, metres.
-        radius: of the disk that the coefficients are for, metres.
+    Parameters
+    ----------
+    surface : Surface
+        Without a figure or polynomial of its own.
+    coefficients : Mapping[tuple[int, int], float]
+        (a, b) -> c_ab of (x/radius)^a (y/radius)^b, metres.
+    radius : float
+        Of the disk that the coefficients are for, metres.
 
-    Raises:
-        ValueError: an order above LARGEST_ORDER.
+    Raises
+    ------
+    ValueError
+        An order above LARGEST_ORDER.
     """
     given = {k: c for k, c in coefficients.items() if c != 0.0}
     order = max((a + b for a, b in given), default=0)
@@ -96,8 +106,10 @@ def moved_polynomial(
 def joined(surface: Surface) -> Surface:
     """The surface with the Zernike terms of its own sag in its figure: one set of them, as other programs have it.
 
-    Raises:
-        ValueError: the figure is one on a grid, or has a term beyond those of Noll's that are known.
+    Raises
+    ------
+    ValueError
+        The figure is one on a grid, or has a term beyond those of Noll's that are known.
     """
     own = next((term for term in surface.terms if isinstance(term, ZernikeSag)), None)
     if own is None:
@@ -138,8 +150,10 @@ def clear(
 ) -> Aperture | None:
     """A clear aperture of what a file gives, in metres; None for nothing.
 
-    Raises:
-        ValueError: sizes that no aperture has.
+    Raises
+    ------
+    ValueError
+        Sizes that no aperture has.
     """
     if rectangle is not None:
         return Rectangle(*rectangle, centre)
@@ -218,9 +232,12 @@ def written(value: float, kind: Kind) -> str:
     """A number of another program's file as a camera's file has it, without the tail that conversions leave: 540 arcsec
     and not 539.9999999999999 arcsec.
 
-    Args:
-        value: SI.
-        kind: what it measures.
+    Parameters
+    ----------
+    value : float
+        SI.
+    kind : Kind
+        What it measures.
     """
     return format_quantity(value, kind, _ROUNDING.get(kind.si, 0.0) + 2e-15 * abs(value))
 
@@ -288,10 +305,14 @@ SEQUENCE = "imaging"
 class Note:
     """What of a foreign file did not come along, or how it was taken.
 
-    Attributes:
-        line: of the file, counted from 1; 0 for the file as a whole.
-        statement: as it stands there.
-        text: what became of it.
+    Attributes
+    ----------
+    line : int
+        Of the file, counted from 1; 0 for the file as a whole.
+    statement : str
+        As it stands there.
+    text : str
+        What became of it.
     """
 
     line: int
@@ -307,16 +328,26 @@ class Note:
 class LensSurface:
     """One surface of a prescription.
 
-    Attributes:
-        name: unique in it.
-        pose: its frame in the prescription's, z along the axis that light enters along; metres.
-        surface: its shape.
-        interaction: reflects, refracts or lets pass.
-        index: refractive index of what lies behind it for the light, at the prescription's wavelength.
-        aperture: clear aperture, None for an unlimited one.
-        edges: what cuts light there beside the clear aperture: obscurations, vanes.
-        line: where it begins in the file.
-        glass: name of what lies behind it, empty for the medium of the object.
+    Attributes
+    ----------
+    name : str
+        Unique in it.
+    pose : Pose
+        Its frame in the prescription's, z along the axis that light enters along; metres.
+    surface : Surface
+        Its shape.
+    interaction : Interaction
+        Reflects, refracts or lets pass.
+    index : float
+        Refractive index of what lies behind it for the light, at the prescription's wavelength.
+    aperture : Aperture | None
+        Clear aperture, None for an unlimited one.
+    edges : tuple[Edge, ...]
+        What cuts light there beside the clear aperture: obscurations, vanes.
+    line : int
+        Where it begins in the file.
+    glass : str
+        Name of what lies behind it, empty for the medium of the object.
     """
 
     name: str
@@ -340,10 +371,14 @@ class Pupil:
     """How a file says how wide the beam is: by the diameter of the entrance pupil (metres), the F-number in image
     space, the numerical aperture in object space, or the radius of the stop (metres).
 
-    Attributes:
-        kind: ``diameter``, ``f_number``, ``object_na`` or ``stop``.
-        value: of it.
-        line: where it stands.
+    Attributes
+    ----------
+    kind : str
+        ``diameter``, ``f_number``, ``object_na`` or ``stop``.
+    value : float
+        Of it.
+    line : int
+        Where it stands.
     """
 
     kind: str
@@ -357,23 +392,38 @@ class Prescription:
 
     Frame: that of the first surface after the object, before its own decentre; light enters toward +z.
 
-    Attributes:
-        name: of the file's title, or of the file.
-        file: its path, as the user gave it.
-        surfaces: in the order of the light, the image last; planes that do nothing are left out.
-        stop: index of the surface that is the aperture stop.
-        wavelength: at which indices hold, metres.
-        wavelengths: all that the file names, metres.
-        fields: directions (x, y) from which light comes as their tangents' angles, radians; empty where the file has
-            other fields than angles.
-        field_kind: what the file's fields are, for messages.
-        pupil: how wide the beam is; None where the file does not say.
-        object_distance: from the object to the frame's origin, metres; infinite for a scene.
-        notes: what did not come along.
-        round_field: the fields say how wide a round field about the axis is, of which a camera has the square in it.
-        glasses: of its surfaces by their names, those whose dispersion is known; called with a wavelength (metres) each
-            gives its index.
-        heights: fields that the file has as heights (x, y) on object or image, metres; empty for others.
+    Attributes
+    ----------
+    name : str
+        Of the file's title, or of the file.
+    file : str
+        Its path, as the user gave it.
+    surfaces : tuple[LensSurface, ...]
+        In the order of the light, the image last; planes that do nothing are left out.
+    stop : int
+        Index of the surface that is the aperture stop.
+    wavelength : float
+        At which indices hold, metres.
+    wavelengths : tuple[float, ...]
+        All that the file names, metres.
+    fields : tuple[tuple[float, float], ...]
+        Directions (x, y) from which light comes as their tangents' angles, radians; empty where the file has other
+        fields than angles.
+    field_kind : str
+        What the file's fields are, for messages.
+    pupil : Pupil | None
+        How wide the beam is; None where the file does not say.
+    object_distance : float
+        From the object to the frame's origin, metres; infinite for a scene.
+    notes : tuple[Note, ...]
+        What did not come along.
+    round_field : bool
+        The fields say how wide a round field about the axis is, of which a camera has the square in it.
+    glasses : Mapping[str, Callable[[float], float]]
+        Of its surfaces by their names, those whose dispersion is known; called with a wavelength (metres) each gives
+        its index.
+    heights : tuple[tuple[float, float], ...]
+        Fields that the file has as heights (x, y) on object or image, metres; empty for others.
     """
 
     name: str
@@ -409,8 +459,10 @@ class Prescription:
     def assembly(self, apertures: bool = True) -> Assembly:
         """What the tracer traces: one body and one element for each surface, the way of the light as ``SEQUENCE``.
 
-        Args:
-            apertures: whether clear apertures stop rays.
+        Parameters
+        ----------
+        apertures : bool
+            Whether clear apertures stop rays.
         """
         bodies = tuple(Body(s.name, s.pose) for s in self.surfaces)
         elements = {

@@ -42,11 +42,16 @@ _MARKS = ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"), (b"\xef\xbb\xbf", "u
 class Statement:
     """A command of a file with its words.
 
-    Attributes:
-        line: on which it begins, counted from 1.
-        command: in capitals.
-        words: after it.
-        text: the whole of it, as it stands there.
+    Attributes
+    ----------
+    line : int
+        On which it begins, counted from 1.
+    command : str
+        In capitals.
+    words : tuple[str, ...]
+        After it.
+    text : str
+        The whole of it, as it stands there.
     """
 
     line: int
@@ -59,9 +64,12 @@ class Statement:
 class Source:
     """A file while it is read.
 
-    Attributes:
-        file: path as the user gave it.
-        notes: what was not understood so far.
+    Attributes
+    ----------
+    file : str
+        Path as the user gave it.
+    notes : list[Note]
+        What was not understood so far.
     """
 
     file: str
@@ -91,8 +99,10 @@ class Source:
     def number(self, statement: Statement, place: int, what: str, default: float | None = None) -> float:
         """The number in one of the statement's words.
 
-        Raises:
-            InputError: there is none and no default, or it is none, or too large for anything.
+        Raises
+        ------
+        InputError
+            There is none and no default, or it is none, or too large for anything.
         """
         if place >= len(statement.words):
             if default is not None:
@@ -137,14 +147,20 @@ def is_number(word: str) -> bool:
 def read_lines(source: Source, what: str = "a prescription", most: int = LARGEST_FILE) -> list[str]:
     """The lines of a source's file: UTF-16 of either order, with or without a mark, UTF-8, or one byte a character.
 
-    Args:
-        source: to read from.
-        what: its file should be, for messages.
-        most: bytes that it may have.
+    Parameters
+    ----------
+    source : Source
+        To read from.
+    what : str
+        Its file should be, for messages.
+    most : int
+        Bytes that it may have.
 
-    Raises:
-        InputError: the file cannot be read, is too large or empty, or holds bytes that no text of its encoding has,
-            with their line.
+    Raises
+    ------
+    InputError
+        The file cannot be read, is too large or empty, or holds bytes that no text of its encoding has, with their
+        line.
     """
     content = read_bytes(source.file, what, most, (Path(source.file).suffix,))
     if not content.strip(b"\0 \t\r\n"):
@@ -224,15 +240,23 @@ def of_makers(glasses: Glasses, makers: Sequence[str]) -> Glasses:
 def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, line: int) -> float:
     """Refractive index of a catalogue's glass that a file names.
 
-    Args:
-        source: the file.
-        glasses: that are known.
-        name: as the file has it.
-        wavelength: metres.
-        line: of the file.
+    Parameters
+    ----------
+    source : Source
+        The file.
+    glasses : Glasses
+        That are known.
+    name : str
+        As the file has it.
+    wavelength : float
+        metres.
+    line : int
+        Of the file.
 
-    Raises:
-        InputError: no such glass, or none whose index is known there.
+    Raises
+    ------
+    InputError
+        No such glass, or none whose index is known there.
     """
     found = of_makers(glasses, [name.strip("'\"").upper().partition("_")[2]]).get(glass_key(name))
     if found is None:
@@ -261,12 +285,18 @@ def require_d_line(source: Source, what: str, name: str, wavelength: float, line
 class Chain:
     """Surfaces as a reader meets them, one frame after the other; a reader's own workspace.
 
-    Attributes:
-        source: the file.
-        pose: frame that the next surface stands in.
-        surfaces: so far.
-        stop: number of the aperture stop among them, -1 as long as there is none.
-        index, glass: what lies behind the last surface.
+    Attributes
+    ----------
+    source : Source
+        The file.
+    pose : Pose
+        Frame that the next surface stands in.
+    surfaces : list[LensSurface]
+        So far.
+    stop : int
+        Number of the aperture stop among them, -1 as long as there is none.
+    index, glass : float
+        What lies behind the last surface.
     """
 
     source: Source
@@ -292,17 +322,27 @@ class Chain:
     ) -> None:
         """Take the next surface, under another name where its own is taken; a plane that does nothing is left out.
 
-        Args:
-            name: of the surface.
-            shape: of it.
-            edges: its clear aperture, and what it blocks.
-            behind: index and glass of what lies behind it; None for a mirror.
-            line: where it begins in the file.
-            stop: whether it is the aperture stop.
-            last: whether it is the image.
+        Parameters
+        ----------
+        name : str
+            Of the surface.
+        shape : Surface
+            Of it.
+        edges : tuple[Aperture | None, tuple[Edge, ...]]
+            Its clear aperture, and what it blocks.
+        behind : tuple[float, str] | None
+            Index and glass of what lies behind it; None for a mirror.
+        line : int
+            Where it begins in the file.
+        stop : bool
+            Whether it is the aperture stop.
+        last : bool
+            Whether it is the image.
 
-        Raises:
-            InputError: it is a second stop.
+        Raises
+        ------
+        InputError
+            It is a second stop.
         """
         how = Interaction.REFLECT
         if behind is not None:
@@ -323,14 +363,21 @@ class Chain:
     def prescription(self, keyword: str, distance: float, name: str, **said: Any) -> Prescription:
         """What the file describes.
 
-        Args:
-            keyword: that names the stop in the file.
-            distance: of the object, metres.
-            name: title of the file, empty for none.
-            said: further numbers of the prescription.
+        Parameters
+        ----------
+        keyword : str
+            That names the stop in the file.
+        distance : float
+            Of the object, metres.
+        name : str
+            Title of the file, empty for none.
+        said : Any
+            Further numbers of the prescription.
 
-        Raises:
-            InputError: the image is the stop.
+        Raises
+        ------
+        InputError
+            The image is the stop.
         """
         source = self.source
         if self.stop < 0:
@@ -365,11 +412,15 @@ def own_glasses() -> Glasses:
 def read_catalogues(paths: Sequence[str | Path]) -> Glasses:
     """The twin's glasses and those of AGF files; of one name the first file's counts, before the twin's own.
 
-    Args:
-        paths: of the files.
+    Parameters
+    ----------
+    paths : Sequence[str | Path]
+        Of the files.
 
-    Raises:
-        InputError: a file cannot be read or is damaged.
+    Raises
+    ------
+    InputError
+        a file cannot be read or is damaged.
     """
     out = dict(own_glasses())
     for path in reversed(paths):
@@ -380,8 +431,10 @@ def read_catalogues(paths: Sequence[str | Path]) -> Glasses:
 def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
     """The glasses of an AGF file.
 
-    Raises:
-        InputError: it cannot be read, or says of a glass what cannot be; with the line.
+    Raises
+    ------
+    InputError
+        It cannot be read, or says of a glass what cannot be; with the line.
     """
     source = Source(str(path))
     glasses: list[CatalogueGlass] = []

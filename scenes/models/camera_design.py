@@ -80,8 +80,10 @@ def variables_of(spec: CameraDesignSpec) -> tuple[Variable, ...]:
 def camera_of(start: CameraSpec, prescription: Prescription, name: str, description: str) -> CameraSpec:
     """The camera of an optimised prescription: all that is not optics as in the start.
 
-    Raises:
-        ValueError: mirrors are tilted or surfaces decentred, which a camera's file cannot say.
+    Raises
+    ------
+    ValueError
+        Mirrors are tilted or surfaces decentred, which a camera's file cannot say.
     """
     image = prescription.stands[IMAGE]
     if image.y or any(stand.y or stand.tilt for n, stand in prescription.stands.items() if n != IMAGE):
@@ -114,13 +116,19 @@ def file_with_plane(camera: CameraSpec, plane: FocalPlane, name: str) -> str:
     Data sheets that it names by a path relative to itself are named by their whole path, for the new file may stand
     elsewhere. A camera that has no file of its own gets one without comments.
 
-    Args:
-        camera: as it was read.
-        plane: where its image is to be.
-        name: of the new camera.
+    Parameters
+    ----------
+    camera : CameraSpec
+        As it was read.
+    plane : FocalPlane
+        Where its image is to be.
+    name : str
+        Of the new camera.
 
-    Raises:
-        OSError: the camera's file is not there any more.
+    Raises
+    ------
+    OSError
+        The camera's file is not there any more.
     """
     source = camera.source
     if source.prefix or not source.file:

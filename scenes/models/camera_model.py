@@ -73,12 +73,15 @@ turned surfaces map one circle to another curve and back."""
 class TracedFocalLengths(NamedTuple):
     """Focal lengths of a camera about the chief ray of its field's middle, metres.
 
-    Attributes:
-        image: change of the image's place per angle, along the line and across it, (2,): on the plane that the file
-            states, in focus or not.
-        light: of parallel light, wherever its focus is: in the two principal directions about that ray, infinite
-            without power, and the effective focal length about the axis, (3,); negative where light diverges after the
-            last surface.
+    Attributes
+    ----------
+    image : np.ndarray
+        Change of the image's place per angle, along the line and across it, (2,): on the plane that the file states, in
+        focus or not.
+    light : np.ndarray
+        Of parallel light, wherever its focus is: in the two principal directions about that ray, infinite without
+        power, and the effective focal length about the axis, (3,); negative where light diverges after the last
+        surface.
     """
 
     image: np.ndarray
@@ -100,14 +103,20 @@ def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengt
     Either of the two directions will do, since cameras with surfaces off the axis differ in them. A camera that is only
     out of focus is none of another focal length, unless a single number explains it: it can be refocused.
 
-    Args:
-        spec: the camera.
-        traced: its focal lengths.
-        focal_lengths: how those of a changed camera are traced; asked only to find out what is wrong.
+    Parameters
+    ----------
+    spec : CameraSpec
+        The camera.
+    traced : TracedFocalLengths
+        Its focal lengths.
+    focal_lengths : FocalLengths
+        How those of a changed camera are traced; asked only to find out what is wrong.
 
-    Raises:
-        InputError: they differ by more than ``LARGEST_DIFFERENCE``; with the number whose other sign or unit brings
-            the focal length to the stated one, where there is one.
+    Raises
+    ------
+    InputError
+        They differ by more than ``LARGEST_DIFFERENCE``; with the number whose other sign or unit brings the focal
+        length to the stated one, where there is one.
     """
     stated, real = spec.focal_length, bool(np.all(traced.light > 0.0))
     in_place, in_focus = (_difference(np.abs(one), stated) <= LARGEST_DIFFERENCE for one in traced)
@@ -125,9 +134,11 @@ def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengt
 def check_entrance_pupil(spec: CameraSpec, traced: float) -> None:
     """Check the stated entrance pupil of a camera against the traced diameter, metres.
 
-    Raises:
-        InputError: they differ by more than ``LARGEST_PUPIL_DIFFERENCE`` where the stop is stated, else at all: other
-            rays than those of the stated beam meet the rim of the stop.
+    Raises
+    ------
+    InputError
+        They differ by more than ``LARGEST_PUPIL_DIFFERENCE`` where the stop is stated, else at all: other rays than
+        those of the stated beam meet the rim of the stop.
     """
     off = abs(traced / spec.entrance_pupil - 1.0)
     if spec.stop_diameter is None and off > SAME_PUPIL:
@@ -251,13 +262,18 @@ class AfocalError(PhysicalError, ValueError):
 class CameraAxis:
     """The light along the axis of a camera, in the prescription frame.
 
-    Attributes:
-        direction: in which it travels, unit, (3,): along the parent axis, or along the light of the field's middle
-            where none comes through along that axis.
-        base: launch point of the ray that paraxial data are about, (3,), metres: on the parent axis where all mirrors
-            and lenses are about it, else that of the ray through the middle of the stop.
-        centre: launch point of the ray through the middle of the stop, (3,), metres.
-        on_axis: whether it travels along the parent axis.
+    Attributes
+    ----------
+    direction : np.ndarray
+        In which it travels, unit, (3,): along the parent axis, or along the light of the field's middle where none
+        comes through along that axis.
+    base : np.ndarray
+        Launch point of the ray that paraxial data are about, (3,), metres: on the parent axis where all mirrors and
+        lenses are about it, else that of the ray through the middle of the stop.
+    centre : np.ndarray
+        Launch point of the ray through the middle of the stop, (3,), metres.
+    on_axis : bool
+        Whether it travels along the parent axis.
     """
 
     direction: np.ndarray
@@ -280,15 +296,23 @@ def find_axis(
     entrance pupil before the first surface: its rays are traced to the stop, and the area that they enclose there is
     the stop's.
 
-    Args:
-        spec: the camera.
-        backend: where to trace.
-        to_stop: one system, from the scene to the stop.
-        imaging: one system, from the scene to the image.
-        middle: direction of the light of the field's middle, prescription frame, (3,).
+    Parameters
+    ----------
+    spec : CameraSpec
+        The camera.
+    backend : Backend
+        Where to trace.
+    to_stop : SystemBatch
+        One system, from the scene to the stop.
+    imaging : SystemBatch
+        One system, from the scene to the image.
+    middle : np.ndarray
+        Direction of the light of the field's middle, prescription frame, (3,).
 
-    Raises:
-        AimError, BeamMissedError: no light comes through, neither along the parent axis nor along the field's middle.
+    Raises
+    ------
+    AimError, BeamMissedError
+        No light comes through, neither along the parent axis nor along the field's middle.
     """
     try:
         return _along(spec, backend, to_stop, imaging, PARENT_AXIS)
@@ -329,14 +353,21 @@ def pupil_diameter(backend: Backend, to_stop: SystemBatch, axis: CameraAxis, rad
     """Return the diameter of the entrance pupil: that of the round beam along the axis with the area of the light,
     before the first surface, that fills the stop, metres.
 
-    Args:
-        backend: where to trace.
-        to_stop: one system, from the scene to the stop.
-        axis: in the same frame as the system.
-        radius: of the stop, metres.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    to_stop : SystemBatch
+        One system, from the scene to the stop.
+    axis : CameraAxis
+        In the same frame as the system.
+    radius : float
+        Of the stop, metres.
 
-    Raises:
-        AimError: the beam does not reach the stop.
+    Raises
+    ------
+    AimError
+        The beam does not reach the stop.
     """
     rays, axes = aim_collimated(backend, to_stop, axis.direction[None], axis.centre[None], radius * _ring())
     return 2.0 * equal_area_radius(rays[0] @ axes[0].T)
@@ -347,15 +378,23 @@ def axis_data(
 ) -> Paraxial:
     """Return the paraxial data about the axis of a camera.
 
-    Args:
-        backend: where to trace.
-        imaging: one system, from the scene to the image.
-        spec: the camera.
-        axis: in the same frame as the system.
-        first: near this direction of that frame lies the first axis of the launch plane, (3,).
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    imaging : SystemBatch
+        One system, from the scene to the image.
+    spec : CameraSpec
+        The camera.
+    axis : CameraAxis
+        In the same frame as the system.
+    first : np.ndarray
+        Near this direction of that frame lies the first axis of the launch plane, (3,).
 
-    Raises:
-        AfocalError: parallel light leaves the system parallel.
+    Raises
+    ------
+    AfocalError
+        Parallel light leaves the system parallel.
     """
     count, launch, direction = len(imaging.structure), axis.base[None], axis.direction[None]
     traced = trace(backend, imaging, make_rays(backend, launch, axis.direction), keep=range(count))
@@ -436,11 +475,16 @@ def camera_sequences(name: str, model: CameraModel) -> dict[str, tuple[str, ...]
 def shape_changes(model: CameraModel, root: str) -> dict[str, tuple[str, ...]]:
     """What may change of the shapes and glasses of a camera's surfaces.
 
-    Args:
-        model: of the camera.
-        root: path of its body.
+    Parameters
+    ----------
+    model : CameraModel
+        Of the camera.
+    root : str
+        Path of its body.
 
-    Returns:
+    Returns
+    -------
+    dict[str, tuple[str, ...]]
         Body -> which of "figure", "radius", "conic", "index" and "abbe"; surfaces that light passes have none.
     """
     glass, dispersive = lenses(model.spec), above_d_line(model.spec)
@@ -468,10 +512,14 @@ def camera_alone(model: CameraModel) -> Assembly:
 class CameraUnderTest:
     """A camera ready to be traced.
 
-    Attributes:
-        model: derived numbers of the prescription.
-        assembly: bodies ``camera/M1`` ... ``camera/focal_plane``, sequences ``camera/imaging`` ...
-        as_built: how it departs from the prescription.
+    Attributes
+    ----------
+    model : CameraModel
+        Derived numbers of the prescription.
+    assembly : Assembly
+        Bodies ``camera/M1`` ... ``camera/focal_plane``, sequences ``camera/imaging`` ...
+    as_built : State
+        How it departs from the prescription.
     """
 
     model: CameraModel
@@ -482,8 +530,10 @@ class CameraUnderTest:
 def build_camera_under_test(test: CameraUnderTestSpec, camera: CameraSpec, backend: Backend) -> CameraUnderTest:
     """Build the camera and check what the test says of it.
 
-    Raises:
-        InputError: ``as_built`` names what the camera does not have.
+    Raises
+    ------
+    InputError
+        ``as_built`` names what the camera does not have.
     """
     camera.require_mirrors("a camera under test")
     model = derive_camera(camera, backend)
@@ -516,18 +566,30 @@ _RIM_POINTS = 24
 class CameraModel:
     """A camera's derived numbers; poses and points are in the prescription frame, metres and radians.
 
-    Attributes:
-        spec: the prescription.
-        surfaces: mirror name -> shape.
-        apertures: mirror name -> clear aperture (the stop's is the stop itself).
-        camera_frame: the camera frame in the prescription frame.
-        focal_plane: the focal-plane frame in the prescription frame.
-        first_order: parabasal quantities about the centre's chief ray.
-        image_direction: direction of the centre's chief ray at the image.
-        rear_node: point one principal distance (along the line) upstream of the line's centre along that ray.
-        axis: light along its axis.
-        paraxial: paraxial data about that axis.
-        entrance_pupil: diameter of the entrance pupil, metres: of the beam along the axis that fills the stop.
+    Attributes
+    ----------
+    spec : CameraSpec
+        The prescription.
+    surfaces : Mapping[str, Surface]
+        Mirror name -> shape.
+    apertures : Mapping[str, Aperture]
+        Mirror name -> clear aperture (the stop's is the stop itself).
+    camera_frame : Pose
+        The camera frame in the prescription frame.
+    focal_plane : Pose
+        The focal-plane frame in the prescription frame.
+    first_order : FirstOrder
+        Parabasal quantities about the centre's chief ray.
+    image_direction : np.ndarray
+        Direction of the centre's chief ray at the image.
+    rear_node : np.ndarray
+        Point one principal distance (along the line) upstream of the line's centre along that ray.
+    axis : CameraAxis
+        Light along its axis.
+    paraxial : Paraxial
+        Paraxial data about that axis.
+    entrance_pupil : float
+        Diameter of the entrance pupil, metres: of the beam along the axis that fills the stop.
     """
 
     spec: CameraSpec
@@ -562,8 +624,10 @@ class CameraModel:
     def uncut(self, met: Callable[[str], np.ndarray]) -> np.ndarray | bool:
         """Which rays all edges let through; True where there are none.
 
-        Args:
-            met: mirror name -> (..., 2 or 3) where rays meet it, in its own frame, metres of the nominal mirror.
+        Parameters
+        ----------
+        met : Callable[[str], np.ndarray]
+            Mirror name -> (..., 2 or 3) where rays meet it, in its own frame, metres of the nominal mirror.
         """
         through: np.ndarray | bool = True
         for name, edges in self.edges.items():
@@ -625,13 +689,20 @@ def image_pose(spec: CameraSpec) -> Pose:
 def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Launch points of collimated beams that meet the stop at given points.
 
-    Args:
-        backend: where to trace.
-        to_stop: one system, from the scene to the stop.
-        directions: (F, 3) beam directions.
-        targets: (N, 2) stop coordinates, metres, the same for every beam.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    to_stop : SystemBatch
+        One system, from the scene to the stop.
+    directions : np.ndarray
+        (F, 3) beam directions.
+    targets : np.ndarray
+        (N, 2) stop coordinates, metres, the same for every beam.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (F, N, 3) points on a plane before the first mirror, prescription frame.
     """
     every = to_stop.take(np.zeros(len(directions), dtype=int))
@@ -641,15 +712,21 @@ def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, t
 def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> CameraModel:
     """Trace a prescription and work out frames, stop, apertures and first-order numbers.
 
-    Args:
-        spec: the prescription.
-        backend: where to trace.
-        stated: whether its focal length is held against the traced one; it is not while a file is made, whose focal
-            length follows from the trace.
+    Parameters
+    ----------
+    spec : CameraSpec
+        The prescription.
+    backend : Backend
+        Where to trace.
+    stated : bool
+        Whether its focal length is held against the traced one; it is not while a file is made, whose focal length
+        follows from the trace.
 
-    Raises:
-        InputError: the prescription does not bring the light of its field through the stop to the image, or has
-            another focal length than it states.
+    Raises
+    ------
+    InputError
+        The prescription does not bring the light of its field through the stop to the image, or has another focal
+        length than it states.
     """
     try:
         return _derived(spec, backend, stated)
@@ -755,8 +832,10 @@ def lenses(spec: CameraSpec) -> dict[str, str]:
 def glass_indices(spec: CameraSpec, wavelength: float | None = None) -> dict[str, float]:
     """Lens -> its refractive index at a wavelength, metres; at that of the design by default.
 
-    Raises:
-        ValueError: a lens whose glass is not named, or not known there.
+    Raises
+    ------
+    ValueError
+        a lens whose glass is not named, or not known there.
     """
     return {name: spec.index_behind(name, wavelength) for name in dict.fromkeys(lenses(spec).values())}
 
@@ -779,18 +858,27 @@ def coloured(spec: CameraSpec, root: str, state: State, wavelength: float) -> St
 
     What the state itself says of an index, as heat does, is added to that of the wavelength.
 
-    Args:
-        spec: of the camera.
-        root: path of its body; empty for a bare camera.
-        state: body path -> motion.
-        wavelength: metres.
+    Parameters
+    ----------
+    spec : CameraSpec
+        Of the camera.
+    root : str
+        Path of its body; empty for a bare camera.
+    state : State
+        Body path -> motion.
+    wavelength : float
+        metres.
 
-    Returns:
+    Returns
+    -------
+    State
         The state, with the change of index of every lens; the same one for a camera without lenses, and at the design
         wavelength.
 
-    Raises:
-        ValueError: as ``glass_indices``.
+    Raises
+    ------
+    ValueError
+        As ``glass_indices``.
     """
     return in_glass(state, glass_steps(spec, root, wavelength))
 
@@ -812,9 +900,12 @@ def in_glass(state: State, steps: Mapping[str, float]) -> State:
 
     A glass with another Abbe number disperses more or less than the catalogue's.
 
-    Args:
-        state: body path -> motion.
-        steps: of ``glass_steps``.
+    Parameters
+    ----------
+    state : State
+        Body path -> motion.
+    steps : Mapping[str, float]
+        Of ``glass_steps``.
     """
     if not steps:
         return state

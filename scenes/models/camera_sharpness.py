@@ -58,9 +58,12 @@ _FEW_FIELDS = tuple((x, y) for x in (0.0, 1.0) for y in (-1.0, 0.0, 1.0))
 class FocalPlane:
     """Where a camera's image plane stands.
 
-    Attributes:
-        z: where it crosses the parent axis, metres.
-        tilt: about the prescription's x, at the parent axis, radians; 0 stands square to the axis.
+    Attributes
+    ----------
+    z : float
+        Where it crosses the parent axis, metres.
+    tilt : float
+        About the prescription's x, at the parent axis, radians; 0 stands square to the axis.
     """
 
     z: float
@@ -87,10 +90,14 @@ def stop_nodes(model: CameraModel, rings: int, cut: bool = False) -> PupilNodes:
     Where nothing but the stop limits a beam, Gauss' rule of ``rings``, exact for smooth wavefronts; where edges cut it,
     ``EVEN`` points whatever the rings, so that all that is told of such a beam is of the same rays.
 
-    Args:
-        model: of the camera.
-        rings: of Gauss' rule.
-        cut: whether bodies about the camera cut the beam, too.
+    Parameters
+    ----------
+    model : CameraModel
+        Of the camera.
+    rings : int
+        Of Gauss' rule.
+    cut : bool
+        Whether bodies about the camera cut the beam, too.
     """
     return quadrature.even_disk(EVEN) if model.edges or cut else quadrature.disk(rings)
 
@@ -99,15 +106,24 @@ def stop_nodes(model: CameraModel, rings: int, cut: bool = False) -> PupilNodes:
 class FieldBeams:
     """Beams of F fields near the image, in the prescription frame; of each the chief ray, then N of a quadrature.
 
-    Attributes:
-        camera: whose.
-        fields: shares of the half field, (F, 2).
-        nodes: of the stop, N.
-        position, direction: (F, 1 + N, 3), metres and unit.
-        path: optical path from the incoming wavefront, (F, 1 + N), metres.
-        exit_pupil: from the camera's own image to its exit pupil, upstream, metres.
-        room: from the last mirror along the chief ray to the camera's own image, (F,), metres.
-        lit: which of the N rays edges of surfaces let through, (F, N); None for all.
+    Attributes
+    ----------
+    camera : CameraSpec
+        whose.
+    fields : np.ndarray
+        Shares of the half field, (F, 2).
+    nodes : PupilNodes
+        Of the stop, N.
+    position, direction : np.ndarray
+        (F, 1 + N, 3), metres and unit.
+    path : np.ndarray
+        Optical path from the incoming wavefront, (F, 1 + N), metres.
+    exit_pupil : float
+        From the camera's own image to its exit pupil, upstream, metres.
+    room : np.ndarray
+        From the last mirror along the chief ray to the camera's own image, (F,), metres.
+    lit : np.ndarray | None
+        Which of the N rays edges of surfaces let through, (F, N); None for all.
     """
 
     camera: CameraSpec
@@ -134,10 +150,14 @@ class FieldBeams:
 
         ``wavelength`` is that of the light, metres; the design wavelength by default. Errors stay in waves of that.
 
-        Raises:
-            AimError, BeamMissedError: light of a field does not come through.
-            InputError: edges stop all of it.
-            ValueError: a glass is not known at the wavelength.
+        Raises
+        ------
+        AimError, BeamMissedError
+            Light of a field does not come through.
+        InputError
+            Edges stop all of it.
+        ValueError
+            a glass is not known at the wavelength.
         """
         spec, nodes = model.spec, stop_nodes(model, rings, cut is not None)
         bare = model.bare_assembly(apertures=False)
@@ -276,11 +296,16 @@ def _levelled(error: np.ndarray, basis: np.ndarray, share: np.ndarray) -> np.nda
 class Sharpness:
     """A quick judgement of a camera as designed.
 
-    Attributes:
-        worst: largest wavefront error over the field, waves rms.
-        field: where, shares of the half field along the line and along the track.
-        plane: the best focal plane; None for a sharp camera, and where light has no focus after its last mirror.
-        refocused: the largest error on that plane, waves rms.
+    Attributes
+    ----------
+    worst : float
+        Largest wavefront error over the field, waves rms.
+    field : tuple[float, float]
+        Where, shares of the half field along the line and along the track.
+    plane : FocalPlane | None
+        The best focal plane; None for a sharp camera, and where light has no focus after its last mirror.
+    refocused : float
+        The largest error on that plane, waves rms.
     """
 
     worst: float
@@ -293,9 +318,12 @@ class Sharpness:
 def sharpness(camera: CameraSpec, backend: Backend) -> Sharpness:
     """Judge a camera from 222 rays, once.
 
-    Raises:
-        InputError: the prescription does not bring the light of its field through the stop to the image.
-        AimError, BeamMissedError: the same of some of it.
+    Raises
+    ------
+    InputError
+        The prescription does not bring the light of its field through the stop to the image.
+    AimError, BeamMissedError
+        The same of some of it.
     """
     beams = FieldBeams.trace(derive_camera(camera, backend), backend, _FEW_FIELDS, _RINGS)
     own = FocalPlane.of(camera)
@@ -343,9 +371,12 @@ def no_cameras(cameras: Iterable[CameraSpec], backend: Backend) -> tuple[Issue, 
     """One issue for each prescription that makes no image, wherever its image plane stands: the first cause of whatever
     its light then misses.
 
-    Args:
-        cameras: prescriptions whose light comes through.
-        backend: where to trace.
+    Parameters
+    ----------
+    cameras : Iterable[CameraSpec]
+        Prescriptions whose light comes through.
+    backend : Backend
+        Where to trace.
     """
     out = []
     for camera in cameras:

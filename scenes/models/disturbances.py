@@ -78,13 +78,20 @@ _Where = Callable[[str, KeyPath, Problem], Issue]
 class Component:
     """One component of the motion or of the temperature of one body.
 
-    Attributes:
-        cause: name of its cause.
-        body: path.
-        kind: one of UNITS.
-        axis: 0, 1, 2 of the body's own frame; the Noll index of a figure term; 0 where there is one only.
-        pivot: of turns and growth.
-        sigma: standard deviation, SI.
+    Attributes
+    ----------
+    cause : str
+        Name of its cause.
+    body : str
+        path.
+    kind : str
+        One of UNITS.
+    axis : int
+        0, 1, 2 of the body's own frame; the Noll index of a figure term; 0 where there is one only.
+    pivot : str
+        Of turns and growth.
+    sigma : float
+        Standard deviation, SI.
     """
 
     cause: str
@@ -121,12 +128,18 @@ class Component:
 class StatedMotions:
     """What is stated of an instrument's M components.
 
-    Attributes:
-        name: of the disturbances file.
-        components: cause by cause, body by body.
-        correlation: (M, M), positive semidefinite; zero between causes.
-        laws: of each component in time.
-        jump_false_alarm: chance that a series without a jump has one reported; None for that of every other test.
+    Attributes
+    ----------
+    name : str
+        Of the disturbances file.
+    components : tuple[Component, ...]
+        Cause by cause, body by body.
+    correlation : np.ndarray
+        (M, M), positive semidefinite; zero between causes.
+    laws : tuple[TimeLawSpec, ...]
+        Of each component in time.
+    jump_false_alarm : float | None
+        Chance that a series without a jump has one reported; None for that of every other test.
     """
 
     name: str
@@ -160,9 +173,12 @@ class StatedMotions:
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Random amounts, (count, M), SI; one state after the other, in it one component after the other.
 
-        Args:
-            rng: their source.
-            count: how many states.
+        Parameters
+        ----------
+        rng : np.random.Generator
+            Their source.
+        count : int
+            How many states.
         """
         unit = rng.standard_normal((count, len(self.components)))
         return np.asarray(unit @ covariance_root(self.correlation) * self.sigma)
@@ -171,9 +187,11 @@ class StatedMotions:
 def stated_motions(resolved: ResolvedJob, instrument: Instrument) -> StatedMotions | None:
     """What a job states of its instrument; None for nothing.
 
-    Raises:
-        InputError: a body that the instrument does not have, or that does not move so; correlations that cannot be.
-            One issue for each fault.
+    Raises
+    ------
+    InputError
+        a body that the instrument does not have, or that does not move so; correlations that cannot be. One issue for
+        each fault.
     """
     spec = resolved.disturbances
     if spec is None:
@@ -184,13 +202,19 @@ def stated_motions(resolved: ResolvedJob, instrument: Instrument) -> StatedMotio
 def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where | None = None) -> StatedMotions:
     """What a disturbances file says of an instrument.
 
-    Args:
-        spec: the file.
-        instrument: on whose bodies.
-        at: makes an issue of what is wrong at a key of a cause; by default one of the file itself.
+    Parameters
+    ----------
+    spec : DisturbancesSpec
+        The file.
+    instrument : Instrument
+        On whose bodies.
+    at : _Where | None
+        Makes an issue of what is wrong at a key of a cause; by default one of the file itself.
 
-    Raises:
-        InputError: as ``stated_motions``.
+    Raises
+    ------
+    InputError
+        As ``stated_motions``.
     """
     spec = spec.with_tables()
     where = at or (lambda cause, key, wrong: spec.issue(wrong, ("causes", cause, *key)))
@@ -224,13 +248,19 @@ def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where |
 def check_heat(resolved: ResolvedJob, stated: StatedMotions, thermal: ThermalModel) -> None:
     """Check that what is stated of temperatures can be worked out: that glasses have a dn/dT that is known there.
 
-    Args:
-        resolved: the job.
-        stated: of it.
-        thermal: of its instrument.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job.
+    stated : StatedMotions
+        Of it.
+    thermal : ThermalModel
+        Of its instrument.
 
-    Raises:
-        InputError: it cannot.
+    Raises
+    ------
+    InputError
+        It cannot.
     """
     cause_of = {c.body: c.cause for c in stated.components if c.kind in HEAT}
     warmer = {
@@ -249,11 +279,16 @@ def state_of(
 ) -> State:
     """The state in which components have given amounts.
 
-    Args:
-        amounts: (M,), SI.
-        components: M of them.
-        thermal: of the instrument.
-        motions: what else happens; it acts on top of the same body's motion.
+    Parameters
+    ----------
+    amounts : np.ndarray
+        (M,), SI.
+    components : Sequence[Component]
+        M of them.
+    thermal : ThermalModel
+        Of the instrument.
+    motions : State | None
+        What else happens; it acts on top of the same body's motion.
     """
     return states_of(np.asarray(amounts)[None], components, thermal, motions)[0]
 
@@ -550,10 +585,14 @@ Array = NDArray[np.float64]
 def drawn_motions(stated: StatedMotions, seconds: Array, source: Callable[[int], np.random.Generator]) -> Array:
     """Amounts (T, M) of all motions, SI, without jumps.
 
-    Args:
-        stated: the motions and their laws of time.
-        seconds: (T,) rising, from which the laws count.
-        source: number of a cause -> of what is drawn of it, so that no cause depends on the others.
+    Parameters
+    ----------
+    stated : StatedMotions
+        The motions and their laws of time.
+    seconds : Array
+        (T,) rising, from which the laws count.
+    source : Callable[[int], np.random.Generator]
+        Number of a cause -> of what is drawn of it, so that no cause depends on the others.
     """
     out = np.zeros((len(seconds), len(stated.components)))
     for number, where in enumerate(causes_of(stated).values()):
@@ -565,11 +604,16 @@ def drawn_motions(stated: StatedMotions, seconds: Array, source: Callable[[int],
 def drawn_course(law: TimeLawSpec, seconds: Array, rng: np.random.Generator, count: int) -> Array:
     """Independent courses (T, count) of unit standard deviation that have the covariance of a law of time.
 
-    Args:
-        law: of all of them. A jump does nothing here: its times are drawn for a body.
-        seconds: (T,) rising.
-        rng: source of what is drawn.
-        count: how many.
+    Parameters
+    ----------
+    law : TimeLawSpec
+        Of all of them. A jump does nothing here: its times are drawn for a body.
+    seconds : Array
+        (T,) rising.
+    rng : np.random.Generator
+        Source of what is drawn.
+    count : int
+        How many.
     """
     each = (len(seconds), count)
     if law.kind == "white":
@@ -635,18 +679,29 @@ def joint_disturbances(
     ``scenes.models.disturbances.motions_of_spec`` makes of it the components that move, in this order and with these
     standard deviations, and states drawn from it have this covariance.
 
-    Args:
-        name: of the file.
-        components: M of them, of different bodies, kinds or axes; their own standard deviations do not count.
-        covariance: (M, M), SI. Components without any are left out.
-        nodes: of the instrument.
-        reason: where the numbers come from.
-        description: for people.
-        time: how they go on in a series of measurements; constant by default.
+    Parameters
+    ----------
+    name : str
+        Of the file.
+    components : Sequence[Component]
+        M of them, of different bodies, kinds or axes; their own standard deviations do not count.
+    covariance : np.ndarray
+        (M, M), SI. Components without any are left out.
+    nodes : Mapping[str, NodeInfo]
+        Of the instrument.
+    reason : str
+        Where the numbers come from.
+    description : str
+        For people.
+    time : TimeLawSpec | None
+        How they go on in a series of measurements; constant by default.
 
-    Raises:
-        ValueError: it is no covariance of these components.
-        InputError: a component is there twice, or moves by more than a file can say.
+    Raises
+    ------
+    ValueError
+        It is no covariance of these components.
+    InputError
+        a component is there twice, or moves by more than a file can say.
     """
     covariance = np.asarray(covariance, dtype=np.float64)
     if covariance.shape != (len(components),) * 2 or not np.all(np.isfinite(covariance)):
@@ -682,12 +737,18 @@ def joint_disturbances(
 def joint_files(spec: DisturbancesSpec, stem: str, remark: str = "") -> dict[str, str]:
     """Files that say a statement with `joint`: its own, and beside it a table of the correlations where there are many.
 
-    Args:
-        spec: the statement.
-        stem: of the files' names.
-        remark: at the top of the file, lines of comment.
+    Parameters
+    ----------
+    spec : DisturbancesSpec
+        The statement.
+    stem : str
+        Of the files' names.
+    remark : str
+        At the top of the file, lines of comment.
 
-    Returns:
+    Returns
+    -------
+    dict[str, str]
         Name -> text.
     """
     joint = spec.joint

@@ -57,12 +57,16 @@ def as_built(drawn: Instrument) -> Instrument:
     as built, and a state of it acts on top. What was worked out of the drawing (frames, apertures, first-order numbers,
     the turns of the central prism's facets) stays that of the drawing.
 
-    Args:
-        drawn: the instrument of the drawing.
+    Parameters
+    ----------
+    drawn : Instrument
+        The instrument of the drawing.
 
-    Raises:
-        InputError: a node that the instrument does not have, or that does not move or change so; one issue for each
-            fault, at the file and line that says it.
+    Raises
+    ------
+    InputError
+        a node that the instrument does not have, or that does not move or change so; one issue for each fault, at the
+        file and line that says it.
     """
     stated = drawn.spec.as_built
     if not stated:
@@ -82,15 +86,22 @@ def squared_facets(instrument: Instrument, backend: Backend) -> State:
     Those of a drawing do. The facets of an instrument are turned so when its monitor is mounted, after its cameras were
     aligned: ``compose`` this with ``as_built`` for the file of such an instrument.
 
-    Args:
-        instrument: as built.
-        backend: where to trace.
+    Parameters
+    ----------
+    instrument : Instrument
+        As built.
+    backend : Backend
+        Where to trace.
 
-    Returns:
+    Returns
+    -------
+    State
         Body path of each facet -> its turn, about its own axes.
 
-    Raises:
-        MisplacedError: a beam misses a mirror or a prism.
+    Raises
+    ------
+    MisplacedError
+        a beam misses a mirror or a prism.
     """
     tree = instrument.assembly.tree
     square = square_facets(instrument.assembly, instrument.channels, instrument.cameras, backend).tree
@@ -116,18 +127,25 @@ def build_instrument(
 ) -> Instrument:
     """Build an instrument.
 
-    Args:
-        spec: the instrument.
-        camera_specs: camera file stem -> CameraSpec, for every stem the instrument names.
-        backend: where to trace while the geometry is worked out.
-        free_beams: refuse bodies that stand in the monitor's beams; False for comparisons of layouts that nobody would
-            build.
-        free_bodies: refuse bodies that stand in each other, and apertures that reach over their faces; False for
-            derivatives of layouts that are at such a limit.
+    Parameters
+    ----------
+    spec : InstrumentSpec
+        The instrument.
+    camera_specs : Mapping[str, object]
+        Camera file stem -> CameraSpec, for every stem the instrument names.
+    backend : Backend
+        Where to trace while the geometry is worked out.
+    free_beams : bool
+        Refuse bodies that stand in the monitor's beams; False for comparisons of layouts that nobody would build.
+    free_bodies : bool
+        Refuse bodies that stand in each other, and apertures that reach over their faces; False for derivatives of
+        layouts that are at such a limit.
 
-    Raises:
-        InputError: prisms or central prism cannot stand as the file says, the cameras are too different, or what was
-            built is not of this instrument.
+    Raises
+    ------
+    InputError
+        Prisms or central prism cannot stand as the file says, the cameras are too different, or what was built is not
+        of this instrument.
     """
     named = tuple(camera_specs.items())
     read = tuple((one.source.file, one.source.lines) for one in (spec, *camera_specs.values()) if isinstance(one, Spec))
@@ -148,11 +166,15 @@ def build_instrument(
 class _Asked:
     """What an instrument is built from.
 
-    Attributes:
-        spec, cameras, backend, free_beams, free_bodies: as of ``build_instrument``.
-        text: of the specifications, by which they are looked up; the order of parts is that of the results, and no part
-            of equality.
-        read: file and lines of each specification, which errors name later; equal specifications may differ in them.
+    Attributes
+    ----------
+    spec, cameras, backend, free_beams, free_bodies : InstrumentSpec
+        As of ``build_instrument``.
+    text : str
+        Of the specifications, by which they are looked up; the order of parts is that of the results, and no part of
+        equality.
+    read : tuple[tuple[str, Mapping[KeyPath, int]], ...]
+        File and lines of each specification, which errors name later; equal specifications may differ in them.
     """
 
     spec: InstrumentSpec = field(hash=False)
@@ -313,8 +335,10 @@ def _check_alike(spec: InstrumentSpec, assembly: Assembly) -> None:
 def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Channel]:
     """Where the reticles and area CCDs stand: at f tan(field) along the line.
 
-    Raises:
-        InputError: two of them would stand in each other.
+    Raises
+    ------
+    InputError
+        Two of them would stand in each other.
     """
     if spec.monitor is None:
         return []
@@ -365,8 +389,10 @@ def _ccd_elements(channels: list[Channel]) -> dict[str, Element]:
 def _baffles(spec: InstrumentSpec, tree: RigidTree) -> tuple[Plate, ...]:
     """Plates of all baffles.
 
-    Raises:
-        InputError: a baffle stands on a body that does not exist.
+    Raises
+    ------
+    InputError
+        a baffle stands on a body that does not exist.
     """
     out: list[Plate] = []
     for name, baffle in spec.baffles.items():

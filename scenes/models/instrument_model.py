@@ -23,17 +23,27 @@ from scenes.yaml.errors import KeyPath
 class Instrument:
     """An instrument ready to be perturbed and traced.
 
-    Attributes:
-        spec: what the YAML says.
-        assembly: bodies, elements, sequences.
-        cameras: name -> model.
-        channels: all monitor channels, camera by camera, left before right.
-        nodes: body path -> what may be done to it.
-        solids: the prisms of all channels, camera by camera, and the central prism.
-        glass_path: channel key -> prism -> length of the beam inside its glass, one way, metres.
-        baffles: black plates that only the path tracer and pictures know.
-        as_built: how it stands and is shaped against the drawing; the assembly has it in it, so that nominal and the
-            state {} are the instrument as built.
+    Attributes
+    ----------
+    spec : InstrumentSpec
+        What the YAML says.
+    assembly : Assembly
+        Bodies, elements, sequences.
+    cameras : Mapping[str, CameraModel]
+        Name -> model.
+    channels : tuple[Channel, ...]
+        All monitor channels, camera by camera, left before right.
+    nodes : Mapping[str, NodeInfo]
+        Body path -> what may be done to it.
+    solids : tuple[Solid, ...]
+        The prisms of all channels, camera by camera, and the central prism.
+    glass_path : Mapping[str, Mapping[str, float]]
+        Channel key -> prism -> length of the beam inside its glass, one way, metres.
+    baffles : tuple[Plate, ...]
+        Black plates that only the path tracer and pictures know.
+    as_built : State
+        How it stands and is shaped against the drawing; the assembly has it in it, so that nominal and the state {} are
+        the instrument as built.
     """
 
     spec: InstrumentSpec
@@ -82,10 +92,14 @@ class Instrument:
 class MisplacedError(PhysicalError, ValueError):
     """A part of the monitor cannot stand as the instrument's file says.
 
-    Attributes:
-        key: of the file, what to change, as it is for all channels.
-        remedy: what to choose there.
-        channel: camera and name of the channel that it is about, which may say it itself; None for none.
+    Attributes
+    ----------
+    key
+        Of the file, what to change, as it is for all channels.
+    remedy
+        What to choose there.
+    channel
+        Camera and name of the channel that it is about, which may say it itself; None for none.
     """
 
     def __init__(self, problem: str, key: KeyPath, remedy: str, channel: tuple[str, str] | None = None) -> None:

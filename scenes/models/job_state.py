@@ -57,10 +57,14 @@ INDEX_WAVES = 0.01
 class HeatedFace:
     """What a table does to an optical face beyond its linear part.
 
-    Attributes:
-        motion: of the face's body: rigid, Zernike terms and, of a mirror, a grid with the rest.
-        lost: what is not carried, metres rms of sag.
-        unmeshed: by how much coarser finite elements differ, metres rms of sag.
+    Attributes
+    ----------
+    motion : Motion
+        Of the face's body: rigid, Zernike terms and, of a mirror, a grid with the rest.
+    lost : float
+        What is not carried, metres rms of sag.
+    unmeshed : float
+        By how much coarser finite elements differ, metres rms of sag.
     """
 
     motion: Motion
@@ -77,15 +81,24 @@ class HeatedFace:
 class HeatedBody:
     """What a table of temperatures is for its body.
 
-    Attributes:
-        nodes: how many there are.
-        spacing: of the nodes, metres.
-        linear: the nearest linear field, in the body's frame.
-        left: what it leaves, over the body's volume: rms and largest, kelvin.
-        between: rms of the error at nodes that are left out, kelvin.
-        coverage: of the body by the nodes, None for a body without finite elements.
-        faces: body of a face -> what the rest does to it.
-        index_path: largest optical path that the index of the rest may be worth, metres; 0 for what is not glass.
+    Attributes
+    ----------
+    nodes : int
+        How many there are.
+    spacing : float
+        Of the nodes, metres.
+    linear : Temperature
+        The nearest linear field, in the body's frame.
+    left : tuple[float, float]
+        What it leaves, over the body's volume: rms and largest, kelvin.
+    between : float
+        Rms of the error at nodes that are left out, kelvin.
+    coverage : Coverage | None
+        Of the body by the nodes, None for a body without finite elements.
+    faces : Mapping[str, HeatedFace]
+        Body of a face -> what the rest does to it.
+    index_path : float
+        Largest optical path that the index of the rest may be worth, metres; 0 for what is not glass.
     """
 
     nodes: int
@@ -100,8 +113,10 @@ class HeatedBody:
     def state(self, gridded: State | None = None) -> State:
         """What the rest does, beyond the linear field.
 
-        Args:
-            gridded: motions of the same bodies whose grids these are to be added to.
+        Parameters
+        ----------
+        gridded : State | None
+            Motions of the same bodies whose grids these are to be added to.
         """
         out = {}
         for path, face in self.faces.items():
@@ -150,15 +165,22 @@ class HeatedBody:
 def heated_body(thermal: ThermalModel, job: JobSpec, path: str, spec: TableTemperatureSpec) -> HeatedBody:
     """What a job's table of temperatures does to one body.
 
-    Args:
-        thermal: of the instrument.
-        job: that names the table, for what is wrong.
-        path: of the body.
-        spec: the table, as ``scenes.specs.job.with_tables`` has left it.
+    Parameters
+    ----------
+    thermal : ThermalModel
+        Of the instrument.
+    job : JobSpec
+        That names the table, for what is wrong.
+    path : str
+        Of the body.
+    spec : TableTemperatureSpec
+        The table, as ``scenes.specs.job.with_tables`` has left it.
 
-    Raises:
-        InputError: no such frame; nodes that do not cover the body, are too cold, or have more that is not linear than
-            this body can follow.
+    Raises
+    ------
+    InputError
+        No such frame; nodes that do not cover the body, are too cold, or have more that is not linear than this body
+        can follow.
     """
     key = ("perturb", path, "temperature")
     assert spec.table is not None
@@ -275,8 +297,10 @@ def _in_words(field: Temperature) -> str:
 def heated_bodies(job: JobSpec, thermal: ThermalModel) -> dict[str, HeatedBody]:
     """Body -> what the table of temperatures is that warms it.
 
-    Raises:
-        InputError: a table that does not describe its body.
+    Raises
+    ------
+    InputError
+        a table that does not describe its body.
     """
     named = {path: what.heat for path, what in job.perturb.items() if what.heat.table is not None}
     return {path: heated_body(thermal, job, path, spec) for path, spec in named.items()}
@@ -290,14 +314,21 @@ def with_heat(fields: Mapping[str, Temperature], heated: Mapping[str, HeatedBody
 def deformed_face(instrument: Instrument, job: JobSpec, path: str, spec: DeformationSpec) -> NodalDeformation:
     """What a job's table does to one body.
 
-    Args:
-        instrument: the instrument.
-        job: that names the table, for what is wrong.
-        path: of the body, which has a reflecting or refracting surface.
-        spec: the table, as ``scenes.specs.job.with_tables`` has left it.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    job : JobSpec
+        That names the table, for what is wrong.
+    path : str
+        Of the body, which has a reflecting or refracting surface.
+    spec : DeformationSpec
+        The table, as ``scenes.specs.job.with_tables`` has left it.
 
-    Raises:
-        InputError: no such frame; nodes that are not on the surface or do not cover it.
+    Raises
+    ------
+    InputError
+        No such frame; nodes that are not on the surface or do not cover it.
     """
     key = ("perturb", path, "deformation")
     face = instrument.assembly.face(path)
@@ -315,15 +346,23 @@ def deformed_face(instrument: Instrument, job: JobSpec, path: str, spec: Deforma
 def pose_of_frame(instrument: Instrument, job: JobSpec, key: KeyPath, path: str, frame: str | None) -> Pose:
     """Where the nominal frame in which a table is told stands in that of the body.
 
-    Args:
-        instrument: the instrument.
-        job: that names the table, for what is wrong.
-        key: of the table's specification in there.
-        path: of the body.
-        frame: path of the body in whose frame the nodes are told, None for its own.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    job : JobSpec
+        That names the table, for what is wrong.
+    key : KeyPath
+        Of the table's specification in there.
+    path : str
+        Of the body.
+    frame : str | None
+        Path of the body in whose frame the nodes are told, None for its own.
 
-    Raises:
-        InputError: no such frame.
+    Raises
+    ------
+    InputError
+        No such frame.
     """
     if frame is None:
         return Pose()
@@ -343,16 +382,24 @@ def job_state(
 ) -> State:
     """The perturbed state that a job describes.
 
-    Args:
-        job: its perturbation, checked by ``scenes.specs.job.checked_nodes``.
-        thermal: of its instrument.
-        progress: called with the path of each body whose thermo-elastic solution begins.
-        moved: the state without its linear temperatures, where it is known; None for all that the job says.
-        heated: what its tables of temperatures are, where it is known.
+    Parameters
+    ----------
+    job : JobSpec
+        Its perturbation, checked by ``scenes.specs.job.checked_nodes``.
+    thermal : ThermalModel
+        Of its instrument.
+    progress : Callable[[str], None]
+        Called with the path of each body whose thermo-elastic solution begins.
+    moved : State | None
+        The state without its linear temperatures, where it is known; None for all that the job says.
+    heated : Mapping[str, HeatedBody] | None
+        What its tables of temperatures are, where it is known.
 
-    Raises:
-        InputError: a temperature at or below 0 K, or one at which a glass's index is not known; a table of nodes that
-            does not describe its body.
+    Raises
+    ------
+    InputError
+        a temperature at or below 0 K, or one at which a glass's index is not known; a table of nodes that does not
+        describe its body.
     """
     heated = heated_bodies(job, thermal) if heated is None else heated
     fields = with_heat(job.fields(), heated)
@@ -369,8 +416,10 @@ def job_state(
 def deformations_of(job: JobSpec, instrument: Instrument) -> dict[str, NodalDeformation]:
     """Body -> what the table of nodes is that a job deforms it by.
 
-    Raises:
-        InputError: a table that does not describe its body.
+    Raises
+    ------
+    InputError
+        a table that does not describe its body.
     """
     named = {path: what.deformation for path, what in job.perturb.items() if what.deformation is not None}
     return {path: deformed_face(instrument, job, path, table) for path, table in named.items()}
@@ -395,9 +444,12 @@ def on_deformed(
 def motions_of(job: JobSpec, time: int | None = None) -> State:
     """The rigid motions, scales and shapes of surfaces that a job asks for; its temperatures come on top of them.
 
-    Args:
-        job: its perturbation.
-        time: number of a time of its course, whose motions are added; None for none.
+    Parameters
+    ----------
+    job : JobSpec
+        Its perturbation.
+    time : int | None
+        Number of a time of its course, whose motions are added; None for none.
     """
     out = {path: what.motion() for path, what in job.perturb.items()}
     if job.course is not None and time is not None:
@@ -417,12 +469,18 @@ LIKELY = 4.0
 class Excess:
     """A component of a job's perturbation that its statement does not hold.
 
-    Attributes:
-        body: path.
-        what: ``shift z``, ``figure Z7``, ``temperature``.
-        kind: of `scenes.models.disturbances.UNITS`; ``table`` for what files of nodes say.
-        amount: SI; 0 for a table.
-        sigma: stated of that component, SI; 0 for one that is not stated.
+    Attributes
+    ----------
+    body : str
+        path.
+    what : str
+        ``shift z``, ``figure Z7``, ``temperature``.
+    kind : str
+        Of `scenes.models.disturbances.UNITS`; ``table`` for what files of nodes say.
+    amount : float
+        SI; 0 for a table.
+    sigma : float
+        Stated of that component, SI; 0 for one that is not stated.
     """
 
     body: str
@@ -446,9 +504,12 @@ def beyond_statement(resolved: ResolvedJob, stated: StatedMotions | None) -> tup
 
     Pivots are left aside: of a turn about another point its angle counts.
 
-    Args:
-        resolved: the job.
-        stated: of it; None for nothing.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job.
+    stated : StatedMotions | None
+        Of it; None for nothing.
     """
     return tuple(_excesses(resolved.job, _variances(stated)))
 

@@ -45,13 +45,20 @@ def mirror_triangles(
 ) -> tuple[np.ndarray, np.ndarray]:
     """A mirror as a closed surface: its optical surface over the clear aperture, a flat back and an edge.
 
-    Args:
-        surface: shape, metres.
-        aperture: clear aperture.
-        back: +1 when the substrate is on the surface's +z side, -1 when on its -z side.
-        cells: across the mirror.
+    Parameters
+    ----------
+    surface : Surface
+        Shape, metres.
+    aperture : Aperture
+        Clear aperture.
+    back : float
+        +1 when the substrate is on the surface's +z side, -1 when on its -z side.
+    cells : int
+        Across the mirror.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray]
         Vertices (V, 3) in the mirror's frame, metres; triangles (T, 3) with outward winding.
     """
     x0, x1, y0, y1 = aperture.bounds
@@ -106,9 +113,12 @@ def behind(model: CameraModel, mirror: str) -> float:
 def board_size(model: CameraModel, pinholes: list[tuple[float, float]]) -> tuple[float, float]:
     """Size of a focal plane's board along its X and Y, metres, centred on the line.
 
-    Args:
-        model: the camera.
-        pinholes: X, Y of its channels' pinholes and area CCDs in the focal plane, metres.
+    Parameters
+    ----------
+    model : CameraModel
+        The camera.
+    pinholes : list[tuple[float, float]]
+        X, Y of its channels' pinholes and area CCDs in the focal plane, metres.
     """
     line = 0.5 * model.spec.line.pixels * model.spec.line.pitch
     x = max((abs(p[0]) for p in pinholes), default=0.0)
@@ -129,11 +139,16 @@ chords of the outline and of the surface must not cut a ray off that meets the s
 def sheet_mesh(surface: Surface, aperture: Aperture) -> tuple[np.ndarray, np.ndarray, float]:
     """Triangles over a clear aperture and a little more.
 
-    Args:
-        surface: shape, metres.
-        aperture: clear aperture; a hole in it is covered, too.
+    Parameters
+    ----------
+    surface : Surface
+        Shape, metres.
+    aperture : Aperture
+        Clear aperture; a hole in it is covered, too.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray, float]
         Vertices (V, 3) in the surface's frame, metres; triangles (T, 3); largest distance between the triangles and the
         surface, metres.
     """

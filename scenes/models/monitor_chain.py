@@ -52,10 +52,13 @@ _OUTLINE = 2000  # points of a clear aperture's edge: a few millimetres apart at
 class LeavingBeam:
     """A channel's beam in front of its camera, base frame.
 
-    Attributes:
-        middle: where it meets the 180-deg prism's window, metres.
-        direction: of its middle ray, halfway between the beam from the pinhole and the one that would come from the
-            middle of the area CCD; unit vector.
+    Attributes
+    ----------
+    middle : np.ndarray
+        Where it meets the 180-deg prism's window, metres.
+    direction : np.ndarray
+        Of its middle ray, halfway between the beam from the pinhole and the one that would come from the middle of the
+        area CCD; unit vector.
     """
 
     middle: np.ndarray
@@ -66,11 +69,16 @@ class LeavingBeam:
 class MonitorChain:
     """What a channel's beam meets outside the camera.
 
-    Attributes:
-        bodies: of the prisms and their faces, and of the facet.
-        elements: in the order in which the leaving beam meets them; the last one is the return face.
-        solids: of the two prisms, or of what stands in their place.
-        glass: prism -> length of the beam inside it, one way, metres.
+    Attributes
+    ----------
+    bodies : tuple[Body, ...]
+        Of the prisms and their faces, and of the facet.
+    elements : tuple[Element, ...]
+        In the order in which the leaving beam meets them; the last one is the return face.
+    solids : tuple[Solid, ...]
+        Of the two prisms, or of what stands in their place.
+    glass : Mapping[str, float]
+        Prism -> length of the beam inside it, one way, metres.
     """
 
     bodies: tuple[Body, ...]
@@ -86,14 +94,21 @@ def leaving_beams(
 
     The beam's middle is where the pinhole's chief ray passes, displaced by the sub-aperture's offset in the pupil.
 
-    Args:
-        model: the camera.
-        distances: channel -> from the camera's origin to its 180-deg prism's window, metres.
-        to_base: the camera's pose in the base.
-        backend: where to trace.
+    Parameters
+    ----------
+    model : CameraModel
+        The camera.
+    distances : Mapping[Channel, float]
+        Channel -> from the camera's origin to its 180-deg prism's window, metres.
+    to_base : Pose
+        The camera's pose in the base.
+    backend : Backend
+        Where to trace.
 
-    Raises:
-        MisplacedError: light from the pinholes or the area CCDs misses a mirror's surface.
+    Raises
+    ------
+    MisplacedError
+        Light from the pinholes or the area CCDs misses a mirror's surface.
     """
     out: dict[Channel, LeavingBeam] = {}
     for distance in dict.fromkeys(distances.values()):
@@ -164,13 +179,18 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
     the lowest of all such planes there. Further facets of the same corner, whose beams come from nearly the same
     direction, meet it halfway between the middles of both.
 
-    Args:
-        spec: the instrument.
-        beams: of one camera.
+    Parameters
+    ----------
+    spec : InstrumentSpec
+        The instrument.
+    beams : Mapping[Channel, LeavingBeam]
+        Of one camera.
 
-    Raises:
-        InputError: two beams share a facet, or a facet would lie under its neighbour: of two in one corner the one that
-            leans more has to stand farther out.
+    Raises
+    ------
+    InputError
+        Two beams share a facet, or a facet would lie under its neighbour: of two in one corner the one that leans more
+        has to stand farther out.
     """
     apex = np.array(spec.reference_prism.position)
     corners: dict[tuple[float, float], list[tuple[Channel, np.ndarray, np.ndarray, float]]] = {}
@@ -209,17 +229,26 @@ def monitor_chain(
 ) -> MonitorChain:
     """Place both prisms and the facet of a channel.
 
-    Args:
-        spec: the instrument.
-        channel: which.
-        given: what the file says of it, with nothing left out.
-        beam: as it leaves the camera.
-        centre: of its facet, base frame, metres.
-        to_base: the camera's pose in the base.
+    Parameters
+    ----------
+    spec : InstrumentSpec
+        The instrument.
+    channel : Channel
+        which.
+    given : ChannelParts
+        What the file says of it, with nothing left out.
+    beam : LeavingBeam
+        As it leaves the camera.
+    centre : np.ndarray
+        Of its facet, base frame, metres.
+    to_base : Pose
+        The camera's pose in the base.
 
-    Raises:
-        InputError: the central prism is too near the camera's beam for the rhomboid's displacement, or that is too
-            small for the rhomboid's width.
+    Raises
+    ------
+    InputError
+        The central prism is too near the camera's beam for the rhomboid's displacement, or that is too small for the
+        rhomboid's width.
     """
     up, made, small = beam.direction, given.prism_180, given.prism_0
     apex = np.array(spec.reference_prism.position)
@@ -289,8 +318,10 @@ def check_prisms(spec: InstrumentSpec) -> None:
     """Check that the prisms' glasses have an index at the monitor's wavelength, that they let the beam pass, and that
     all channels have the same kinds.
 
-    Raises:
-        InputError: one of them does not.
+    Raises
+    ------
+    InputError
+        One of them does not.
     """
     wavelength = spec.autocollimator.wavelength
     kinds: dict[str, Reflector] = {}
@@ -334,8 +365,10 @@ def square_facets(
     The normal halves the angle between the beam that arrives and the one that would come from the CCD's middle, both
     through the facet's centre, after all prisms with their angle errors.
 
-    Raises:
-        MisplacedError: a beam misses a mirror or a prism; the message names the element.
+    Raises
+    ------
+    MisplacedError
+        a beam misses a mirror or a prism; the message names the element.
     """
     poses = {}
     placed = assembly.place()
@@ -414,15 +447,24 @@ def beside(
 ) -> float | None:
     """How far beside the clear aperture of the last of some elements lost rays pass at most, metres.
 
-    Args:
-        assembly: with the elements.
-        backend: where to trace.
-        names: of the elements, in the order of the light.
-        position: of rays, world, metres, broadcastable to (1, N, 3).
-        direction: unit vectors, likewise.
-        lost: which of them get lost at the last element, (N,).
+    Parameters
+    ----------
+    assembly : Assembly
+        With the elements.
+    backend : Backend
+        Where to trace.
+    names : Sequence[str]
+        Of the elements, in the order of the light.
+    position : np.ndarray
+        Of rays, world, metres, broadcastable to (1, N, 3).
+    direction : np.ndarray
+        Unit vectors, likewise.
+    lost : np.ndarray
+        Which of them get lost at the last element, (N,).
 
-    Returns:
+    Returns
+    -------
+    float | None
         None where they do not meet its surface, or where it has no edge.
     """
     element = assembly.elements[names[-1]]

@@ -37,12 +37,18 @@ AS_STARTED = "start"
 class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
     """A design with all it refers to.
 
-    Attributes:
-        instrument: to start from.
-        cameras: by the name that the instrument gives them.
-        detector: data sheet of the area CCDs.
-        disturbances: by the name that the design, or the instrument, gives them.
-        detectors: data sheets of the area CCDs that the design may choose from, by its names for them.
+    Attributes
+    ----------
+    instrument : instruments.InstrumentSpec
+        To start from.
+    cameras : Paths[CameraSpec]
+        By the name that the instrument gives them.
+    detector : DetectorSpec
+        Data sheet of the area CCDs.
+    disturbances : Paths[DisturbancesSpec]
+        By the name that the design, or the instrument, gives them.
+    detectors : Paths[DetectorSpec]
+        Data sheets of the area CCDs that the design may choose from, by its names for them.
     """
 
     instrument: instruments.InstrumentSpec
@@ -97,17 +103,28 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
 class Beam:
     """One beam of a layout, at both ends of both cameras' lines.
 
-    Attributes:
-        pupil_x, pupil_y: middle in the entrance pupil, toward the central prism and toward its own end of the line, m.
-        width: diameter of its return face, m.
-        field: angle of its area CCD from the visual axis, rad.
-        prism_180_distance: from the camera's origin, m.
-        prism_0_distance: from its return face, m.
-        shift: of its rhomboid, m.
-        spread_x, spread_y: of its facet from the apex, m.
-        prisms: by their name in the design.
-        photons: of its spot, per frame; None for the monitor's.
-        area_ccd: of all channels, by its name in the design.
+    Attributes
+    ----------
+    pupil_x, pupil_y : float
+        Middle in the entrance pupil, toward the central prism and toward its own end of the line, m.
+    width : float
+        Diameter of its return face, m.
+    field : float
+        Angle of its area CCD from the visual axis, rad.
+    prism_180_distance : float
+        From the camera's origin, m.
+    prism_0_distance : float
+        From its return face, m.
+    shift : float
+        Of its rhomboid, m.
+    spread_x, spread_y : float
+        Of its facet from the apex, m.
+    prisms : str
+        By their name in the design.
+    photons : float | None
+        Of its spot, per frame; None for the monitor's.
+    area_ccd : str
+        Of all channels, by its name in the design.
     """
 
     pupil_x: float
@@ -137,8 +154,10 @@ Layout = tuple[Beam, ...]
 def start_beams(setup: MonitorDesignSetup) -> Layout:
     """The beams of the instrument that a design starts from.
 
-    Raises:
-        InputError: they do not stand mirrored at both ends of both lines.
+    Raises
+    ------
+    InputError
+        They do not stand mirrored at both ends of both lines.
     """
     start, first = setup.instrument, next(iter(setup.instrument.cameras))
     sign, beams = _toward(start, start.cameras[first]), []
@@ -196,9 +215,12 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.Instrum
     """The instrument that has these beams; all else as in the start, but for its name, light, frames, area CCDs and the
     central prism's material.
 
-    Args:
-        setup: the design.
-        beams: each becomes a channel at both ends of both lines: ``left`` and ``right``, ``left_2`` and ``right_2``.
+    Parameters
+    ----------
+    setup : MonitorDesignSetup
+        The design.
+    beams : Layout
+        Each becomes a channel at both ends of both lines: ``left`` and ``right``, ``left_2`` and ``right_2``.
     """
     start, test = setup.instrument, setup.test
     monitor = start.autocollimator
@@ -281,11 +303,16 @@ def drawn_beam(setup: MonitorDesignSetup, rng: np.random.Generator) -> Beam:
 def changed_beam(setup: MonitorDesignSetup, beam: Beam, step: float, rng: np.random.Generator) -> Beam:
     """A beam near another one.
 
-    Args:
-        setup: the design.
-        beam: that is changed.
-        step: standard deviation of the change of each number, relative to its range; its ends throw back.
-        rng: source of all that is drawn. About half of the numbers stay, so that single ones are tried, too.
+    Parameters
+    ----------
+    setup : MonitorDesignSetup
+        The design.
+    beam : Beam
+        That is changed.
+    step : float
+        Standard deviation of the change of each number, relative to its range; its ends throw back.
+    rng : np.random.Generator
+        Source of all that is drawn. About half of the numbers stay, so that single ones are tried, too.
     """
     numbers = {}
     for name, (low, high) in ranges(setup).items():
@@ -331,8 +358,10 @@ def prism_mass(instrument: Instrument) -> float:
 class ImagingBeams:
     """Imaging beams of an instrument's cameras, of which prisms take their part.
 
-    Attributes:
-        segments: camera -> rays to both ends and the middle of the line, three of (RAYS, K, 2, 3), base frame, metres.
+    Attributes
+    ----------
+    segments : Mapping[str, Sequence[np.ndarray]]
+        Camera -> rays to both ends and the middle of the line, three of (RAYS, K, 2, 3), base frame, metres.
     """
 
     segments: Mapping[str, Sequence[np.ndarray]]

@@ -53,11 +53,15 @@ _CELLS = 12  # across a mirror: the hull lies within a few tenths of a millimetr
 class Overlap:
     """Two bodies that stand in each other, or touch.
 
-    Attributes:
-        first, second: their paths.
-        depth: how far one of them has to move for them to touch only; negative for a gap below ``LEAST_GAP``; metres.
-        way: along which axis of the base, 0 to 2, and how far, metres with its sign, the second one is moved to leave
-            ``LEAST_GAP``: of the three axes the shortest way. None where nobody asked.
+    Attributes
+    ----------
+    first, second : str
+        Their paths.
+    depth : float
+        How far one of them has to move for them to touch only; negative for a gap below ``LEAST_GAP``; metres.
+    way : tuple[int, float] | None
+        Along which axis of the base, 0 to 2, and how far, metres with its sign, the second one is moved to leave
+        ``LEAST_GAP``: of the three axes the shortest way. None where nobody asked.
     """
 
     first: str
@@ -103,12 +107,18 @@ def _distances(triangles: np.ndarray) -> np.ndarray:
 def way_apart(first: np.ndarray, second: np.ndarray, room: float = LEAST_GAP) -> tuple[int, float]:
     """Shortest way along an axis that takes the convex hull of one set of points away from that of another.
 
-    Args:
-        first: (P, 3), metres.
-        second: of the body that is moved, (Q, 3), metres.
-        room: that is left at the end, metres.
+    Parameters
+    ----------
+    first : np.ndarray
+        (P, 3), metres.
+    second : np.ndarray
+        Of the body that is moved, (Q, 3), metres.
+    room : float
+        That is left at the end, metres.
 
-    Returns:
+    Returns
+    -------
+    tuple[int, float]
         The axis, 0 to 2, and how far the second is moved along it, metres with its sign.
     """
     faces = convex_hull((first[:, None] - second[None]).reshape(-1, 3)).equations
@@ -125,9 +135,12 @@ def way_apart(first: np.ndarray, second: np.ndarray, room: float = LEAST_GAP) ->
 def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) -> Mapping[str, np.ndarray]:
     """Path -> corners of the body in the base frame, (P, 3), metres.
 
-    Args:
-        instrument: the instrument.
-        placed: where its bodies stand; by default as designed.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    placed : PlacedBodies | None
+        Where its bodies stand; by default as designed.
     """
     placed = instrument.assembly.place() if placed is None else placed
     out = {s.path: placed.pose(s.path).apply(solid_mesh(s, placed).vertices) for s in instrument.solids}
@@ -177,9 +190,12 @@ def _between_boxes(first: np.ndarray, second: np.ndarray) -> float:
 class Clearances:
     """How far bodies may move before they can touch, for many states one after the other.
 
-    Attributes:
-        paths: of the bodies; corners: of each in its own frame, (P, 3), metres; poses: where each stands as designed.
-        pairs: numbers of two bodies each, (Q, 2); gaps: (Q,) metres, no more than there is between them as designed.
+    Attributes
+    ----------
+    paths : tuple[str, ...]
+        Of the bodies; corners: of each in its own frame, (P, 3), metres; poses: where each stands as designed.
+    pairs : np.ndarray
+        Numbers of two bodies each, (Q, 2); gaps: (Q,) metres, no more than there is between them as designed.
     """
 
     paths: tuple[str, ...]
@@ -208,8 +224,10 @@ class Clearances:
     def overlaps(self, placed: PlacedBodies) -> tuple[Overlap, ...]:
         """Pairs of bodies that stand in each other, deepest first.
 
-        Args:
-            placed: where the bodies stand, in one state; how they have grown is left out.
+        Parameters
+        ----------
+        placed : PlacedBodies
+            Where the bodies stand, in one state; how they have grown is left out.
         """
         poses = [placed.pose(path) for path in self.paths]
         moved = np.array(
@@ -231,8 +249,10 @@ class Clearances:
 def check_clearance(instrument: Instrument) -> None:
     """Check that no two bodies stand in each other.
 
-    Raises:
-        InputError: some do; one issue for each pair, at the key that moves the more movable of the two.
+    Raises
+    ------
+    InputError
+        Some do; one issue for each pair, at the key that moves the more movable of the two.
     """
     issues = [_issue(instrument, overlap) for overlap in find_overlaps(instrument)]
     if issues:
@@ -289,8 +309,10 @@ def _camera(path: str) -> str:
 def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
     """Check that every solid is closed and that clear apertures lie on their faces.
 
-    Raises:
-        MisplacedError: names the body and the face.
+    Raises
+    ------
+    MisplacedError
+        Names the body and the face.
     """
     placed = assembly.place()
     for solid in solids:
@@ -355,11 +377,16 @@ _RINGS, _AROUND = 6, 24
 class Obstruction:
     """A prism in a beam.
 
-    Attributes:
-        body: path of the prism.
-        beam: e.g. ``forward/imaging`` or ``forward/left``.
-        share: of the beam's cross-section that it takes; for imaging the largest along the line.
-        used: part of ``share`` that its own channel's clear aperture uses; 0 for beams that it has no business in.
+    Attributes
+    ----------
+    body : str
+        Path of the prism.
+    beam : str
+        e.g. ``forward/imaging`` or ``forward/left``.
+    share : float
+        Of the beam's cross-section that it takes; for imaging the largest along the line.
+    used : float
+        Part of ``share`` that its own channel's clear aperture uses; 0 for beams that it has no business in.
     """
 
     body: str
@@ -432,11 +459,16 @@ _WHOLE = _whole()
 def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays: int = RAYS) -> list[np.ndarray]:
     """Rays from the scene to both ends and the middle of the line, (N, K, 2, 3) each, world.
 
-    Args:
-        instrument: the instrument.
-        backend: where to trace.
-        camera: whose.
-        rays: N, in each of the three beams.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    backend : Backend
+        Where to trace.
+    camera : str
+        whose.
+    rays : int
+        N, in each of the three beams.
     """
     assembly, model, placed = instrument.assembly, instrument.cameras[camera], instrument.assembly.place()
     half = 0.5 * model.spec.line.pixels * model.spec.line.pitch
@@ -466,12 +498,18 @@ def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays
 class MonitorBeam:
     """A channel's light from the pinhole to the area CCD.
 
-    Attributes:
-        channel: whose.
-        segments: of its N rays, (N, K, 2, 3), world.
-        inside: the solid around each segment.
-        position, direction: of the rays at the pinhole, (N, 3) each, world.
-        valid: which rays get there, (N,).
+    Attributes
+    ----------
+    channel : Channel
+        whose.
+    segments : np.ndarray
+        Of its N rays, (N, K, 2, 3), world.
+    inside : tuple[str | None, ...]
+        The solid around each segment.
+    position, direction : np.ndarray
+        Of the rays at the pinhole, (N, 3) each, world.
+    valid : np.ndarray
+        Which rays get there, (N,).
     """
 
     channel: Channel
@@ -491,14 +529,21 @@ def monitor_beams(
 ) -> list[MonitorBeam]:
     """Trace the beams of all channels.
 
-    Args:
-        instrument: the instrument.
-        backend: where to trace.
-        points: of the return faces that the rays meet, (N, 2), the faces' radius being 1.
-        state: of the instrument; as designed unless one is given.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    backend : Backend
+        Where to trace.
+    points : np.ndarray
+        Of the return faces that the rays meet, (N, 2), the faces' radius being 1.
+    state : State | None
+        Of the instrument; as designed unless one is given.
 
-    Raises:
-        AimError: no such rays.
+    Raises
+    ------
+    AimError
+        No such rays.
     """
     states = [state or {}]
     assembly, channels, placed = instrument.assembly, instrument.channels, instrument.assembly.place(states)
@@ -526,9 +571,12 @@ def monitor_beams(
 def check_beams(instrument: Instrument, backend: Backend) -> None:
     """Check that every monitor beam gets to its area CCD whole.
 
-    Raises:
-        InputError: the edge of a clear aperture or a body takes a part of one; one issue for each.
-        MisplacedError: light of a channel does not get to its return face.
+    Raises
+    ------
+    InputError
+        The edge of a clear aperture or a body takes a part of one; one issue for each.
+    MisplacedError
+        Light of a channel does not get to its return face.
     """
     try:
         beams = monitor_beams(instrument, backend, _WHOLE)

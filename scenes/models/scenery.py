@@ -54,12 +54,18 @@ IN_PLANE = 1e-9
 class Finishes:
     """Finish of every kind of surface.
 
-    Attributes:
-        mirror: optical side of the mirrors; mirror_back: their back.
-        metallised: mirror faces of glass bodies, None for that of the mirrors.
-        coated, bare, ground: faces of glass bodies, see ``Coating``.
-        detector: light-sensitive faces; board: what carries them.
-        baffle: of baffles, None for each one's own.
+    Attributes
+    ----------
+    mirror : Finish
+        Optical side of the mirrors; mirror_back: their back.
+    metallised : Finish | None
+        Mirror faces of glass bodies, None for that of the mirrors.
+    coated, bare, ground : Finish
+        Faces of glass bodies, see ``Coating``.
+    detector : Finish
+        Light-sensitive faces; board: what carries them.
+    baffle : Finish | None
+        Of baffles, None for each one's own.
     """
 
     mirror: Finish = MIRROR
@@ -86,10 +92,14 @@ class Finishes:
 class Detector:
     """A pixel grid in the frame of its surface: columns along x, rows along y, centred.
 
-    Attributes:
-        name: of the surface and, where there is one, of the element.
-        columns, rows: number of pixels.
-        pitch: along x and y, metres.
+    Attributes
+    ----------
+    name : str
+        Of the surface and, where there is one, of the element.
+    columns, rows : int
+        Number of pixels.
+    pitch : tuple[float, float]
+        Along x and y, metres.
     """
 
     name: str
@@ -107,18 +117,30 @@ class Detector:
 class SceneSurface:
     """One surface in one state.
 
-    Attributes:
-        name: unique; part: what it is called in the results (plates of one baffle share it).
-        elements: names of the assembly's elements on it.
-        pose: of its frame in the world, float64.
-        surface: shape, grown as the state says.
-        vertices, triangles: (V, 3) in its frame, metres, and (T, 3).
-        front, back, outside: finish met from +z, from -z, and outside the clear apertures.
-        apertures: none, one or two clear apertures.
-        ends: nothing is there outside the clear apertures (else ``outside`` is).
-        solid: path of the glass body behind it (-z side), and ``index``, that body's refractive index.
-        detector: name of the detector on its front, None for none.
-        clearance: how far beyond it a leaving path looks for the next surface, metres.
+    Attributes
+    ----------
+    name : str
+        Unique; part: what it is called in the results (plates of one baffle share it).
+    elements : tuple[str, ...]
+        Names of the assembly's elements on it.
+    pose : Pose
+        Of its frame in the world, float64.
+    surface : Surface
+        Shape, grown as the state says.
+    vertices, triangles : np.ndarray
+        (V, 3) in its frame, metres, and (T, 3).
+    front, back, outside : Finish
+        Finish met from +z, from -z, and outside the clear apertures.
+    apertures : tuple[Aperture, ...]
+        None, one or two clear apertures.
+    ends : bool
+        Nothing is there outside the clear apertures (else ``outside`` is).
+    solid : str | None
+        Path of the glass body behind it (-z side), and ``index``, that body's refractive index.
+    detector : str | None
+        Name of the detector on its front, None for none.
+    clearance : float
+        How far beyond it a leaving path looks for the next surface, metres.
     """
 
     name: str
@@ -144,15 +166,23 @@ def mirror_surface(
 ) -> SceneSurface:
     """The surface of a reflecting element that is not a face of a solid.
 
-    Args:
-        element: with a clear aperture.
-        placed: bodies of one state.
-        finishes: what surfaces do with light.
-        lit_side: +1 when the optical side is +z, -1 when it is -z; the other one is the substrate's back.
-        motion: of the mirror's body in that state; only what it adds to the figure is taken from it.
+    Parameters
+    ----------
+    element : Element
+        With a clear aperture.
+    placed : PlacedBodies
+        Bodies of one state.
+    finishes : Finishes
+        What surfaces do with light.
+    lit_side : float
+        +1 when the optical side is +z, -1 when it is -z; the other one is the substrate's back.
+    motion : Motion
+        Of the mirror's body in that state; only what it adds to the figure is taken from it.
 
-    Raises:
-        ValueError: no clear aperture, or a figure that cannot be added (``Element.figured``).
+    Raises
+    ------
+    ValueError
+        No clear aperture, or a figure that cannot be added (``Element.figured``).
     """
     if element.aperture is None:
         raise ValueError(f"{element.name}: a mirror without a clear aperture cannot stand in a scene")
@@ -183,8 +213,10 @@ def solid_surfaces(
     Outside its elements' clear apertures a face has the same coating, but the path counts as another one than the
     nominal; a body that light does not enter is ground there.
 
-    Raises:
-        ValueError: a face carries more than two elements with apertures.
+    Raises
+    ------
+    ValueError
+        a face carries more than two elements with apertures.
     """
     mesh = solid_mesh(solid, placed)
     own = placed.pose(solid.path)
@@ -306,10 +338,14 @@ RECIPROCAL_TO = 0.3
 class MeasuredFinishes:
     """Measured finishes.
 
-    Attributes:
-        finishes: of all surfaces, the measured ones among them.
-        scatter: kind of surface -> its table of scattering.
-        coatings: kind of surface -> its coating.
+    Attributes
+    ----------
+    finishes : Finishes
+        Of all surfaces, the measured ones among them.
+    scatter : Mapping[str, MeasuredScatter]
+        Kind of surface -> its table of scattering.
+    coatings : Mapping[str, CoatingTable]
+        Kind of surface -> its coating.
     """
 
     finishes: Finishes
@@ -353,9 +389,10 @@ class MeasuredFinishes:
 def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
     """The finishes that a job has measured; None where there are none.
 
-    Raises:
-        InputError: a coating that does not hold the monitor's wavelength, or a table that scatters more than is
-            reflected.
+    Raises
+    ------
+    InputError
+        a coating that does not hold the monitor's wavelength, or a table that scatters more than is reflected.
     """
     stray = resolved.job.render.stray
     if stray is None or stray.finishes is None:
@@ -455,13 +492,19 @@ def build_scenery(
 ) -> Scenery:
     """Surfaces of an instrument in one state.
 
-    Args:
-        instrument: the instrument.
-        state: what is perturbed.
-        finishes: what surfaces do with light; by default those of ``Finishes``.
-        baffles: more parts than the instrument's own.
-        whole_focal_planes: make each focal plane one large detector, named ``CAMERA/focal_plane``, in the place
-            of its CCDs and its board: for light from the scene.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    state : State
+        What is perturbed.
+    finishes : Finishes | None
+        What surfaces do with light; by default those of ``Finishes``.
+    baffles : Iterable[Plate]
+        More parts than the instrument's own.
+    whole_focal_planes : bool
+        Make each focal plane one large detector, named ``CAMERA/focal_plane``, in the place of its CCDs and its board:
+        for light from the scene.
     """
     finishes = finishes or Finishes()
     assembly = instrument.assembly

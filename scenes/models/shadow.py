@@ -62,10 +62,14 @@ _NODES = 5
 class Caster:
     """A convex body that may stand in a beam.
 
-    Attributes:
-        name: of the prism, mirror or board (its path) or of the baffle.
-        body: path of the body that carries it.
-        corners: in that body's frame, (C, 3), metres.
+    Attributes
+    ----------
+    name : str
+        Of the prism, mirror or board (its path) or of the baffle.
+    body : str
+        Path of the body that carries it.
+    corners : np.ndarray
+        In that body's frame, (C, 3), metres.
     """
 
     name: str
@@ -77,13 +81,20 @@ class Caster:
 class Shadows:
     """Shadows in the pupils of B images, on the stop's unit disk.
 
-    Attributes:
-        pieces: convex polygons that do not overlap, (B, K, V, 2); K may be 0. They reach a little beyond the disk.
-        owners: the body that throws each piece; of several the one that was found first.
-        points: nodes of a quadrature over all of them within the disk, complex, (B, Q).
-        weights: of the area, (B, Q).
-        areas: of each within the disk, (B, K).
-        known: name -> share of the stop's area, (B,), where the pieces alone do not say it; None where they do.
+    Attributes
+    ----------
+    pieces : np.ndarray
+        Convex polygons that do not overlap, (B, K, V, 2); K may be 0. They reach a little beyond the disk.
+    owners : tuple[str, ...]
+        The body that throws each piece; of several the one that was found first.
+    points : np.ndarray
+        Nodes of a quadrature over all of them within the disk, complex, (B, Q).
+    weights : np.ndarray
+        Of the area, (B, Q).
+    areas : np.ndarray
+        Of each within the disk, (B, K).
+    known : Mapping[str, np.ndarray] | None
+        Name -> share of the stop's area, (B,), where the pieces alone do not say it; None where they do.
     """
 
     pieces: np.ndarray
@@ -109,12 +120,17 @@ class Shadows:
     def and_edges(self, outlines: Callable[[int], StopOutlines], name: str) -> Shadows:
         """These shadows together with those of edges of surfaces.
 
-        Args:
-            outlines: of the edges, as ``SeenEdges.outlines`` gives them.
-            name: under which ``shares`` tells what the edges take beside all bodies.
+        Parameters
+        ----------
+        outlines : Callable[[int], StopOutlines]
+            Of the edges, as ``SeenEdges.outlines`` gives them.
+        name : str
+            Under which ``shares`` tells what the edges take beside all bodies.
 
-        Raises:
-            UnphysicalError: they cut a pupil into too many pieces.
+        Raises
+        ------
+        UnphysicalError
+            They cut a pupil into too many pieces.
         """
         pieces, _ = settled_shadows(outlines, len(self.pieces), tuple(np.moveaxis(self.pieces, 1, 0)))
         whole = Shadows.within(pieces, (name,) * pieces.shape[1])
@@ -169,14 +185,22 @@ def _plate(plate: Plate) -> list[Caster]:
 class TracedBeams:
     """Beams of B images, as traced.
 
-    Attributes:
-        assembly: with the camera's elements.
-        placed: bodies in all states.
-        owner: which state each image belongs to, (B,).
-        systems: on the way to the image, B.
-        rays: of the images.
-        heading: of their light, world, unit, (3,) or (B, 3).
-        nodes: at which the rays meet the stop.
+    Attributes
+    ----------
+    assembly : Assembly
+        With the camera's elements.
+    placed : PlacedBodies
+        Bodies in all states.
+    owner : np.ndarray
+        Which state each image belongs to, (B,).
+    systems : SystemBatch
+        On the way to the image, B.
+    rays : ImagingRays
+        Of the images.
+    heading : np.ndarray
+        Of their light, world, unit, (3,) or (B, 3).
+    nodes : PupilNodes
+        At which the rays meet the stop.
     """
 
     assembly: Assembly
@@ -191,10 +215,14 @@ class TracedBeams:
 class ImagingShadows:
     """What throws shadows into the imaging beams of one camera.
 
-    Args:
-        instrument: with the camera.
-        camera: its name.
-        backend: where to trace.
+    Parameters
+    ----------
+    instrument
+        With the camera.
+    camera
+        Its name.
+    backend
+        Where to trace.
     """
 
     def __init__(self, instrument: Instrument, camera: str, backend: Backend) -> None:
@@ -264,10 +292,14 @@ def no_shadows(count: int) -> Shadows:
 class SeenEdges:
     """The edges of a camera's surfaces as B images see them.
 
-    Attributes:
-        edges: of every surface that has some, in the order of the light.
-        places: where rays meet these surfaces, edges or not, in their own x and y, metres of nominal size, (B, N, 2).
-        nodes: of the stop, through which the rays go.
+    Attributes
+    ----------
+    edges : Mapping[str, tuple[Edge, ...]]
+        Of every surface that has some, in the order of the light.
+    places : Mapping[str, np.ndarray]
+        Where rays meet these surfaces, edges or not, in their own x and y, metres of nominal size, (B, N, 2).
+    nodes : PupilNodes
+        Of the stop, through which the rays go.
     """
 
     edges: Mapping[str, tuple[Edge, ...]]
@@ -278,11 +310,16 @@ class SeenEdges:
     def of(cls, beams: TracedBeams, model: CameraModel, camera: str, backend: Backend) -> SeenEdges:
         """Those of a camera.
 
-        Args:
-            beams: to the images.
-            model: of the camera.
-            camera: its name in the assembly, that its elements' names begin with.
-            backend: where to trace.
+        Parameters
+        ----------
+        beams : TracedBeams
+            To the images.
+        model : CameraModel
+            Of the camera.
+        camera : str
+            Its name in the assembly, that its elements' names begin with.
+        backend : Backend
+            Where to trace.
         """
         cut = {name: model.mirrors.index(name) for name in model.edges}
         launched = beams.rays.launched
@@ -308,8 +345,10 @@ class SeenEdges:
     def outlines(self, round_sides: int) -> StopOutlines:
         """Outlines on the stop, with so many sides for a circle.
 
-        Raises:
-            UnphysicalError: rays meet a surface at places that no polynomials follow.
+        Raises
+        ------
+        UnphysicalError
+            Rays meet a surface at places that no polynomials follow.
         """
         found = StopOutlines()
         for (name, place), lit in zip(self.places.items(), [None, *self.passed[:-1]], strict=True):
@@ -350,12 +389,18 @@ def _corners(caster: Caster, beams: TracedBeams) -> np.ndarray:
 class _Bundle:
     """Rays from one surface to the next in B beams, over the stop.
 
-    Attributes:
-        start, end: coefficients of the rays' points at both, (B, K, 3), for ``products``.
-        middle: of both, (B, 2, 3).
-        spread: their derivatives by the stop's x and y in the mean, (B, 2, 3, 2).
-        along: mean direction, (B, 3).
-        axes: square to it, (B, 2, 3).
+    Attributes
+    ----------
+    start, end : np.ndarray
+        Coefficients of the rays' points at both, (B, K, 3), for ``products``.
+    middle : np.ndarray
+        Of both, (B, 2, 3).
+    spread : np.ndarray
+        Their derivatives by the stop's x and y in the mean, (B, 2, 3, 2).
+    along : np.ndarray
+        Mean direction, (B, 3).
+    axes : np.ndarray
+        Square to it, (B, 2, 3).
     """
 
     start: np.ndarray

@@ -53,13 +53,20 @@ from scenes.specs.instrument import BASE
 class Lens:
     """One lens of an instrument.
 
-    Attributes:
-        path: of the body of its first face, by which it is called.
-        faces: body of each face -> its pose in the frame of the first.
-        parent: pose of the first face in the frame of the body that carries it.
-        middle: where it is held, (3,), in the frame of the first face, metres.
-        glass: what heat does to it; None where nothing says it.
-        unknown: what is not said, empty where all is.
+    Attributes
+    ----------
+    path : str
+        Of the body of its first face, by which it is called.
+    faces : Mapping[str, Pose]
+        Body of each face -> its pose in the frame of the first.
+    parent : Pose
+        Pose of the first face in the frame of the body that carries it.
+    middle : np.ndarray
+        Where it is held, (3,), in the frame of the first face, metres.
+    glass : WarmGlass | None
+        What heat does to it; None where nothing says it.
+    unknown : str
+        What is not said, empty where all is.
     """
 
     path: str
@@ -84,11 +91,15 @@ class Lens:
     def carried(self, turn: np.ndarray, move: np.ndarray, stretch: float) -> dict[str, Motion]:
         """What the body that carries the lens does to its faces.
 
-        Args:
-            turn: rotation vector of the lens about where it is held, (3,), radians.
-            move: of where it is held, (3,), metres, beside what the carrier's growth does.
-            stretch: growth of the carrier, which moves the origins of the faces in the tree; the lens goes where that
-                moves its middle. All in the frame of the carrier.
+        Parameters
+        ----------
+        turn : np.ndarray
+            Rotation vector of the lens about where it is held, (3,), radians.
+        move : np.ndarray
+            Of where it is held, (3,), metres, beside what the carrier's growth does.
+        stretch : float
+            Growth of the carrier, which moves the origins of the faces in the tree; the lens goes where that moves its
+            middle. All in the frame of the carrier.
         """
         out = {}
         for face, pose in self.faces.items():
@@ -103,10 +114,14 @@ class Lens:
 def lenses_of(name: str, model: CameraModel, bodies: Mapping[str, Body]) -> list[Lens]:
     """All lenses of a camera.
 
-    Args:
-        name: of the camera in its instrument.
-        model: its numbers.
-        bodies: of the instrument, by path.
+    Parameters
+    ----------
+    name : str
+        Of the camera in its instrument.
+    model : CameraModel
+        Its numbers.
+    bodies : Mapping[str, Body]
+        Of the instrument, by path.
     """
     root, groups = f"{BASE}/{name}", dict[str, list[str]]()
     for face, first in lenses(model.spec).items():
@@ -137,10 +152,12 @@ TERMS = 15
 class _Response:
     """What gradients of 1 K/m along x, y and z of a body do to its F faces.
 
-    Attributes:
-        terms: body of each face -> Noll indices of its figures.
-        numbers: rotation vector, shift and figures of one face after the other, radians and metres, a column for each
-            gradient.
+    Attributes
+    ----------
+    terms : Mapping[str, tuple[int, ...]]
+        Body of each face -> Noll indices of its figures.
+    numbers : np.ndarray
+        Rotation vector, shift and figures of one face after the other, radians and metres, a column for each gradient.
     """
 
     terms: Mapping[str, tuple[int, ...]]
@@ -187,9 +204,12 @@ _Moves = Mapping[str, Sequence[Motion | None]]
 class TemperatureError(PhysicalError, ValueError):
     """A temperature that cannot be.
 
-    Attributes:
-        origin: path of the body that was given it (bodies that it carries inherit it).
-        allowed: in words.
+    Attributes
+    ----------
+    origin
+        Path of the body that was given it (bodies that it carries inherit it).
+    allowed
+        In words.
     """
 
     def __init__(self, problem: str, origin: str, allowed: str) -> None:
@@ -201,10 +221,14 @@ class TemperatureError(PhysicalError, ValueError):
 class _Carried:
     """What stands on a body: lenses, and N other bodies.
 
-    Attributes:
-        lenses, bodies: they.
-        mount: where the bodies are held, in their own frames, (N, 3), metres; place: the same in the carrier's.
-        inward: rotations from the carrier's frame to theirs, (N, 3, 3).
+    Attributes
+    ----------
+    lenses, bodies : tuple[Lens, ...]
+        they.
+    mount : np.ndarray
+        Where the bodies are held, in their own frames, (N, 3), metres; place: the same in the carrier's.
+    inward : np.ndarray
+        Rotations from the carrier's frame to theirs, (N, 3, 3).
     """
 
     lenses: tuple[Lens, ...]
@@ -217,8 +241,10 @@ class _Carried:
 class ThermalModel:
     """Temperatures of an instrument's bodies turned into a perturbed state.
 
-    Args:
-        instrument: the instrument.
+    Parameters
+    ----------
+    instrument
+        The instrument.
     """
 
     def __init__(self, instrument: Instrument) -> None:
@@ -284,9 +310,12 @@ class ThermalModel:
     def fields(self, temperatures: Mapping[str, _Field], pieces: bool = True) -> dict[str, _Field]:
         """Every warmed body's field in its own frame, its own or inherited.
 
-        Args:
-            temperatures: of the bodies that have one of their own.
-            pieces: also of the bodies that are pieces of a solid or a lens.
+        Parameters
+        ----------
+        temperatures : Mapping[str, _Field]
+            Of the bodies that have one of their own.
+        pieces : bool
+            Also of the bodies that are pieces of a solid or a lens.
         """
         out: dict[str, _Field] = {}
         for path, body in self._bodies.items():
@@ -304,8 +333,10 @@ class ThermalModel:
     def check(self, temperatures: Mapping[str, Temperature]) -> None:
         """Check that no body gets to where its material's expansion or its glass's index is not known.
 
-        Raises:
-            TemperatureError: names the body.
+        Raises
+        ------
+        TemperatureError
+            Names the body.
         """
         for path, field in self.fields(temperatures).items():
             if self._owner(path) not in (None, path):
@@ -387,10 +418,14 @@ class ThermalModel:
     ) -> State:
         """The perturbed state: thermal motions under the given other motions.
 
-        Args:
-            temperatures: body path -> field in its own frame.
-            motions: what else happens; it acts on top of the thermal motion of the same body.
-            progress: called with the path of each body whose finite-element solution begins.
+        Parameters
+        ----------
+        temperatures : Mapping[str, Temperature]
+            Body path -> field in its own frame.
+        motions : State | None
+            What else happens; it acts on top of the thermal motion of the same body.
+        progress : Callable[[str], None]
+            Called with the path of each body whose finite-element solution begins.
         """
         one = {path: Temperatures.of([field]) for path, field in temperatures.items()}
         return self.states(one, [motions or {}], progress)[0]
@@ -403,10 +438,14 @@ class ThermalModel:
     ) -> list[State]:
         """S perturbed states together, as ``state`` makes one.
 
-        Args:
-            temperatures: body path -> its fields in the S states, in its own frame.
-            motions: what else happens in each.
-            progress: as for one.
+        Parameters
+        ----------
+        temperatures : Mapping[str, Temperatures]
+            Body path -> its fields in the S states, in its own frame.
+        motions : Sequence[State]
+            What else happens in each.
+        progress : Callable[[str], None]
+            As for one.
         """
         fields = self.fields(temperatures, pieces=False)
         change, gradient = (np.array([getattr(f, n) for f in fields.values()]) for n in ("change", "gradient"))
@@ -536,12 +575,18 @@ class ThermalModel:
     def elastic(self, path: str, cells: int = CELLS, spacing: float = SPACING) -> Held | None:
         """Finite elements of a mirror or a solid in its own frame, and the three points that hold it.
 
-        Args:
-            path: of the body.
-            cells: across a mirror.
-            spacing: longest edge in a solid, metres.
+        Parameters
+        ----------
+        path : str
+            Of the body.
+        cells : int
+            Across a mirror.
+        spacing : float
+            Longest edge in a solid, metres.
 
-        Returns:
+        Returns
+        -------
+        Held | None
             None for a body that has none: one without a shape, or of several pieces.
         """
         if path in self.mirrors:
@@ -578,8 +623,10 @@ class ThermalModel:
         """Displacements of the material of a mirror or a solid, in its frame, by a gradient of 1 K/m along x, y and z
         of it, the temperature being zero at its middle.
 
-        Args:
-            path: of the body.
+        Parameters
+        ----------
+        path : str
+            Of the body.
         """
         held = self.elastic(path)
         if held is None:
@@ -597,10 +644,14 @@ class ThermalModel:
     def changes(self, path: str, displaced: Displaced, terms: int = TERMS) -> dict[str, FaceChange]:
         """What a displacement of a mirror's or a solid's material does to its optical faces.
 
-        Args:
-            path: of the body.
-            displaced: in its frame.
-            terms: highest Noll index of the figures.
+        Parameters
+        ----------
+        path : str
+            Of the body.
+        displaced : Displaced
+            In its frame.
+        terms : int
+            Highest Noll index of the figures.
         """
         return {
             face: face_change(displaced, self.surface(face), aperture, pose, terms)

@@ -51,8 +51,10 @@ Focus = Literal["free"] | Annotated[float, Quantity(LENGTH, smallest="0 m", larg
 class ReadingsSpec(Spec):
     """Base of what every kind of measurement says.
 
-    Attributes:
-        after: the last of `moves` that had been made when it was taken; none by default.
+    Attributes
+    ----------
+    after : Name | None
+        The last of `moves` that had been made when it was taken; none by default.
     """
 
     after: Name | None = None
@@ -66,22 +68,33 @@ class ReadingsSpec(Spec):
 class WavefrontReadingsSpec(ReadingsSpec):
     """Wavefronts at fields, by an interferometer in single or double pass. Piston and tilt never count.
 
-    Attributes:
-        after: the last of `moves` that had been made when it was taken; none by default.
-        fields: shares of the half field, along the line and along the track.
-        terms: first and last Zernike term (Noll) that count, `[Z4, Z11]`.
-        sigma: standard deviation of each coefficient's noise, rms, metres.
-        common: standard deviation of an error of each term that is the same at all fields, as of a reference surface,
-            metres.
-        focus: `free`, by default: where the interferometer's focus stood along the light at each field is not known;
-            or its standard deviation along the light.
-        zernikes: CSV file with the coefficients of every field.
-        maps: files of wavefront maps, one for each field: Zygo .dat or .datx, CODE V INT, Zemax grid sag, FITS.
-        double_pass: whether the light went through the camera twice, so that the maps or coefficients show twice the
-            error.
-        reference: map or CSV file of the reference surface's error, which is taken off.
-        orientation: how maps and coefficients have to be turned to the stop's axes, as `check` names it.
-        sign: -1 where the file counts a wavefront that is ahead as negative.
+    Attributes
+    ----------
+    after
+        The last of `moves` that had been made when it was taken; none by default.
+    fields : Fields
+        Shares of the half field, along the line and along the track.
+    terms : tuple[Text, Text]
+        First and last Zernike term (Noll) that count, `[Z4, Z11]`.
+    sigma : Sigma
+        Standard deviation of each coefficient's noise, rms, metres.
+    common : Common
+        Standard deviation of an error of each term that is the same at all fields, as of a reference surface, metres.
+    focus : Focus
+        `free`, by default: where the interferometer's focus stood along the light at each field is not known; or its
+        standard deviation along the light.
+    zernikes : Reference | None
+        CSV file with the coefficients of every field.
+    maps : tuple[Reference, ...] | None
+        Files of wavefront maps, one for each field: Zygo .dat or .datx, CODE V INT, Zemax grid sag, FITS.
+    double_pass : Flag
+        Whether the light went through the camera twice, so that the maps or coefficients show twice the error.
+    reference : Reference | None
+        Map or CSV file of the reference surface's error, which is taken off.
+    orientation : Text
+        How maps and coefficients have to be turned to the stop's axes, as `check` names it.
+    sign : Literal[1, -1]
+        -1 where the file counts a wavefront that is ahead as negative.
     """
 
     fields: Fields
@@ -123,13 +136,20 @@ class WavefrontReadingsSpec(ReadingsSpec):
 class FocusReadingsSpec(ReadingsSpec):
     """Best focus at fields, along the light of the designed camera, from the line CCD on downstream.
 
-    Attributes:
-        after: the last of `moves` that had been made when it was taken; none by default.
-        fields: as of wavefronts.
-        values: of each field, metres.
-        sigma: standard deviation of each, metres.
-        common: standard deviation of an error that all have in common, metres.
-        file: in place of fields and values, the `focus.json` of a run of `twin.lab focus`.
+    Attributes
+    ----------
+    after
+        The last of `moves` that had been made when it was taken; none by default.
+    fields : Fields | None
+        As of wavefronts.
+    values : Places | None
+        Of each field, metres.
+    sigma : Sigma
+        Standard deviation of each, metres.
+    common : Common
+        Standard deviation of an error that all have in common, metres.
+    file : Reference | None
+        In place of fields and values, the `focus.json` of a run of `twin.lab focus`.
     """
 
     fields: Fields | None = None
@@ -153,13 +173,20 @@ class FocusReadingsSpec(ReadingsSpec):
 class MtfReadingsSpec(ReadingsSpec):
     """MTF of the optics at fields, at one frequency.
 
-    Attributes:
-        after: the last of `moves` that had been made when it was taken; none by default.
-        fields: as of wavefronts.
-        frequency: cycles per mm; that of the pixels (Nyquist) if not given.
-        along_line: MTF for lines across the line CCD, of each field.
-        along_track: MTF for lines along the line CCD, of each field.
-        sigma: standard deviation of each.
+    Attributes
+    ----------
+    after
+        The last of `moves` that had been made when it was taken; none by default.
+    fields : Fields
+        As of wavefronts.
+    frequency : Number | None
+        Cycles per mm; that of the pixels (Nyquist) if not given.
+    along_line : tuple[Modulation, ...] | None
+        MTF for lines across the line CCD, of each field.
+    along_track : tuple[Modulation, ...] | None
+        MTF for lines along the line CCD, of each field.
+    sigma : Number
+        Standard deviation of each.
     """
 
     fields: Fields
@@ -186,11 +213,16 @@ class DistortionReadingsSpec(ReadingsSpec):
     """Places of images along the line CCD at known angles, which tell principal distance and distortion. The zero of
     the angles is free.
 
-    Attributes:
-        after: the last of `moves` that had been made when it was taken; none by default.
-        fields: shares of half the line at which images were taken, where the data are simulated.
-        sigma: standard deviation of a place, metres; of a file its own if not given.
-        file: the `distortion.json` of a run of `twin.lab distortion`.
+    Attributes
+    ----------
+    after
+        The last of `moves` that had been made when it was taken; none by default.
+    fields : tuple[FieldShare, ...] | None
+        Shares of half the line at which images were taken, where the data are simulated.
+    sigma : Sigma | None
+        Standard deviation of a place, metres; of a file its own if not given.
+    file : Reference | None
+        The `distortion.json` of a run of `twin.lab distortion`.
     """
 
     fields: Annotated[tuple[FieldShare, ...], Field(min_length=3, max_length=200)] | None = None
@@ -213,12 +245,17 @@ class DistortionReadingsSpec(ReadingsSpec):
 class SpotReadingsSpec(ReadingsSpec):
     """Spots of the instrument's monitor, against where the design has them.
 
-    Attributes:
-        after: the last of `moves` that had been made when it was taken; none by default.
-        sigma: standard deviation of each coordinate, pixels.
-        file: the `recovered.json` of a run of `twin.recover`, or a CSV file with the places: columns camera, channel,
-            row_px, column_px.
-        state: whether the spots of `recovered.json` count that were recorded before or after.
+    Attributes
+    ----------
+    after
+        The last of `moves` that had been made when it was taken; none by default.
+    sigma : Number
+        Standard deviation of each coordinate, pixels.
+    file : Reference | None
+        The `recovered.json` of a run of `twin.recover`, or a CSV file with the places: columns camera, channel, row_px,
+        column_px.
+    state : Literal['before', 'after']
+        Whether the spots of `recovered.json` count that were recorded before or after.
     """
 
     sigma: Annotated[Number, Field(gt=0.0, le=100.0)]
@@ -234,14 +271,22 @@ class SpotReadingsSpec(ReadingsSpec):
 class SightReadingsSpec(ReadingsSpec):
     """Line of sight, roll and principal distance against the design, as of a theodolite or of a calibration in orbit.
 
-    Attributes:
-        after: the last of `moves` that had been made when it was taken; none by default.
-        alpha, beta: turns of the line of sight about the camera's Y and X, radians.
-        gamma: roll of the line about it, radians.
-        principal_distance: its change, metres.
-        sigma_alpha, sigma_beta, sigma_gamma: standard deviations, radians; of what is not measured they are left out.
-        sigma_principal_distance: likewise, metres.
-        correlation: matrix of those that are measured, in this order; the unit matrix by default.
+    Attributes
+    ----------
+    after
+        The last of `moves` that had been made when it was taken; none by default.
+    alpha, beta : Turn | None
+        Turns of the line of sight about the camera's Y and X, radians.
+    gamma : Turn | None
+        Roll of the line about it, radians.
+    principal_distance : Place | None
+        Its change, metres.
+    sigma_alpha, sigma_beta, sigma_gamma : AngleSigma | None
+        Standard deviations, radians; of what is not measured they are left out.
+    sigma_principal_distance : Sigma | None
+        Likewise, metres.
+    correlation : tuple[tuple[Number, ...], ...] | None
+        Matrix of those that are measured, in this order; the unit matrix by default.
     """
 
     alpha: Turn | None = None
@@ -283,12 +328,18 @@ class SightReadingsSpec(ReadingsSpec):
 class TemperatureReadingsSpec(ReadingsSpec):
     """Temperatures of bodies against that at which the instrument is as drawn.
 
-    Attributes:
-        after: the last of `moves` that had been made when it was taken; none by default.
-        bodies: paths or short names.
-        values: of each body, kelvin.
-        sigma: standard deviation of each, kelvin.
-        common: standard deviation of an error that all have in common, kelvin.
+    Attributes
+    ----------
+    after
+        The last of `moves` that had been made when it was taken; none by default.
+    bodies : tuple[Text, ...]
+        Paths or short names.
+    values : tuple[Warmth, ...] | None
+        Of each body, kelvin.
+    sigma : WarmthSigma
+        Standard deviation of each, kelvin.
+    common : float
+        Standard deviation of an error that all have in common, kelvin.
     """
 
     bodies: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
@@ -310,13 +361,19 @@ class TemperatureReadingsSpec(ReadingsSpec):
 class PositionReadingsSpec(ReadingsSpec):
     """Places of bodies' origins against the drawing, by a laser tracker or a coordinate-measuring machine.
 
-    Attributes:
-        after: the last of `moves` that had been made when it was taken; none by default.
-        bodies: paths or short names.
-        values: displacement of each in the axes of the instrument's base, metres.
-        sigma: standard deviation of each coordinate, metres.
-        frame: `free`, by default with three bodies or more: the frame of the measuring machine may be shifted and
-            turned; `base` where it is the instrument's.
+    Attributes
+    ----------
+    after
+        The last of `moves` that had been made when it was taken; none by default.
+    bodies : tuple[Text, ...]
+        Paths or short names.
+    values : tuple[Place3, ...] | None
+        Displacement of each in the axes of the instrument's base, metres.
+    sigma : Sigma
+        Standard deviation of each coordinate, metres.
+    frame : Literal['free', 'base']
+        `free`, by default with three bodies or more: the frame of the measuring machine may be shifted and turned;
+        `base` where it is the instrument's.
     """
 
     bodies: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
@@ -346,15 +403,24 @@ def _one_for_each(places: Any, values: Any, key: str) -> None:
 class MeasurementsSpec(Spec):
     """What was measured, kind by kind; each measurement has a name of its own.
 
-    Attributes:
-        wavefronts: by interferometers.
-        focus: best focus by field.
-        mtf: at fields.
-        distortion: places along the line at known angles.
-        spots: of the monitor.
-        sight: lines of sight and principal distances.
-        temperatures: of bodies.
-        positions: of bodies.
+    Attributes
+    ----------
+    wavefronts : Named[WavefrontReadingsSpec]
+        By interferometers.
+    focus : Named[FocusReadingsSpec]
+        Best focus by field.
+    mtf : Named[MtfReadingsSpec]
+        At fields.
+    distortion : Named[DistortionReadingsSpec]
+        Places along the line at known angles.
+    spots : Named[SpotReadingsSpec]
+        Of the monitor.
+    sight : Named[SightReadingsSpec]
+        Lines of sight and principal distances.
+    temperatures : Named[TemperatureReadingsSpec]
+        Of bodies.
+    positions : Named[PositionReadingsSpec]
+        Of bodies.
     """
 
     wavefronts: Annotated[Named[WavefrontReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
@@ -385,14 +451,22 @@ class MeasurementsSpec(Spec):
 class ActuatorSpec(CompensatorSpec):
     """One thing that can be moved.
 
-    Attributes:
-        motion: what is moved: `M2 shift z`.
-        carrying: further bodies that move rigidly with it.
-        range: largest amount either way, all moves together.
-        step: of which it is moved by a whole number, as of shims; None for any amount.
-        accuracy: standard deviation of a move, whatever its size.
-        move_error: standard deviation of a move as a share of it.
-        response: standard deviation of what the traced response of the instrument to it may be wrong by, as a share.
+    Attributes
+    ----------
+    motion
+        What is moved: `M2 shift z`.
+    carrying
+        Further bodies that move rigidly with it.
+    range
+        Largest amount either way, all moves together.
+    step
+        Of which it is moved by a whole number, as of shims; None for any amount.
+    accuracy
+        Standard deviation of a move, whatever its size.
+    move_error : Number
+        Standard deviation of a move as a share of it.
+    response : Number
+        Standard deviation of what the traced response of the instrument to it may be wrong by, as a share.
     """
 
     move_error: Annotated[Number, Field(ge=0.0, le=1.0)] = 0.02
@@ -408,8 +482,10 @@ def _some_amounts(value: Mapping[str, Amount]) -> Mapping[str, Amount]:
 class MoveSpec(Spec):
     """A move that was made.
 
-    Attributes:
-        by: actuator -> by how much.
+    Attributes
+    ----------
+    by : dict[Name, Amount]
+        Actuator -> by how much.
     """
 
     by: Annotated[dict[Name, Amount], AfterValidator(_some_amounts)]
@@ -418,10 +494,14 @@ class MoveSpec(Spec):
 class SimulatedInstrumentSpec(Spec):
     """An instrument that is drawn, measured and moved by the program, in place of a real one.
 
-    Attributes:
-        law: how its motions are distributed, with the prior's covariance.
-        prior: disturbances file it is drawn from; that of the estimate by default.
-        seed: of the instrument and of all errors of measurement.
+    Attributes
+    ----------
+    law : Literal['normal', 'uniform']
+        How its motions are distributed, with the prior's covariance.
+    prior : Ref | None
+        Disturbances file it is drawn from; that of the estimate by default.
+    seed : Seed
+        Of the instrument and of all errors of measurement.
     """
 
     law: Literal["normal", "uniform"] = "normal"
@@ -432,18 +512,30 @@ class SimulatedInstrumentSpec(Spec):
 class AsBuiltSpec(Spec):
     """The state of one instrument from everything that was measured on it.
 
-    Attributes:
-        instrument: a camera or an instrument, by name or path, as in a job.
-        camera: which camera of an instrument is meant; may be left out where there is one.
-        prior: disturbances file: what is known of the state before anything is measured.
-        measurements: by kind and name.
-        merits: by name, what is asked of the camera, as in a tolerance budget.
-        actuators: by name, what can be moved.
-        moves: by name, in their order, what was moved.
-        candidates: measurements that could be made next; their worth is told.
-        draws: states of the posterior that are traced for the merits.
-        seed: of these draws.
-        simulate: a drawn instrument in place of data.
+    Attributes
+    ----------
+    instrument : Ref
+        a camera or an instrument, by name or path, as in a job.
+    camera : Name | None
+        Which camera of an instrument is meant; may be left out where there is one.
+    prior : Ref
+        Disturbances file: what is known of the state before anything is measured.
+    measurements : MeasurementsSpec
+        By kind and name.
+    merits : Named[MeritSpec]
+        By name, what is asked of the camera, as in a tolerance budget.
+    actuators : Named[ActuatorSpec]
+        By name, what can be moved.
+    moves : Named[MoveSpec]
+        By name, in their order, what was moved.
+    candidates : MeasurementsSpec
+        Measurements that could be made next; their worth is told.
+    draws : Whole
+        States of the posterior that are traced for the merits.
+    seed : Seed
+        Of these draws.
+    simulate : SimulatedInstrumentSpec | None
+        a drawn instrument in place of data.
     """
 
     instrument: Ref
@@ -489,9 +581,12 @@ def unknown_within(text: str, found: object, names: Mapping[str, Any], within: t
 class AsBuiltSetup(ExperimentSetup[AsBuiltSpec]):
     """The measurements of an instrument with the instrument and the prior.
 
-    Attributes:
-        base: the nominal job of the instrument, with the prior as its disturbances.
-        drawn: disturbances from which a simulated instrument is drawn; None for the prior.
+    Attributes
+    ----------
+    base : ResolvedJob
+        The nominal job of the instrument, with the prior as its disturbances.
+    drawn : DisturbancesSpec | None
+        Disturbances from which a simulated instrument is drawn; None for the prior.
     """
 
     base: ResolvedJob

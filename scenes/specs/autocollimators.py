@@ -25,14 +25,22 @@ class LensSpec(Spec):
     """The collimator's lens: one element, conic on the front. Radii are positive with the centre of curvature on the
     side of the focal plane.
 
-    Attributes:
-        front_radius: of the surface toward the mirrors, metres.
-        front_conic: its conic constant.
-        back_radius: of the surface toward the focal plane, metres.
-        thickness: on the axis, metres.
-        glass: of the catalogue.
-        diameter: clear aperture of both surfaces, metres.
-        focal_distance: from the back vertex to the focal plane, metres.
+    Attributes
+    ----------
+    front_radius : Length
+        Of the surface toward the mirrors, metres.
+    front_conic : Number
+        Its conic constant.
+    back_radius : Length
+        Of the surface toward the focal plane, metres.
+    thickness : PositiveLength
+        On the axis, metres.
+    glass : GlassName
+        Of the catalogue.
+    diameter : PositiveLength
+        Clear aperture of both surfaces, metres.
+    focal_distance : PositiveLength
+        From the back vertex to the focal plane, metres.
     """
 
     front_radius: Length
@@ -59,15 +67,23 @@ class AutocollimatorSpec(Spec):
     The pinhole and the area CCD stand side by side, symmetric about the lens's axis, so that a mirror square to the
     axis sends the pinhole's image to the middle of the CCD.
 
-    Attributes:
-        wavelength: of the source, metres.
-        lens: the collimator.
-        reticle: light source.
-        area_ccd: detector; its offset counts from the pinhole to the middle of the pixel grid along the system's Y
-            (horizontal) and X (up), metres.
-        window: side of the square region around the spot that is read out, pixels.
-        distance: from the lens's front vertex to the turntable's centre, metres.
-        frames: number of frames in one reading.
+    Attributes
+    ----------
+    wavelength : Wavelength
+        Of the source, metres.
+    lens : LensSpec
+        The collimator.
+    reticle : ReticleSpec
+        Light source.
+    area_ccd : AreaCcdSpec
+        Detector; its offset counts from the pinhole to the middle of the pixel grid along the system's Y (horizontal)
+        and X (up), metres.
+    window : Whole
+        Side of the square region around the spot that is read out, pixels.
+    distance : PositiveLength
+        From the lens's front vertex to the turntable's centre, metres.
+    frames : Frames
+        Number of frames in one reading.
     """
 
     wavelength: Wavelength
@@ -99,9 +115,12 @@ class AutocollimatorSpec(Spec):
 class MirrorsSpec(Spec):
     """The two plane mirrors on the turntable.
 
-    Attributes:
-        aperture: their diameter, metres; it limits the beam.
-        radius: distance of their middles from the turntable's centre, metres.
+    Attributes
+    ----------
+    aperture : PositiveLength
+        Their diameter, metres; it limits the beam.
+    radius : PositiveLength
+        Distance of their middles from the turntable's centre, metres.
     """
 
     aperture: PositiveLength
@@ -119,11 +138,16 @@ class StandSpec(Spec):
 class ProgrammeSpec(Spec):
     """What is turned by how much.
 
-    Attributes:
-        steps: how many steps follow the first reading at zero.
-        small, table, large: the three step sizes, radians; `table` is the one of the main series.
-        narrow, wide: the two half angles theta between the mirrors, radians.
-        stands: half angle of each axis in the main series, radians.
+    Attributes
+    ----------
+    steps : Whole
+        How many steps follow the first reading at zero.
+    small, table, large : Step
+        The three step sizes, radians; `table` is the one of the main series.
+    narrow, wide : HalfAngle
+        The two half angles theta between the mirrors, radians.
+    stands : StandSpec
+        Half angle of each axis in the main series, radians.
     """
 
     steps: Annotated[Whole, Field(ge=1, le=100)]
@@ -138,13 +162,20 @@ class ProgrammeSpec(Spec):
 class BenchErrorsSpec(Spec):
     """Standard deviations of what is not as it should be; all independent and normal, drawn from the seed.
 
-    Attributes:
-        focal_length: relative error of an autocollimator's focal length against its calibration.
-        ccd_rotation: turn of an area CCD in its focal plane, radians.
-        reading: unrest of an autocollimator about its own X and Y from one reading to the next, radians.
-        turntable_step: error of each position of the turntable, radians.
-        axis_tilt: of each axis of the turntable toward the two others, radians.
-        mirror_mount: of each mirror about its X and Y, radians.
+    Attributes
+    ----------
+    focal_length : ScaleSigma
+        Relative error of an autocollimator's focal length against its calibration.
+    ccd_rotation : AngleSigma
+        Turn of an area CCD in its focal plane, radians.
+    reading : AngleSigma
+        Unrest of an autocollimator about its own X and Y from one reading to the next, radians.
+    turntable_step : AngleSigma
+        Error of each position of the turntable, radians.
+    axis_tilt : AngleSigma
+        Of each axis of the turntable toward the two others, radians.
+    mirror_mount : AngleSigma
+        Of each mirror about its X and Y, radians.
     """
 
     focal_length: ScaleSigma
@@ -158,13 +189,20 @@ class BenchErrorsSpec(Spec):
 class AutocollimatorTestSpec(TitledSpec):
     """The test with two autocollimators.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        autocollimator: both of them.
-        mirrors: on the turntable.
-        programme: what is turned.
-        errors: of the bench.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    autocollimator : AutocollimatorSpec
+        Both of them.
+    mirrors : MirrorsSpec
+        On the turntable.
+    programme : ProgrammeSpec
+        What is turned.
+    errors : BenchErrorsSpec
+        Of the bench.
     """
 
     autocollimator: AutocollimatorSpec
@@ -202,9 +240,12 @@ class AutocollimatorTestSpec(TitledSpec):
 class AutocollimatorSetup:
     """A test with two autocollimators, with what its file refers to.
 
-    Attributes:
-        spec: the test.
-        detector: data sheet of the area CCDs.
+    Attributes
+    ----------
+    spec : AutocollimatorTestSpec
+        The test.
+    detector : DetectorSpec
+        Data sheet of the area CCDs.
     """
 
     spec: AutocollimatorTestSpec

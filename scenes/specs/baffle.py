@@ -27,12 +27,18 @@ TUBE_SIDES = 24
 class Plate:
     """A flat plate of no thickness.
 
-    Attributes:
-        name: of the part it belongs to; plates of one name are one part in the results.
-        body: path of the body that carries it.
-        pose: of the plate in that body's frame.
-        outline: its edge in the plate's x, y; a ring has a hole.
-        finish: of both sides.
+    Attributes
+    ----------
+    name : str
+        Of the part it belongs to; plates of one name are one part in the results.
+    body : str
+        Path of the body that carries it.
+    pose : Pose
+        Of the plate in that body's frame.
+    outline : Circle | Rectangle
+        Its edge in the plate's x, y; a ring has a hole.
+    finish : Finish
+        Of both sides.
     """
 
     name: str
@@ -45,11 +51,16 @@ class Plate:
 def box(name: str, body: str, pose: Pose, size: tuple[float, float, float]) -> tuple[Plate, ...]:
     """A box, open at +z, whose bottom's middle is the pose's origin and whose walls rise along +z.
 
-    Args:
-        name: of the part.
-        body: path of the body that carries it.
-        pose: in that body's frame.
-        size: along x, y, z, metres.
+    Parameters
+    ----------
+    name : str
+        Of the part.
+    body : str
+        Path of the body that carries it.
+    pose : Pose
+        In that body's frame.
+    size : tuple[float, float, float]
+        Along x, y, z, metres.
     """
     x, y, z = (0.5 * s for s in size)
 
@@ -92,17 +103,27 @@ _NEEDS = {"plate": ("width", "height"), "box": ("width", "height", "length"), "t
 class BaffleSpec(Spec):
     """A black mechanical part. The wave path does not see it; the path tracer, scene.glb and the picture do.
 
-    Attributes:
-        shape: plate (width x height), box (width x height x length, open at +z), tube (diameter, length, open at both
-            ends) or ring (diameter, with a round hole).
-        body: path of the body that carries it.
-        position: in that body's frame, metres: the middle of a plate, a ring, a box's bottom or a tube's lower end.
-        rotate: rotation vector in that frame, radians; plates stand square to z, boxes and tubes run along z.
-        width: along x, metres.
-        height: along y, metres.
-        length: along z, metres.
-        diameter: metres.
-        hole: diameter, metres.
+    Attributes
+    ----------
+    shape : Literal['plate', 'box', 'tube', 'ring']
+        Plate (width x height), box (width x height x length, open at +z), tube (diameter, length, open at both ends) or
+        ring (diameter, with a round hole).
+    body : str
+        Path of the body that carries it.
+    position : Vector3
+        In that body's frame, metres: the middle of a plate, a ring, a box's bottom or a tube's lower end.
+    rotate : tuple[float, float, float]
+        Rotation vector in that frame, radians; plates stand square to z, boxes and tubes run along z.
+    width : Size | None
+        Along x, metres.
+    height : Size | None
+        Along y, metres.
+    length : Size | None
+        Along z, metres.
+    diameter : Size | None
+        metres.
+    hole : Size | None
+        Diameter, metres.
     """
 
     shape: Literal["plate", "box", "tube", "ring"]
@@ -163,16 +184,26 @@ SIZES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = FrozenMap(
 class SurfaceEdgeSpec(Spec):
     """An edge of a surface, in the surface's own x and y; one of ``clear`` and ``blocks`` says what it does.
 
-    Attributes:
-        clear: shape inside of which light comes through.
-        blocks: shape inside of which light is stopped.
-        centre: of the shape; of a ray the middle of its beginning; metres.
-        radius: of a circle, metres.
-        inner: of a circle, radius of the hole in it, metres.
-        half: of a rectangle or an ellipse, half its width along x and along y, metres.
-        width: of a ray, a vane that runs without end along x before it is turned, metres.
-        turn: of rectangle, ellipse or ray about its centre, right-handed about the surface's z, radians.
-        corners: of a polygon, one after the other, metres.
+    Attributes
+    ----------
+    clear : Shape | None
+        Shape inside of which light comes through.
+    blocks : Shape | None
+        Shape inside of which light is stopped.
+    centre : Vector2 | None
+        Of the shape; of a ray the middle of its beginning; metres.
+    radius : PositiveLength | None
+        Of a circle, metres.
+    inner : PositiveLength | None
+        Of a circle, radius of the hole in it, metres.
+    half : Half | None
+        Of a rectangle or an ellipse, half its width along x and along y, metres.
+    width : PositiveLength | None
+        Of a ray, a vane that runs without end along x before it is turned, metres.
+    turn : float | None
+        Of rectangle, ellipse or ray about its centre, right-handed about the surface's z, radians.
+    corners : tuple[Vector2, ...] | None
+        Of a polygon, one after the other, metres.
     """
 
     clear: Shape | None = None

@@ -37,13 +37,19 @@ Diffusion = Annotated[float, Quantity(LENGTH, smallest="0 um", largest="1 mm")]
 class TdiSpec(Spec):
     """How a line CCD collects light while the image moves across it.
 
-    Attributes:
-        stages: lines over which the charge is collected.
-        phases: steps in which the charge moves on by one pixel; between two steps it stands still and the image does
-            not, which blurs it along the track by one step.
-        open_share: share of each step in which light is collected.
-        line_time: from one line to the next, seconds.
-        rate_error: relative difference between the image's speed and the charge's; over all stages it blurs as well.
+    Attributes
+    ----------
+    stages : Whole
+        Lines over which the charge is collected.
+    phases : Whole
+        Steps in which the charge moves on by one pixel; between two steps it stands still and the image does not, which
+        blurs it along the track by one step.
+    open_share : Number
+        Share of each step in which light is collected.
+    line_time : instruments.Exposure
+        From one line to the next, seconds.
+    rate_error : float
+        Relative difference between the image's speed and the charge's; over all stages it blurs as well.
     """
 
     stages: Annotated[Whole, Field(ge=1, le=4096)] = 1
@@ -56,14 +62,22 @@ class TdiSpec(Spec):
 class BandSpec(Spec):
     """A line CCD in the focal plane and the light it sees.
 
-    Attributes:
-        offset: along X' (flight direction) from the line's centre, metres.
-        pixels: number of pixels along the line.
-        pitch: of the pixels, which are square, metres.
-        spectrum: the signal by wavelength; as two wavelengths, light that is evenly spread between them.
-        detector: data sheet, by name or path.
-        diffusion: rms spread of charge between pixels (crosstalk), metres.
-        tdi: time delay and integration.
+    Attributes
+    ----------
+    offset : Length
+        Along X' (flight direction) from the line's centre, metres.
+    pixels : Whole
+        Number of pixels along the line.
+    pitch : PixelPitch
+        Of the pixels, which are square, metres.
+    spectrum : Spectrum
+        The signal by wavelength; as two wavelengths, light that is evenly spread between them.
+    detector : Ref
+        Data sheet, by name or path.
+    diffusion : Diffusion
+        Rms spread of charge between pixels (crosstalk), metres.
+    tdi : TdiSpec
+        Time delay and integration.
     """
 
     offset: Length = 0.0
@@ -98,17 +112,28 @@ class BeamRangesSpec(Spec):
 
     A beam stands four times in a pair: at both ends of both cameras' lines, mirrored.
 
-    Attributes:
-        pupil_x: of its middle in the entrance pupil, toward the central prism positive, metres.
-        pupil_y: likewise along the line, positive toward the beam's own end of it, metres.
-        width: diameter of its return face, metres; prisms are wider by as much as those of the start.
-        field: angle from the visual axis at which its area CCD stands, radians.
-        prism_180_distance: from the camera's origin to its 180-deg prism, metres.
-        prism_0_distance: from its return face to its rhomboid, metres.
-        shift: of its rhomboid, metres.
-        spread_x: from the central prism's apex to its facet along the base's X, metres.
-        spread_y: likewise along Y, metres.
-        photons: of its spot, per frame; spots that would fill their pixels to the brim are refused.
+    Attributes
+    ----------
+    pupil_x : Vector2 | None
+        Of its middle in the entrance pupil, toward the central prism positive, metres.
+    pupil_y : Vector2 | None
+        Likewise along the line, positive toward the beam's own end of it, metres.
+    width : Vector2 | None
+        Diameter of its return face, metres; prisms are wider by as much as those of the start.
+    field : tuple[float, float] | None
+        Angle from the visual axis at which its area CCD stands, radians.
+    prism_180_distance : Vector2 | None
+        From the camera's origin to its 180-deg prism, metres.
+    prism_0_distance : Vector2 | None
+        From its return face to its rhomboid, metres.
+    shift : Vector2 | None
+        Of its rhomboid, metres.
+    spread_x : Vector2 | None
+        From the central prism's apex to its facet along the base's X, metres.
+    spread_y : Vector2 | None
+        Likewise along Y, metres.
+    photons : PhotonRange | None
+        Of its spot, per frame; spots that would fill their pixels to the brim are refused.
     """
 
     pupil_x: Vector2 | None = None
@@ -134,9 +159,12 @@ class BeamRangesSpec(Spec):
 class TransferChoiceSpec(Spec):
     """What sends a beam back.
 
-    Attributes:
-        material: its glass, or what its mirrors stand on.
-        kind: by its name among the reflectors; the prism when nothing is said.
+    Attributes
+    ----------
+    material : instruments.MadeOf
+        Its glass, or what its mirrors stand on.
+    kind : str | None
+        By its name among the reflectors; the prism when nothing is said.
     """
 
     material: instruments.MadeOf
@@ -151,9 +179,12 @@ class TransferChoiceSpec(Spec):
 class ShiftChoiceSpec(Spec):
     """What displaces a beam.
 
-    Attributes:
-        material: its glass, or what its mirrors stand on.
-        kind: by its name among the reflectors; the rhomboid when nothing is said.
+    Attributes
+    ----------
+    material : instruments.MadeOf
+        Its glass, or what its mirrors stand on.
+    kind : str | None
+        By its name among the reflectors; the rhomboid when nothing is said.
     """
 
     material: instruments.MadeOf
@@ -168,9 +199,12 @@ class ShiftChoiceSpec(Spec):
 class PrismChoiceSpec(Spec):
     """What a beam may have for its two prisms.
 
-    Attributes:
-        prism_180: in place of the start's lateral-transfer prism.
-        prism_0: in place of its rhomboid.
+    Attributes
+    ----------
+    prism_180 : TransferChoiceSpec
+        In place of the start's lateral-transfer prism.
+    prism_0 : ShiftChoiceSpec
+        In place of its rhomboid.
     """
 
     prism_180: TransferChoiceSpec
@@ -181,10 +215,14 @@ class MonitorGoalSpec(Spec):
     """What a layout is to reach: standard deviations that are left when the spots have been read; of both cameras the
     worse, of several disturbances files the worst.
 
-    Attributes:
-        angle: of the change of the intersection angle, radians.
-        d_f: of the change of a principal distance, metres.
-        height: of a point on the ground, metres; needs the instrument's altitude.
+    Attributes
+    ----------
+    angle : float | None
+        Of the change of the intersection angle, radians.
+    d_f : PositiveLength | None
+        Of the change of a principal distance, metres.
+    height : PositiveLength | None
+        Of a point on the ground, metres; needs the instrument's altitude.
     """
 
     angle: Annotated[float, Quantity(ANGLE, above_zero=True)] | None = None
@@ -206,12 +244,17 @@ class MonitorGoalSpec(Spec):
 class MonitorLimitsSpec(Spec):
     """What a layout must not exceed.
 
-    Attributes:
-        pupil_share: of a camera's imaging pupil that its monitor's prisms take, at the worst place of the line.
-        mass: of all prisms together, with what stands in their place and without the central prism, kg.
-        spot_sigmas: so many standard deviations of its place each spot stays on its area CCD.
-        ghost_paths: of every source, by which the layouts on the front are path-traced; one is left out whose ghosts
-            have more than a thousandth of a spot's light. None are traced when left out.
+    Attributes
+    ----------
+    pupil_share : float | None
+        Of a camera's imaging pupil that its monitor's prisms take, at the worst place of the line.
+    mass : float | None
+        Of all prisms together, with what stands in their place and without the central prism, kg.
+    spot_sigmas : Number
+        So many standard deviations of its place each spot stays on its area CCD.
+    ghost_paths : Whole | None
+        Of every source, by which the layouts on the front are path-traced; one is left out whose ghosts have more than
+        a thousandth of a spot's light. None are traced when left out.
     """
 
     pupil_share: Annotated[float, Quantity(SCALE, above_zero=True, largest="100 percent")] | None = None
@@ -223,16 +266,24 @@ class MonitorLimitsSpec(Spec):
 class MonitorSearchSpec(Spec):
     """How long is searched.
 
-    Attributes:
-        beams: that are drawn at random before anything is known.
-        layouts: combinations of them that are compared, at most.
-        rounds: in which the beams of the best layouts are changed and combined anew, by steps that halve each time the
-            round before found nothing better.
-        changed: beams that each round tries.
-        exact: layouts that are built as a whole after the first draw, and after each round.
-        refine: steps by exact gradients with which the best layout is improved at last, at most.
-        starts: further searches, each from beams of its own that are drawn at random, and without those of the
-            instrument: do they come to the same end?
+    Attributes
+    ----------
+    beams : Whole
+        That are drawn at random before anything is known.
+    layouts : Whole
+        Combinations of them that are compared, at most.
+    rounds : Whole
+        In which the beams of the best layouts are changed and combined anew, by steps that halve each time the round
+        before found nothing better.
+    changed : Whole
+        Beams that each round tries.
+    exact : Whole
+        Layouts that are built as a whole after the first draw, and after each round.
+    refine : Whole
+        Steps by exact gradients with which the best layout is improved at last, at most.
+    starts : Whole
+        Further searches, each from beams of its own that are drawn at random, and without those of the instrument: do
+        they come to the same end?
     """
 
     beams: Annotated[Whole, Field(ge=1, le=100_000)] = 120
@@ -247,22 +298,38 @@ class MonitorSearchSpec(Spec):
 class MonitorDesignSpec(Spec):
     """A monitor's layout to be found: how many beams, where and through which prisms.
 
-    Attributes:
-        instrument: to start from, by name or path; a pair whose monitor's channels are mirrored.
-        name: of the new instrument.
-        description: of the new instrument, for people.
-        disturbances: files of what is expected to move, by name or path; what the instrument names, when left out.
-        beams: at each end of a line, at most.
-        vary: what may vary of each beam.
-        prisms: by a name of one's own, what each beam may have for prisms; the start's, when left out.
-        area_ccds: by a name of one's own, which area CCD all channels may have; the start's, when left out.
-        central_material: of the central prism, in place of the start's.
-        photons_per_frame: of every spot, in place of the start's.
-        frames: of a measurement, in place of the start's.
-        goal: what is to be reached.
-        limits: what must not be exceeded.
-        search: how long is searched.
-        seed: of everything drawn.
+    Attributes
+    ----------
+    instrument : Ref
+        To start from, by name or path; a pair whose monitor's channels are mirrored.
+    name : Name
+        Of the new instrument.
+    description : Text
+        Of the new instrument, for people.
+    disturbances : tuple[Ref, ...] | None
+        Files of what is expected to move, by name or path; what the instrument names, when left out.
+    beams : Whole
+        At each end of a line, at most.
+    vary : BeamRangesSpec
+        What may vary of each beam.
+    prisms : Named[PrismChoiceSpec] | None
+        By a name of one's own, what each beam may have for prisms; the start's, when left out.
+    area_ccds : Named[instruments.AreaCcdChoiceSpec] | None
+        By a name of one's own, which area CCD all channels may have; the start's, when left out.
+    central_material : instruments.GlassName | None
+        Of the central prism, in place of the start's.
+    photons_per_frame : instruments.Photons | None
+        Of every spot, in place of the start's.
+    frames : instruments.Frames | None
+        Of a measurement, in place of the start's.
+    goal : MonitorGoalSpec
+        What is to be reached.
+    limits : MonitorLimitsSpec
+        What must not be exceeded.
+    search : MonitorSearchSpec
+        How long is searched.
+    seed : Seed
+        Of everything drawn.
     """
 
     instrument: Ref
@@ -290,21 +357,32 @@ class MirrorSpec(Spec):
     """A mirror about the parent axis; of revolution, unless ``sag`` has terms that are not. A camera may have faces of
     lenses and a stop of its own among its mirrors: ``light`` says what happens there.
 
-    Attributes:
-        z: vertex on the parent axis, metres; light enters toward +z.
-        decentre: of the vertex from the parent axis, along x and y, metres.
-        rotate: rotation vector by which the surface is turned about its vertex, radians.
-        radius: vertex radius of curvature, metres, positive if the centre of curvature lies toward +z; ``flat`` for a
-            plane.
-        conic: conic constant k.
-        aspheric: terms A4, A6, ... of the sag beyond the conic's, 1/m^3, 1/m^5, ...; empty for a pure conic.
-        sag: further terms of the sag, by kind, each with its numbers.
-        light: what it does there, left out for a mirror; a plane that it passes is there to be the stop.
-        index: refractive index behind a face of a lens, where light goes to, at the design wavelength; 1 where it
-            leaves the lens.
-        glass: what lies behind a face where light enters a lens, in place of its index there, which then follows from
-            the dispersion at every wavelength.
-        edges: what cuts light there beside the stop; several stop what any of them stops.
+    Attributes
+    ----------
+    z : Length
+        Vertex on the parent axis, metres; light enters toward +z.
+    decentre : Vector2 | None
+        Of the vertex from the parent axis, along x and y, metres.
+    rotate : Turn | None
+        Rotation vector by which the surface is turned about its vertex, radians.
+    radius : Radius
+        Vertex radius of curvature, metres, positive if the centre of curvature lies toward +z; ``flat`` for a plane.
+    conic : Number
+        Conic constant k.
+    aspheric : AsphereTerms
+        Terms A4, A6, ... of the sag beyond the conic's, 1/m^3, 1/m^5, ...; empty for a pure conic.
+    sag : FrozenMap[str, SagTerm] | None
+        Further terms of the sag, by kind, each with its numbers.
+    light : Light | None
+        What it does there, left out for a mirror; a plane that it passes is there to be the stop.
+    index : Number | None
+        Refractive index behind a face of a lens, where light goes to, at the design wavelength; 1 where it leaves the
+        lens.
+    glass : LensGlass | None
+        What lies behind a face where light enters a lens, in place of its index there, which then follows from the
+        dispersion at every wavelength.
+    edges : tuple[SurfaceEdgeSpec, ...] | None
+        What cuts light there beside the stop; several stop what any of them stops.
     """
 
     z: Length
@@ -353,9 +431,12 @@ class FieldSpec(Spec):
 class ImageSpec(Spec):
     """The focal plane.
 
-    Attributes:
-        z: where it crosses the parent axis, metres.
-        tilt: about the prescription's x, along the line CCD, radians; left out for a plane square to the axis.
+    Attributes
+    ----------
+    z : Length
+        Where it crosses the parent axis, metres.
+    tilt : float | None
+        About the prescription's x, along the line CCD, radians; left out for a plane square to the axis.
     """
 
     z: Length
@@ -372,25 +453,42 @@ class LineSpec(Spec):
 class CameraSpec(TitledSpec):
     """An off-axis mirror camera.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        focal_length: nominal, metres; the trace tells the exact one.
-        entrance_pupil: diameter of the entrance pupil, metres: of the beam along the axis before the first surface.
-            Its rays make the stop as large as they spread there, unless ``stop_diameter`` states that.
-        field_bias: angle of the line CCD's centre from the parent axis, in the plane of symmetry, radians.
-        field: half angles about the field bias.
-        wavelength: design wavelength, metres.
-        stop: name of the mirror, or other surface, that is the aperture stop.
-        stop_diameter: diameter of the stop, metres, where it is known; ``entrance_pupil`` is then nominal.
-        mirrors: by name, in the order in which the light meets them; faces of lenses and a stop among them.
-        image: focal plane.
-        line: line CCD.
-        bands: line CCDs by spectral band, for images of targets; empty when none is described.
-        spectrum: light of which the camera is judged over all wavelengths; that of its band when left out.
-        medium: what its lenses stand in at 20 C, which the index of a glass is against: ``air``, as prescriptions on
-            the ground take it, or ``vacuum``, also when left out.
-        edge_margin: by how much a mirror's clear aperture is wider than the beams that use it, metres.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    focal_length : PositiveLength
+        Nominal, metres; the trace tells the exact one.
+    entrance_pupil : PositiveLength
+        Diameter of the entrance pupil, metres: of the beam along the axis before the first surface. Its rays make the
+        stop as large as they spread there, unless ``stop_diameter`` states that.
+    field_bias : instruments.FieldPlace
+        Angle of the line CCD's centre from the parent axis, in the plane of symmetry, radians.
+    field : FieldSpec
+        Half angles about the field bias.
+    wavelength : Wavelength
+        Design wavelength, metres.
+    stop : Name
+        Name of the mirror, or other surface, that is the aperture stop.
+    stop_diameter : PositiveLength | None
+        Diameter of the stop, metres, where it is known; ``entrance_pupil`` is then nominal.
+    mirrors : Named[MirrorSpec]
+        By name, in the order in which the light meets them; faces of lenses and a stop among them.
+    image : ImageSpec
+        Focal plane.
+    line : LineSpec
+        Line CCD.
+    bands : Named[BandSpec]
+        Line CCDs by spectral band, for images of targets; empty when none is described.
+    spectrum : Spectrum | None
+        Light of which the camera is judged over all wavelengths; that of its band when left out.
+    medium : Medium | None
+        What its lenses stand in at 20 C, which the index of a glass is against: ``air``, as prescriptions on the ground
+        take it, or ``vacuum``, also when left out.
+    edge_margin : float
+        By how much a mirror's clear aperture is wider than the beams that use it, metres.
     """
 
     focal_length: PositiveLength
@@ -468,13 +566,18 @@ class CameraSpec(TitledSpec):
     def index_behind(self, name: str, wavelength: float | None = None) -> float:
         """Refractive index behind a face of a lens, against what the lens stands in.
 
-        Args:
-            name: of the face.
-            wavelength: metres; the design wavelength by default.
+        Parameters
+        ----------
+        name : str
+            Of the face.
+        wavelength : float | None
+            Metres; the design wavelength by default.
 
-        Raises:
-            ValueError: its glass is not known there, or the face has an index alone and another wavelength is asked for
-                than that of the design.
+        Raises
+        ------
+        ValueError
+            Its glass is not known there, or the face has an index alone and another wavelength is asked for than that
+            of the design.
         """
         mirror, colour = self.mirrors[name], self.wavelength if wavelength is None else wavelength
         if mirror.glass is not None:
@@ -488,8 +591,10 @@ class CameraSpec(TitledSpec):
     def warm_glass(self, name: str) -> WarmGlass:
         """What heat does to the glass behind a face where light enters a lens, at the design wavelength.
 
-        Raises:
-            ValueError: nothing says it.
+        Raises
+        ------
+        ValueError
+            Nothing says it.
         """
         mirror = self.mirrors[name]
         if mirror.glass is None:
@@ -509,8 +614,10 @@ class CameraSpec(TitledSpec):
     def with_curves(self) -> CameraSpec:
         """Return the camera with the tables of its spectra read.
 
-        Raises:
-            InputError: a table is not there or not right, or has wavelengths at which a glass is not known.
+        Raises
+        ------
+        InputError
+            a table is not there or not right, or has wavelengths at which a glass is not known.
         """
         bands = {
             name: band.model_copy(update={"spectrum": band.spectrum.read(self, ("bands", name, "spectrum"))})
@@ -529,12 +636,17 @@ class CameraSpec(TitledSpec):
     def require_mirrors(self, where: str, on_axis: bool = False) -> None:
         """Refuse a camera that is not made of mirrors alone.
 
-        Args:
-            where: such a camera cannot stand, for the message.
-            on_axis: refuse mirrors that are flat, turned or off the parent axis, too.
+        Parameters
+        ----------
+        where : str
+            Such a camera cannot stand, for the message.
+        on_axis : bool
+            Refuse mirrors that are flat, turned or off the parent axis, too.
 
-        Raises:
-            InputError: it has a lens, a stop or edges of its own; with the line.
+        Raises
+        ------
+        InputError
+            It has a lens, a stop or edges of its own; with the line.
         """
         for name, mirror in self.mirrors.items():
             if mirror.edges:
@@ -558,20 +670,31 @@ class CameraDesignSpec(Spec):
 
     The focal length along the line, the entrance pupil, the field and its bias stay as they are.
 
-    Attributes:
-        camera: prescription to start from, by name or path.
-        name: of the new camera.
-        description: of the new camera, for people.
-        vary: mirror, or ``image`` -> what of it varies.
-        envelope: extent along the parent axis over all mirrors and the image, relative to the start's; the largest.
-        clearance: least distance of every beam, in the plane of symmetry, from the edge of every mirror and of the
-            focal plane that it passes, metres.
-        anamorphism: by how much the focal length along the line may differ from that across it, a share of the latter;
-            free where it is left out.
-        steps: in which the envelope is brought from the start's to the goal's.
-        starts: how many: the camera itself with the envelope shortened in steps, the same at once, and others drawn
-            about it. One start finds one local optimum.
-        seed: of the starts that are drawn.
+    Attributes
+    ----------
+    camera : Ref
+        Prescription to start from, by name or path.
+    name : Name
+        Of the new camera.
+    description : Text
+        Of the new camera, for people.
+    vary : Named[tuple[Vary, ...]]
+        Mirror, or ``image`` -> what of it varies.
+    envelope : float | None
+        Extent along the parent axis over all mirrors and the image, relative to the start's; the largest.
+    clearance : Length
+        Least distance of every beam, in the plane of symmetry, from the edge of every mirror and of the focal plane
+        that it passes, metres.
+    anamorphism : float | None
+        By how much the focal length along the line may differ from that across it, a share of the latter; free where it
+        is left out.
+    steps : Whole
+        In which the envelope is brought from the start's to the goal's.
+    starts : Whole
+        How many: the camera itself with the envelope shortened in steps, the same at once, and others drawn about it.
+        One start finds one local optimum.
+    seed : Seed
+        Of the starts that are drawn.
     """
 
     camera: Ref

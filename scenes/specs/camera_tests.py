@@ -30,10 +30,14 @@ from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity
 class CollimatorSpec(Spec):
     """A long collimator with its target at the focus.
 
-    Attributes:
-        focal_length: metres.
-        aperture: diameter, metres.
-        wavefront: its error over the aperture by Zernike terms, Noll's numbering, metres rms.
+    Attributes
+    ----------
+    focal_length : PositiveLength
+        metres.
+    aperture : PositiveLength
+        Diameter, metres.
+    wavefront : dict[Term, FigureTerm]
+        Its error over the aperture by Zernike terms, Noll's numbering, metres rms.
     """
 
     focal_length: PositiveLength
@@ -50,10 +54,13 @@ class CollimatorSpec(Spec):
 class CameraUnderTestSpec(Spec):
     """The camera under test, alone in front of the collimator.
 
-    Attributes:
-        camera: prescription, or an instrument as built to one, by name or path.
-        as_built: how it departs from the prescription: ``M1``, ``M2`` ... or ``focal_plane`` -> perturbation, as in a
-            job; figures of mirrors for the most part.
+    Attributes
+    ----------
+    camera : Ref
+        Prescription, or an instrument as built to one, by name or path.
+    as_built : Paths[PlainPerturbationSpec]
+        How it departs from the prescription: ``M1``, ``M2`` ... or ``focal_plane`` -> perturbation, as in a job;
+        figures of mirrors for the most part.
     """
 
     camera: Ref
@@ -78,9 +85,12 @@ Share = Annotated[Number, Field(ge=-1.0, le=1.0)]
 class EdgeSpec(Spec):
     """The slanted knife edge, turned to measure along the line and along the track.
 
-    Attributes:
-        angle: between the edge and the pixel columns or rows, radians.
-        region: side of the square region around it that is analysed, pixels.
+    Attributes
+    ----------
+    angle : EdgeAngle
+        Between the edge and the pixel columns or rows, radians.
+    region : Whole
+        Side of the square region around it that is analysed, pixels.
     """
 
     angle: EdgeAngle
@@ -90,13 +100,18 @@ class EdgeSpec(Spec):
 class ScanSpec(Spec):
     """How the target is moved through focus; lengths are those by which the image moves.
 
-    Attributes:
-        reach: the first scan goes from -reach to +reach, metres.
-        step: of the first scan, metres.
-        points: of the second scan, about the peak that the first one found; fewer than seven would leave no room for an
-            error of the first.
-        depth: half width of the second scan as a share of the defocus at which geometric blur takes all contrast at the
-            Nyquist frequency.
+    Attributes
+    ----------
+    reach : PositiveLength
+        The first scan goes from -reach to +reach, metres.
+    step : PositiveLength
+        Of the first scan, metres.
+    points : Whole
+        Of the second scan, about the peak that the first one found; fewer than seven would leave no room for an error
+        of the first.
+    depth : Number
+        Half width of the second scan as a share of the defocus at which geometric blur takes all contrast at the
+        Nyquist frequency.
     """
 
     reach: PositiveLength
@@ -108,12 +123,18 @@ class ScanSpec(Spec):
 class MountSpec(Spec):
     """How the focal-plane assembly is screwed to its mounting surface.
 
-    Attributes:
-        holes: their places in the assembly's frame O'-X'Y'Z', metres.
-        tilt: of the mounting surface's normal from Z', about Y', radians.
-        clearance: by which the screws leave each hole free to slide, metres.
-        thickness: of the shims before the work, metres.
-        step: to which the workshop grinds a shim, metres.
+    Attributes
+    ----------
+    holes : tuple[Vector3, ...]
+        Their places in the assembly's frame O'-X'Y'Z', metres.
+    tilt : Tilt
+        Of the mounting surface's normal from Z', about Y', radians.
+    clearance : PositiveLength
+        By which the screws leave each hole free to slide, metres.
+    thickness : PositiveLength
+        Of the shims before the work, metres.
+    step : PositiveLength
+        To which the workshop grinds a shim, metres.
     """
 
     holes: Annotated[tuple[Vector3, ...], Field(min_length=3)]
@@ -126,10 +147,14 @@ class MountSpec(Spec):
 class MissetSpec(Spec):
     """Standard deviations of how the focal-plane assembly stands at the beginning, against the optics.
 
-    Attributes:
-        rotate: about X', Y', Z' through the middle of the panchromatic line, radians.
-        shift: along X', Y', Z', metres.
-        chips: of the height of each line CCD above the assembly, which no shim can change, metres.
+    Attributes
+    ----------
+    rotate : AngleSigmas
+        About X', Y', Z' through the middle of the panchromatic line, radians.
+    shift : LengthSigmas
+        Along X', Y', Z', metres.
+    chips : LengthSigma
+        Of the height of each line CCD above the assembly, which no shim can change, metres.
     """
 
     rotate: AngleSigmas
@@ -140,22 +165,38 @@ class MissetSpec(Spec):
 class FocusTestSpec(CameraUnderTestSpec):
     """A focal-plane alignment.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: prescription, by name or path.
-        as_built: how it departs from the prescription, ``M1`` ... or ``focal_plane`` -> perturbation as in a job.
-        collimator: what the camera looks into.
-        edge: the target.
-        fields: where along the line it is imaged, as shares of half the line's length, -1 to 1.
-        white: signal of the bright side, as a share of the full well.
-        frames: images of each position of the target that are averaged.
-        scan: how the target is moved.
-        misset: how the assembly stands at the beginning.
-        mount: how it is mounted.
-        level: standard deviation of the theodolite's reading of the line's level, radians.
-        rounds: of shimming.
-        seed: of everything that is drawn.
+    Attributes
+    ----------
+    name : Name
+        As the file is called.
+    description : Text
+        For people.
+    camera
+        Prescription, by name or path.
+    as_built
+        How it departs from the prescription, ``M1`` ... or ``focal_plane`` -> perturbation as in a job.
+    collimator : CollimatorSpec
+        What the camera looks into.
+    edge : EdgeSpec
+        The target.
+    fields : tuple[Share, ...]
+        Where along the line it is imaged, as shares of half the line's length, -1 to 1.
+    white : Light
+        Signal of the bright side, as a share of the full well.
+    frames : Frames
+        Images of each position of the target that are averaged.
+    scan : ScanSpec
+        How the target is moved.
+    misset : MissetSpec
+        How the assembly stands at the beginning.
+    mount : MountSpec
+        How it is mounted.
+    level : AngleSigma
+        Standard deviation of the theodolite's reading of the line's level, radians.
+    rounds : Whole
+        Of shimming.
+    seed : Seed
+        Of everything that is drawn.
     """
 
     name: Name
@@ -185,26 +226,45 @@ class FocusTestSpec(CameraUnderTestSpec):
 class DistortionTestSpec(CameraUnderTestSpec):
     """The camera on a turntable looks at a pinhole in the collimator, point by point along its line.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: prescription, by name or path.
-        as_built: how it departs from the prescription, ``M1`` ... or ``focal_plane`` -> perturbation as in a job.
-        collimator: what the camera looks into.
-        turntable: its dividing error and calibration, by name or path.
-        pinhole: diameter of the target, metres.
-        band: whose line CCD is measured.
-        points: over the field.
-        reach: of the first and last point, as a share of half the line's length.
-        sets: how often all points are measured.
-        light: of the brightest pixel, as a share of the full well.
-        frames: images of each point that are averaged.
-        window: side of the square region around the spot, pixels.
-        zero: standard deviation with which the middle of the line is put on the collimator's axis at the turntable's
-            middle angle, radians.
-        axis_tilt: standard deviation of the turntable's axis against the camera's X, radians.
-        setting: standard deviation with which the table stops at a wanted reading, radians.
-        seed: of everything that is drawn.
+    Attributes
+    ----------
+    name : Name
+        As the file is called.
+    description : Text
+        For people.
+    camera
+        Prescription, by name or path.
+    as_built
+        How it departs from the prescription, ``M1`` ... or ``focal_plane`` -> perturbation as in a job.
+    collimator : CollimatorSpec
+        What the camera looks into.
+    turntable : Ref
+        Its dividing error and calibration, by name or path.
+    pinhole : PositiveLength
+        Diameter of the target, metres.
+    band : Name
+        Whose line CCD is measured.
+    points : Whole
+        Over the field.
+    reach : Number
+        Of the first and last point, as a share of half the line's length.
+    sets : Whole
+        How often all points are measured.
+    light : Light
+        Of the brightest pixel, as a share of the full well.
+    frames : Frames
+        Images of each point that are averaged.
+    window : Whole
+        Side of the square region around the spot, pixels.
+    zero : AngleSigma
+        Standard deviation with which the middle of the line is put on the collimator's axis at the turntable's middle
+        angle, radians.
+    axis_tilt : AngleSigma
+        Standard deviation of the turntable's axis against the camera's X, radians.
+    setting : AngleSigma
+        Standard deviation with which the table stops at a wanted reading, radians.
+    seed : Seed
+        Of everything that is drawn.
     """
 
     name: Name
@@ -232,9 +292,12 @@ Positive = Annotated[Number, Field(gt=0.0, le=1e9)]
 class LineSpec(Spec):
     """A line CCD whose spots are given in pixels.
 
-    Attributes:
-        pitch: of its pixels, metres.
-        middle: column of the line's middle, where positions count from; the centre of the first pixel is 0.
+    Attributes
+    ----------
+    pitch : PositiveLength
+        Of its pixels, metres.
+    middle : Number
+        Column of the line's middle, where positions count from; the centre of the first pixel is 0.
     """
 
     pitch: PositiveLength
@@ -244,15 +307,21 @@ class LineSpec(Spec):
 class DistortionFiles(Spec):
     """Angles and spots of a camera on a turntable.
 
-    Attributes:
-        spots: table of readings of the turntable and places of the spot on the line, a CSV file.
-        zero: reading at which the middle of the line is imaged, as near as it is known, radians; the fit finds its
-            error.
-        line: pixels of the line, for a table whose places are columns; none for one of lengths.
-        reversed: readings of the turntable rise where places on the line fall.
-        turntable: calibration of the turntable; without it angles count as read.
-        angle_sigma: without a calibration: standard deviation of the error of each point's angle, independent from
-            point to point and the same in all sets, radians.
+    Attributes
+    ----------
+    spots : Reference
+        Table of readings of the turntable and places of the spot on the line, a CSV file.
+    zero : TableAngle
+        Reading at which the middle of the line is imaged, as near as it is known, radians; the fit finds its error.
+    line : LineSpec | None
+        Pixels of the line, for a table whose places are columns; none for one of lengths.
+    reversed : bool
+        Readings of the turntable rise where places on the line fall.
+    turntable : TurntableFiles | None
+        Calibration of the turntable; without it angles count as read.
+    angle_sigma : AngleSigma | None
+        Without a calibration: standard deviation of the error of each point's angle, independent from point to point
+        and the same in all sets, radians.
     """
 
     spots: Reference
@@ -272,12 +341,18 @@ class DistortionFiles(Spec):
 class MeasuredDistortionSpec(TitledSpec):
     """The distortion test on measured angles and spots.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        principal_distance: of the camera, about, metres; it serves to see the scatter between sets.
-        measured: the angles and spots.
-        seed: of nothing; the fits of the turntable that compete here draw nothing.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    principal_distance : PositiveLength
+        Of the camera, about, metres; it serves to see the scatter between sets.
+    measured : DistortionFiles
+        The angles and spots.
+    seed : Seed
+        Of nothing; the fits of the turntable that compete here draw nothing.
     """
 
     principal_distance: PositiveLength
@@ -288,14 +363,22 @@ class MeasuredDistortionSpec(TitledSpec):
 class NoiseSpec(Spec):
     """Noise of the detector that took images, as a data sheet of EMVA 1288 has it.
 
-    Attributes:
-        gain_dn_per_e: grey values per electron.
-        dark_noise_e: read noise, electrons rms.
-        dark_signal_e: dark signal of one exposure, electrons.
-        offset_dn: black level, grey values.
-        prnu: non-uniformity of the response, share rms.
-        dsnu_e: non-uniformity of the dark signal, electrons rms.
-        saturation_dn: grey value from which the response is not linear.
+    Attributes
+    ----------
+    gain_dn_per_e : Positive
+        Grey values per electron.
+    dark_noise_e : NotNegative
+        Read noise, electrons rms.
+    dark_signal_e : NotNegative
+        Dark signal of one exposure, electrons.
+    offset_dn : NotNegative
+        Black level, grey values.
+    prnu : Number
+        Non-uniformity of the response, share rms.
+    dsnu_e : NotNegative
+        Non-uniformity of the dark signal, electrons rms.
+    saturation_dn : Positive
+        Grey value from which the response is not linear.
     """
 
     gain_dn_per_e: Positive
@@ -310,9 +393,12 @@ class NoiseSpec(Spec):
 class LevelSpec(Spec):
     """The line's level as a theodolite read it.
 
-    Attributes:
-        angle: of the line out of the direction it is to have, about Z', radians.
-        sigma: its standard deviation, radians.
+    Attributes
+    ----------
+    angle : Angle
+        Of the line out of the direction it is to have, about Z', radians.
+    sigma : AngleSigma
+        Its standard deviation, radians.
     """
 
     angle: Angle
@@ -322,16 +408,24 @@ class LevelSpec(Spec):
 class FocusFiles(Spec):
     """A through-focus series of many places.
 
-    Attributes:
-        mtf: table of MTF values with sigmas, a CSV file; or
-        images: table of images of a slanted knife edge, a CSV file.
-        moved: what was moved through focus. ``image``: shifts are those of the image along the light; ``target``: of
-            the target along the light; ``focal_plane``: of the CCD along the light.
-        per_shift: with ``target``: move of the image per move of the target, (f of the camera / f of the
-            collimator)^2; a column `per shift` of the table overrides it.
-        frequency: of the MTF that is measured in images, cycles per pixel.
-        noise: with images: name of a band -> its detector; a band without one has its noise estimated from the image.
-        level: of the line; without it the turn about Z' is left as it is.
+    Attributes
+    ----------
+    mtf : Reference | None
+        Table of MTF values with sigmas, a CSV file; or
+    images : Reference | None
+        Table of images of a slanted knife edge, a CSV file.
+    moved : Literal['image', 'target', 'focal_plane']
+        What was moved through focus. ``image``: shifts are those of the image along the light; ``target``: of the
+        target along the light; ``focal_plane``: of the CCD along the light.
+    per_shift : Number | None
+        With ``target``: move of the image per move of the target, (f of the camera / f of the collimator)^2; a column
+        `per shift` of the table overrides it.
+    frequency : Number
+        Of the MTF that is measured in images, cycles per pixel.
+    noise : dict[Name, NoiseSpec]
+        With images: name of a band -> its detector; a band without one has its noise estimated from the image.
+    level : LevelSpec | None
+        Of the line; without it the turn about Z' is left as it is.
     """
 
     mtf: Reference | None = None
@@ -357,16 +451,25 @@ class FocusFiles(Spec):
 class MeasuredFocusSpec(TitledSpec):
     """A focal-plane alignment from a measured through-focus series.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        measured: the series.
-        mount: how the assembly is mounted.
-        shims: thickness of each hole's shim now, metres; by default all are as thick as `mount` says.
-        vertex_error: error that the form of the through-focus curve leaves in all vertices alike, metres; its default
-            is that of F/8 to F/10 and wavefronts of 0.2 waves.
-        vertex_trend: by how much that error changes from the middle to the ends of the places, metres.
-        seed: of nothing; nothing is drawn.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    measured : FocusFiles
+        The series.
+    mount : MountSpec
+        How the assembly is mounted.
+    shims : tuple[PositiveLength, ...] | None
+        Thickness of each hole's shim now, metres; by default all are as thick as `mount` says.
+    vertex_error : LengthSigma
+        Error that the form of the through-focus curve leaves in all vertices alike, metres; its default is that of F/8
+        to F/10 and wavefronts of 0.2 waves.
+    vertex_trend : LengthSigma
+        By how much that error changes from the middle to the ends of the places, metres.
+    seed : Seed
+        Of nothing; nothing is drawn.
     """
 
     measured: FocusFiles

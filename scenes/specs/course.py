@@ -38,8 +38,10 @@ _TERM = re.compile(r"Z([1-9][0-9]{0,3})")
 def noll(term: str) -> int:
     """The Noll index of a figure term: 5 for "Z5".
 
-    Raises:
-        Problem: not Z1 .. Z66.
+    Raises
+    ------
+    Problem
+        Not Z1 .. Z66.
     """
     match = _TERM.fullmatch(term)
     if match is None or int(match[1]) > MAX_NOLL:
@@ -90,9 +92,12 @@ class TemperatureCourse(Spec):
     """How the temperature of a body, and of all it carries that has none of its own, changes: for each of the course's
     times change + gradient . r. What is left out is zero at all times.
 
-    Attributes:
-        change: at the body's origin, kelvin.
-        gradient: in the body's own frame, K/m.
+    Attributes
+    ----------
+    change : tuple[TemperatureChange, ...] | None
+        At the body's origin, kelvin.
+    gradient : tuple[TemperatureGradient, ...] | None
+        In the body's own frame, K/m.
     """
 
     change: tuple[TemperatureChange, ...] | None = None
@@ -103,11 +108,16 @@ class MotionCourse(Spec):
     """How a body moves: for each of the course's times what `perturb` says of one state. What is left out is zero at
     all times.
 
-    Attributes:
-        rotate: rotation vectors in the body's own frame about the pivot, radians; they come before the shifts.
-        shift: in the body's own frame, metres.
-        scale: relative growth of the body and all it carries.
-        pivot: name of the body's point that rotation and scale leave in place, at all times.
+    Attributes
+    ----------
+    rotate : tuple[Rotation, ...] | None
+        Rotation vectors in the body's own frame about the pivot, radians; they come before the shifts.
+    shift : tuple[Shift, ...] | None
+        In the body's own frame, metres.
+    scale : tuple[ScaleChange, ...] | None
+        Relative growth of the body and all it carries.
+    pivot : Name
+        Name of the body's point that rotation and scale leave in place, at all times.
     """
 
     rotate: tuple[Rotation, ...] | None = None
@@ -146,16 +156,22 @@ class CourseSpec(Spec):
     A body that stands under `temperature` has a temperature of its own at all times, also where the table says 0 K.
     Rotation vectors, shifts and scales are added, component by component, to what `perturb` says of the same node.
 
-    Attributes:
-        times: ascending, seconds; only their order matters to the instrument, which has no memory.
-        temperature: node path -> its temperatures, one for each time.
-        motion: node path -> its motions, one for each time.
-        table: in place of times, temperatures and motions a CSV file with them, relative to the job's file. Heads name
-            what a column holds and its unit: `time [min]`, `base/forward/M2 shift z [um]`, `base/forward/M2 rotate x
-            [arcsec]`, `base/forward scale [ppm]`, `base/forward temperature [K]`, `base/forward gradient x [mK/m]`.
-            Under `motion` stand then only the pivots.
-        detail: the one of the times that is shown in full, like the single state of a job without a course, seconds;
-            the last one by default.
+    Attributes
+    ----------
+    times : tuple[Moment, ...]
+        Ascending, seconds; only their order matters to the instrument, which has no memory.
+    temperature : Paths[TemperatureCourse]
+        Node path -> its temperatures, one for each time.
+    motion : Paths[MotionCourse]
+        Node path -> its motions, one for each time.
+    table : Reference | None
+        In place of times, temperatures and motions a CSV file with them, relative to the job's file. Heads name what a
+        column holds and its unit: `time [min]`, `base/forward/M2 shift z [um]`, `base/forward/M2 rotate x [arcsec]`,
+        `base/forward scale [ppm]`, `base/forward temperature [K]`, `base/forward gradient x [mK/m]`. Under `motion`
+        stand then only the pivots.
+    detail : Moment | None
+        The one of the times that is shown in full, like the single state of a job without a course, seconds; the last
+        one by default.
     """
 
     times: Annotated[tuple[Moment, ...], AfterValidator(_some_times), AfterValidator(ascending)] = ()
@@ -243,11 +259,16 @@ _HEAD = re.compile(r"(?:(?P<node>\S+) +)?(?P<what>[a-z]+)(?: +(?P<axis>[a-z]))? 
 class _Column:
     """What a column holds.
 
-    Attributes:
-        what: TIME, or a name of VECTORS or NUMBERS.
-        node: its path, empty for the time.
-        axis: 0 to 2 of a vector.
-        unit: of its numbers.
+    Attributes
+    ----------
+    what : str
+        TIME, or a name of VECTORS or NUMBERS.
+    node : str
+        Its path, empty for the time.
+    axis : int
+        0 to 2 of a vector.
+    unit : str
+        Of its numbers.
     """
 
     what: str
@@ -266,12 +287,17 @@ class _Column:
 def read_course(path: Path, named: CourseSpec) -> CourseSpec:
     """The course that a table holds, with the detail and the pivots of the course that names it.
 
-    Args:
-        path: of a CSV file with a row for each time, whose heads name node, quantity, axis and unit.
-        named: the course that names it.
+    Parameters
+    ----------
+    path : Path
+        Of a CSV file with a row for each time, whose heads name node, quantity, axis and unit.
+    named : CourseSpec
+        The course that names it.
 
-    Raises:
-        InputError: the table cannot be read, with its line.
+    Raises
+    ------
+    InputError
+        The table cannot be read, with its line.
     """
     file, rows = str(path), rows_of(path, LARGEST_BYTES)
     if len(rows) < 2:

@@ -24,19 +24,32 @@ LEAST_STEPS = 1.0
 class DetectorSpec(TitledSpec):
     """Plain numbers in the units of EMVA 1288; e stands for electrons and DN for digital numbers (grey values).
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        quantum_efficiency: electrons per photon at the wavelength it is used at.
-        system_gain_dn_per_e: DN per electron (K of EMVA 1288).
-        dark_noise_e: temporal noise in the dark without dark current, rms.
-        dark_current_e_per_s: mean dark current of a pixel.
-        full_well_e: saturation capacity.
-        prnu: photo response non-uniformity, relative rms.
-        dsnu_e: dark signal non-uniformity, rms.
-        bit_depth: of the analogue-to-digital converter; frames are stored as 16 bits.
-        offset_dn: grey value of no signal.
-        noise: beyond the model of EMVA 1288, name -> its number, electrons rms; None for nothing.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    quantum_efficiency : Number
+        Electrons per photon at the wavelength it is used at.
+    system_gain_dn_per_e : Number
+        DN per electron (K of EMVA 1288).
+    dark_noise_e : Number
+        Temporal noise in the dark without dark current, rms.
+    dark_current_e_per_s : Number
+        Mean dark current of a pixel.
+    full_well_e : Number
+        Saturation capacity.
+    prnu : Number
+        Photo response non-uniformity, relative rms.
+    dsnu_e : Number
+        Dark signal non-uniformity, rms.
+    bit_depth : Whole
+        Of the analogue-to-digital converter; frames are stored as 16 bits.
+    offset_dn : Number
+        Grey value of no signal.
+    noise : Named[Number] | None
+        Beyond the model of EMVA 1288, name -> its number, electrons rms; None for nothing.
     """
 
     quantum_efficiency: Annotated[Number, Field(gt=0.0, le=1.0)]
@@ -86,11 +99,15 @@ class DetectorSpec(TitledSpec):
     def check_exposure(self, exposure: float) -> None:
         """See whether the dark signal leaves room for light.
 
-        Args:
-            exposure: of a frame, seconds.
+        Parameters
+        ----------
+        exposure : float
+            Of a frame, seconds.
 
-        Raises:
-            InputError: the dark current alone saturates the pixels.
+        Raises
+        ------
+        InputError
+            The dark current alone saturates the pixels.
         """
         limit = self.saturation_e
         if self.dark_current_e_per_s * exposure >= limit:

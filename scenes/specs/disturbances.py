@@ -70,9 +70,12 @@ Correlation = Annotated[Number, Field(ge=-1.0, le=1.0)]
 class TemperatureSigmaSpec(Spec):
     """Standard deviations of a body's temperature field; what it does to light is worked out by the thermal model.
 
-    Attributes:
-        change: of its temperature at its origin, kelvin.
-        gradient: of each component of its gradient in the body's own frame, K/m.
+    Attributes
+    ----------
+    change : float
+        Of its temperature at its origin, kelvin.
+    gradient : GradientSigma
+        Of each component of its gradient in the body's own frame, K/m.
     """
 
     change: Annotated[float, _spread(units.TEMPERATURE_DIFFERENCE, "100 K")] = 0.0
@@ -92,15 +95,24 @@ class TimeLawSpec(Spec):
 
     A trend can be multiplied by a period, a swing that grows; an event by drift and period: what sets in at a moment.
 
-    Attributes:
-        kind: `white`, `constant` or `jump`, in place of the others.
-        drift: time in which it forgets where it was, seconds.
-        period: it comes back with, seconds.
-        trend: time in which it grows by its standard deviation, seconds.
-        relaxation: time constant with which it goes to a new value, seconds.
-        event: when it steps, seconds.
-        jump: mean time between two jumps, seconds; what is too small to be found then counts in sigma.
-        since: when a trend or relaxation starts, seconds; 0 by default.
+    Attributes
+    ----------
+    kind : Literal['white', 'constant', 'jump'] | None
+        `white`, `constant` or `jump`, in place of the others.
+    drift : Span | None
+        Time in which it forgets where it was, seconds.
+    period : Span | None
+        It comes back with, seconds.
+    trend : Span | None
+        Time in which it grows by its standard deviation, seconds.
+    relaxation : Span | None
+        Time constant with which it goes to a new value, seconds.
+    event : Moment | None
+        When it steps, seconds.
+    jump : Span | None
+        Mean time between two jumps, seconds; what is too small to be found then counts in sigma.
+    since : Moment | None
+        When a trend or relaxation starts, seconds; 0 by default.
     """
 
     kind: Literal["white", "constant", "jump"] | None = None
@@ -174,11 +186,15 @@ def _check_matrix(rows: tuple[tuple[float, ...], ...], count: int, within: KeyPa
 class CorrelationSpec(Spec):
     """Components of one cause that move together.
 
-    Attributes:
-        between: their names: `base/forward/M1 shift z`, `NODE rotate x`, `NODE scale`, `NODE figure Z5`, `NODE radius`,
-            `NODE conic`, `NODE temperature`, `NODE gradient x`, `NODE index_gradient x`.
-        correlation: of any two of them.
-        matrix: their correlation matrix, in place of one number.
+    Attributes
+    ----------
+    between : tuple[str, ...]
+        Their names: `base/forward/M1 shift z`, `NODE rotate x`, `NODE scale`, `NODE figure Z5`, `NODE radius`, `NODE
+        conic`, `NODE temperature`, `NODE gradient x`, `NODE index_gradient x`.
+    correlation : Correlation | None
+        Of any two of them.
+    matrix : tuple[tuple[Correlation, ...], ...] | None
+        Their correlation matrix, in place of one number.
     """
 
     between: Annotated[tuple[Annotated[str, Field(strict=True)], ...], Field(min_length=2)]
@@ -217,11 +233,15 @@ _AXES = ("x", "y", "z")
 def component_named(text: str) -> tuple[str, str, str, str]:
     """The parts of a component's name: node, kind, axis or term, and pivot; parts that are not there are empty.
 
-    Args:
-        text: ``NODE KIND [AXIS] [about PIVOT]``, as the names of ``CorrelationSpec``.
+    Parameters
+    ----------
+    text : str
+        ``NODE KIND [AXIS] [about PIVOT]``, as the names of ``CorrelationSpec``.
 
-    Raises:
-        Problem: it is not of this form.
+    Raises
+    ------
+    Problem
+        It is not of this form.
     """
     words = text.split()
     if len(words) > 1 and words[1] == "index_gradient":  # no perturbation of a job
@@ -282,9 +302,12 @@ def _components(value: Any) -> Any:
 def written_sigma(name: str, sigma: float) -> str | float:
     """A standard deviation of a component, SI, as a file has it.
 
-    Args:
-        name: of the component.
-        sigma: its standard deviation.
+    Parameters
+    ----------
+    name : str
+        Of the component.
+    sigma : float
+        Its standard deviation.
     """
     kind = component_named(name)[1]
     return sigma if kind in _PURE else _SPREADS[kind].format(sigma)
@@ -306,14 +329,20 @@ class JointSpec(Spec):
     """Components of bodies that go together, with a standard deviation each and one matrix of correlations: for example
     what an estimate of an instrument's state leaves unknown.
 
-    Attributes:
-        components: name -> standard deviation with its unit, a plain number for `conic` and `index`. Names are those of
-            `correlations`, also `NODE index`; after a shift, a turn or a scale, `about PIVOT` names another pivot than
-            the body's centre, or its origin where it has none.
-        correlation: their correlation matrix, rows in the order of the components; independent without it.
-        correlation_file: a CSV file with the matrix in its place, and the names of the components as heads.
-        time: how they go on in a series of measurements.
-        reason: where the numbers come from.
+    Attributes
+    ----------
+    components : JointSigmas
+        Name -> standard deviation with its unit, a plain number for `conic` and `index`. Names are those of
+        `correlations`, also `NODE index`; after a shift, a turn or a scale, `about PIVOT` names another pivot than the
+        body's centre, or its origin where it has none.
+    correlation : tuple[tuple[Correlation, ...], ...] | None
+        Their correlation matrix, rows in the order of the components; independent without it.
+    correlation_file : Reference | None
+        a CSV file with the matrix in its place, and the names of the components as heads.
+    time : TimeLaw
+        How they go on in a series of measurements.
+    reason : Reason
+        Where the numbers come from.
     """
 
     components: JointSigmas
@@ -333,8 +362,10 @@ class JointSpec(Spec):
     def with_table(self) -> "JointSpec":
         """The same with the matrix of its file in it.
 
-        Raises:
-            InputError: the file cannot be read, or is no correlation matrix of these components.
+        Raises
+        ------
+        InputError
+            The file cannot be read, or is no correlation matrix of these components.
         """
         assert self.correlation_file is not None
         key = ("correlation_file",)
@@ -406,22 +437,37 @@ class CauseSpec(_CauseWords):
     """One cause of change: its bodies and the standard deviation of each component of each of their motions. Components
     are independent of each other unless it says otherwise.
 
-    Attributes:
-        bodies: node paths; `*` stands for one part of a path or a piece of it (`base/*/M?` are all mirrors),
-            `<camera>` for the name of a camera (`base/<camera>`).
-        shift: of the bodies in their own frames, metres.
-        rotate: about the pivot, radians.
-        scale: relative growth of a camera and all in it.
-        figure: Zernike term (Noll) -> of the surface error, metres.
-        radius: relative, of the vertex radius of curvature of a mirror or face.
-        conic: of its conic constant, a pure number.
-        temperature: of the bodies' temperature fields.
-        index_gradient: of the refractive index in a prism, 1/m, other than by heat.
-        pivot: of turns and growth; by default the body's centre if it has one, else its origin.
-        together: correlation of the same component of any two of the bodies.
-        correlations: of single components.
-        time: how it goes on in a series of measurements.
-        reason: where the numbers come from.
+    Attributes
+    ----------
+    bodies : BodyPatterns
+        Node paths; `*` stands for one part of a path or a piece of it (`base/*/M?` are all mirrors), `<camera>` for the
+        name of a camera (`base/<camera>`).
+    shift
+        Of the bodies in their own frames, metres.
+    rotate
+        About the pivot, radians.
+    scale
+        Relative growth of a camera and all in it.
+    figure
+        Zernike term (Noll) -> of the surface error, metres.
+    radius
+        Relative, of the vertex radius of curvature of a mirror or face.
+    conic
+        Of its conic constant, a pure number.
+    temperature
+        Of the bodies' temperature fields.
+    index_gradient
+        Of the refractive index in a prism, 1/m, other than by heat.
+    pivot
+        Of turns and growth; by default the body's centre if it has one, else its origin.
+    together
+        Correlation of the same component of any two of the bodies.
+    correlations : tuple[CorrelationSpec, ...]
+        Of single components.
+    time : TimeLaw
+        How it goes on in a series of measurements.
+    reason : Reason
+        Where the numbers come from.
     """
 
     bodies: BodyPatterns
@@ -440,9 +486,12 @@ class CauseChangeSpec(_CauseWords):
     """What a job says of a cause in place of the disturbances file, number by number; a cause that the file does not
     have needs all that a cause needs.
 
-    Attributes:
-        bodies, shift, rotate, scale, figure, radius, conic, temperature, index_gradient: as of a cause.
-        pivot, together, correlations, time, reason: as of a cause.
+    Attributes
+    ----------
+    bodies, shift, rotate, scale, figure, radius, conic, temperature, index_gradient
+        As of a cause.
+    pivot, together, correlations, time, reason
+        As of a cause.
     """
 
     @property
@@ -466,15 +515,22 @@ class CauseChangeSpec(_CauseWords):
 class DisturbancesSpec(TitledSpec):
     """What is expected to change between the nominal measurement and a later one.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        sigmas: how many standard deviations every number of the file is; 3 for a list of 3-sigma values.
-        causes: by name.
-        joint: components of bodies, each by its name, that go together as an estimate of them does; besides the causes,
-            or in their place.
-        jump_false_alarm: chance that a series in which nothing jumps has a jump reported, over all its times and all
-            components whose law in time is `jump`; 0.001 by default.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    sigmas : Number
+        How many standard deviations every number of the file is; 3 for a list of 3-sigma values.
+    causes : Named[CauseSpec]
+        By name.
+    joint : JointSpec | None
+        Components of bodies, each by its name, that go together as an estimate of them does; besides the causes, or in
+        their place.
+    jump_false_alarm : Number | None
+        Chance that a series in which nothing jumps has a jump reported, over all its times and all components whose law
+        in time is `jump`; 0.001 by default.
     """
 
     sigmas: Annotated[Number, Field(gt=0.0, le=10.0)] = 1.0
@@ -500,8 +556,10 @@ class DisturbancesSpec(TitledSpec):
     def changed(self, changes: "JobDisturbancesSpec") -> "DisturbancesSpec":
         """Return the statement with a job's changes made.
 
-        Raises:
-            InputError: it leaves out a cause that is not there, or adds one that is not complete.
+        Raises
+        ------
+        InputError
+            It leaves out a cause that is not there, or adds one that is not complete.
         """
         causes = dict(self.causes)
         for k, name in enumerate(changes.without):
@@ -531,12 +589,16 @@ class DisturbancesSpec(TitledSpec):
 class JobDisturbancesSpec(Spec):
     """Which disturbances a job's sigmas rest on.
 
-    Attributes:
-        file: name of a file in scenes/library/disturbances, or path of one's own; the instrument's by default; `none`
-            for none at all.
-        causes: what is to be said instead of, or besides, the causes of the file, in as many standard deviations as
-            the file's own numbers.
-        without: causes of the file that are left out.
+    Attributes
+    ----------
+    file : Ref | None
+        Name of a file in scenes/library/disturbances, or path of one's own; the instrument's by default; `none` for
+        none at all.
+    causes : Named[CauseChangeSpec]
+        What is to be said instead of, or besides, the causes of the file, in as many standard deviations as the file's
+        own numbers.
+    without : tuple[Name, ...]
+        Causes of the file that are left out.
     """
 
     file: Ref | None = None
@@ -574,16 +636,25 @@ AngleErrors = Annotated[
 class ErrorBudgetSpec(Spec):
     """An error budget.
 
-    Attributes:
-        description: for people.
-        instrument: which, by name or path.
-        photons_per_frame: light of one spot in one frame; weak, as noise of the centroid is a line.
-        frames: averaged in one measurement.
-        trials: number of random states for each line.
-        all_together: number of random states with all causes at once.
-        angle_errors: prism (prism_180 or prism_0) -> face -> tilt about its x and y, as made.
-        disturbances: what changes, and by how much: a file of scenes/library/disturbances or of one's own. Each of its
-            causes is a line.
+    Attributes
+    ----------
+    description : Text
+        For people.
+    instrument : Ref
+        Which, by name or path.
+    photons_per_frame : Number
+        Light of one spot in one frame; weak, as noise of the centroid is a line.
+    frames : Frames
+        Averaged in one measurement.
+    trials : Whole
+        Number of random states for each line.
+    all_together : Whole
+        Number of random states with all causes at once.
+    angle_errors : AngleErrors
+        Prism (prism_180 or prism_0) -> face -> tilt about its x and y, as made.
+    disturbances : Ref
+        What changes, and by how much: a file of scenes/library/disturbances or of one's own. Each of its causes is a
+        line.
     """
 
     description: Text = ""

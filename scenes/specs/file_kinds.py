@@ -59,13 +59,19 @@ def kinds_of(data: Any) -> tuple[FileKind, ...]:
 def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Given:
     """What ``resolve`` makes of the file that was given to a command.
 
-    Args:
-        command: as the user calls it, ``twin.lab focus``.
-        file: given to it.
-        resolve: raises InputError.
+    Parameters
+    ----------
+    command : str
+        As the user calls it, ``twin.lab focus``.
+    file : Path
+        Given to it.
+    resolve : Callable[[Path], Given]
+        Raises InputError.
 
-    Raises:
-        InputError: as ``resolve``; for a file of another kind it says what the file is and which command reads it.
+    Raises
+    ------
+    InputError
+        As ``resolve``; for a file of another kind it says what the file is and which command reads it.
     """
     try:
         return resolve(file)

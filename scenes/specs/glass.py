@@ -42,15 +42,22 @@ def glass_entry(glass: CatalogueGlass) -> dict[str, Any]:
 class LensGlassSpec(Spec):
     """A glass whose index is known by wavelength, at 20 C.
 
-    Attributes:
-        name: of the catalogue (`N-BK7`, `N-SF11`, `S-FPL53`, `FCD1`, `H-K9L`, ...), or any name beside a formula.
-        formula: number of the dispersion formula as AGF catalogues have it (1 Schott, 2 Sellmeier 1, ...).
-        coefficients: of it, for micrometres, in the catalogue's order; for Sellmeier's B1, C1, B2, C2, B3, C3.
-        range: wavelengths between which it holds, metres.
-        expansion: linear, 1/K, mean of -30..70 C as the ED line of AGF catalogues has it; that of the twin's material
-            of the same name when left out, else unknown, and the lens is not warmed.
-        thermal: Schott's constants D0, D1, D2, E0, E1 and Lambda_TK of dn/dT, in the units of data sheets, as the TD
-            line of AGF catalogues has them; those of the catalogue when left out, else unknown.
+    Attributes
+    ----------
+    name : Text
+        Of the catalogue (`N-BK7`, `N-SF11`, `S-FPL53`, `FCD1`, `H-K9L`, ...), or any name beside a formula.
+    formula : Whole | None
+        Number of the dispersion formula as AGF catalogues have it (1 Schott, 2 Sellmeier 1, ...).
+    coefficients : tuple[Number, ...] | None
+        Of it, for micrometres, in the catalogue's order; for Sellmeier's B1, C1, B2, C2, B3, C3.
+    range : WavelengthRange | None
+        Wavelengths between which it holds, metres.
+    expansion : float | None
+        Linear, 1/K, mean of -30..70 C as the ED line of AGF catalogues has it; that of the twin's material of the same
+        name when left out, else unknown, and the lens is not warmed.
+    thermal : tuple[Number, ...] | None
+        Schott's constants D0, D1, D2, E0, E1 and Lambda_TK of dn/dT, in the units of data sheets, as the TD line of AGF
+        catalogues has them; those of the catalogue when left out, else unknown.
     """
 
     name: Text
@@ -89,12 +96,17 @@ class LensGlassSpec(Spec):
     def index(self, wavelength: float, medium: Medium) -> float:
         """Refractive index at 20 C.
 
-        Args:
-            wavelength: metres.
-            medium: what the index is against: ``air`` of 20 C and 1013 hPa, as makers state it, or ``vacuum``.
+        Parameters
+        ----------
+        wavelength : float
+            metres.
+        medium : Medium
+            What the index is against: ``air`` of 20 C and 1013 hPa, as makers state it, or ``vacuum``.
 
-        Raises:
-            ValueError: the formula does not hold at that wavelength.
+        Raises
+        ------
+        ValueError
+            The formula does not hold at that wavelength.
         """
         if self.formula is None or self.coefficients is None or self.range is None:
             own = glass(self.name)
@@ -105,12 +117,17 @@ class LensGlassSpec(Spec):
     def warm(self, wavelength: float, medium: Medium) -> WarmGlass:
         """What heat does to the glass in light of a wavelength, metres.
 
-        Args:
-            wavelength: metres.
-            medium: as of ``index``. What the lens stands in is not warmed.
+        Parameters
+        ----------
+        wavelength : float
+            metres.
+        medium : Medium
+            As of ``index``. What the lens stands in is not warmed.
 
-        Raises:
-            ValueError: neither the catalogue nor the file says how it expands, or how its index changes.
+        Raises
+        ------
+        ValueError
+            Neither the catalogue nor the file says how it expands, or how its index changes.
         """
         own = None if self.formula is not None else glass(self.name)
         stuff = None if own is None else MATERIALS.get(own.name)

@@ -64,13 +64,19 @@ def channel_of(path: str) -> tuple[str, str] | None:
 class Channel:
     """One monitor channel of one camera.
 
-    Attributes:
-        camera, name: e.g. ``forward``, ``left``: the camera's and its own; those of a plain pair are
-            ``left`` (the +Y end of the line) and ``right``.
-        pinhole, ccd: positions in the focal plane's X, Y, metres.
-        pupil_offset: of its beam's middle in the entrance pupil, X and Y, metres.
-        aperture: diameter of its return face, metres.
-        photons: that its spot gets in a frame.
+    Attributes
+    ----------
+    camera, name : str
+        e.g. ``forward``, ``left``: the camera's and its own; those of a plain pair are ``left`` (the +Y end of the
+        line) and ``right``.
+    pinhole, ccd : tuple[float, float]
+        Positions in the focal plane's X, Y, metres.
+    pupil_offset : tuple[float, float]
+        Of its beam's middle in the entrance pupil, X and Y, metres.
+    aperture : float
+        Diameter of its return face, metres.
+    photons : float
+        That its spot gets in a frame.
     """
 
     camera: str
@@ -157,16 +163,23 @@ def check_made(made_of: str, reflector: Reflector) -> None:
 class Prism180Spec(Spec):
     """The lateral-transfer prism: three mutually perpendicular faces send the beam back parallel to itself.
 
-    Attributes:
-        material: its glass; of a kind without glass the material of its frame and mirrors.
-        distance: from the camera's origin to its window, along the line of sight, metres.
-        width: of the clear apertures across the beam, metres; somewhat more than the return face's.
-        tilt: turn about its own x and y from where its faces stand square to the beam, about its null point, radians.
-            It leaves the beam's direction alone and sends the reflections off its faces past the area CCD.
-        angle_errors: face -> tilt about the face's own x and y, radians, as made. Faces: window, mirror, roof_a,
-            roof_b; of the hollow kind mirror, roof_a, roof_b.
-        kind: what stands in its place, by its name among ``REFLECTORS``: the prism (lateral_transfer) when nothing is
-            said, or three mirrors on a frame (hollow_transfer).
+    Attributes
+    ----------
+    material : MadeOf
+        Its glass; of a kind without glass the material of its frame and mirrors.
+    distance : PositiveLength
+        From the camera's origin to its window, along the line of sight, metres.
+    width : PositiveLength
+        Of the clear apertures across the beam, metres; somewhat more than the return face's.
+    tilt : Tilt
+        Turn about its own x and y from where its faces stand square to the beam, about its null point, radians. It
+        leaves the beam's direction alone and sends the reflections off its faces past the area CCD.
+    angle_errors : FaceErrors
+        Face -> tilt about the face's own x and y, radians, as made. Faces: window, mirror, roof_a, roof_b; of the
+        hollow kind mirror, roof_a, roof_b.
+    kind : str | None
+        What stands in its place, by its name among ``REFLECTORS``: the prism (lateral_transfer) when nothing is said,
+        or three mirrors on a frame (hollow_transfer).
     """
 
     material: MadeOf
@@ -191,16 +204,24 @@ class Prism180Spec(Spec):
 class Prism0Spec(Spec):
     """The rhomboid: two parallel reflecting faces displace the beam and keep its direction.
 
-    Attributes:
-        material: its glass; of a kind without glass the material of its frame and mirrors.
-        distance: from the return face to its centre, along the beam, metres.
-        shift: by how much it displaces the beam, toward the central prism, metres.
-        width: of the clear apertures across the beam, metres.
-        tilt: turn about its own x and y from where its faces stand square to the beam, about its middle, radians.
-        angle_errors: face -> tilt, as for the 180-deg prism. Faces: entry, mirror_a, mirror_b, exit; of the periscope
-            mirror_a, mirror_b.
-        kind: what stands in its place, by its name among ``REFLECTORS``: the prism (rhomboid) when nothing is said, or
-            two mirrors on a frame (periscope).
+    Attributes
+    ----------
+    material : MadeOf
+        Its glass; of a kind without glass the material of its frame and mirrors.
+    distance : PositiveLength
+        From the return face to its centre, along the beam, metres.
+    shift : PositiveLength
+        By how much it displaces the beam, toward the central prism, metres.
+    width : PositiveLength
+        Of the clear apertures across the beam, metres.
+    tilt : Tilt
+        Turn about its own x and y from where its faces stand square to the beam, about its middle, radians.
+    angle_errors : FaceErrors
+        Face -> tilt, as for the 180-deg prism. Faces: entry, mirror_a, mirror_b, exit; of the periscope mirror_a,
+        mirror_b.
+    kind : str | None
+        What stands in its place, by its name among ``REFLECTORS``: the prism (rhomboid) when nothing is said, or two
+        mirrors on a frame (periscope).
     """
 
     material: MadeOf
@@ -230,11 +251,16 @@ class CentralPrismSpec(Spec):
     """The central prism, the common reference of all cameras: a block with one mirror facet per channel, which meet in
     its apex.
 
-    Attributes:
-        position: of the apex in the base frame, metres.
-        material: of the block.
-        spread: how far from the apex the beams meet their facets, along the base's X and Y, metres.
-        height: of the block below the apex, metres.
+    Attributes
+    ----------
+    position : Vector3
+        Of the apex in the base frame, metres.
+    material : GlassName
+        Of the block.
+    spread : Spread
+        How far from the apex the beams meet their facets, along the base's X and Y, metres.
+    height : PositiveLength
+        Of the block below the apex, metres.
     """
 
     position: Vector3
@@ -255,9 +281,12 @@ Frames = Annotated[Whole, Field(ge=1, le=MOST_FRAMES)]
 class ReticleSpec(Spec):
     """The light source of a monitor channel: a lit pinhole in the focal plane.
 
-    Attributes:
-        pinhole: diameter, metres.
-        photons_per_frame: expected number of photons of one spot that reach the area CCD's plane during one exposure.
+    Attributes
+    ----------
+    pinhole : PositiveLength
+        Diameter, metres.
+    photons_per_frame : Photons
+        Expected number of photons of one spot that reach the area CCD's plane during one exposure.
     """
 
     pinhole: PositiveLength
@@ -267,13 +296,20 @@ class ReticleSpec(Spec):
 class AreaCcdSpec(Spec):
     """The area CCD of a monitor channel.
 
-    Attributes:
-        detector: its data sheet, by name or path.
-        rows: number of pixel rows.
-        columns: number of pixel columns.
-        pitch: of the pixels, metres.
-        offset: (X, Y) from the pinhole to the centre of the pixel grid, in the focal plane, metres.
-        exposure: of a frame, seconds.
+    Attributes
+    ----------
+    detector : Ref
+        Its data sheet, by name or path.
+    rows : AreaSide
+        Number of pixel rows.
+    columns : AreaSide
+        Number of pixel columns.
+    pitch : PixelPitch
+        Of the pixels, metres.
+    offset : Vector2
+        (X, Y) from the pinhole to the centre of the pixel grid, in the focal plane, metres.
+    exposure : Exposure
+        Of a frame, seconds.
     """
 
     detector: Ref
@@ -287,11 +323,16 @@ class AreaCcdSpec(Spec):
 class AreaCcdChoiceSpec(Spec):
     """An area CCD that the monitor may have: pixels of another size are another detector, with a data sheet of its own.
 
-    Attributes:
-        detector: its data sheet, by name or path.
-        pitch: of its pixels, metres.
-        rows: number of pixel rows.
-        columns: number of pixel columns.
+    Attributes
+    ----------
+    detector : Ref
+        Its data sheet, by name or path.
+    pitch : PixelPitch
+        Of its pixels, metres.
+    rows : AreaSide
+        Number of pixel rows.
+    columns : AreaSide
+        Number of pixel columns.
     """
 
     detector: Ref
@@ -312,14 +353,22 @@ class ChannelSpec(Spec):
     """One channel of a camera's monitor, where a camera has others than the plain pair; what is left out is the
     monitor's.
 
-    Attributes:
-        field: angle from the visual axis at which its area CCD stands, positive at the +Y end of the line, radians.
-        pupil_offset: centre (X, Y) of its beam in the entrance pupil, metres.
-        return_face: the mirror that returns its beam, and limits it.
-        spread: how far from the central prism's apex its beam meets its facet, along the base's X and Y, metres.
-        photons_per_frame: of its spot.
-        prism_180: its lateral-transfer prism.
-        prism_0: its rhomboid.
+    Attributes
+    ----------
+    field : FieldPlace
+        Angle from the visual axis at which its area CCD stands, positive at the +Y end of the line, radians.
+    pupil_offset : Vector2
+        Centre (X, Y) of its beam in the entrance pupil, metres.
+    return_face : ReturnFaceSpec | None
+        The mirror that returns its beam, and limits it.
+    spread : Spread | None
+        How far from the central prism's apex its beam meets its facet, along the base's X and Y, metres.
+    photons_per_frame : Photons | None
+        Of its spot.
+    prism_180 : Prism180Spec | None
+        Its lateral-transfer prism.
+    prism_0 : Prism0Spec | None
+        Its rhomboid.
     """
 
     field: FieldPlace
@@ -353,13 +402,19 @@ class MountedCameraSpec(Spec):
     """A camera in its place on the base, with the channels of its monitor: a plain pair at both ends of the line,
     through the same part of the pupil, or any number of channels; none in an instrument without a monitor.
 
-    Attributes:
-        camera: which camera, by name or path.
-        look: angle of its visual axis from the base's +Z, about the base's Y, positive forward (toward +X), radians.
-        position: of the camera's origin in the base frame, metres.
-        pupil_offset: centre (X, Y) of a plain pair's sub-aperture in the entrance pupil, metres.
-        channels: by name, in place of a plain pair. The printed formulas are about a pair at opposite fields called
-            left and right; a camera without such a pair is measured by the estimators that take all spots.
+    Attributes
+    ----------
+    camera : Ref
+        Which camera, by name or path.
+    look : LookAngle
+        Angle of its visual axis from the base's +Z, about the base's Y, positive forward (toward +X), radians.
+    position : Vector3
+        Of the camera's origin in the base frame, metres.
+    pupil_offset : Vector2 | None
+        Centre (X, Y) of a plain pair's sub-aperture in the entrance pupil, metres.
+    channels : Named[ChannelSpec] | None
+        By name, in place of a plain pair. The printed formulas are about a pair at opposite fields called left and
+        right; a camera without such a pair is measured by the estimators that take all spots.
     """
 
     camera: Ref
@@ -387,12 +442,18 @@ class MaterialsSpec(Spec):
     """What the parts are made of, by name in the catalogue of optics/materials/material.py; prisms name their own
     glass.
 
-    Attributes:
-        base: the common structure.
-        camera: each camera's structure, with the monitor's brackets.
-        mirror: all mirrors.
-        focal_plane: what carries the line CCD.
-        board: what carries reticle and area CCD at each end of it.
+    Attributes
+    ----------
+    base : MaterialName
+        The common structure.
+    camera : MaterialName
+        Each camera's structure, with the monitor's brackets.
+    mirror : MaterialName
+        All mirrors.
+    focal_plane : MaterialName
+        What carries the line CCD.
+    board : MaterialName
+        What carries reticle and area CCD at each end of it.
     """
 
     base: MaterialName = "CFRP"
@@ -405,15 +466,24 @@ class MaterialsSpec(Spec):
 class MonitorSpec(Spec):
     """The autocollimation monitor, alike in all cameras and in both channels of each.
 
-    Attributes:
-        wavelength: of the source, metres.
-        field: angle from the visual axis at which the area CCDs stand, left at +Y and right at -Y, radians.
-        reticle: light source.
-        area_ccd: detector.
-        prism_180: the lateral-transfer prism of every channel.
-        prism_0: the rhomboid of every channel.
-        return_face: what sends the light back.
-        frames: number of frames in one measurement.
+    Attributes
+    ----------
+    wavelength : Wavelength
+        Of the source, metres.
+    field : float
+        Angle from the visual axis at which the area CCDs stand, left at +Y and right at -Y, radians.
+    reticle : ReticleSpec
+        Light source.
+    area_ccd : AreaCcdSpec
+        detector.
+    prism_180 : Prism180Spec
+        The lateral-transfer prism of every channel.
+    prism_0 : Prism0Spec
+        The rhomboid of every channel.
+    return_face : ReturnFaceSpec
+        What sends the light back.
+    frames : Frames
+        Number of frames in one measurement.
     """
 
     wavelength: Wavelength
@@ -434,20 +504,31 @@ class MonitorSpec(Spec):
 class InstrumentSpec(TitledSpec):
     """Cameras on a common base, each with its monitor, or all without one.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        cameras: by name; the first is the reference for the change of the intersection angle.
-        central_prism: common reference of the monitor.
-        monitor: of every camera; left out, with the central prism, where there is none.
-        temperature: at which everything has its nominal shape, kelvin.
-        materials: what the parts are made of.
-        baffles: by name; none by default.
-        altitude: of its orbit, metres; for what changes of a pair's cameras do to points on the ground.
-        disturbances: what is expected to move, unless a job says otherwise: a file of scenes/library/disturbances or of
-            one's own.
-        as_built: node -> how it stands and is shaped against all else that the file says, as in a job's `perturb`. What
-            a job perturbs comes on top of it, and changes count from it.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    cameras : Named[MountedCameraSpec]
+        By name; the first is the reference for the change of the intersection angle.
+    central_prism : CentralPrismSpec | None
+        Common reference of the monitor.
+    monitor : MonitorSpec | None
+        Of every camera; left out, with the central prism, where there is none.
+    temperature : float
+        At which everything has its nominal shape, kelvin.
+    materials : MaterialsSpec
+        What the parts are made of.
+    baffles : Named[BaffleSpec]
+        By name; none by default.
+    altitude : float | None
+        Of its orbit, metres; for what changes of a pair's cameras do to points on the ground.
+    disturbances : Ref | None
+        What is expected to move, unless a job says otherwise: a file of scenes/library/disturbances or of one's own.
+    as_built : AsBuilt | None
+        Node -> how it stands and is shaped against all else that the file says, as in a job's `perturb`. What a job
+        perturbs comes on top of it, and changes count from it.
     """
 
     cameras: Annotated[Named[MountedCameraSpec], Field(min_length=1)]
@@ -482,9 +563,12 @@ class InstrumentSpec(TitledSpec):
     def of_camera(cls, name: str, camera: str) -> InstrumentSpec:
         """A camera by itself as an instrument: on the base, without a look angle and without a monitor.
 
-        Args:
-            name: of the camera, and of the instrument.
-            camera: which camera, by name or path.
+        Parameters
+        ----------
+        name : str
+            Of the camera, and of the instrument.
+        camera : str
+            Which camera, by name or path.
         """
         site = MountedCameraSpec.model_construct(camera=camera, look=0.0, position=(0.0, 0.0, 0.0))
         return cls.model_construct(name=name, cameras=FrozenMap({name: site}))
@@ -493,8 +577,10 @@ class InstrumentSpec(TitledSpec):
     def autocollimator(self) -> MonitorSpec:
         """The monitor of an instrument that has one.
 
-        Raises:
-            InputError: it has none.
+        Raises
+        ------
+        InputError
+            It has none.
         """
         if self.monitor is None:
             raise self._without_monitor()
@@ -515,10 +601,14 @@ class InstrumentSpec(TitledSpec):
         """Where the file says something of a channel: at the channel itself if it does there, else where it says it of
         all.
 
-        Args:
-            camera: its name; one that is not in the file changes nothing.
-            channel: its name, likewise.
-            key: where it says it of all, e.g. ``("monitor", "prism_180", "width")``.
+        Parameters
+        ----------
+        camera : str
+            Its name; one that is not in the file changes nothing.
+        channel : str
+            Its name, likewise.
+        key : KeyPath
+            Where it says it of all, e.g. ``("monitor", "prism_180", "width")``.
         """
         site = self.cameras.get(camera)
         if site is None or site.channels is None or channel not in site.channels:
@@ -540,8 +630,10 @@ class InstrumentSpec(TitledSpec):
     def channels_of(self, camera: str) -> dict[str, ChannelParts]:
         """All channels of a camera's monitor, by name; none where there is no monitor.
 
-        Args:
-            camera: its name.
+        Parameters
+        ----------
+        camera : str
+            Its name.
         """
         site = self.cameras[camera]
         if self.monitor is None or self.central_prism is None:
@@ -573,16 +665,22 @@ DESIGN = "design"
 class AsBuiltInstrumentSpec(TitledSpec):
     """An instrument as it was built: the instrument of a design, and how its bodies stand and are shaped against that.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        design: the instrument of the drawing: name of one in scenes/library/instruments, or path of an own file. A
-            camera, as `{camera: NAME or FILE}` or named like an instrument, is one without a monitor.
-        as_built: node -> how it stands and is shaped against the drawing, as in a job's `perturb`, by the node's path
-            or the last parts of it; or a list of texts such as `M2 shift z 20 um`. What a job perturbs comes on top of
-            it, and changes count from it.
-        disturbances: what is expected to move, or how well it is known how the bodies stand: a file of
-            scenes/library/disturbances or of one's own; the design's by default.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    design : Ref
+        The instrument of the drawing: name of one in scenes/library/instruments, or path of an own file. A camera, as
+        `{camera: NAME or FILE}` or named like an instrument, is one without a monitor.
+    as_built : AsBuilt
+        Node -> how it stands and is shaped against the drawing, as in a job's `perturb`, by the node's path or the last
+        parts of it; or a list of texts such as `M2 shift z 20 um`. What a job perturbs comes on top of it, and changes
+        count from it.
+    disturbances : Ref | None
+        What is expected to move, or how well it is known how the bodies stand: a file of scenes/library/disturbances or
+        of one's own; the design's by default.
     """
 
     design: Ref
@@ -592,9 +690,12 @@ class AsBuiltInstrumentSpec(TitledSpec):
     def made_of(self, design: InstrumentSpec, disturbances: str | None = None) -> InstrumentSpec:
         """The instrument that this one is.
 
-        Args:
-            design: what `design` names.
-            disturbances: name or absolute path of the file of disturbances; None for the design's.
+        Parameters
+        ----------
+        design : InstrumentSpec
+            What `design` names.
+        disturbances : str | None
+            Name or absolute path of the file of disturbances; None for the design's.
         """
         update: dict[str, Any] = {"name": self.name, "as_built": self.as_built}
         update |= {} if not self.description else {"description": self.description}
@@ -605,12 +706,16 @@ class AsBuiltInstrumentSpec(TitledSpec):
 def as_built_of(state: State) -> FrozenMap[str, PlainPerturbationSpec]:
     """A state of an instrument as `as_built` has it.
 
-    Args:
-        state: body path -> motion, for example what `optics.geometry.tree.compose` makes of the state that was found
-            and of the one that the file has already. Bodies at rest are left out.
+    Parameters
+    ----------
+    state : State
+        Body path -> motion, for example what `optics.geometry.tree.compose` makes of the state that was found and of
+        the one that the file has already. Bodies at rest are left out.
 
-    Raises:
-        ValueError: a motion that no file can say: with a scale, a stretch, a gradient of the index or a grid.
+    Raises
+    ------
+    ValueError
+        a motion that no file can say: with a scale, a stretch, a gradient of the index or a grid.
     """
     return FrozenMap({path: _built(path, motion) for path, motion in state.items() if motion != Motion()})
 
@@ -641,17 +746,25 @@ def as_built_file(
     """Text of the file of an instrument as it was built; `scenes.specs.load.load_instrument` reads it back to exactly
     this state.
 
-    Args:
-        name: of the instrument.
-        design: name or path of the instrument of the drawing, as the file is to say it, or what its file says.
-        state: body path -> motion against the drawing.
-        disturbances: name of a file of disturbances, or its path from where the file is going to stand; None for those
-            of the design.
-        description: for people.
-        remark: at the top of the file, lines of comment.
+    Parameters
+    ----------
+    name : str
+        Of the instrument.
+    design : str | dict[str, Any]
+        Name or path of the instrument of the drawing, as the file is to say it, or what its file says.
+    state : State
+        Body path -> motion against the drawing.
+    disturbances : str | None
+        Name of a file of disturbances, or its path from where the file is going to stand; None for those of the design.
+    description : str
+        For people.
+    remark : str
+        At the top of the file, lines of comment.
 
-    Raises:
-        ValueError: as ``as_built_of``.
+    Raises
+    ------
+    ValueError
+        As ``as_built_of``.
     """
     spec = AsBuiltInstrumentSpec.model_construct(
         name=name, description=description, design=name, as_built=as_built_of(state), disturbances=disturbances

@@ -42,12 +42,17 @@ White = Annotated[float, Quantity(SCALE, smallest="0.1 percent", largest="100 pe
 class TargetsSpec(Spec):
     """How the test targets are turned and exposed.
 
-    Attributes:
-        angle: of the knife edge against the pixel columns or rows, radians.
-        region: side of the recorded images, pixels.
-        white: signal of a wide bright area in each frame, as a share of the full well, through a free pupil; what
-            bodies in the beam take is missing.
-        frames: number of frames, None for as many as there are of the spots.
+    Attributes
+    ----------
+    angle : EdgeAngle
+        Of the knife edge against the pixel columns or rows, radians.
+    region : Whole
+        Side of the recorded images, pixels.
+    white : White
+        Signal of a wide bright area in each frame, as a share of the full well, through a free pupil; what bodies in
+        the beam take is missing.
+    frames : Frames | None
+        Number of frames, None for as many as there are of the spots.
     """
 
     angle: EdgeAngle = float(np.radians(5.0))
@@ -60,19 +65,31 @@ class PerturbationSpec(PlainPerturbationSpec):
     """What happens to one body of a job's instrument: also temperatures at nodes and, for a mirror or a prism's face,
     displaced nodes of a finite-element program. The other motions come on top of these.
 
-    Attributes:
-        rotate: rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
-        shift: in the body's own frame, metres.
-        pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
-        figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
-        scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
-        radius: relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
-        conic: change of the conic constant, a pure number.
-        index: change of the refractive index of the lens that begins at this face, a pure number.
-        abbe: relative change of the Abbe number of the lens that begins at this face; its index at the d line stays.
-        temperature: uniform change as `2 K`, with a gradient, or a table of temperatures at nodes, in place of what the
-            body inherits from the one that carries it, also where the change is `0 K`; None for what it inherits.
-        deformation: the table of displaced nodes, or a mesh; None for none.
+    Attributes
+    ----------
+    rotate
+        Rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
+    shift
+        In the body's own frame, metres.
+    pivot
+        Name of the body's point that the rotation leaves in place and that the scale change starts from.
+    figure
+        Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
+    scale
+        Relative growth of the body and all it carries, 1e-6 for 1 ppm.
+    radius
+        Relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
+    conic
+        Change of the conic constant, a pure number.
+    index
+        Change of the refractive index of the lens that begins at this face, a pure number.
+    abbe
+        Relative change of the Abbe number of the lens that begins at this face; its index at the d line stays.
+    temperature : job_tables.TableTemperature | None
+        Uniform change as `2 K`, with a gradient, or a table of temperatures at nodes, in place of what the body
+        inherits from the one that carries it, also where the change is `0 K`; None for what it inherits.
+    deformation : job_tables.Deformation | None
+        The table of displaced nodes, or a mesh; None for none.
     """
 
     temperature: job_tables.TableTemperature | None = None
@@ -115,9 +132,12 @@ def _some(images: tuple[str, ...]) -> tuple[str, ...]:
 class StraySpec(Spec):
     """Path tracing of ghosts and stray light.
 
-    Attributes:
-        paths: from every source.
-        finishes: measured BSDFs and coatings of surfaces in place of the built-in finishes.
+    Attributes
+    ----------
+    paths : Whole
+        From every source.
+    finishes : job_tables.FinishesSpec | None
+        Measured BSDFs and coatings of surfaces in place of the built-in finishes.
     """
 
     paths: Annotated[Whole, Field(ge=10_000, le=1_000_000_000)] = 1_000_000
@@ -132,15 +152,23 @@ def _switch(value: Any) -> Any:
 class RenderSpec(Spec):
     """What is rendered.
 
-    Attributes:
-        images: which images: the monitor's spots, which are always among them, and test targets on the line CCDs.
-        targets: how the test targets are turned and exposed, None for the defaults.
-        stray: whether ghosts and stray light are path-traced and added: true, or the number of paths.
-        quality: whether wavefront errors, defocus and MTF on the line CCDs are worked out.
-        obstruction: `traced`: what prisms, baffles and other bodies take of the cameras' beams is missing in image
-            quality and targets; `ignore`: their pupils are free.
-        frames: number of frames, None for as many as the instrument's monitor takes.
-        seed: of every random number in the job.
+    Attributes
+    ----------
+    images : tuple[str, ...]
+        Which images: the monitor's spots, which are always among them, and test targets on the line CCDs.
+    targets : TargetsSpec | None
+        How the test targets are turned and exposed, None for the defaults.
+    stray : StraySpec | None
+        Whether ghosts and stray light are path-traced and added: true, or the number of paths.
+    quality : Flag
+        Whether wavefront errors, defocus and MTF on the line CCDs are worked out.
+    obstruction : Literal['traced', 'ignore']
+        `traced`: what prisms, baffles and other bodies take of the cameras' beams is missing in image quality and
+        targets; `ignore`: their pupils are free.
+    frames : Frames | None
+        Number of frames, None for as many as the instrument's monitor takes.
+    seed : Seed
+        Of every random number in the job.
     """
 
     images: Annotated[tuple[Annotated[str, OneOf(lambda: ("spots", *target_names()))], ...], AfterValidator(_some)] = (
@@ -184,10 +212,14 @@ def pivot_problem(
 ) -> Problem | None:
     """What is wrong where a course turns a node about another pivot than the perturbation that it is added to.
 
-    Args:
-        perturb: of the job.
-        course: with its motions.
-        within: where the course stands.
+    Parameters
+    ----------
+    perturb : Mapping[str, PlainPerturbationSpec]
+        Of the job.
+    course : CourseSpec
+        With its motions.
+    within : KeyPath
+        Where the course stands.
     """
     for path, moves in course.motion.items():
         own = perturb.get(path)
@@ -200,16 +232,23 @@ def pivot_problem(
 class JobSpec(Spec):
     """A job.
 
-    Attributes:
-        instrument: name of an instrument in scenes/library/instruments, or path of an own file, relative to the job's
-            file. A camera, as `{camera: NAME or FILE}` or named like an instrument, is one without a monitor.
-        perturb: node -> perturbation, by the node's path or the last parts of it; or a list of texts such as
-            `M2 shift z 20 um`. Empty for the nominal state.
-        course: temperatures and motions that change with time, None for a single state.
-        disturbances: what is expected to move, on which the sigmas rest: a file, or changes of single lines of it; the
-            instrument's own by default, `none` for the noise alone.
-        render: what is rendered.
-        analysis: how it is analysed.
+    Attributes
+    ----------
+    instrument : Ref
+        Name of an instrument in scenes/library/instruments, or path of an own file, relative to the job's file. A
+        camera, as `{camera: NAME or FILE}` or named like an instrument, is one without a monitor.
+    perturb : Paths[PerturbationSpec]
+        Node -> perturbation, by the node's path or the last parts of it; or a list of texts such as `M2 shift z 20 um`.
+        Empty for the nominal state.
+    course : CourseSpec | None
+        Temperatures and motions that change with time, None for a single state.
+    disturbances : JobDisturbances | None
+        What is expected to move, on which the sigmas rest: a file, or changes of single lines of it; the instrument's
+        own by default, `none` for the noise alone.
+    render : RenderSpec
+        What is rendered.
+    analysis : AnalysisSpec
+        How it is analysed.
     """
 
     instrument: Ref
@@ -264,8 +303,10 @@ def with_tables(job: JobSpec) -> JobSpec:
     """The job with the contents of its course's table, and the full paths and checksums of its other tables: of nodes
     that deform or warm its bodies, of finishes.
 
-    Raises:
-        InputError: a table that cannot be read or is not the one of the checksum.
+    Raises
+    ------
+    InputError
+        a table that cannot be read or is not the one of the checksum.
     """
     job = _with_course(job)
     changed = {}
@@ -288,15 +329,22 @@ def with_tables(job: JobSpec) -> JobSpec:
 def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
     """Check that every perturbed node exists, has the named pivot and allows what is done to it.
 
-    Args:
-        job: as loaded.
-        nodes: node path -> what may be done to it, for all bodies of the instrument.
+    Parameters
+    ----------
+    job : JobSpec
+        As loaded.
+    nodes : Mapping[str, NodeInfo]
+        Node path -> what may be done to it, for all bodies of the instrument.
 
-    Returns:
+    Returns
+    -------
+    JobSpec
         The job with the paths of nodes in place of their short names.
 
-    Raises:
-        InputError: one issue for each fault, with the nearest valid name.
+    Raises
+    ------
+    InputError
+        One issue for each fault, with the nearest valid name.
     """
     perturb = in_full(job.perturb, nodes, lambda problem, name: job.issue(problem, ("perturb", name)))
     if perturb != job.perturb:

@@ -31,9 +31,12 @@ class TemperatureSpec(Spec):
     """A change of a body's temperature, and of all it carries that has none of its own: change + gradient . r. It
     stands in place of what the body would inherit, and no change does, too.
 
-    Attributes:
-        change: at the body's origin, kelvin.
-        gradient: in the body's own frame, K/m.
+    Attributes
+    ----------
+    change : TemperatureChange
+        At the body's origin, kelvin.
+    gradient : TemperatureGradient
+        In the body's own frame, K/m.
     """
 
     change: TemperatureChange = 0.0
@@ -53,17 +56,26 @@ class TemperatureSpec(Spec):
 class TableTemperatureSpec(TemperatureSpec):
     """A change of a body's temperature: change + gradient . r, to which a table of nodes is added.
 
-    Attributes:
-        change: at the body's origin, kelvin.
-        gradient: in the body's own frame, K/m.
-        table: CSV file with the columns x, y, z and T (absolute, `T [degC]` or `T [K]`) or dT (`dT [K]`, changes from
-            the instrument's temperature), or a mesh (.vtu, .vtk, .msh, .med) with temperatures at its nodes; relative
-            to this file.
-        frame: path of the body in whose nominal frame the nodes are told; by default the warmed one.
-        values: of a mesh: whether its numbers are changes in kelvin (`change`) or absolute temperatures (`K`, `degC`).
-        unit: of a mesh's coordinates, whose file has none.
-        field: name of the temperatures in a mesh; needed when it has several numbers at its nodes.
-        sha256: checksum of the table, which is filled in when it is read: another table is then refused.
+    Attributes
+    ----------
+    change
+        At the body's origin, kelvin.
+    gradient
+        In the body's own frame, K/m.
+    table : Reference | None
+        CSV file with the columns x, y, z and T (absolute, `T [degC]` or `T [K]`) or dT (`dT [K]`, changes from the
+        instrument's temperature), or a mesh (.vtu, .vtk, .msh, .med) with temperatures at its nodes; relative to this
+        file.
+    frame : Reference | None
+        Path of the body in whose nominal frame the nodes are told; by default the warmed one.
+    values : Literal['change', 'K', 'degC'] | None
+        Of a mesh: whether its numbers are changes in kelvin (`change`) or absolute temperatures (`K`, `degC`).
+    unit : MeshUnit | None
+        Of a mesh's coordinates, whose file has none.
+    field : Text | None
+        Name of the temperatures in a mesh; needed when it has several numbers at its nodes.
+    sha256 : Checksum | None
+        Checksum of the table, which is filled in when it is read: another table is then refused.
     """
 
     table: Reference | None = None
@@ -107,14 +119,21 @@ TableTemperature = Annotated[TableTemperatureSpec, ZERO_IS_NONE, _uniform, Befor
 class DeformationSpec(Spec):
     """Displaced nodes of a finite-element program, on a mirror's optical surface or a face.
 
-    Attributes:
-        table: CSV file with the columns x, y, z, dx, dy and dz, units in its heads, or a mesh (.vtu, .vtk, .msh, .med)
-            that has displacements at its nodes; relative to this file.
-        frame: path of the body in whose nominal frame nodes and displacements are told; by default the deformed one.
-        terms: highest Zernike term of the figure, by Noll's numbering; a grid holds the rest.
-        unit: of a mesh, whose file has none.
-        field: name of the displacements in a mesh; needed when it has several vectors at its nodes.
-        sha256: checksum of the table, which is filled in when it is read: another table is then refused.
+    Attributes
+    ----------
+    table : Reference
+        CSV file with the columns x, y, z, dx, dy and dz, units in its heads, or a mesh (.vtu, .vtk, .msh, .med) that
+        has displacements at its nodes; relative to this file.
+    frame : Reference | None
+        Path of the body in whose nominal frame nodes and displacements are told; by default the deformed one.
+    terms : Whole
+        Highest Zernike term of the figure, by Noll's numbering; a grid holds the rest.
+    unit : MeshUnit | None
+        Of a mesh, whose file has none.
+    field : Text | None
+        Name of the displacements in a mesh; needed when it has several vectors at its nodes.
+    sha256 : Checksum | None
+        Checksum of the table, which is filled in when it is read: another table is then refused.
     """
 
     table: Reference
@@ -134,13 +153,19 @@ TableSpec = TypeVar("TableSpec", DeformationSpec, TableTemperatureSpec)
 def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
     """Fill in the table's full path and checksum, when it can be read.
 
-    Args:
-        owner: the specification that names it, which knows its file.
-        key: of the deformation or the temperature in there.
-        spec: as read, with a table.
+    Parameters
+    ----------
+    owner : Spec
+        The specification that names it, which knows its file.
+    key : KeyPath
+        Of the deformation or the temperature in there.
+    spec : TableSpec
+        As read, with a table.
 
-    Raises:
-        InputError: no such table, one that is not right, or another one than the checksum says.
+    Raises
+    ------
+    InputError
+        No such table, one that is not right, or another one than the checksum says.
     """
     heat = isinstance(spec, TableTemperatureSpec)
     assert spec.table is not None
@@ -179,9 +204,12 @@ Share = Annotated[float, Quantity(SCALE, smallest="0 percent", largest="100 perc
 class FinishTableSpec(Spec):
     """A table of a finish.
 
-    Attributes:
-        table: the file, relative to this one.
-        sha256: its checksum, which is filled in when it is read: another table is then refused.
+    Attributes
+    ----------
+    table : Reference
+        The file, relative to this one.
+    sha256 : Checksum | None
+        Its checksum, which is filled in when it is read: another table is then refused.
     """
 
     table: Reference
@@ -194,11 +222,15 @@ FinishTable = Annotated[FinishTableSpec, short_for("table", str)]
 class FinishSpec(Spec):
     """A measured finish of one kind of surface; what it does not say stays as built in.
 
-    Attributes:
-        bsdf: Zemax's tabular BSDF of the reflected light (.bsdf), in place of the scatter lobe: shares of the incident
-            light, which come out of what is reflected.
-        coating: CSV file with the columns wavelength, angle, R and, if need be, T (or Rs and Rp, Ts and Tp).
-        reflectance: share that is reflected, specular and scattered together.
+    Attributes
+    ----------
+    bsdf : FinishTable | None
+        Zemax's tabular BSDF of the reflected light (.bsdf), in place of the scatter lobe: shares of the incident light,
+        which come out of what is reflected.
+    coating : FinishTable | None
+        CSV file with the columns wavelength, angle, R and, if need be, T (or Rs and Rp, Ts and Tp).
+    reflectance : Share | None
+        Share that is reflected, specular and scattered together.
     """
 
     bsdf: FinishTable | None = None
@@ -244,11 +276,16 @@ ALLOWS: Mapping[str, tuple[str, ...]] = FrozenMap(
 class FinishesSpec(Spec):
     """Measured finishes, by kind of surface.
 
-    Attributes:
-        mirror: of the cameras' mirrors; metallised faces of prisms keep theirs.
-        black: of the backs of mirrors, boards and baffles: with a table nothing else comes back from them.
-        coated: of faces of glass that light goes through, from outside and inside.
-        detector: of CCDs; what is not reflected is recorded.
+    Attributes
+    ----------
+    mirror : Finish | None
+        Of the cameras' mirrors; metallised faces of prisms keep theirs.
+    black : Finish | None
+        Of the backs of mirrors, boards and baffles: with a table nothing else comes back from them.
+    coated : Finish | None
+        Of faces of glass that light goes through, from outside and inside.
+    detector : Finish | None
+        Of CCDs; what is not reflected is recorded.
     """
 
     mirror: Finish | None = None
@@ -290,13 +327,19 @@ class FinishesSpec(Spec):
 def checked_finishes(owner: Spec, key: KeyPath, spec: FinishesSpec) -> FinishesSpec:
     """Fill in the tables' full paths and checksums, when they can be read.
 
-    Args:
-        owner: the specification that names them, which knows its file.
-        key: of the finishes in there.
-        spec: as read.
+    Parameters
+    ----------
+    owner : Spec
+        The specification that names them, which knows its file.
+    key : KeyPath
+        Of the finishes in there.
+    spec : FinishesSpec
+        As read.
 
-    Raises:
-        InputError: no such table, one that is not right, or another one than the checksum says.
+    Raises
+    ------
+    InputError
+        No such table, one that is not right, or another one than the checksum says.
     """
     out = {}
     for (kind, what), table in spec.tables.items():

@@ -44,9 +44,10 @@ def library_names(folder: str) -> tuple[str, ...]:
 def load_job(path: str | Path) -> JobSpec:
     """Read a job. The instrument it names is looked for, not read.
 
-    Raises:
-        InputError: the file cannot be read or is not a valid job, or there is no such instrument; one issue for each
-            fault.
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not a valid job, or there is no such instrument; one issue for each fault.
     """
     job = with_tables(validate(JobSpec, read_yaml(path)))
     _instrument_file(job.instrument, job, ("instrument",))
@@ -69,14 +70,20 @@ def load_instrument(reference: str | Path, owner: Spec | None = None, key: KeyPa
     """Read an instrument. The cameras and the detector it names are looked for, not read. Of one as built the design
     is read as well, to which its errors and its paths belong.
 
-    Args:
-        reference: a name in the library, a path from the folder of the owner's file (anything with a slash or ending in
-            .yaml or .yml), or the mapping itself. Of a camera it is the instrument that consists of this camera alone.
-        owner: the specification that refers to it; None for a path from the current folder.
-        key: where the owner refers to it.
+    Parameters
+    ----------
+    reference : str | Path
+        a name in the library, a path from the folder of the owner's file (anything with a slash or ending in .yaml or
+        .yml), or the mapping itself. Of a camera it is the instrument that consists of this camera alone.
+    owner : Spec | None
+        The specification that refers to it; None for a path from the current folder.
+    key : KeyPath
+        Where the owner refers to it.
 
-    Raises:
-        InputError: as `load_job`.
+    Raises
+    ------
+    InputError
+        As `load_job`.
     """
     text = _instrument_file(reference, owner, key)
     data = text.data if isinstance(text.data, dict) else {}
@@ -126,8 +133,10 @@ def load_disturbances(reference: str | Path, owner: Spec | None = None, key: Key
 def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesSpec | None:
     """What is stated for a job: its own file or its instrument's, with the job's changes; None for nothing.
 
-    Raises:
-        InputError: there is no such file or it is not valid, or a change of what it does not have.
+    Raises
+    ------
+    InputError
+        There is no such file or it is not valid, or a change of what it does not have.
     """
     asked = job.disturbances
     owner: Spec = job
@@ -151,8 +160,10 @@ AREA_CCD: KeyPath = ("monitor", "area_ccd", "detector")
 def load_cameras(instrument: InstrumentSpec) -> FrozenMap[str, CameraSpec]:
     """The prescriptions of an instrument's cameras, by the names that its file gives them.
 
-    Raises:
-        InputError: a camera is not there or not valid, or two that are described in the file have one name.
+    Raises
+    ------
+    InputError
+        a camera is not there or not valid, or two that are described in the file have one name.
     """
     cameras: dict[str, CameraSpec] = {}
     for name, mounted in instrument.cameras.items():
@@ -188,11 +199,15 @@ def load_autocollimator_test(name_or_path: str | Path = "principle_experiment") 
 def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
     """The camera under test and the test; of a camera as built, with what was built in the test's `as_built`.
 
-    Args:
-        test: names the camera: a prescription, or an instrument as built that consists of one camera.
+    Parameters
+    ----------
+    test : TestType
+        Names the camera: a prescription, or an instrument as built that consists of one camera.
 
-    Raises:
-        InputError: as `load_instrument`; the instrument has several cameras, or both files say how a body was built.
+    Raises
+    ------
+    InputError
+        As `load_instrument`; the instrument has several cameras, or both files say how a body was built.
     """
     key = ("camera",)
     text = referred(CAMERAS, test.camera, test, key)
@@ -226,15 +241,23 @@ def load_named(
 ) -> SpecType:
     """Read a file of one folder of the library, a user's own of that kind, or the mapping in its place.
 
-    Args:
-        model: what its kind of files may say.
-        folder: of the library, for a name.
-        reference: as of `load_instrument`, likewise owner and key.
-        owner: that refers to it.
-        key: where.
+    Parameters
+    ----------
+    model : type[SpecType]
+        What its kind of files may say.
+    folder : str
+        Of the library, for a name.
+    reference : str | Path
+        As of `load_instrument`, likewise owner and key.
+    owner : Spec | None
+        That refers to it.
+    key : KeyPath
+        where.
 
-    Raises:
-        InputError: as `load_instrument`.
+    Raises
+    ------
+    InputError
+        As `load_instrument`.
     """
     return validate(model, referred(folder, reference, owner, key))
 
@@ -255,15 +278,23 @@ def referred(
 ) -> YamlFile:
     """Return what a reference leads to: the one way in which names, paths and mappings are resolved.
 
-    Args:
-        folder: of the library, for a name.
-        reference: a name there, a path from the folder of the owner's file, or the mapping itself.
-        owner: the specification that refers to it; None for a path from the current folder.
-        key: where the owner refers to it.
-        others: folders whose names may be meant by a name that is unknown, since they may stand here as well.
+    Parameters
+    ----------
+    folder : str
+        Of the library, for a name.
+    reference : str | Path
+        a name there, a path from the folder of the owner's file, or the mapping itself.
+    owner : Spec | None
+        The specification that refers to it; None for a path from the current folder.
+    key : KeyPath
+        Where the owner refers to it.
+    others : tuple[str, ...]
+        Folders whose names may be meant by a name that is unknown, since they may stand here as well.
 
-    Raises:
-        InputError: there is no such file or it cannot be read; with the line of the reference and the nearest name.
+    Raises
+    ------
+    InputError
+        There is no such file or it cannot be read; with the line of the reference and the nearest name.
     """
     if isinstance(reference, Inline):
         return reference.placed(Source() if owner is None else owner.source, key).yaml

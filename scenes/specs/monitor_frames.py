@@ -44,11 +44,16 @@ FirstPixel = tuple[Annotated[Whole, Field(ge=0, le=65535)], Annotated[Whole, Fie
 class ChannelFramesSpec(Spec):
     """The frames of one channel.
 
-    Attributes:
-        before: files of the nominal state.
-        after: files of the state to be measured; of a series one entry for each time, a file or a list of files.
-        offset: row and column of the CCD at which the frames' first pixel stands; needed for frames of a part of it.
-        offset_after: the same of the frames after, where it is another one; needed where they have another size.
+    Attributes
+    ----------
+    before : Files
+        Files of the nominal state.
+    after : tuple[Files, ...]
+        Files of the state to be measured; of a series one entry for each time, a file or a list of files.
+    offset : FirstPixel
+        Row and column of the CCD at which the frames' first pixel stands; needed for frames of a part of it.
+    offset_after : FirstPixel | None
+        The same of the frames after, where it is another one; needed where they have another size.
     """
 
     before: Files
@@ -60,13 +65,20 @@ class ChannelFramesSpec(Spec):
 class GeometrySpec(Spec):
     """What the formulas need of one camera's monitor, where the instrument is not modelled.
 
-    Attributes:
-        principal_distance: along the line, metres.
-        separation: distance of the two area CCDs, metres.
-        pitch: of their pixels, metres.
-        look: angle of the camera's line of sight about the base's Y, radians.
-        field: angle from the visual axis at which the area CCDs stand, radians.
-        principal_distance_across: plate scale across the line, metres; the principal distance by default.
+    Attributes
+    ----------
+    principal_distance : PositiveLength
+        Along the line, metres.
+    separation : PositiveLength
+        Distance of the two area CCDs, metres.
+    pitch : PixelPitch
+        Of their pixels, metres.
+    look : LookAngle
+        Angle of the camera's line of sight about the base's Y, radians.
+    field : FieldPlace
+        Angle from the visual axis at which the area CCDs stand, radians.
+    principal_distance_across : PositiveLength | None
+        Plate scale across the line, metres; the principal distance by default.
     """
 
     principal_distance: PositiveLength
@@ -80,26 +92,41 @@ class GeometrySpec(Spec):
 class MeasurementSpec(Spec):
     """A measurement.
 
-    Attributes:
-        instrument: name of an instrument in scenes/library/instruments, or path of an own file: its model gives the
-            spots' shape and what moves them.
-        geometry: camera -> the few numbers of the formulas, in place of an instrument.
-        frames: folder with CAMERA_CHANNEL_before.tiff and CAMERA_CHANNEL_after.tiff (or .fits), a CSV table of files,
-            or CAMERA/CHANNEL -> files.
-        times: of a series, of each entry of `after`.
-        disturbances: what is expected to move, on which the sigmas rest, as in a job.
-        template: where the calibrated shape of the spots is from: `twin`, or `measured` from the frames before.
-        detector: data sheet of the area CCDs in place of the instrument's; name in the library or path.
-        exposure: of a frame, in place of the instrument's, seconds.
-        photon_transfer: where gain and noise of the CCDs are from: `stated` in the data sheet, or `measured` in the
-            dark and flat frames.
-        dark: frames without light, for all channels or by channel.
-        flat: frames of even light, likewise.
-        bad_pixels: image in which every pixel that is not 0 is bad, likewise.
-        corrections: whether the frames are searched for defects, which are then left out or fitted: `automatic`, or
-            `none`.
-        vibration: whether the smear by vibration during an exposure is fitted: `none`, or `fitted`.
-        analysis: how the centres of the spots are found.
+    Attributes
+    ----------
+    instrument : Ref | None
+        Name of an instrument in scenes/library/instruments, or path of an own file: its model gives the spots' shape
+        and what moves them.
+    geometry : Named[GeometrySpec] | None
+        Camera -> the few numbers of the formulas, in place of an instrument.
+    frames : Reference | Paths[ChannelFramesSpec]
+        Folder with CAMERA_CHANNEL_before.tiff and CAMERA_CHANNEL_after.tiff (or .fits), a CSV table of files, or
+        CAMERA/CHANNEL -> files.
+    times : tuple[Moment, ...] | None
+        Of a series, of each entry of `after`.
+    disturbances : JobDisturbances | None
+        What is expected to move, on which the sigmas rest, as in a job.
+    template : Literal['twin', 'measured']
+        Where the calibrated shape of the spots is from: `twin`, or `measured` from the frames before.
+    detector : Ref | None
+        Data sheet of the area CCDs in place of the instrument's; name in the library or path.
+    exposure : Exposure | None
+        Of a frame, in place of the instrument's, seconds.
+    photon_transfer : Literal['stated', 'measured']
+        Where gain and noise of the CCDs are from: `stated` in the data sheet, or `measured` in the dark and flat
+        frames.
+    dark : PerChannel | None
+        Frames without light, for all channels or by channel.
+    flat : PerChannel | None
+        Frames of even light, likewise.
+    bad_pixels : PerChannel | None
+        Image in which every pixel that is not 0 is bad, likewise.
+    corrections : Literal['automatic', 'none']
+        Whether the frames are searched for defects, which are then left out or fitted: `automatic`, or `none`.
+    vibration : Literal['none', 'fitted']
+        Whether the smear by vibration during an exposure is fitted: `none`, or `fitted`.
+    analysis : AnalysisSpec
+        How the centres of the spots are found.
     """
 
     instrument: Ref | None = None
@@ -169,8 +196,10 @@ class MeasurementSpec(Spec):
     def states(self, files: ChannelFramesSpec) -> tuple[tuple[str, ...], ...]:
         """Files of each state after.
 
-        Args:
-            files: of a channel.
+        Parameters
+        ----------
+        files : ChannelFramesSpec
+            Of a channel.
         """
         if self.times is not None:
             return files.after
@@ -180,9 +209,12 @@ class MeasurementSpec(Spec):
 def per_channel(files: Any, channel: str) -> tuple[str, ...]:
     """Files for one channel, or those for all; none where there are none.
 
-    Args:
-        files: by channel, None for none at all.
-        channel: its name.
+    Parameters
+    ----------
+    files : Any
+        By channel, None for none at all.
+    channel : str
+        Its name.
     """
     return () if files is None else tuple(files.get(channel, files.get(ALL, ())))
 
@@ -197,9 +229,12 @@ _TIME_HEAD = re.compile(r"time *\[(?P<unit>[^\[\]]+)\]")
 class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
     """A measurement with all it refers to; the paths of its files are absolute.
 
-    Attributes:
-        model: the instrument as a job to which nothing happens; None where only its geometry is given.
-        detector: data sheet of the area CCDs.
+    Attributes
+    ----------
+    model : ResolvedJob | None
+        The instrument as a job to which nothing happens; None where only its geometry is given.
+    detector : DetectorSpec
+        Data sheet of the area CCDs.
     """
 
     model: ResolvedJob | None = None
@@ -336,12 +371,17 @@ def _is_picture(file: Path) -> bool:
 def read_frame_table(path: Path, channels: tuple[str, ...]) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
     """Frames of every channel, by their absolute paths, and the times of a series; none for a single state.
 
-    Args:
-        path: of the CSV table.
-        channels: that it has to list.
+    Parameters
+    ----------
+    path : Path
+        Of the CSV table.
+    channels : tuple[str, ...]
+        That it has to list.
 
-    Raises:
-        InputError: the table cannot be read, with its line.
+    Raises
+    ------
+    InputError
+        The table cannot be read, with its line.
     """
     return _FrameTable(path, channels).read()
 

@@ -42,9 +42,12 @@ _ABOUT = "about"
 def meant(name: str, nodes: Iterable[str]) -> list[str]:
     """The bodies that a name may mean: the one with this path, else all whose paths end with it.
 
-    Args:
-        name: ``base/forward/M2``, ``forward/M2`` or ``M2``.
-        nodes: paths of all bodies.
+    Parameters
+    ----------
+    name : str
+        ``base/forward/M2``, ``forward/M2`` or ``M2``.
+    nodes : Iterable[str]
+        Paths of all bodies.
     """
     paths = tuple(nodes)
     return [name] if name in paths else [path for path in paths if path.endswith(f"/{name}")]
@@ -53,12 +56,17 @@ def meant(name: str, nodes: Iterable[str]) -> list[str]:
 def node_named(name: str, nodes: Iterable[str]) -> str:
     """The body that a name means: its path, or the last parts of the path where only one body ends so.
 
-    Args:
-        name: ``base/forward/M2``, ``forward/M2``, or ``M2`` in an instrument with one.
-        nodes: paths of all bodies.
+    Parameters
+    ----------
+    name : str
+        ``base/forward/M2``, ``forward/M2``, or ``M2`` in an instrument with one.
+    nodes : Iterable[str]
+        Paths of all bodies.
 
-    Raises:
-        Problem: no body is called so, or several are.
+    Raises
+    ------
+    Problem
+        No body is called so, or several are.
     """
     found = meant(name, nodes)
     if len(found) == 1:
@@ -71,9 +79,12 @@ def node_named(name: str, nodes: Iterable[str]) -> str:
 def short_name(path: str, nodes: Iterable[str]) -> str:
     """The last parts of a body's path, as many as tell it from all others.
 
-    Args:
-        path: of the body.
-        nodes: paths of all bodies.
+    Parameters
+    ----------
+    path : str
+        Of the body.
+    nodes : Iterable[str]
+        Paths of all bodies.
     """
     parts, every = path.split("/"), tuple(nodes)
     tails = ("/".join(parts[-count:]) for count in range(1, len(parts) + 1))
@@ -83,11 +94,15 @@ def short_name(path: str, nodes: Iterable[str]) -> str:
 def motion_of(text: str) -> tuple[str, str, str, str, str]:
     """The parts of a motion in words: node, kind, axis or term, quantity, and pivot.
 
-    Args:
-        text: ``NODE KIND [AXIS] [QUANTITY] [about PIVOT]``; parts that are not there are empty.
+    Parameters
+    ----------
+    text : str
+        ``NODE KIND [AXIS] [QUANTITY] [about PIVOT]``; parts that are not there are empty.
 
-    Raises:
-        Problem: the text is not of this form.
+    Raises
+    ------
+    Problem
+        The text is not of this form.
     """
     words = text.split()
     pivot = ""
@@ -114,9 +129,12 @@ def motion_of(text: str) -> tuple[str, str, str, str, str]:
 def key_below(kind: str, axis: str) -> tuple[str | int, ...]:
     """Where a component stands in a node's perturbation: ``("shift", 2)``, ``("temperature", "gradient", 0)``.
 
-    Args:
-        kind: of ``KINDS``.
-        axis: ``x``, ``y`` or ``z``, a figure's term, or empty.
+    Parameters
+    ----------
+    kind : str
+        Of ``KINDS``.
+    axis : str
+        ``x``, ``y`` or ``z``, a figure's term, or empty.
     """
     heat = {"temperature": ("temperature", "change"), "gradient": ("temperature", "gradient")}
     place: tuple[str | int, ...] = heat.get(kind, (kind,))
@@ -126,12 +144,18 @@ def key_below(kind: str, axis: str) -> tuple[str | int, ...]:
 def put(keys: dict[str, Any], kind: str, axis: str, value: Any, nothing: Any) -> None:
     """Put a component where a node's perturbation has it.
 
-    Args:
-        keys: of the perturbation, which are added to.
-        kind: as of ``key_below``.
-        axis: as of ``key_below``.
-        value: of the component.
-        nothing: of the other components of a vector, where they are not said.
+    Parameters
+    ----------
+    keys : dict[str, Any]
+        Of the perturbation, which are added to.
+    kind : str
+        As of ``key_below``.
+    axis : str
+        As of ``key_below``.
+    value : Any
+        Of the component.
+    nothing : Any
+        Of the other components of a vector, where they are not said.
     """
     *above, last = key_below(kind, axis)
     inner: Any = keys
@@ -155,11 +179,15 @@ def _pure(kind: str, quantity: str, text: str) -> float:
 def perturbation_in_words(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
     """What texts come to: ``perturb`` of a job's file. Nodes are called as in the texts.
 
-    Args:
-        texts: such as ``M2 shift z 20 um``; several of one body add to its perturbation.
+    Parameters
+    ----------
+    texts : Iterable[str]
+        Such as ``M2 shift z 20 um``; several of one body add to its perturbation.
 
-    Raises:
-        Problem: a text is not of this form, or two say the same component.
+    Raises
+    ------
+    Problem
+        a text is not of this form, or two say the same component.
     """
     out: dict[str, dict[str, Any]] = {}
     said: set[tuple[str, str, str]] = set()

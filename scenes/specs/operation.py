@@ -61,11 +61,15 @@ def _known_events(value: Mapping[str, tuple[Name, ...]]) -> FrozenMap[str, tuple
 class RequirementSpec(Spec):
     """What one quantity has to keep.
 
-    Attributes:
-        quantity: `GROUP KEY`: a camera with `d_alpha_arcsec`, `d_beta_arcsec`, `d_gamma_arcsec` or `d_f_um`;
-            `intersection_angle change_arcsec`; `ground along_m`, `across_m` or `height_m`.
-        limit: that the size of its change must not exceed, with its unit.
-        probability: with which it has to keep it at every time.
+    Attributes
+    ----------
+    quantity : Text
+        `GROUP KEY`: a camera with `d_alpha_arcsec`, `d_beta_arcsec`, `d_gamma_arcsec` or `d_f_um`; `intersection_angle
+        change_arcsec`; `ground along_m`, `across_m` or `height_m`.
+    limit : Text
+        That the size of its change must not exceed, with its unit.
+    probability : Number
+        With which it has to keep it at every time.
     """
 
     quantity: Text
@@ -121,18 +125,26 @@ class RequirementSpec(Spec):
 class OperationSpec(Spec):
     """How the state of an instrument is followed in operation.
 
-    Attributes:
-        instrument: name of an instrument in scenes/library/instruments, or path of an own file; that of the record.
-        disturbances: what is expected to move over years, with its laws of time: name of a file in
-            scenes/library/disturbances, or path of an own one.
-        events: event of the record -> causes of the disturbances file whose motions step then by their standard
-            deviations. An event without causes steps nothing.
-        coefficients: standard deviation of what heat does to light, of each body with a sensor, over the computed
-            value.
-        mission: life over which the disturbances' `jump_false_alarm` counts.
-        window: readings for which a jump is looked for after it has come.
-        horizon: how far a forecast reaches.
-        requirements: what has to be kept; no quantity twice.
+    Attributes
+    ----------
+    instrument : Ref
+        Name of an instrument in scenes/library/instruments, or path of an own file; that of the record.
+    disturbances : Ref
+        What is expected to move over years, with its laws of time: name of a file in scenes/library/disturbances, or
+        path of an own one.
+    events : dict[str, Causes]
+        Event of the record -> causes of the disturbances file whose motions step then by their standard deviations. An
+        event without causes steps nothing.
+    coefficients : float
+        Standard deviation of what heat does to light, of each body with a sensor, over the computed value.
+    mission : Span
+        Life over which the disturbances' `jump_false_alarm` counts.
+    window : Whole
+        Readings for which a jump is looked for after it has come.
+    horizon : Span
+        How far a forecast reaches.
+    requirements : tuple[RequirementSpec, ...]
+        What has to be kept; no quantity twice.
     """
 
     instrument: Ref
@@ -157,9 +169,12 @@ class OperationSpec(Spec):
 class OperationSetup(Spec):
     """A plan with all it refers to, so that one text says under what a record was followed.
 
-    Attributes:
-        operation: the plan.
-        model: the instrument, with what the plan states to move.
+    Attributes
+    ----------
+    operation : OperationSpec
+        The plan.
+    model : ResolvedJob
+        The instrument, with what the plan states to move.
     """
 
     operation: OperationSpec
@@ -175,8 +190,10 @@ class OperationSetup(Spec):
 def read_operation(path: str | Path) -> OperationSetup:
     """Read a plan of operation and all it refers to.
 
-    Raises:
-        InputError: any of the files cannot be read or is not valid, or an event steps a cause that is not there.
+    Raises
+    ------
+    InputError
+        Any of the files cannot be read or is not valid, or an event steps a cause that is not there.
     """
     return resolve_operation(validate(OperationSpec, read_yaml(path)))
 
@@ -216,11 +233,15 @@ Heads = Annotated[tuple[Text, ...], short_for(None, str, schema=Text | tuple[Tex
 class ReadingColumnSpec(Spec):
     """The columns of one body, star tracker or camera.
 
-    Attributes:
-        column: head of its column, or the list of the heads of its components: three angles of an attitude, or the four
-            numbers of its quaternion, the scalar last.
-        unit: of the numbers; `quaternion` of a quaternion.
-        sigma: standard deviation of each of them, with its unit; of a quaternion the angle about each axis.
+    Attributes
+    ----------
+    column : Heads
+        Head of its column, or the list of the heads of its components: three angles of an attitude, or the four numbers
+        of its quaternion, the scalar last.
+    unit : Text
+        Of the numbers; `quaternion` of a quaternion.
+    sigma : Text
+        Standard deviation of each of them, with its unit; of a quaternion the angle about each axis.
     """
 
     column: Heads
@@ -231,19 +252,31 @@ class ReadingColumnSpec(Spec):
 class ReadingTableSpec(Spec):
     """Tables of one form, with a row for each moment.
 
-    Attributes:
-        kind: what a row is: `temperature` of bodies, `attitude` of star trackers, `focus` of cameras; `monitor`,
-            `calibration` or `angle`, whose row names a run folder; or `event`.
-        files: of the tables, relative to this file; `*` and `?` stand for any letters.
-        form: `csv`, whose first row has the heads; or `keywords`, lines of `KEYWORD = TIME NUMBER` as CCSDS has them.
-        time: head of the column of times.
-        time_scale: what the clock shows.
-        epoch: reading of that clock at 0, where the column has numbers and not dates.
-        time_unit: of those numbers.
-        columns: body, star tracker or camera -> its columns, for sorts that are numbers.
-        name: head of the column with the run folder or the event, relative to the table.
-        detail: head of the column that says more of an event.
-        events: name of an event in the table -> what it is.
+    Attributes
+    ----------
+    kind : str
+        What a row is: `temperature` of bodies, `attitude` of star trackers, `focus` of cameras; `monitor`,
+        `calibration` or `angle`, whose row names a run folder; or `event`.
+    files : Reference
+        Of the tables, relative to this file; `*` and `?` stand for any letters.
+    form : Literal['csv', 'keywords']
+        `csv`, whose first row has the heads; or `keywords`, lines of `KEYWORD = TIME NUMBER` as CCSDS has them.
+    time : Text
+        Head of the column of times.
+    time_scale : TimeScale
+        What the clock shows.
+    epoch : ClockReading | None
+        Reading of that clock at 0, where the column has numbers and not dates.
+    time_unit : Text
+        Of those numbers.
+    columns : Paths[ReadingColumnSpec]
+        Body, star tracker or camera -> its columns, for sorts that are numbers.
+    name : Text | None
+        Head of the column with the run folder or the event, relative to the table.
+    detail : Text | None
+        Head of the column that says more of an event.
+    events : Paths[Event]
+        Name of an event in the table -> what it is.
     """
 
     kind: Literal["temperature", "attitude", "focus", "monitor", "calibration", "angle", "event"]
@@ -305,9 +338,12 @@ def _measures(unit: str, kind: Kind, where: tuple[str, ...]) -> None:
 class TelemetrySpec(Spec):
     """What the tables of an instrument's readings hold.
 
-    Attributes:
-        instrument: that was read: name of an instrument in scenes/library/instruments, or path of an own file.
-        readings: the tables.
+    Attributes
+    ----------
+    instrument : Ref
+        That was read: name of an instrument in scenes/library/instruments, or path of an own file.
+    readings : tuple[ReadingTableSpec, ...]
+        The tables.
     """
 
     instrument: Ref

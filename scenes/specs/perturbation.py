@@ -38,18 +38,29 @@ class PlainPerturbationSpec(Spec):
     """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, for a
     mirror or a face an error of its figure, radius or conic constant, and for a lens of its index.
 
-    Attributes:
-        rotate: rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
-        shift: in the body's own frame, metres.
-        pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
-        figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
-        scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
-        radius: relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
-        conic: change of the conic constant, a pure number.
-        index: change of the refractive index of the lens that begins at this face, a pure number.
-        abbe: relative change of the Abbe number of the lens that begins at this face; its index at the d line stays.
-        temperature: uniform change as `2 K`, or with a gradient, in place of what the body inherits from the one that
-            carries it, also where the change is `0 K`; None for what it inherits.
+    Attributes
+    ----------
+    rotate : Rotation
+        Rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
+    shift : Shift
+        In the body's own frame, metres.
+    pivot : Name
+        Name of the body's point that the rotation leaves in place and that the scale change starts from.
+    figure : dict[Term, FigureTerm]
+        Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
+    scale : ScaleChange
+        Relative growth of the body and all it carries, 1e-6 for 1 ppm.
+    radius : RadiusChange | None
+        Relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
+    conic : ConicChange | None
+        Change of the conic constant, a pure number.
+    index : IndexChange | None
+        Change of the refractive index of the lens that begins at this face, a pure number.
+    abbe : AbbeChange | None
+        Relative change of the Abbe number of the lens that begins at this face; its index at the d line stays.
+    temperature : job_tables.PlainTemperature | None
+        Uniform change as `2 K`, or with a gradient, in place of what the body inherits from the one that carries it,
+        also where the change is `0 K`; None for what it inherits.
     """
 
     rotate: Rotation = NO_MOTION
@@ -117,10 +128,14 @@ IN_WORDS = BeforeValidator(_in_words)
 class NodeInfo:
     """What may be done to a body of the instrument.
 
-    Attributes:
-        pivots: names of its pivots.
-        allows: which of ACTIONS.
-        cold: why it has no temperature, where that is not plain.
+    Attributes
+    ----------
+    pivots : tuple[str, ...]
+        Names of its pivots.
+    allows : frozenset[str]
+        Which of ACTIONS.
+    cold : str
+        Why it has no temperature, where that is not plain.
     """
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
@@ -161,13 +176,19 @@ def in_full(
 ) -> FrozenMap[str, Perturbed]:
     """Perturbations by the paths of their nodes; names of no node stay as they are.
 
-    Args:
-        perturb: by path, or by the last parts of it.
-        nodes: node path -> what may be done to it.
-        issue: what is wrong with a name -> the issue of it.
+    Parameters
+    ----------
+    perturb : Mapping[str, Perturbed]
+        By path, or by the last parts of it.
+    nodes : Mapping[str, NodeInfo]
+        Node path -> what may be done to it.
+    issue : Callable[[Problem, str], Issue]
+        What is wrong with a name -> the issue of it.
 
-    Raises:
-        InputError: a name of several nodes, or two names of one.
+    Raises
+    ------
+    InputError
+        a name of several nodes, or two names of one.
     """
     issues: list[Issue] = []
     named: dict[str, str] = {}
@@ -189,12 +210,18 @@ def perturbation_issues(
 ) -> list[Issue]:
     """What is wrong with a perturbation of the node ``path`` that stands at ``key`` of a specification.
 
-    Args:
-        owner: the specification.
-        nodes: node path -> what may be done to it.
-        path: of the node.
-        what: is done to it.
-        key: where it is written.
+    Parameters
+    ----------
+    owner : Spec
+        The specification.
+    nodes : Mapping[str, NodeInfo]
+        Node path -> what may be done to it.
+    path : str
+        Of the node.
+    what : PlainPerturbationSpec
+        Is done to it.
+    key : KeyPath
+        Where it is written.
     """
     if path not in nodes:
         return [no_such_node(owner, nodes, path, key)]

@@ -24,20 +24,34 @@ class Procedure:
     Functions and the set-up may be given as names that `Named` takes. No module that ``run`` and ``numbers`` need draws
     anything or fills a template.
 
-    Attributes:
-        kind: for example ``focus``; KIND.json has the numbers.
-        setup: class of the simulated test with all it refers to, an `ExperimentSetup`; or what reads its file.
-        run: set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
-        numbers: run -> what KIND.json holds, plain data; keys end in their unit.
-        report: run -> `twin.framework.report.Report`.
-        measured: class of the test on measurements, chosen by the keys of the file; None where there is none.
-        export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
-        files: kinds of file that it reads beside those in file_kinds.csv; their command is known from the list.
-        varied: whether a study can vary it.
-        judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
-        seeded: whether anything is drawn at random; config.yaml then states the seed.
-        about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
-        frames: quantity of KIND.json -> what it refers to, where `twin.framework.reference_frames` does not say it.
+    Attributes
+    ----------
+    kind : str
+        For example ``focus``; KIND.json has the numbers.
+    setup : Any
+        Class of the simulated test with all it refers to, an `ExperimentSetup`; or what reads its file.
+    run : Any
+        Set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
+    numbers : Any
+        Run -> what KIND.json holds, plain data; keys end in their unit.
+    report : Any
+        Run -> `twin.framework.report.Report`.
+    measured : Any
+        Class of the test on measurements, chosen by the keys of the file; None where there is none.
+    export : Any
+        Run -> path and contents of files with what was measured; the command then has an option ``--export``.
+    files : tuple[FileKind, ...]
+        Kinds of file that it reads beside those in file_kinds.csv; their command is known from the list.
+    varied : bool
+        Whether a study can vary it.
+    judged : bool
+        Whether the user is warned of cameras among what the test is given that are blurred as designed.
+    seeded : bool
+        Whether anything is drawn at random; config.yaml then states the seed.
+    about : str
+        What ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
+    frames : Mapping[str, str]
+        Quantity of KIND.json -> what it refers to, where `twin.framework.reference_frames` does not say it.
     """
 
     kind: str
@@ -68,12 +82,17 @@ class Procedure:
     def resolve(self, path: Path | str, *named: str | None) -> Any:
         """Read a test with all it refers to.
 
-        Args:
-            path: of its file or of a run's config.yaml, or the name of a test in the library.
-            named: what else is named of a set-up that is read by a function.
+        Parameters
+        ----------
+        path : Path | str
+            Of its file or of a run's config.yaml, or the name of a test in the library.
+        named : str | None
+            What else is named of a set-up that is read by a function.
 
-        Raises:
-            InputError: a file cannot be read or is not valid, or they do not fit together.
+        Raises
+        ------
+        InputError
+            a file cannot be read or is not valid, or they do not fit together.
         """
         if self.measured is not None:
             measured = Named(self.measured).get()

@@ -28,13 +28,20 @@ TestType = TypeVar("TestType", bound=Spec)
 class ResolvedJob(Spec):
     """A job with its instrument, cameras and detector.
 
-    Attributes:
-        job: as the user wrote it, defaults filled in.
-        instrument: what `job.instrument` names.
-        cameras: what `instrument.cameras.<name>.camera` says -> prescription.
-        detector: data sheet of the monitor's area CCDs; None where there is no monitor.
-        line_detectors: as cameras -> data sheet of the line CCD on which targets are imaged, None without targets.
-        disturbances: on which the sigmas rest, the job's changes made; None for the noise alone.
+    Attributes
+    ----------
+    job : JobSpec
+        As the user wrote it, defaults filled in.
+    instrument : InstrumentSpec
+        What `job.instrument` names.
+    cameras : Paths[CameraSpec]
+        What `instrument.cameras.<name>.camera` says -> prescription.
+    detector : DetectorSpec | None
+        Data sheet of the monitor's area CCDs; None where there is no monitor.
+    line_detectors : Paths[DetectorSpec] | None
+        As cameras -> data sheet of the line CCD on which targets are imaged, None without targets.
+    disturbances : DisturbancesSpec | None
+        On which the sigmas rest, the job's changes made; None for the noise alone.
     """
 
     job: JobSpec
@@ -105,8 +112,10 @@ class ResolvedJob(Spec):
 def resolve(path: str | Path) -> ResolvedJob:
     """Read a job and all it refers to. The config.yaml of an earlier run can be given in place of a job.
 
-    Raises:
-        InputError: any of the files cannot be read or is not valid.
+    Raises
+    ------
+    InputError
+        Any of the files cannot be read or is not valid.
     """
     yaml = read_yaml(path)
     if isinstance(yaml.data, dict) and "job" in yaml.data:
@@ -141,8 +150,10 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
 def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
     """The nominal job on an error budget's instrument, with what the budget states to change.
 
-    Raises:
-        InputError: as `resolve`; or the budget names no disturbances.
+    Raises
+    ------
+    InputError
+        As `resolve`; or the budget names no disturbances.
     """
     resolved = resolve_on(budget, budget.instrument, budget.disturbances)
     if resolved.disturbances is None:
@@ -154,13 +165,19 @@ def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
 def resolve_on(owner: Spec, instrument: str, disturbances: Any = None) -> ResolvedJob:
     """The nominal job on the instrument of another file.
 
-    Args:
-        owner: the file, whose keys `instrument` and `disturbances` these are.
-        instrument: that it refers to.
-        disturbances: that it refers to, as in a job; None for the instrument's own.
+    Parameters
+    ----------
+    owner : Spec
+        The file, whose keys `instrument` and `disturbances` these are.
+    instrument : str
+        That it refers to.
+    disturbances : Any
+        That it refers to, as in a job; None for the instrument's own.
 
-    Raises:
-        InputError: as `resolve`.
+    Raises
+    ------
+    InputError
+        As `resolve`.
     """
     plain = {"instrument": instrument, "disturbances": disturbances}
     return resolve_job(JobSpec.model_validate(plain).with_source(owner.source))
@@ -169,12 +186,17 @@ def resolve_on(owner: Spec, instrument: str, disturbances: Any = None) -> Resolv
 def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJob:
     """A job, or an instrument to which nothing happens, with all it refers to.
 
-    Args:
-        file: of a job or an instrument, the config.yaml of a run, or the name of an instrument in the library.
-        disturbances: name in the library or path of a disturbances file, in place of what is stated; None for that.
+    Parameters
+    ----------
+    file : str | Path
+        Of a job or an instrument, the config.yaml of a run, or the name of an instrument in the library.
+    disturbances : str | None
+        Name in the library or path of a disturbances file, in place of what is stated; None for that.
 
-    Raises:
-        InputError: as `resolve`; there is no such instrument or no such disturbances file.
+    Raises
+    ------
+    InputError
+        As `resolve`; there is no such instrument or no such disturbances file.
     """
     text = str(file)
     named = not load.is_path(text) and not Path(text).is_file()
@@ -193,8 +215,10 @@ def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJ
 def target_band(camera: CameraSpec) -> str:
     """The band on whose line CCD a camera images test targets: P (panchromatic) if it has one, else its first.
 
-    Raises:
-        InputError: it has none.
+    Raises
+    ------
+    InputError
+        It has none.
     """
     if not camera.bands:
         raise camera.error("images of targets need a line CCD, and this camera describes none", ("bands",))
@@ -204,11 +228,15 @@ def target_band(camera: CameraSpec) -> str:
 def line_detector(camera: CameraSpec) -> DetectorSpec:
     """Data sheet of the line CCD with which a camera images.
 
-    Args:
-        camera: with bands.
+    Parameters
+    ----------
+    camera : CameraSpec
+        With bands.
 
-    Raises:
-        InputError: it has no band, or there is no such sheet.
+    Raises
+    ------
+    InputError
+        It has no band, or there is no such sheet.
     """
     return load.load_band_detectors(camera)[camera.bands[target_band(camera)].detector]
 
@@ -234,8 +262,10 @@ class ExperimentSetup(Spec, Generic[TestType]):
     A kind of test is a subclass: its fields are what is read, ``parts`` reads them, ``checked`` holds them against each
     other.
 
-    Attributes:
-        test: what the test's file says.
+    Attributes
+    ----------
+    test : TestType
+        What the test's file says.
     """
 
     FOLDER: ClassVar[str] = load.LAB
@@ -247,11 +277,15 @@ class ExperimentSetup(Spec, Generic[TestType]):
     def read(cls, path: str | Path) -> Self:
         """Return a test and all it refers to.
 
-        Args:
-            path: of the test's file, or of a run's config.yaml; or the name of a test in the library.
+        Parameters
+        ----------
+        path : str | Path
+            Of the test's file, or of a run's config.yaml; or the name of a test in the library.
 
-        Raises:
-            InputError: a file cannot be read or is not valid, or they do not fit together.
+        Raises
+        ------
+        InputError
+            a file cannot be read or is not valid, or they do not fit together.
         """
         yaml = load.referred(cls.FOLDER, path)
         if isinstance(yaml.data, dict) and "test" in yaml.data:
@@ -303,9 +337,12 @@ DATA_FILES = ("comparisons", "held_out", "spots", "mtf", "images")
 class CameraTestSetup(ExperimentSetup[TestType], Generic[TestType]):
     """A test of a camera in the laboratory.
 
-    Attributes:
-        camera: prescription and bands.
-        detectors: as the bands name them -> data sheet.
+    Attributes
+    ----------
+    camera : CameraSpec
+        Prescription and bands.
+    detectors : Paths[DetectorSpec]
+        As the bands name them -> data sheet.
     """
 
     camera: CameraSpec
@@ -344,8 +381,10 @@ class FocusSetup(CameraTestSetup[FocusTestSpec]):
 class DistortionSetup(CameraTestSetup[DistortionTestSpec]):
     """A distortion test with its camera, detectors and turntable.
 
-    Attributes:
-        turntable: its dividing error and calibration.
+    Attributes
+    ----------
+    turntable : TurntableTestSpec
+        Its dividing error and calibration.
     """
 
     turntable: TurntableTestSpec
@@ -393,8 +432,10 @@ class MeasuredTurntableSetup(MeasuredSetup[MeasuredTurntableSpec]):
 def test_keys(path: str | Path) -> Mapping[str, Any]:
     """What a test's file, or the test in a run's config.yaml, holds at its top; nothing for a name in the library.
 
-    Raises:
-        InputError: it cannot be read.
+    Raises
+    ------
+    InputError
+        It cannot be read.
     """
     data = read_yaml(path).data if load.is_path(path) else {}
     inner = data.get("test", data) if isinstance(data, dict) else {}
@@ -419,12 +460,18 @@ ALLOWED = "the file of a camera or of an instrument, or the config.yaml of a run
 class CameraSetup(Spec):
     """A camera, with its instrument if it is to be looked at as mounted there.
 
-    Attributes:
-        camera: its prescription.
-        mounted: its name in the instrument.
-        instrument: that holds it; None for a camera by itself.
-        cameras: what the instrument's cameras are called -> prescription.
-        perturb: what happens to bodies of the instrument, as in a job; of a camera by itself to its parts.
+    Attributes
+    ----------
+    camera : CameraSpec
+        Its prescription.
+    mounted : Name | None
+        Its name in the instrument.
+    instrument : InstrumentSpec | None
+        That holds it; None for a camera by itself.
+    cameras : Paths[CameraSpec]
+        What the instrument's cameras are called -> prescription.
+    perturb : Paths[PerturbationSpec]
+        What happens to bodies of the instrument, as in a job; of a camera by itself to its parts.
     """
 
     camera: CameraSpec
@@ -455,11 +502,15 @@ class CameraSetup(Spec):
     def perturbed(self, words: Sequence[str]) -> CameraSetup:
         """The same with further perturbations.
 
-        Args:
-            words: such as ``M2 shift z 20 um``; they replace what was said of the same node.
+        Parameters
+        ----------
+        words : Sequence[str]
+            Such as ``M2 shift z 20 um``; they replace what was said of the same node.
 
-        Raises:
-            InputError: a text that says no perturbation.
+        Raises
+        ------
+        InputError
+            a text that says no perturbation.
         """
         if not words:
             return self
@@ -484,13 +535,18 @@ class CameraSetup(Spec):
 def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
     """Read a camera and all it refers to.
 
-    Args:
-        file: name of a camera or instrument of the library, path of such a file, of a job, or a run's config.yaml; a
-            job's perturbations come with it.
-        name: which camera, where there are several.
+    Parameters
+    ----------
+    file : Path | str
+        Name of a camera or instrument of the library, path of such a file, of a job, or a run's config.yaml; a job's
+        perturbations come with it.
+    name : str | None
+        Which camera, where there are several.
 
-    Raises:
-        InputError: the file cannot be read or is not valid, holds no camera, or several and ``name`` none of them.
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not valid, holds no camera, or several and ``name`` none of them.
     """
     text = str(file)
     place: Path | str = text if not load.is_path(text) and not is_file(Path(text)) else Path(text)

@@ -24,11 +24,16 @@ from scenes.yaml.units import LENGTH, TEMPERATURE, format_quantity
 def black_body_photons(wavelength: np.ndarray, temperature: float) -> np.ndarray:
     """Spectral radiance of a black body as photons, by Planck's law.
 
-    Args:
-        wavelength: metres, of any shape.
-        temperature: kelvin.
+    Parameters
+    ----------
+    wavelength : np.ndarray
+        Metres, of any shape.
+    temperature : float
+        kelvin.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         Photons/(s m^2 sr m), of the wavelength's shape.
     """
     # messages about files wait for this module, and scipy's table of constants is long
@@ -55,15 +60,22 @@ class SpectrumSpec(Spec):
     Signal counts photons: ``weights`` and a table's response are signal per photon (transmission times quantum
     efficiency), and a black body gives photons. Only ratios count.
 
-    Attributes:
-        between: shortest and longest wavelength of light that is evenly spread between them, metres.
-        wavelengths: of lines, ascending, metres.
-        weights: signal of each line; all alike when left out.
-        table: CSV file with the columns `wavelength` (unit in its head) and `response`; relative to this file. Between
-            its rows the response is linear, beyond them nothing.
-        curve: what the table says, which is filled in when it is read; a table is not looked for where it is given.
-        black_body: temperature of a source whose photons the band or the table takes, kelvin; as many at all
-            wavelengths when left out.
+    Attributes
+    ----------
+    between : WavelengthRange | None
+        Shortest and longest wavelength of light that is evenly spread between them, metres.
+    wavelengths : tuple[Wavelength, ...] | None
+        Of lines, ascending, metres.
+    weights : tuple[Number, ...] | None
+        Signal of each line; all alike when left out.
+    table : Reference | None
+        CSV file with the columns `wavelength` (unit in its head) and `response`; relative to this file. Between its
+        rows the response is linear, beyond them nothing.
+    curve : tuple[tuple[Wavelength, Number], ...] | None
+        What the table says, which is filled in when it is read; a table is not looked for where it is given.
+    black_body : float | None
+        Temperature of a source whose photons the band or the table takes, kelvin; as many at all wavelengths when left
+        out.
     """
 
     between: WavelengthRange | None = None
@@ -141,14 +153,20 @@ class SpectrumSpec(Spec):
         What depends on the wavelength like a polynomial of degree below 2 ``count`` has its exact mean, whatever the
         response looks like. Lines are all given, in place of a rule.
 
-        Args:
-            count: of wavelengths.
+        Parameters
+        ----------
+        count : int
+            Of wavelengths.
 
-        Returns:
+        Returns
+        -------
+        tuple[np.ndarray, np.ndarray]
             Wavelengths, metres, and weights that sum to 1, (K,) each.
 
-        Raises:
-            ValueError: the table has not been read.
+        Raises
+        ------
+        ValueError
+            The table has not been read.
         """
         if self.between is not None and self.black_body is None:
             first, last = self.between
@@ -169,12 +187,17 @@ class SpectrumSpec(Spec):
     def read(self, owner: Spec, key: KeyPath) -> SpectrumSpec:
         """Return it with its table's curve filled in.
 
-        Args:
-            owner: the specification whose file names the table.
-            key: of this spectrum in there.
+        Parameters
+        ----------
+        owner : Spec
+            The specification whose file names the table.
+        key : KeyPath
+            Of this spectrum in there.
 
-        Raises:
-            InputError: no such table, or one that is not right.
+        Raises
+        ------
+        InputError
+            No such table, or one that is not right.
         """
         if self.table is None or self.curve is not None:
             return self

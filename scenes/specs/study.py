@@ -42,13 +42,15 @@ GRID = "grid"
 class Sampler:
     """How a design spreads its runs.
 
-    Attributes:
-        title: for readers.
-        points: number of runs, number of independent factors, generator of all that is drawn -> points of the unit
-            cube, (runs, factors) in [0, 1]. A factor takes the value at which its distribution function is the point's
-            coordinate.
-        even: whether the points lie more evenly than independent ones, so that means are known better than by
-            sigma/sqrt(n).
+    Attributes
+    ----------
+    title : str
+        For readers.
+    points : Callable[[int, int, np.random.Generator], np.ndarray]
+        Number of runs, number of independent factors, generator of all that is drawn -> points of the unit cube, (runs,
+        factors) in [0, 1]. A factor takes the value at which its distribution function is the point's coordinate.
+    even : bool
+        Whether the points lie more evenly than independent ones, so that means are known better than by sigma/sqrt(n).
     """
 
     title: str
@@ -92,15 +94,23 @@ SAMPLERS = ExtensionTable("samplers", _SAMPLERS, Sampler)
 def unit_cube(kind: str, runs: int, factors: int, seed: int) -> np.ndarray:
     """Points of a design in the open unit cube, (runs, factors).
 
-    Args:
-        kind: one of SAMPLERS.
-        runs: number of points.
-        factors: number of coordinates.
-        seed: of what is drawn.
+    Parameters
+    ----------
+    kind : str
+        One of SAMPLERS.
+    runs : int
+        Number of points.
+    factors : int
+        Number of coordinates.
+    seed : int
+        Of what is drawn.
 
-    Raises:
-        KeyError: no such kind.
-        ValueError: the sampler gave no points of that cube.
+    Raises
+    ------
+    KeyError
+        No such kind.
+    ValueError
+        The sampler gave no points of that cube.
     """
     generator = np.random.default_rng(np.random.SeedSequence(seed))
     cube = np.asarray(SAMPLERS[kind].points(runs, factors, generator), np.float64)
@@ -127,9 +137,12 @@ CONTINUOUS = ("range", "uniform", "normal", "truncated")
 class NormalSpec(Spec):
     """A normal distribution.
 
-    Attributes:
-        mean: its middle, with the unit of the base's value.
-        sigma: standard deviation.
+    Attributes
+    ----------
+    mean : Scalar
+        Its middle, with the unit of the base's value.
+    sigma : Scalar
+        Standard deviation.
     """
 
     mean: Scalar
@@ -139,10 +152,14 @@ class NormalSpec(Spec):
 class TruncatedSpec(Spec):
     """A normal distribution that is cut off.
 
-    Attributes:
-        mean: middle of the normal distribution before it is cut.
-        sigma: its standard deviation.
-        limits: smallest and largest value.
+    Attributes
+    ----------
+    mean : Scalar
+        Middle of the normal distribution before it is cut.
+    sigma : Scalar
+        Its standard deviation.
+    limits : tuple[Scalar, Scalar]
+        Smallest and largest value.
     """
 
     mean: Scalar
@@ -153,10 +170,14 @@ class TruncatedSpec(Spec):
 class TableSpec(Spec):
     """A column of a table; columns of one file belong together, row by row.
 
-    Attributes:
-        file: CSV with a line of names first, relative to the study's file.
-        column: name of the column.
-        values: what stands there; a study's config.yaml holds them, so that it needs no other file.
+    Attributes
+    ----------
+    file : Reference
+        CSV with a line of names first, relative to the study's file.
+    column : Text
+        Name of the column.
+    values : tuple[Scalar, ...] | None
+        What stands there; a study's config.yaml holds them, so that it needs no other file.
     """
 
     file: Reference
@@ -168,9 +189,12 @@ class ScaleSpec(Spec):
     """A value that follows a factor: the base's own, or what another factor sets it to, times a power of the factor
     over its value in the base. Several factors may scale one value.
 
-    Attributes:
-        key: where it stands in the base's resolved config.yaml; a number or a quantity.
-        power: of the ratio, 2 for what grows with an area when the factor is a diameter.
+    Attributes
+    ----------
+    key : Key
+        Where it stands in the base's resolved config.yaml; a number or a quantity.
+    power : Number
+        Of the ratio, 2 for what grows with an area when the factor is a diameter.
     """
 
     key: Key
@@ -181,18 +205,30 @@ class FactorSpec(Spec):
     """What is changed and how: one of key and keys, or scales alone, and exactly one of values, range, uniform, normal,
     truncated and table.
 
-    Attributes:
-        key: where in the base's resolved config.yaml, keys and list indices.
-        motion: in place of the key of a number below `perturb` of a job, `M2 shift z`.
-        keys: several such places that all get the same value.
-        scales: values that follow the factor; one without key and keys is itself the ratio, 1 for the base as it is.
-        values: a list of values; a design that draws takes each as often as the others.
-        range: smallest and largest value, evenly spaced in a grid and evenly spread in designs that draw.
-        count: number of values of a range in a grid.
-        uniform: smallest and largest value of a uniform distribution.
-        normal: a normal distribution.
-        truncated: a normal distribution within limits.
-        table: a column of a CSV file.
+    Attributes
+    ----------
+    key : Key | None
+        Where in the base's resolved config.yaml, keys and list indices.
+    motion : Text | None
+        In place of the key of a number below `perturb` of a job, `M2 shift z`.
+    keys : tuple[Key, ...] | None
+        Several such places that all get the same value.
+    scales : tuple[ScaleSpec, ...]
+        Values that follow the factor; one without key and keys is itself the ratio, 1 for the base as it is.
+    values : tuple[Scalar, ...] | None
+        a list of values; a design that draws takes each as often as the others.
+    range : tuple[Scalar, Scalar] | None
+        Smallest and largest value, evenly spaced in a grid and evenly spread in designs that draw.
+    count : Count | None
+        Number of values of a range in a grid.
+    uniform : tuple[Scalar, Scalar] | None
+        Smallest and largest value of a uniform distribution.
+    normal : NormalSpec | None
+        a normal distribution.
+    truncated : TruncatedSpec | None
+        a normal distribution within limits.
+    table : TableSpec | None
+        a column of a CSV file.
     """
 
     key: Key | None = None
@@ -310,11 +346,16 @@ class FactorSpec(Spec):
 class Numbers(tuple[float, ...]):
     """Values of a factor.
 
-    Attributes:
-        numeric: whether they are numbers, with or without a unit.
-        unit: of all of them; None without.
-        values: the numbers in that unit.
-        whole: whether all are whole numbers, written so.
+    Attributes
+    ----------
+    numeric : bool
+        Whether they are numbers, with or without a unit.
+    unit : str | None
+        Of all of them; None without.
+    values
+        The numbers in that unit.
+    whole : bool
+        Whether all are whole numbers, written so.
     """
 
     numeric: bool
@@ -330,8 +371,10 @@ class Numbers(tuple[float, ...]):
     def of(cls, scalars: tuple[Any, ...], kind: str) -> Numbers:
         """Numbers that stand in a factor.
 
-        Raises:
-            Problem: some have a unit and others not, or the units measure different things.
+        Raises
+        ------
+        Problem
+            Some have a unit and others not, or the units measure different things.
         """
         parts = [split_quantity(scalar) for scalar in scalars]
         plain = [isinstance(s, int | float) and not isinstance(s, bool) for s in scalars]
@@ -360,11 +403,15 @@ class Numbers(tuple[float, ...]):
 class DesignSpec(Spec):
     """Which combinations of the factors' values are run.
 
-    Attributes:
-        kind: grid, every combination; latin_hypercube and sobol, evenly spread over all factors; monte_carlo, drawn
-            independently.
-        runs: number of runs; a grid has as many as there are combinations.
-        seed: of what is drawn, and of the noise of every run.
+    Attributes
+    ----------
+    kind : str
+        Grid, every combination; latin_hypercube and sobol, evenly spread over all factors; monte_carlo, drawn
+        independently.
+    runs : Whole | None
+        Number of runs; a grid has as many as there are combinations.
+    seed : Seed
+        Of what is drawn, and of the noise of every run.
     """
 
     kind: Annotated[str, OneOf(lambda: (GRID, *SAMPLERS))] = GRID
@@ -393,9 +440,12 @@ def _amount(text: str) -> str:
 class LimitsSpec(Spec):
     """What a study may use.
 
-    Attributes:
-        runs: more than these are run only with --yes.
-        memory: of all processes together, with its unit MB or GB.
+    Attributes
+    ----------
+    runs : Whole
+        More than these are run only with --yes.
+    memory : str
+        Of all processes together, with its unit MB or GB.
     """
 
     runs: Annotated[Whole, Field(ge=1, le=MOST_RUNS)] = 20_000
@@ -421,10 +471,13 @@ UNITS = {
 class BaseSpec(Spec):
     """The job that every run of the study changes.
 
-    Attributes:
-        command: what runs it, as `python -m twin.COMMAND`.
-        file: its file, or the config.yaml of one of its runs, relative to the study's file; for lab and orbit also a
-            name in the library.
+    Attributes
+    ----------
+    command : str
+        What runs it, as `python -m twin.COMMAND`.
+    file : Reference
+        Its file, or the config.yaml of one of its runs, relative to the study's file; for lab and orbit also a name in
+        the library.
     """
 
     command: Annotated[str, OneOf(studied)]
@@ -438,14 +491,20 @@ TOTAL, NOISE = "_sigma", "_sigma_noise"
 class ResponseSpec(Spec):
     """A number that is kept of every run.
 
-    Attributes:
-        key: where in the results: the run folder's JSON file without .json, then its keys and list indices.
-        unit: of the number; read from the ending of its key if it is not given.
-        sigma: where its standard deviation stands, if the results have one: of all that is stated, for readings of the
-            monitor noise and motions that the spots cannot separate.
-        noise: where its standard deviation by the noise of the run alone stands, which differs from run to run; for
-            readings of the monitor the key that ends in ``_sigma_noise``.
-        minus: where a number stands that is subtracted: an error is what is recovered minus what is true.
+    Attributes
+    ----------
+    key : Key
+        Where in the results: the run folder's JSON file without .json, then its keys and list indices.
+    unit : Text | None
+        Of the number; read from the ending of its key if it is not given.
+    sigma : Key | None
+        Where its standard deviation stands, if the results have one: of all that is stated, for readings of the monitor
+        noise and motions that the spots cannot separate.
+    noise : Key | None
+        Where its standard deviation by the noise of the run alone stands, which differs from run to run; for readings
+        of the monitor the key that ends in ``_sigma_noise``.
+    minus : Key | None
+        Where a number stands that is subtracted: an error is what is recovered minus what is true.
     """
 
     key: Key
@@ -477,11 +536,16 @@ class ResponseSpec(Spec):
 class ThresholdSpec(Spec):
     """A requirement on a response, in the response's unit: the report tells the share of runs that meet it.
 
-    Attributes:
-        response: its name.
-        at_most: largest value that is good.
-        at_least: smallest value that is good.
-        magnitude: judge the size of the response, without its sign.
+    Attributes
+    ----------
+    response : Name
+        Its name.
+    at_most : Number | None
+        Largest value that is good.
+    at_least : Number | None
+        Smallest value that is good.
+    magnitude : Flag
+        Judge the size of the response, without its sign.
     """
 
     response: Name
@@ -499,11 +563,16 @@ class ThresholdSpec(Spec):
 class ParetoSpec(Spec):
     """Two responses, or a factor and a response, that compete; `max` in place of `min` where more is better.
 
-    Attributes:
-        x: name of a factor or response.
-        y: name of a factor or response.
-        best_x: whether small or large x is wanted.
-        best_y: whether small or large y is wanted.
+    Attributes
+    ----------
+    x : Name
+        Name of a factor or response.
+    y : Name
+        Name of a factor or response.
+    best_x : Literal['min', 'max']
+        Whether small or large x is wanted.
+    best_y : Literal['min', 'max']
+        Whether small or large y is wanted.
     """
 
     x: Name
@@ -515,12 +584,18 @@ class ParetoSpec(Spec):
 class StudyReportSpec(Spec):
     """What the report shows beside the table of the responses.
 
-    Attributes:
-        histograms: responses whose distribution is drawn; all when it is not given.
-        scatter: pairs of names, of a factor or response along x and of one along y.
-        pareto: pairs whose best compromises are sought.
-        sobol: whether variance-based sensitivity indices are estimated.
-        thresholds: by name, requirements on responses.
+    Attributes
+    ----------
+    histograms : tuple[Name, ...] | None
+        Responses whose distribution is drawn; all when it is not given.
+    scatter : tuple[tuple[Name, Name], ...]
+        Pairs of names, of a factor or response along x and of one along y.
+    pareto : tuple[ParetoSpec, ...]
+        Pairs whose best compromises are sought.
+    sobol : Flag
+        Whether variance-based sensitivity indices are estimated.
+    thresholds : Named[ThresholdSpec]
+        By name, requirements on responses.
     """
 
     histograms: tuple[Name, ...] | None = None
@@ -543,16 +618,26 @@ class StudyReportSpec(Spec):
 class StudySpec(TitledSpec):
     """A design trade study.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        base: the job that is varied.
-        factors: by name, what varies in it.
-        design: which combinations are run.
-        noise: own, every run has noise of its own; shared, all have that of the base job's seed.
-        responses: by name, what is kept of each run.
-        limits: what the study may use.
-        report: what the report shows.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    base : BaseSpec
+        The job that is varied.
+    factors : Named[FactorSpec]
+        By name, what varies in it.
+    design : DesignSpec
+        Which combinations are run.
+    noise : Literal['own', 'shared']
+        Own, every run has noise of its own; shared, all have that of the base job's seed.
+    responses : Named[ResponseSpec]
+        By name, what is kept of each run.
+    limits : LimitsSpec
+        What the study may use.
+    report : StudyReportSpec
+        What the report shows.
     """
 
     base: BaseSpec

@@ -55,9 +55,12 @@ SPECTRUM = "figure"
 class Varied(Spec):
     """Base of what a motion in words says: which body, how, about which point.
 
-    Attributes:
-        motion: of one body, `M2 shift z`, `M2 rotate x about centre`, `M1 radius`; without an amount.
-        carrying: further bodies that move rigidly with it, about the same point.
+    Attributes
+    ----------
+    motion : Text
+        Of one body, `M2 shift z`, `M2 rotate x about centre`, `M1 radius`; without an amount.
+    carrying : tuple[Text, ...]
+        Further bodies that move rigidly with it, about the same point.
     """
 
     motion: Text
@@ -80,8 +83,10 @@ class Varied(Spec):
     def si(self, value: Amount, key: str, positive: bool = False) -> float:
         """An amount of the motion in SI.
 
-        Raises:
-            Problem: another unit than the motion's, or not greater than zero where it has to be.
+        Raises
+        ------
+        Problem
+            Another unit than the motion's, or not greater than zero where it has to be.
         """
         kind = self.parts[1]
         try:
@@ -110,23 +115,37 @@ def amount_text(value: float, kind: str) -> str | float:
 class ToleranceSpec(Varied):
     """One tolerance.
 
-    Attributes:
-        motion: what varies: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`, `M1 conic`, `L1 index`,
-            `L1 abbe` (relative), `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
-        carrying: further bodies that move rigidly with the first.
-        limit: largest amount either way; of a figure error its rms over the clear aperture, about its mean.
-        law: how it is distributed: `normal` within the limit, which is `sigmas` standard deviations; `uniform` within
-            it; `ends`, one of both ends.
-        sigmas: standard deviations that the limit of a normal law is.
-        mean: about which it is distributed, for what has been measured and is not adjusted.
-        measured: in place of the law, amounts that were measured of such parts, each drawn as often as the others.
-        terms: of a figure error, the first and the last term of Noll's, `[Z5, Z36]`.
-        power: of a figure error: the variance of its terms falls with the power of their radial order.
-        cost: of holding it as stated, in any unit.
-        exponent: the cost goes with the inverse limit to this power.
-        costs: in place of both, what limits cost where it is known, `[[20 um, 1], [10 um, 3]]`; between them and beyond
-            their ends along a smooth line in logarithms.
-        kept: whether the allocation leaves it as it is.
+    Attributes
+    ----------
+    motion
+        What varies: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`, `M1 conic`, `L1 index`, `L1 abbe`
+        (relative), `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
+    carrying
+        Further bodies that move rigidly with the first.
+    limit : Amount
+        Largest amount either way; of a figure error its rms over the clear aperture, about its mean.
+    law : Literal['normal', 'uniform', 'ends']
+        How it is distributed: `normal` within the limit, which is `sigmas` standard deviations; `uniform` within it;
+        `ends`, one of both ends.
+    sigmas : Number
+        Standard deviations that the limit of a normal law is.
+    mean : Amount | None
+        About which it is distributed, for what has been measured and is not adjusted.
+    measured : tuple[Amount, ...] | None
+        In place of the law, amounts that were measured of such parts, each drawn as often as the others.
+    terms : tuple[Text, Text] | None
+        Of a figure error, the first and the last term of Noll's, `[Z5, Z36]`.
+    power : Number
+        Of a figure error: the variance of its terms falls with the power of their radial order.
+    cost : Cost
+        Of holding it as stated, in any unit.
+    exponent : Number
+        The cost goes with the inverse limit to this power.
+    costs : tuple[tuple[Amount, Cost], ...] | None
+        In place of both, what limits cost where it is known, `[[20 um, 1], [10 um, 3]]`; between them and beyond their
+        ends along a smooth line in logarithms.
+    kept : Flag
+        Whether the allocation leaves it as it is.
     """
 
     limit: Amount
@@ -225,12 +244,18 @@ class ToleranceSpec(Varied):
 class CompensatorSpec(Varied):
     """One adjustment; those that are listed first are made first.
 
-    Attributes:
-        motion: what is moved: `focal_plane shift z`.
-        carrying: further bodies that move rigidly with the first.
-        range: largest amount either way; zero leaves it as it is.
-        step: of which it is moved by a whole number, None for any amount.
-        accuracy: standard deviation of a move.
+    Attributes
+    ----------
+    motion
+        What is moved: `focal_plane shift z`.
+    carrying
+        Further bodies that move rigidly with the first.
+    range : Amount
+        Largest amount either way; zero leaves it as it is.
+    step : Amount | None
+        Of which it is moved by a whole number, None for any amount.
+    accuracy : Amount | None
+        Standard deviation of a move.
     """
 
     range: Amount
@@ -291,26 +316,37 @@ POSTERIOR = "posterior"
 class MeritSpec(Spec):
     """What is asked of the camera.
 
-    Attributes:
-        kind: `wavefront`, rms error in waves of the design wavelength; `mtf` of the optics; `boresight`, angle by which
-            the line of sight turns; `roll` of the line about it; `principal_distance`, its change; `distortion`,
-            largest change of an image's place along the line that neither of these three explains; `chief_ray`, largest
-            turn of a chief ray at the line CCD; `obstruction`, largest share of a field's beam, by area of the stop,
-            that bodies of the instrument take; `monitor_angle` and `monitor_focus`, standard deviation that the
-            monitor's readings of a rotation and of `d_f` have under the disturbances. The budget's `light` says in
-            which light wavefronts and MTFs are.
-        fields: of wavefront, mtf, chief_ray and obstruction, the worst of which counts: shares of the half field along
-            the line and the track.
-        frequency: of mtf, cycles per mm; that of the pixels (Nyquist) if not given.
-        direction: of mtf: along the line, along the track, or the worse of both.
-        reading: of monitor_angle: `angle` between the lines of sight of a pair, or `d_alpha`, `d_beta`, `d_gamma` of
-            the camera; by default that angle of a pair, and the worst of these three of one camera.
-        estimator: of the monitor's readings.
-        at_most: largest value that passes; a change counts either way.
-        at_least: smallest value that passes, of mtf.
-        probability: share of cameras that are to pass.
-        loss: of the inverse: what one tolerance alone may spoil of the merit; by default what is left between design
-            and requirement over the square root of the number of tolerances.
+    Attributes
+    ----------
+    kind : str
+        `wavefront`, rms error in waves of the design wavelength; `mtf` of the optics; `boresight`, angle by which the
+        line of sight turns; `roll` of the line about it; `principal_distance`, its change; `distortion`, largest change
+        of an image's place along the line that neither of these three explains; `chief_ray`, largest turn of a chief
+        ray at the line CCD; `obstruction`, largest share of a field's beam, by area of the stop, that bodies of the
+        instrument take; `monitor_angle` and `monitor_focus`, standard deviation that the monitor's readings of a
+        rotation and of `d_f` have under the disturbances. The budget's `light` says in which light wavefronts and MTFs
+        are.
+    fields : tuple[tuple[FieldShare, FieldShare], ...]
+        Of wavefront, mtf, chief_ray and obstruction, the worst of which counts: shares of the half field along the line
+        and the track.
+    frequency : Number | None
+        Of mtf, cycles per mm; that of the pixels (Nyquist) if not given.
+    direction : Literal['line', 'track', 'worse']
+        Of mtf: along the line, along the track, or the worse of both.
+    reading : Literal['angle', 'd_alpha', 'd_beta', 'd_gamma'] | None
+        Of monitor_angle: `angle` between the lines of sight of a pair, or `d_alpha`, `d_beta`, `d_gamma` of the camera;
+        by default that angle of a pair, and the worst of these three of one camera.
+    estimator : Name
+        Of the monitor's readings.
+    at_most : Amount | None
+        Largest value that passes; a change counts either way.
+    at_least : Number | None
+        Smallest value that passes, of mtf.
+    probability : Share
+        Share of cameras that are to pass.
+    loss : Amount | None
+        Of the inverse: what one tolerance alone may spoil of the merit; by default what is left between design and
+        requirement over the square root of the number of tolerances.
     """
 
     kind: Literal[
@@ -386,11 +422,16 @@ class MeritSpec(Spec):
 class AllocationSpec(Spec):
     """Limits that meet the yield at the least cost.
 
-    Attributes:
-        target: share of cameras that are to pass all requirements.
-        grades: limits are rounded to these numbers times powers of ten.
-        loosest: by what limits may grow at most.
-        tightest: by what limits may shrink at most.
+    Attributes
+    ----------
+    target : Share
+        Share of cameras that are to pass all requirements.
+    grades : tuple[Number, ...]
+        Limits are rounded to these numbers times powers of ten.
+    loosest : Number
+        By what limits may grow at most.
+    tightest : Number
+        By what limits may shrink at most.
     """
 
     target: Share = 0.9
@@ -402,21 +443,33 @@ class AllocationSpec(Spec):
 class ToleranceBudgetSpec(Spec):
     """A tolerance budget of a camera.
 
-    Attributes:
-        instrument: a camera or an instrument, by name or path, as in a job.
-        camera: which camera of an instrument is judged; may be left out where there is one.
-        disturbances: what is expected to move between two measurements of the monitor, as in a job; those of the
-            instrument if not given.
-        tolerances: by name, what varies.
-        compensators: by name, what is adjusted in every camera, in this order; the mean square wavefront error over all
-            fields of the merits is made least.
-        merits: by name, what is asked.
-        light: in which wavefronts and MTFs are judged: `spectrum`, that of the camera, or `design`, its
-            design wavelength alone; the spectrum of a camera with lenses that has one, when left out.
-        samples: cameras that are drawn.
-        seed: of everything drawn.
-        allocation: whether limits are allocated anew, and for which yield.
-        limits: what the Monte Carlo run may use.
+    Attributes
+    ----------
+    instrument : Ref
+        a camera or an instrument, by name or path, as in a job.
+    camera : Name | None
+        Which camera of an instrument is judged; may be left out where there is one.
+    disturbances : JobDisturbances | None
+        What is expected to move between two measurements of the monitor, as in a job; those of the instrument if not
+        given.
+    tolerances : Named[ToleranceSpec]
+        By name, what varies.
+    compensators : Named[CompensatorSpec]
+        By name, what is adjusted in every camera, in this order; the mean square wavefront error over all fields of the
+        merits is made least.
+    merits : Named[MeritSpec]
+        By name, what is asked.
+    light : Literal['spectrum', 'design'] | None
+        In which wavefronts and MTFs are judged: `spectrum`, that of the camera, or `design`, its design wavelength
+        alone; the spectrum of a camera with lenses that has one, when left out.
+    samples : Whole
+        Cameras that are drawn.
+    seed : Seed
+        Of everything drawn.
+    allocation : AllocationSpec | None
+        Whether limits are allocated anew, and for which yield.
+    limits : LimitsSpec
+        What the Monte Carlo run may use.
     """
 
     instrument: Ref
@@ -442,10 +495,12 @@ class ToleranceBudgetSpec(Spec):
 class ToleranceSetup(ExperimentSetup[ToleranceBudgetSpec]):
     """A tolerance budget with its instrument.
 
-    Attributes:
-        base: the nominal job of the instrument.
-        draws: by number that varies, what one camera has of it, in units of its limit; those that are left out are
-            zero.
+    Attributes
+    ----------
+    base : ResolvedJob
+        The nominal job of the instrument.
+    draws : dict[str, Number]
+        By number that varies, what one camera has of it, in units of its limit; those that are left out are zero.
     """
 
     base: ResolvedJob

@@ -23,10 +23,14 @@ MOST_LINES = 10_000_000
 class GraduationSpec(Spec):
     """Errors of the grating's lines: a random curve from harmonics of the turn.
 
-    Attributes:
-        rms: over the full circle, expected, radians.
-        first, last: harmonics; the shortest wave is 360 deg / last.
-        slope: the amplitude of harmonic k falls as k^-slope.
+    Attributes
+    ----------
+    rms : AngleSigma
+        Over the full circle, expected, radians.
+    first, last : Whole
+        Harmonics; the shortest wave is 360 deg / last.
+    slope : Number
+        The amplitude of harmonic k falls as k^-slope.
     """
 
     rms: AngleSigma
@@ -46,10 +50,14 @@ class GraduationSpec(Spec):
 class SubdivisionSpec(Spec):
     """Error of the interpolation within one period of the grating's signal.
 
-    Attributes:
-        rms: expected, radians.
-        lines: periods of the signal in a full turn.
-        harmonics: of the signal that carry it, equal in the mean.
+    Attributes
+    ----------
+    rms : AngleSigma
+        Expected, radians.
+    lines : Whole
+        Periods of the signal in a full turn.
+    harmonics : tuple[Whole, ...]
+        Of the signal that carry it, equal in the mean.
     """
 
     rms: AngleSigma
@@ -70,12 +78,18 @@ class DividingErrorSpec(Spec):
     """What the dividing error is made of. Sizes are RMS values over the full circle that the draws have in the mean;
     the amplitude and phase of each harmonic are drawn from the seed.
 
-    Attributes:
-        axis: wobble of the axis, first and second harmonic, radians.
-        eccentricity: of the grating, first harmonic, radians.
-        graduation: of the lines.
-        subdivision: within a period of the signal.
-        repeatability: standard deviation of one reading, radians.
+    Attributes
+    ----------
+    axis : AngleSigma
+        Wobble of the axis, first and second harmonic, radians.
+    eccentricity : AngleSigma
+        Of the grating, first harmonic, radians.
+    graduation : GraduationSpec
+        Of the lines.
+    subdivision : SubdivisionSpec
+        Within a period of the signal.
+    repeatability : AngleSigma
+        Standard deviation of one reading, radians.
     """
 
     axis: AngleSigma
@@ -88,12 +102,16 @@ class DividingErrorSpec(Spec):
 class ReferenceSpec(Spec):
     """The reference: a polygon on an indexing table, seen by an autocollimator.
 
-    Attributes:
-        calibration: standard deviation of what its certificate leaves unknown at each position, the same in all
-            repeats, radians.
-        noise: standard deviation of one reading of the autocollimator, radians.
-        gross_error: size of a gross error (a shock, a draught), either sign, radians.
-        gross_probability: of one in a comparison.
+    Attributes
+    ----------
+    calibration : AngleSigma
+        Standard deviation of what its certificate leaves unknown at each position, the same in all repeats, radians.
+    noise : AngleSigma
+        Standard deviation of one reading of the autocollimator, radians.
+    gross_error : AngleSigma
+        Size of a gross error (a shock, a draught), either sign, radians.
+    gross_probability : Number
+        Of one in a comparison.
     """
 
     calibration: AngleSigma
@@ -105,10 +123,13 @@ class ReferenceSpec(Spec):
 class HeldOutSpec(Spec):
     """Angles that no fit sees, in the middle of the calibration's steps, measured in a series of their own.
 
-    Attributes:
-        repeats: of each.
-        spread: the table is set off the middle by a random amount within +- this, radians, so that readings fall at all
-            phases of the grating's signal, as in use.
+    Attributes
+    ----------
+    repeats : Whole
+        Of each.
+    spread : AngleSigma
+        The table is set off the middle by a random amount within +- this, radians, so that readings fall at all phases
+        of the grating's signal, as in use.
     """
 
     repeats: Annotated[Whole, Field(ge=2, le=1000)]
@@ -118,11 +139,16 @@ class HeldOutSpec(Spec):
 class CalibrationPlanSpec(Spec):
     """Which readings are compared how often.
 
-    Attributes:
-        first, last, step: of the readings, radians.
-        repeats: of each.
-        folds: of the cross-validation.
-        held_out: the angles for the comparison of the fits.
+    Attributes
+    ----------
+    first, last, step : TableAngle
+        Of the readings, radians.
+    repeats : Whole
+        Of each.
+    folds : Whole
+        Of the cross-validation.
+    held_out : HeldOutSpec
+        The angles for the comparison of the fits.
     """
 
     first: TableAngle
@@ -170,14 +196,22 @@ class CalibrationPlanSpec(Spec):
 class TurntableTestSpec(TitledSpec):
     """The turntable test.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        dividing_error: of the table; the analysis does not know it.
-        reference: what the table is compared with.
-        calibration: what is compared.
-        camera_angle: reading of the table at the middle of the camera's field in the distortion test, radians.
-        seed: of everything that is drawn.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    dividing_error : DividingErrorSpec
+        Of the table; the analysis does not know it.
+    reference : ReferenceSpec
+        What the table is compared with.
+    calibration : CalibrationPlanSpec
+        What is compared.
+    camera_angle : TableAngle
+        Reading of the table at the middle of the camera's field in the distortion test, radians.
+    seed : Seed
+        Of everything that is drawn.
     """
 
     dividing_error: DividingErrorSpec
@@ -203,13 +237,18 @@ class TurntableTestSpec(TitledSpec):
 class TurntableFiles(Spec):
     """Readings of a turntable that were compared with a reference.
 
-    Attributes:
-        comparisons: table of the calibrated readings, a CSV file.
-        held_out: table of readings between them, measured in a series of their own, by which the fits are judged;
-            without it cross-validation judges them, and an error of a period below the step stays unseen.
-        reference: standard deviation of what the reference's certificate leaves unknown at each position, the same in
-            all repeats, radians.
-        folds: of the cross-validation.
+    Attributes
+    ----------
+    comparisons : Reference
+        Table of the calibrated readings, a CSV file.
+    held_out : Reference | None
+        Table of readings between them, measured in a series of their own, by which the fits are judged; without it
+        cross-validation judges them, and an error of a period below the step stays unseen.
+    reference : AngleSigma
+        Standard deviation of what the reference's certificate leaves unknown at each position, the same in all repeats,
+        radians.
+    folds : Whole
+        Of the cross-validation.
     """
 
     comparisons: Reference
@@ -221,11 +260,16 @@ class TurntableFiles(Spec):
 class MeasuredTurntableSpec(TitledSpec):
     """The turntable test on measured readings.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        measured: the readings.
-        seed: of the network's starts.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    measured : TurntableFiles
+        The readings.
+    seed : Seed
+        Of the network's starts.
     """
 
     measured: TurntableFiles

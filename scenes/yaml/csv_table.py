@@ -33,14 +33,22 @@ _LEAST, _MOST = -np.inf, np.inf
 class Column:
     """A column that a table may have.
 
-    Attributes:
-        name: its head, without the unit.
-        kind: of the quantity; its head then ends in a unit in square brackets. None for numbers without a unit.
-        text: whether it holds names and not numbers.
-        needed: whether a table without it is refused.
-        least, most: of its numbers, both allowed, SI units.
-        whole: whether its numbers are whole.
-        bare: whether the unit may be missing, and numbers are then in the SI unit.
+    Attributes
+    ----------
+    name : str
+        Its head, without the unit.
+    kind : Kind | None
+        Of the quantity; its head then ends in a unit in square brackets. None for numbers without a unit.
+    text : bool
+        Whether it holds names and not numbers.
+    needed : bool
+        Whether a table without it is refused.
+    least, most : float
+        Of its numbers, both allowed, SI units.
+    whole : bool
+        Whether its numbers are whole.
+    bare : bool
+        Whether the unit may be missing, and numbers are then in the SI unit.
     """
 
     name: str
@@ -62,11 +70,16 @@ class Column:
 class Table:
     """What a table holds.
 
-    Attributes:
-        file: its path, as the user gave it.
-        lines: (N,) line of each row in the file, counted from 1.
-        heads: name of a column -> its head as it stands in the file.
-        columns: name -> (N,) numbers in SI units, or names; those that the file does not have are missing.
+    Attributes
+    ----------
+    file : str
+        Its path, as the user gave it.
+    lines : np.ndarray
+        (N,) line of each row in the file, counted from 1.
+    heads : Mapping[str, str]
+        Name of a column -> its head as it stands in the file.
+    columns : Mapping[str, np.ndarray]
+        Name -> (N,) numbers in SI units, or names; those that the file does not have are missing.
     """
 
     file: str
@@ -104,14 +117,20 @@ class Table:
 def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1) -> Table:
     """A table of a file.
 
-    Args:
-        path: of the file, UTF-8 text with commas, semicolons or tabs between its cells.
-        columns: that it may have; another one is refused.
-        least_rows: that it must have.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file, UTF-8 text with commas, semicolons or tabs between its cells.
+    columns : Sequence[Column]
+        That it may have; another one is refused.
+    least_rows : int
+        That it must have.
 
-    Raises:
-        InputError: the file cannot be read, a needed column is missing, a cell holds no number or one that is not
-            allowed; with the line and the head of the column.
+    Raises
+    ------
+    InputError
+        The file cannot be read, a needed column is missing, a cell holds no number or one that is not allowed; with the
+        line and the head of the column.
     """
     file = str(path)
     pieces = _rows(file, table_text(path))
@@ -154,13 +173,19 @@ def _numbers(
 def table_text(path: str | Path, what: str = "a CSV file", most: int = LARGEST_TABLE) -> str:
     """The text of a file of measured numbers.
 
-    Args:
-        path: of the file, UTF-8 text.
-        what: it should be, for messages.
-        most: bytes that it may have.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file, UTF-8 text.
+    what : str
+        It should be, for messages.
+    most : int
+        Bytes that it may have.
 
-    Raises:
-        InputError: there is none, it cannot be read, is too large or holds other than UTF-8 text.
+    Raises
+    ------
+    InputError
+        There is none, it cannot be read, is too large or holds other than UTF-8 text.
     """
     return read_text(path, what, most, (Path(path).suffix,))
 
@@ -173,8 +198,10 @@ _LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")
 def lines_of(text: str) -> Iterator[str]:
     """The lines of a text with their ends, as a file opened with ``newline=""`` has them, one at a time.
 
-    Args:
-        text: whole.
+    Parameters
+    ----------
+    text : str
+        whole.
     """
     return (match[0] for match in _LINE.finditer(text))
 
@@ -251,12 +278,17 @@ def rows_of(path: str | Path, most: int) -> list[tuple[int, list[str]]]:
     """Line, counted from 1, and cells of every row of a small table; empty lines and those that begin with # are left
     out.
 
-    Args:
-        path: of the file, as for ``read_table``.
-        most: bytes that it may have.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file, as for ``read_table``.
+    most : int
+        Bytes that it may have.
 
-    Raises:
-        InputError: it cannot be read, or is no table.
+    Raises
+    ------
+    InputError
+        It cannot be read, or is no table.
     """
     pieces = _rows(str(path), table_text(path, most=most))
     return [row for lines, rows in pieces for row in zip(lines, rows, strict=True)]

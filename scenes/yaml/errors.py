@@ -21,14 +21,22 @@ LONGEST_SHOWN = 60
 class Issue:
     """One fault of an input.
 
-    Attributes:
-        problem: what is wrong, in a few words.
-        file: path as the user gave it; "" if the input did not come from a file.
-        line: counted from 1; None if unknown.
-        key: where in the file; empty for the file as a whole.
-        found: what stands there, None if that says nothing.
-        allowed: what may stand there.
-        suggestion: the nearest valid name.
+    Attributes
+    ----------
+    problem : str
+        What is wrong, in a few words.
+    file : str
+        Path as the user gave it; "" if the input did not come from a file.
+    line : int | None
+        Counted from 1; None if unknown.
+    key : KeyPath
+        Where in the file; empty for the file as a whole.
+    found : str | None
+        What stands there, None if that says nothing.
+    allowed : str | None
+        What may stand there.
+    suggestion : str | None
+        The nearest valid name.
     """
 
     problem: str
@@ -59,9 +67,12 @@ class Issue:
 class InputError(Exception):
     """An input that cannot be used: one or more issues, one a line in the message. Commands end with exit code 2 on it.
 
-    Attributes:
-        issues: all of them.
-        file, line, key, found, allowed, suggestion: of the first one.
+    Attributes
+    ----------
+    issues
+        All of them.
+    file, line, key, found, allowed, suggestion
+        Of the first one.
     """
 
     def __init__(self, *issues: Issue) -> None:
@@ -79,9 +90,12 @@ class InputError(Exception):
 class Problem(ValueError):
     """Raised by the reader of a value, which knows what is wrong with it but not where it stands.
 
-    Attributes:
-        problem, found, allowed, suggestion: as in `Issue`.
-        within: where in the value the fault lies; empty for the value as a whole.
+    Attributes
+    ----------
+    problem, found, allowed, suggestion
+        As in `Issue`.
+    within
+        Where in the value the fault lies; empty for the value as a whole.
     """
 
     def __init__(
@@ -113,12 +127,18 @@ def unknown(
 ) -> Problem:
     """A name that is none of the known ones, with these and the nearest of them, for the caller to raise.
 
-    Args:
-        problem: what is wrong, "no such line".
-        name: as it was found.
-        known: names that may stand there.
-        within: where in the value it stands.
-        allowed: what may stand there, where the names alone do not say it.
+    Parameters
+    ----------
+    problem : str
+        What is wrong, "no such line".
+    name : object
+        As it was found.
+    known : Iterable[str]
+        Names that may stand there.
+    within : KeyPath
+        Where in the value it stands.
+    allowed : str | None
+        What may stand there, where the names alone do not say it.
     """
     names = tuple(known)
     return Problem(problem, shown(name), allowed or names_text(names), nearest(str(name), names), within)

@@ -64,9 +64,12 @@ WORDS = {
 class MeasuredScatter:
     """What a file holds.
 
-    Attributes:
-        table: the BSDF.
-        stated: total integrated scatter as the file states it, one for each of the table's angles of incidence.
+    Attributes
+    ----------
+    table : ScatterTable
+        The BSDF.
+    stated : tuple[float, ...]
+        Total integrated scatter as the file states it, one for each of the table's angles of incidence.
     """
 
     table: ScatterTable
@@ -169,8 +172,10 @@ def _number(cell: str) -> float | None:
 def read_bsdf(path: str | Path) -> MeasuredScatter:
     """The table of a file.
 
-    Raises:
-        InputError: it cannot be read or is not such a table, or one that is not taken here, with the line.
+    Raises
+    ------
+    InputError
+        It cannot be read or is not such a table, or one that is not taken here, with the line.
     """
     file = str(path)
     lines = _Lines(file, read_text(path, "a BSDF file", LARGEST, (ENDING,)))
@@ -257,8 +262,10 @@ class MeasuredCoating:
     def at(self, wavelength: float) -> CoatingTable:
         """The coating at a wavelength in metres, linear between the two beside it.
 
-        Raises:
-            ValueError: the wavelength lies outside of the table.
+        Raises
+        ------
+        ValueError
+            The wavelength lies outside of the table.
         """
         known = np.array(list(self.by_wavelength))
         near = 1e-9 * wavelength
@@ -285,8 +292,10 @@ class MeasuredCoating:
 def read_coating(path: str | Path) -> MeasuredCoating:
     """The coating of a file.
 
-    Raises:
-        InputError: it cannot be read, a column is missing or twice there, or a row cannot be, with line and column.
+    Raises
+    ------
+    InputError
+        It cannot be read, a column is missing or twice there, or a row cannot be, with line and column.
     """
     table = read_table(path, COLUMNS)
     reflected = _mean(table, "R")

@@ -21,14 +21,21 @@ _UNITS = ((10**9, "GB"), (10**6, "MB"), (10**3, "kB"), (1, "bytes"))
 def read_bytes(path: str | Path, what: str, most: int, ends: Sequence[str]) -> bytes:
     """What a file holds.
 
-    Args:
-        path: of the file.
-        what: it should be, for messages.
-        most: bytes that it may have.
-        ends: of names of the files beside it that may have been meant where there is none.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file.
+    what : str
+        It should be, for messages.
+    most : int
+        Bytes that it may have.
+    ends : Sequence[str]
+        Of names of the files beside it that may have been meant where there is none.
 
-    Raises:
-        InputError: there is none, it cannot be read or is too large.
+    Raises
+    ------
+    InputError
+        There is none, it cannot be read or is too large.
     """
     file = str(path)
     # A device or a pipe could be endless or block.
@@ -53,8 +60,10 @@ def read_bytes(path: str | Path, what: str, most: int, ends: Sequence[str]) -> b
 def read_text(path: str | Path, what: str, most: int, ends: Sequence[str]) -> str:
     """The text of a file, UTF-8 with or without a mark; arguments as `read_bytes`.
 
-    Raises:
-        InputError: as `read_bytes`, and where it holds other than UTF-8 text.
+    Raises
+    ------
+    InputError
+        As `read_bytes`, and where it holds other than UTF-8 text.
     """
     content = read_bytes(path, what, most, ends)
     try:
@@ -97,10 +106,14 @@ def is_file(path: Path) -> bool:
 def no_file(path: Path) -> str | None:
     """Why a path is not that of a regular file, found without opening it; None where it is.
 
-    Args:
-        path: of what may be missing, or of a kind that could be endless or block: a device, a pipe.
+    Parameters
+    ----------
+    path : Path
+        Of what may be missing, or of a kind that could be endless or block: a device, a pipe.
 
-    Returns:
+    Returns
+    -------
+    str | None
         MISSING, "is a directory, not a regular file", "cannot be read: ..." and the like.
     """
     try:
@@ -130,9 +143,12 @@ def digest_of(path: Path) -> str:
 def file_beside(path: Path, ends: Sequence[str] = ()) -> str | None:
     """Name of the file in the same folder that was probably meant; None where none comes near.
 
-    Args:
-        path: of a file that is not there.
-        ends: of names that may have been meant; by default any.
+    Parameters
+    ----------
+    path : Path
+        Of a file that is not there.
+    ends : Sequence[str]
+        Of names that may have been meant; by default any.
     """
     try:
         names = sorted(place.name for place in path.parent.iterdir() if not ends or place.suffix in ends)
@@ -150,8 +166,10 @@ MOST_DIGITS = 300
 def read_json(path: str | Path) -> Any:
     """Plain data of a JSON file.
 
-    Raises:
-        InputError: the file cannot be read, is too large or not JSON.
+    Raises
+    ------
+    InputError
+        The file cannot be read, is too large or not JSON.
     """
     return parse_json(read_text(path, "a JSON file", LARGEST_JSON, (".json",)), str(path))
 
@@ -159,8 +177,10 @@ def read_json(path: str | Path) -> Any:
 def parse_json(text: str, file: str) -> Any:
     """Plain data of JSON; `file` is what messages call it. NaN and infinities are taken, as Python writes them.
 
-    Raises:
-        InputError: it is not JSON, is nested deeper than YAML may be, or has whole numbers that no computation takes.
+    Raises
+    ------
+    InputError
+        It is not JSON, is nested deeper than YAML may be, or has whole numbers that no computation takes.
     """
     try:
         data = json.loads(text, parse_int=_whole)

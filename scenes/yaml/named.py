@@ -22,8 +22,10 @@ _OURS = ("analysis", "optics", "scenes", "twin")
 class Named:
     """A function or a class that is imported when it is used.
 
-    Attributes:
-        path: module and name, ``twin.laboratory.export:export_focus``; of a method ``module:Class.method``.
+    Attributes
+    ----------
+    path : str
+        Module and name, ``twin.laboratory.export:export_focus``; of a method ``module:Class.method``.
     """
 
     path: str
@@ -43,15 +45,23 @@ class Named:
 class FileKind:
     """A kind of file.
 
-    Attributes:
-        name: of its JSON Schema.
-        described: model of what it may say, as `Named` takes its name; with a dot before it one of `scenes.specs`.
-        what: it is, with article, for messages.
-        needs: keys, in words, that the model requires and few other kinds have: a file without them is known to be of
-            another kind before the model is imported.
-        command: that reads it, as the user calls it; empty for what only other files name.
-        place: where other files name it; empty for what only a command reads.
-        one_of: keys, in words, of which it has at least one.
+    Attributes
+    ----------
+    name : str
+        Of its JSON Schema.
+    described : str
+        Model of what it may say, as `Named` takes its name; with a dot before it one of `scenes.specs`.
+    what : str
+        It is, with article, for messages.
+    needs : str
+        Keys, in words, that the model requires and few other kinds have: a file without them is known to be of another
+        kind before the model is imported.
+    command : str
+        That reads it, as the user calls it; empty for what only other files name.
+    place : str
+        Where other files name it; empty for what only a command reads.
+    one_of : str
+        Keys, in words, of which it has at least one.
     """
 
     name: str

@@ -60,10 +60,14 @@ class DisplacedNodes:
 class WarmNodes:
     """Nodes and their temperatures.
 
-    Attributes:
-        points: metres, (N, 3), in the frame that the specification names.
-        values: kelvin, (N,).
-        absolute: whether they are absolute temperatures, and not changes from the instrument's.
+    Attributes
+    ----------
+    points : np.ndarray
+        Metres, (N, 3), in the frame that the specification names.
+    values : np.ndarray
+        Kelvin, (N,).
+    absolute : bool
+        Whether they are absolute temperatures, and not changes from the instrument's.
     """
 
     points: np.ndarray
@@ -76,14 +80,21 @@ def read_nodes(
 ) -> DisplacedNodes:
     """The displaced nodes of a table or a mesh.
 
-    Args:
-        path: of the file; its ending says what it is.
-        unit: of a mesh.
-        field: name of the displacements in a mesh, None for its only vectors.
-        sha256: checksum that the file must have, None for any.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file; its ending says what it is.
+    unit : str | None
+        Of a mesh.
+    field : str | None
+        Name of the displacements in a mesh, None for its only vectors.
+    sha256 : str | None
+        Checksum that the file must have, None for any.
 
-    Raises:
-        InputError: it cannot be read, with the line and the column of a table, or is not the one of the checksum.
+    Raises
+    ------
+    InputError
+        It cannot be read, with the line and the column of a table, or is not the one of the checksum.
     """
     _checked(Path(path), sha256)
     if Path(path).suffix.lower() in MESHES:
@@ -106,15 +117,23 @@ def read_temperatures(
 ) -> WarmNodes:
     """The temperatures of a table's or a mesh's nodes.
 
-    Args:
-        path: of the file; its ending says what it is.
-        unit: of a mesh's coordinates.
-        field: name of the temperatures in a mesh, None for its only numbers.
-        reading: of a mesh: what they are, "change", "K" or "degC".
-        sha256: checksum that the file must have, None for any.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file; its ending says what it is.
+    unit : str | None
+        Of a mesh's coordinates.
+    field : str | None
+        Name of the temperatures in a mesh, None for its only numbers.
+    reading : str | None
+        Of a mesh: what they are, "change", "K" or "degC".
+    sha256 : str | None
+        Checksum that the file must have, None for any.
 
-    Raises:
-        InputError: as ``read_nodes``.
+    Raises
+    ------
+    InputError
+        As ``read_nodes``.
     """
     _checked(Path(path), sha256)
     if Path(path).suffix.lower() in MESHES:

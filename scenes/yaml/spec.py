@@ -56,8 +56,10 @@ Flag = Annotated[bool, Field(strict=True)]
 class Catalogued(AfterValidator):
     """Validator of a name that a catalogue knows.
 
-    Attributes:
-        names: that may be given.
+    Attributes
+    ----------
+    names : Iterable[str]
+        That may be given.
     """
 
     names: Iterable[str] = ()
@@ -66,10 +68,14 @@ class Catalogued(AfterValidator):
 def name_in(what: str, catalogue: Mapping[str, Any], look_up: Callable[[str], Any]) -> Catalogued:
     """A name that a catalogue knows, brought to the catalogue's own spelling.
 
-    Args:
-        what: is named, for the error message.
-        catalogue: the names that may be given.
-        look_up: name -> entry with a ``name``; KeyError for an unknown one.
+    Parameters
+    ----------
+    what : str
+        Is named, for the error message.
+    catalogue : Mapping[str, Any]
+        The names that may be given.
+    look_up : Callable[[str], Any]
+        Name -> entry with a ``name``; KeyError for an unknown one.
     """
 
     def check(name: str) -> str:
@@ -86,8 +92,10 @@ class OneOf:
     """Annotation of a text that must be one of the names that are registered somewhere when the file is read; errors
     and JSON Schema are those of a ``Literal`` of these names.
 
-    Attributes:
-        names: gives them in the order in which a message lists them.
+    Attributes
+    ----------
+    names : Callable[[], Iterable[str]]
+        Gives them in the order in which a message lists them.
     """
 
     names: Callable[[], Iterable[str]]
@@ -125,9 +133,11 @@ Reference = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
 class Inline(str):
     """A reference in whose place stands the mapping itself; as text it is the mapping's name.
 
-    Attributes:
-        yaml: the mapping; with its file, lines and place where these are known, else with its place below the key of
-            the reference.
+    Attributes
+    ----------
+    yaml : YamlFile
+        The mapping; with its file, lines and place where these are known, else with its place below the key of the
+        reference.
     """
 
     yaml: YamlFile
@@ -145,9 +155,12 @@ class Inline(str):
     def placed(self, source: Source, key: KeyPath) -> Inline:
         """Return the reference with the place of its mapping.
 
-        Args:
-            source: of the specification that has the reference.
-            key: of the reference there.
+        Parameters
+        ----------
+        source : Source
+            Of the specification that has the reference.
+        key : KeyPath
+            Of the reference there.
         """
         if self.yaml.file or self.yaml.lines:
             return self
@@ -195,10 +208,14 @@ NothingIsEmpty = BeforeValidator(_nothing_is_empty)
 class Source:
     """Where a specification was read. All sources compare equal: where a value was read does not make it another value.
 
-    Attributes:
-        file: path as the user gave it, "" if it did not come from a file.
-        lines: key path -> line, counted from 1.
-        prefix: key path of the specification inside the file.
+    Attributes
+    ----------
+    file : str
+        Path as the user gave it, "" if it did not come from a file.
+    lines : Mapping[KeyPath, int]
+        Key path -> line, counted from 1.
+    prefix : KeyPath
+        Key path of the specification inside the file.
     """
 
     file: str = ""
@@ -251,10 +268,14 @@ class Spec(BaseModel):
     def issue(self, problem: str | Problem, key: KeyPath = (), **told: Unpack[_Told]) -> Issue:
         """Something wrong with what stands at `key`, with the file and line it was read from.
 
-        Args:
-            problem: what is wrong; or a Problem, which says all but the key.
-            key: in this specification.
-            told: found (what stands there), allowed (what may stand there) and suggestion (the nearest valid name).
+        Parameters
+        ----------
+        problem : str | Problem
+            What is wrong; or a Problem, which says all but the key.
+        key : KeyPath
+            In this specification.
+        told : Unpack[_Told]
+            Found (what stands there), allowed (what may stand there) and suggestion (the nearest valid name).
         """
         if not isinstance(problem, Problem):
             found = told.get("found")
@@ -270,14 +291,21 @@ class Spec(BaseModel):
     def file_at(self, key: KeyPath, value: str, folder: Path, what: str) -> Path:
         """The absolute path of a file that a specification names.
 
-        Args:
-            key: that names it.
-            value: its path, as it is written there.
-            folder: that relative paths start from.
-            what: the file should be, for messages.
+        Parameters
+        ----------
+        key : KeyPath
+            That names it.
+        value : str
+            Its path, as it is written there.
+        folder : Path
+            That relative paths start from.
+        what : str
+            The file should be, for messages.
 
-        Raises:
-            InputError: there is none.
+        Raises
+        ------
+        InputError
+            There is none.
         """
         path = folder / value
         if is_file(path):
@@ -296,9 +324,12 @@ class Spec(BaseModel):
 class TitledSpec(Spec):
     """Base of the files that have a name of their own.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
+    Attributes
+    ----------
+    name : Name
+        As the file is called.
+    description : Text
+        For people.
     """
 
     name: Name
@@ -307,9 +338,12 @@ class TitledSpec(Spec):
     def file_text(self, remark: str, **others: Any) -> str:
         """Text of a file that says this, with remarks at its top; keys without a value are left out.
 
-        Args:
-            remark: lines of comment.
-            others: plain data of keys that are to be written in place of their own.
+        Parameters
+        ----------
+        remark : str
+            Lines of comment.
+        others : Any
+            Plain data of keys that are to be written in place of their own.
         """
         head = "".join(f"# {line}\n" for line in remark.splitlines())
         plain = {**self.plain(), **others}
@@ -319,15 +353,23 @@ class TitledSpec(Spec):
 def one_given(spec: Spec, names: Sequence[str], problem: str, allowed: str | None = None, within: KeyPath = ()) -> None:
     """Refuse a specification that has none or several of the keys of which it needs one.
 
-    Args:
-        spec: that was read.
-        names: of the keys.
-        problem: what is wrong then.
-        allowed: what may be written.
-        within: the key at which that is told.
+    Parameters
+    ----------
+    spec : Spec
+        That was read.
+    names : Sequence[str]
+        Of the keys.
+    problem : str
+        What is wrong then.
+    allowed : str | None
+        What may be written.
+    within : KeyPath
+        The key at which that is told.
 
-    Raises:
-        Problem: not one of them is given.
+    Raises
+    ------
+    Problem
+        Not one of them is given.
     """
     given = [name for name in names if getattr(spec, name) is not None]
     if len(given) != 1:
@@ -350,10 +392,14 @@ def short_for(key: str | None, *types: type, schema: Any = PydanticUndefined) ->
     """Validator of what may be written short: a value of one of the types stands for ``{key: value}``, or for a list
     that holds it if the key is None.
 
-    Args:
-        key: which the value stands for.
-        types: of a value that is short for it.
-        schema: what editors are told that may be written; by default the long form.
+    Parameters
+    ----------
+    key : str | None
+        Which the value stands for.
+    types : type
+        Of a value that is short for it.
+    schema : Any
+        What editors are told that may be written; by default the long form.
     """
 
     def widen(value: Any) -> Any:
@@ -370,8 +416,10 @@ SpecType = TypeVar("SpecType", bound=Spec)
 def validate(model: type[SpecType], yaml: YamlFile) -> SpecType:
     """The specification that a YAML file holds.
 
-    Raises:
-        InputError: one issue for each fault, in the order of the file.
+    Raises
+    ------
+    InputError
+        One issue for each fault, in the order of the file.
     """
     source = Source(yaml.file, yaml.lines, yaml.prefix)
     try:

@@ -40,12 +40,17 @@ def to_stdout(errors: Console, kept: str = "") -> Iterator[None]:
 
     A reader that has seen enough, as ``head`` has, ends the command without a word, as it does other programs.
 
-    Args:
-        errors: where it is told that stdout cannot be written, on a full disk for instance.
-        kept: where the results are all the same, for this message.
+    Parameters
+    ----------
+    errors : Console
+        Where it is told that stdout cannot be written, on a full disk for instance.
+    kept : str
+        Where the results are all the same, for this message.
 
-    Raises:
-        typer.Exit: it cannot.
+    Raises
+    ------
+    typer.Exit
+        It cannot.
     """
     try:
         yield

@@ -32,12 +32,18 @@ from scenes.yaml.errors import KeyPath, Problem, key_text, names_text, shown, un
 class Quantity:
     """Annotation that makes a float field a quantity with limits.
 
-    Attributes:
-        kind: what it measures.
-        largest: limit on its size (its absolute value), with unit; None for no limit.
-        smallest: limit from below on the signed value, with unit.
-        above_zero: it must be greater than zero.
-        unsigned: of a difference: a larger one is written with its sign, since without it is hardly meant as one.
+    Attributes
+    ----------
+    kind : units.Kind
+        What it measures.
+    largest : str | None
+        Limit on its size (its absolute value), with unit; None for no limit.
+    smallest : str | None
+        Limit from below on the signed value, with unit.
+    above_zero : bool
+        It must be greater than zero.
+    unsigned : str | None
+        Of a difference: a larger one is written with its sign, since without it is hardly meant as one.
     """
 
     kind: units.Kind
@@ -63,8 +69,10 @@ class Quantity:
     def parse(self, text: object) -> float:
         """The SI value of the text.
 
-        Raises:
-            Problem: not a quantity of this kind, or outside the limits.
+        Raises
+        ------
+        Problem
+            Not a quantity of this kind, or outside the limits.
         """
         value = units.parse_quantity(text, self.kind)
         outside = (
@@ -106,10 +114,14 @@ class Vector:
     """Annotation that makes a tuple field a list of quantities of one sort and fixed length, in YAML `[0 um, 0 um, 3
     um]` or, with one unit for all, `0 0 3 um`.
 
-    Attributes:
-        of: what each of them is.
-        length: how many there are.
-        alike: `3 um` is allowed, too, and means `3 3 3 um`.
+    Attributes
+    ----------
+    of : Quantity
+        What each of them is.
+    length : int
+        How many there are.
+    alike : bool
+        `3 um` is allowed, too, and means `3 3 3 um`.
     """
 
     of: Quantity
@@ -153,8 +165,10 @@ class Vector:
 class Terms:
     """Annotation that makes a mapping field a few optional quantities, each with a unit of its own.
 
-    Attributes:
-        of: name -> quantity.
+    Attributes
+    ----------
+    of : Mapping[str, Quantity]
+        Name -> quantity.
     """
 
     of: Mapping[str, Quantity]
@@ -363,9 +377,12 @@ def example_of(quantity: Quantity, key: KeyPath) -> str:
 def written(metadata: Iterable[Any], key: KeyPath) -> str | None:
     """How the value of a field may be written, if it is a quantity or a row of them.
 
-    Args:
-        metadata: annotations of the field.
-        key: where it stands in the file.
+    Parameters
+    ----------
+    metadata : Iterable[Any]
+        Annotations of the field.
+    key : KeyPath
+        Where it stands in the file.
     """
     for item in metadata:
         if isinstance(item, Quantity):

@@ -34,12 +34,18 @@ OTHER_MINUS = tuple("\u2212\u2010\u2011\u2012\u2013\u2014\ufe63\uff0d")
 class Kind:
     """A kind of quantity.
 
-    Attributes:
-        name: with its article, as it appears in messages: "an angle".
-        si: the SI unit that values of this kind have inside the program.
-        units: units to suggest. Others that pint knows are read as well if they measure the same thing.
-        example: a number with unit.
-        writes: units to write in, the preferred one first; empty for the SI unit.
+    Attributes
+    ----------
+    name : str
+        With its article, as it appears in messages: "an angle".
+    si : str
+        The SI unit that values of this kind have inside the program.
+    units : tuple[str, ...]
+        Units to suggest. Others that pint knows are read as well if they measure the same thing.
+    example : str
+        a number with unit.
+    writes : tuple[str, ...]
+        Units to write in, the preferred one first; empty for the SI unit.
     """
 
     name: str
@@ -170,12 +176,17 @@ _ZERO_CELSIUS = Decimal("273.15")
 def parse_quantity(text: object, kind: Kind) -> float:
     """The SI value of a quantity written as number and unit.
 
-    Args:
-        text: for instance "-1.5 arcsec"; anything but text is refused.
-        kind: what it must measure.
+    Parameters
+    ----------
+    text : object
+        For instance "-1.5 arcsec"; anything but text is refused.
+    kind : Kind
+        What it must measure.
 
-    Raises:
-        Problem: no unit, no number, not finite, unknown unit (with the nearest known one), or a unit of something else.
+    Raises
+    ------
+    Problem
+        No unit, no number, not finite, unknown unit (with the nearest known one), or a unit of something else.
     """
     if not isinstance(text, str):
         _refuse_untyped(text, kind)
@@ -220,13 +231,19 @@ def format_quantity(value: float, kind: Kind, within: float = 0.0) -> str:
 
     A unit that makes the number lie between 1 and 1000 is preferred, then one with few digits, then the earlier one.
 
-    Args:
-        value: SI.
-        kind: what it measures.
-        within: by how much the text may differ, SI: of a computed value what its rounding has left in the last digits.
+    Parameters
+    ----------
+    value : float
+        SI.
+    kind : Kind
+        What it measures.
+    within : float
+        By how much the text may differ, SI: of a computed value what its rounding has left in the last digits.
 
-    Raises:
-        ValueError: not finite.
+    Raises
+    ------
+    ValueError
+        Not finite.
     """
     if not math.isfinite(value):
         raise ValueError(f"{value} has no text")
@@ -278,8 +295,10 @@ def with_unit(value: float, unit: str) -> str:
 def unit_ratio(unit: str, other: str) -> float:
     """What a number in ``unit`` is multiplied by to be one in ``other``; degrees Celsius are differences here.
 
-    Raises:
-        Problem: the two units measure different things, or one is not known.
+    Raises
+    ------
+    Problem
+        The two units measure different things, or one is not known.
     """
     one, two = _look_up(unit), _look_up(other)
     if one is None or two is None or one[1] != two[1]:

@@ -53,11 +53,16 @@ _WORDS: dict[str, bool | None] = {
 class YamlFile:
     """The contents of one YAML file.
 
-    Attributes:
-        file: path as the user gave it.
-        data: dict, list and scalars. Keys are always text.
-        lines: key path -> line, counted from 1; for a mapping's entry the line of its key.
-        prefix: key path of the data, where they are a part of the file.
+    Attributes
+    ----------
+    file : str
+        Path as the user gave it.
+    data : Any
+        Dict, list and scalars. Keys are always text.
+    lines : Mapping[KeyPath, int]
+        Key path -> line, counted from 1; for a mapping's entry the line of its key.
+    prefix : KeyPath
+        Key path of the data, where they are a part of the file.
     """
 
     file: str
@@ -76,10 +81,12 @@ class YamlFile:
 def read_yaml(path: str | Path) -> YamlFile:
     """Read a YAML file.
 
-    Raises:
-        InputError: no such file, not a regular file, unreadable, larger than 1 MB, not UTF-8, empty, not YAML, several
-            documents, nested deeper than 32, with more than 100 000 keys and values, or with duplicate keys, anchors,
-            aliases, merge keys or tags.
+    Raises
+    ------
+    InputError
+        No such file, not a regular file, unreadable, larger than 1 MB, not UTF-8, empty, not YAML, several documents,
+        nested deeper than 32, with more than 100 000 keys and values, or with duplicate keys, anchors, aliases, merge
+        keys or tags.
     """
     return parse_yaml(read_text(path, "a YAML file", LARGEST_BYTES, (".yaml", ".yml")), str(path))
 
@@ -301,8 +308,10 @@ class _Builder:
 def plain_scalar(text: str) -> Any:
     """The value of an unquoted scalar by the core schema of YAML 1.2.
 
-    Args:
-        text: without spaces around it.
+    Parameters
+    ----------
+    text : str
+        Without spaces around it.
     """
     return _WORDS[text] if text in _WORDS else _number_or_text(text)
 

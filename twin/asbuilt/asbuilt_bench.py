@@ -36,20 +36,32 @@ _SHARE = 1e-2
 class AsBuiltBench(Site):
     """An instrument on which a state is estimated.
 
-    Args:
-        setup: what was measured, and the instrument as designed.
-        backend: where to trace.
+    Parameters
+    ----------
+    setup
+        What was measured, and the instrument as designed.
+    backend
+        Where to trace.
 
-    Attributes:
-        test: the file.
-        camera: that is judged.
-        parameters: that are estimated.
-        kinds: measurements, in their order.
-        afters: of each the last move that had been made.
-        merits: bench of what is asked.
+    Attributes
+    ----------
+    test
+        The file.
+    camera
+        That is judged.
+    parameters
+        That are estimated.
+    kinds
+        Measurements, in their order.
+    afters
+        Of each the last move that had been made.
+    merits
+        Bench of what is asked.
 
-    Raises:
-        InputError: names that do not exist, a prior of nothing, or a camera without light.
+    Raises
+    ------
+    InputError
+        Names that do not exist, a prior of nothing, or a camera without light.
     """
 
     def __init__(self, setup: AsBuiltSetup, backend: Backend) -> None:
@@ -163,12 +175,17 @@ class AsBuiltBench(Site):
     def estimate(self, data: Sequence[np.ndarray], start: np.ndarray | None = None) -> StateEstimate:
         """Estimate the parameters.
 
-        Args:
-            data: numbers of each measurement.
-            start: parameters from which the steps go.
+        Parameters
+        ----------
+        data : Sequence[np.ndarray]
+            Numbers of each measurement.
+        start : np.ndarray | None
+            Parameters from which the steps go.
 
-        Raises:
-            InputError: measurements whose errors or light cannot be.
+        Raises
+        ------
+        InputError
+            Measurements whose errors or light cannot be.
         """
         try:
             return estimate_state(self.parameters.prior, self.groups(data), self.predict, self.slope, start)
@@ -180,9 +197,12 @@ class AsBuiltBench(Site):
     def draw(self, rng: np.random.Generator, law: str) -> np.ndarray:
         """Parameters (K,) of an instrument of the prior; of components that ``simulate`` states otherwise by that.
 
-        Args:
-            rng: source of random numbers.
-            law: ``normal`` or ``uniform`` with the same covariance.
+        Parameters
+        ----------
+        rng : np.random.Generator
+            Source of random numbers.
+        law : str
+            ``normal`` or ``uniform`` with the same covariance.
         """
         prior = self.parameters.prior
         covariance = prior.covariance.copy()
@@ -209,8 +229,10 @@ class AsBuiltBench(Site):
     def measured(self, true: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
         """What measurements of an instrument of parameters (K,) read, with their errors.
 
-        Raises:
-            PhysicalError: its light is lost.
+        Raises
+        ------
+        PhysicalError
+            Its light is lost.
         """
         return tuple(
             kind.drawn(kind.predict(self.view(true[None], after))[0], rng)
@@ -266,11 +288,16 @@ class AsBuiltBench(Site):
 def where_lit(work: Callable[[slice], np.ndarray], count: int, shape: tuple[int, ...], first: int = 0) -> np.ndarray:
     """What is worked out of states, (S, *shape), with NaN for each whose light is lost.
 
-    Args:
-        work: of which of the states; raises PhysicalError where the light of one is lost.
-        count: number of states.
-        shape: of what is worked out of one.
-        first: number of the first state.
+    Parameters
+    ----------
+    work : Callable[[slice], np.ndarray]
+        Of which of the states; raises PhysicalError where the light of one is lost.
+    count : int
+        Number of states.
+    shape : tuple[int, ...]
+        Of what is worked out of one.
+    first : int
+        Number of the first state.
     """
     try:
         return work(slice(first, first + count))

@@ -38,15 +38,24 @@ _DRAW = 7e4
 class Standing:
     """One merit of the instrument.
 
-    Attributes:
-        merit: the merit.
-        designed: of the instrument as drawn, SI.
-        before: quantiles ``LEVELS`` under the prior alone, SI.
-        now: the same with the measurements.
-        meets: probability that it meets the requirement.
-        moved: quantiles after the next move; empty where nothing can be moved.
-        meets_moved: probability then; NaN likewise.
-        true: of a drawn instrument, SI; NaN for a real one.
+    Attributes
+    ----------
+    merit : Merit
+        The merit.
+    designed : float
+        Of the instrument as drawn, SI.
+    before : tuple[float, ...]
+        Quantiles ``LEVELS`` under the prior alone, SI.
+    now : tuple[float, ...]
+        The same with the measurements.
+    meets : float
+        Probability that it meets the requirement.
+    moved : tuple[float, ...]
+        Quantiles after the next move; empty where nothing can be moved.
+    meets_moved : float
+        Probability then; NaN likewise.
+    true : float
+        Of a drawn instrument, SI; NaN for a real one.
     """
 
     merit: Merit
@@ -63,18 +72,29 @@ class Standing:
 class AsBuiltRun:
     """An instrument as it was built.
 
-    Attributes:
-        setup: what was measured.
-        bench: the instrument.
-        data: numbers of each measurement.
-        found: the state.
-        known: combinations of motions, the best known first.
-        standings: of the merits.
-        along: rms wavefront error along the line, waves: designed (F,), and quantiles ``LEVELS`` under the prior, with
-            the measurements and, where something can be moved, after the next move, (2 or 3, 5, F).
-        advice: the next move; None where nothing can be moved.
-        true: parameters of a drawn instrument; None of a real one.
-        warnings: what the user should know.
+    Attributes
+    ----------
+    setup : AsBuiltSetup
+        What was measured.
+    bench : AsBuiltBench
+        The instrument.
+    data : tuple[np.ndarray, ...]
+        Numbers of each measurement.
+    found : StateEstimate
+        The state.
+    known : tuple[Combination, ...]
+        Combinations of motions, the best known first.
+    standings : tuple[Standing, ...]
+        Of the merits.
+    along : tuple[np.ndarray, np.ndarray]
+        Rms wavefront error along the line, waves: designed (F,), and quantiles ``LEVELS`` under the prior, with the
+        measurements and, where something can be moved, after the next move, (2 or 3, 5, F).
+    advice : Advice | None
+        The next move; None where nothing can be moved.
+    true : np.ndarray | None
+        Parameters of a drawn instrument; None of a real one.
+    warnings : tuple[str, ...]
+        What the user should know.
     """
 
     setup: AsBuiltSetup
@@ -94,15 +114,22 @@ def run_asbuilt(
 ) -> AsBuiltRun:
     """Estimate the state of an instrument and what follows from it.
 
-    Args:
-        setup: what was measured.
-        backend: where to trace.
-        seed: of the draws; the file's own by default.
-        advance: shows how far it is.
+    Parameters
+    ----------
+    setup : AsBuiltSetup
+        What was measured.
+    backend : Backend
+        Where to trace.
+    seed : int | None
+        Of the draws; the file's own by default.
+    advance : Advance
+        Shows how far it is.
 
-    Raises:
-        InputError: names that do not exist, files without data, measurements that contradict each other, or more memory
-            than there is.
+    Raises
+    ------
+    InputError
+        Names that do not exist, files without data, measurements that contradict each other, or more memory than there
+        is.
     """
     test = setup.test
     seed = test.seed if seed is None else seed
@@ -153,8 +180,10 @@ def _random(seed: int, number: int) -> np.random.Generator:
 def require_agreement(bench: AsBuiltBench, found: StateEstimate) -> None:
     """Refuse an estimate that has not settled, or of measurements that contradict each other.
 
-    Raises:
-        InputError: names the measurement that agrees least with all others.
+    Raises
+    ------
+    InputError
+        Names the measurement that agrees least with all others.
     """
     test = bench.test
     if not found.converged:

@@ -45,10 +45,14 @@ _LINE_DEGREE = 7
 class View:
     """States at the time of a measurement.
 
-    Attributes:
-        values: parameters, (S, K).
-        states: the instrument, S.
-        warmth: bodies -> temperatures above nominal, (S, bodies).
+    Attributes
+    ----------
+    values : np.ndarray
+        Parameters, (S, K).
+    states : Sequence[State]
+        The instrument, S.
+    warmth : Any
+        Bodies -> temperatures above nominal, (S, bodies).
     """
 
     values: np.ndarray
@@ -76,15 +80,23 @@ class Site(ABC):
 class MeasuredKind(ABC):
     """One measurement.
 
-    Args:
-        site: the instrument.
-        name: of the measurement.
-        spec: what the file says of it.
-        key: where.
+    Parameters
+    ----------
+    site
+        The instrument.
+    name
+        Of the measurement.
+    spec
+        What the file says of it.
+    key
+        where.
 
-    Attributes:
-        labels: of its numbers, (D,).
-        blocks: what one gross error would spoil together, (D,).
+    Attributes
+    ----------
+    labels : tuple[str, ...]
+        Of its numbers, (D,).
+    blocks : tuple[str, ...]
+        What one gross error would spoil together, (D,).
     """
 
     kind: ClassVar[str]

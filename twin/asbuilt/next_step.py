@@ -17,13 +17,18 @@ MOST_ROUNDS = 3
 class Advice:
     """What to do next.
 
-    Attributes:
-        move: of the actuators.
-        before, after: expected merit without a move and after it: the mean over the posterior of the sum of squares of
-            all merits in units of their requirements, by exact traces.
-        ignorance: the part of it that is due to what is not known of the state and could be mended if it were.
-        worth: name of a measurement that could be made -> by how much it is expected to lower the merit after the move
-            that follows from it.
+    Attributes
+    ----------
+    move : NextMove
+        Of the actuators.
+    before, after : float
+        Expected merit without a move and after it: the mean over the posterior of the sum of squares of all merits in
+        units of their requirements, by exact traces.
+    ignorance : float
+        The part of it that is due to what is not known of the state and could be mended if it were.
+    worth : dict[str, float]
+        Name of a measurement that could be made -> by how much it is expected to lower the merit after the move that
+        follows from it.
     """
 
     move: NextMove
@@ -36,13 +41,19 @@ class Advice:
 def wanted_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> NextMove:
     """The move that makes the expected merit least, about where it leads to.
 
-    Args:
-        bench: with actuators.
-        mean: parameters as estimated, (K,).
-        after: name of the last move that was made.
+    Parameters
+    ----------
+    bench : AsBuiltBench
+        With actuators.
+    mean : np.ndarray
+        Parameters as estimated, (K,).
+    after : str | None
+        Name of the last move that was made.
 
-    Raises:
-        PhysicalError: the light of the estimated state is lost.
+    Raises
+    ------
+    PhysicalError
+        The light of the estimated state is lost.
     """
     actuators = bench.actuators
     amounts = np.zeros(len(actuators.names))
@@ -72,14 +83,21 @@ def _about(
 def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np.random.Generator) -> Advice:
     """The next move, its effect over the posterior, and what measurements would be worth before it.
 
-    Args:
-        bench: with actuators.
-        found: the state.
-        draws: states of the posterior, (S, K).
-        rng: source of the errors of the move.
+    Parameters
+    ----------
+    bench : AsBuiltBench
+        With actuators.
+    found : StateEstimate
+        The state.
+    draws : np.ndarray
+        States of the posterior, (S, K).
+    rng : np.random.Generator
+        Source of the errors of the move.
 
-    Raises:
-        PhysicalError: the light of the estimated state is lost.
+    Raises
+    ------
+    PhysicalError
+        The light of the estimated state is lost.
     """
     after = bench.last
     move = wanted_move(bench, found.mean, after)

@@ -31,11 +31,16 @@ ANOTHER, NONE = 3, 4
 class OrientationCheck:
     """All readings of measured wavefronts that share their terms.
 
-    Attributes:
-        setup: what was measured.
-        names: of the measurements.
-        stated: how the file of the test says that they lie.
-        evidence: of every reading.
+    Attributes
+    ----------
+    setup : AsBuiltSetup
+        What was measured.
+    names : tuple[str, ...]
+        Of the measurements.
+    stated : Orientation
+        How the file of the test says that they lie.
+    evidence : ReadingEvidence
+        Of every reading.
     """
 
     setup: AsBuiltSetup
@@ -56,14 +61,21 @@ def run_check(
 ) -> OrientationCheck:
     """Try all sixteen ways in which the wavefronts of a test may lie.
 
-    Args:
-        setup: what was measured; moves that were made are known, and what they do shows best which way round it is.
-        backend: where to trace.
-        seed: of a drawn instrument's errors.
-        advance: shows how far it is.
+    Parameters
+    ----------
+    setup : AsBuiltSetup
+        What was measured; moves that were made are known, and what they do shows best which way round it is.
+    backend : Backend
+        Where to trace.
+    seed : int | None
+        Of a drawn instrument's errors.
+    advance : Advance
+        Shows how far it is.
 
-    Raises:
-        InputError: no measured wavefronts, or wavefronts with several terms or orientations.
+    Raises
+    ------
+    InputError
+        No measured wavefronts, or wavefronts with several terms or orientations.
     """
     test = setup.test
     advance("readings", 0, 1)

@@ -29,18 +29,30 @@ from twin.tolerance.variations import BodyMove, VariedNumber, actuator_number, h
 class Parameters:
     """All that is estimated.
 
-    Attributes:
-        stated: the prior's components, M.
-        words: what each is called, with the shortest name of its body, (M,).
-        numbers: what one SI unit of each component does.
-        actuators: what one SI unit of each actuator does, C.
-        names: of the actuators.
-        gains: numbers of the actuators whose response is in doubt.
-        gain_sigmas: of those, shares.
-        moves: names of the moves.
-        wanted: what each move was meant to be, (J, C), SI.
-        errors: (move, actuator) of each error of a move.
-        error_sigmas: of those, SI.
+    Attributes
+    ----------
+    stated : StatedMotions
+        The prior's components, M.
+    words : tuple[str, ...]
+        What each is called, with the shortest name of its body, (M,).
+    numbers : tuple[VariedNumber, ...]
+        What one SI unit of each component does.
+    actuators : tuple[VariedNumber, ...]
+        What one SI unit of each actuator does, C.
+    names : tuple[str, ...]
+        Of the actuators.
+    gains : tuple[int, ...]
+        Numbers of the actuators whose response is in doubt.
+    gain_sigmas : np.ndarray
+        Of those, shares.
+    moves : tuple[str, ...]
+        Names of the moves.
+    wanted : np.ndarray
+        What each move was meant to be, (J, C), SI.
+    errors : tuple[tuple[int, int], ...]
+        (move, actuator) of each error of a move.
+    error_sigmas : np.ndarray
+        Of those, SI.
     """
 
     stated: StatedMotions
@@ -59,8 +71,10 @@ class Parameters:
     def of(cls, test: AsBuiltSpec, stated: StatedMotions, instrument: Instrument, thermal: ThermalModel) -> Parameters:
         """Parameters of a test.
 
-        Raises:
-            InputError: an actuator of a body that is not there, or that does not move so.
+        Raises
+        ------
+        InputError
+            An actuator of a body that is not there, or that does not move so.
         """
         actuators = tuple(actuator_number(test, instrument, thermal, name, one) for name, one in test.actuators.items())
         names = tuple(test.actuators)
@@ -113,9 +127,12 @@ class Parameters:
     def moved(self, values: np.ndarray, after: str | None) -> np.ndarray:
         """What the actuators have come to in states of parameters (S, K), (S, C), SI.
 
-        Args:
-            values: the parameters.
-            after: name of the last move that was made; None for none.
+        Parameters
+        ----------
+        values : np.ndarray
+            The parameters.
+        after : str | None
+            Name of the last move that was made; None for none.
         """
         out = np.zeros((len(values), len(self.names)))
         if after is None or not self.moves:
@@ -138,10 +155,14 @@ class Parameters:
     def states(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> list[State]:
         """States of the instrument.
 
-        Args:
-            values: parameters, (S, K).
-            after: name of the last move that was made; None for none.
-            further: what is moved beyond that, as it is meant, (C,) or (S, C), SI.
+        Parameters
+        ----------
+        values : np.ndarray
+            Parameters, (S, K).
+        after : str | None
+            Name of the last move that was made; None for none.
+        further : np.ndarray | None
+            What is moved beyond that, as it is meant, (C,) or (S, C), SI.
         """
         moved = self.moved(values, after)
         if further is not None:
@@ -171,10 +192,14 @@ def component_numbers(
 ) -> tuple[VariedNumber, ...]:
     """What one SI unit of each component of a prior does, heat to the first order about none.
 
-    Args:
-        components: of one statement; a body with a temperature of its own does not follow what carries it.
-        instrument: whose bodies move.
-        thermal: what heat does to it.
+    Parameters
+    ----------
+    components : Sequence[Component]
+        Of one statement; a body with a temperature of its own does not follow what carries it.
+    instrument : Instrument
+        Whose bodies move.
+    thermal : ThermalModel
+        What heat does to it.
     """
     warm = {component.body: Temperature() for component in components if component.kind in HEAT}
     return tuple(

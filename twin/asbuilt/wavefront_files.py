@@ -22,9 +22,12 @@ TABLES = (".csv", ".tsv")
 class NamesWavefronts(Protocol):
     """A measurement that names files of wavefronts.
 
-    Attributes:
-        spec: what the test says of it.
-        beams: of its fields.
+    Attributes
+    ----------
+    spec : Any
+        What the test says of it.
+    beams : VariedBeams
+        Of its fields.
     """
 
     spec: Any
@@ -48,12 +51,17 @@ def stated_orientation(one: NamesWavefronts) -> Orientation:
 def read_coefficients(one: NamesWavefronts, orientation: Orientation | None = None) -> np.ndarray:
     """Zernike terms of every field, metres rms of the wavefront in single pass, (F, T).
 
-    Args:
-        one: the measurement.
-        orientation: how its files lie; as it says by default.
+    Parameters
+    ----------
+    one : NamesWavefronts
+        The measurement.
+    orientation : Orientation | None
+        How its files lie; as it says by default.
 
-    Raises:
-        InputError: a file that is none of a wavefront, has other fields or terms, or too little light.
+    Raises
+    ------
+    InputError
+        a file that is none of a wavefront, has other fields or terms, or too little light.
     """
     lies = stated_orientation(one) if orientation is None else orientation
     spec, terms = one.spec, tuple(one.spec.numbers)

@@ -69,11 +69,16 @@ class CameraOptics:
 
     ``CameraOptics.alone`` makes it of a camera's prescription, ``CameraOptics.within`` of a camera of an instrument.
 
-    Attributes:
-        path: its way from the scene to the line CCD.
-        state: motions of bodies, with heat; empty as designed.
-        colour: wavelength of the light, metres; None for that of the design.
-        built: whether it stands apart from the prescription by itself, as its instrument was built.
+    Attributes
+    ----------
+    path : TargetPath
+        Its way from the scene to the line CCD.
+    state : State
+        Motions of bodies, with heat; empty as designed.
+    colour : float | None
+        Wavelength of the light, metres; None for that of the design.
+    built : bool
+        Whether it stands apart from the prescription by itself, as its instrument was built.
     """
 
     path: TargetPath
@@ -85,8 +90,10 @@ class CameraOptics:
     def alone(cls, camera: CameraSpec | CameraModel, backend: Backend, state: State | None = None) -> Self:
         """A camera by itself; its bodies are ``camera/M1`` ... ``camera/focal_plane``.
 
-        Raises:
-            InputError: the prescription does not bring the light of its field through the stop to the image.
+        Raises
+        ------
+        InputError
+            The prescription does not bring the light of its field through the stop to the image.
         """
         model = camera if isinstance(camera, CameraModel) else derive_camera(camera, backend)
         return cls(TargetPath(camera_alone(model), ROOT, ROOT, model, backend), FrozenMap(state or {}))
@@ -97,15 +104,23 @@ class CameraOptics:
     ) -> Self:
         """A camera of an instrument, in a state of the whole instrument.
 
-        Args:
-            instrument: with the camera.
-            name: of the camera there.
-            backend: where to trace.
-            state: for example ``MonitorExperiment.state(job)``: motions and what heat does.
-            obstruction: whether what prisms and other bodies take of the beam is missing in it.
+        Parameters
+        ----------
+        instrument : Instrument
+            With the camera.
+        name : str
+            Of the camera there.
+        backend : Backend
+            Where to trace.
+        state : State | None
+            For example ``MonitorExperiment.state(job)``: motions and what heat does.
+        obstruction : bool
+            Whether what prisms and other bodies take of the beam is missing in it.
 
-        Raises:
-            KeyError: no camera of that name.
+        Raises
+        ------
+        KeyError
+            No camera of that name.
         """
         shadows: ImagingShadows | None = imaging_shadows(instrument, name, backend) if obstruction else None
         path = TargetPath(
@@ -122,8 +137,10 @@ class CameraOptics:
 
         Lenses have their index there; wavefront errors are in waves of it.
 
-        Raises:
-            ValueError: a lens whose glass is not named, or not known there.
+        Raises
+        ------
+        ValueError
+            a lens whose glass is not named, or not known there.
         """
         self.path.coloured(self.state, wavelength)
         return replace(self, colour=wavelength)
@@ -162,8 +179,10 @@ class CameraOptics:
     def directions(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray:
         """Directions of the light of fields (F, 2), world, (F, 3).
 
-        Raises:
-            ValueError: a field beyond the camera's, for which it has no clear apertures.
+        Raises
+        ------
+        ValueError
+            a field beyond the camera's, for which it has no clear apertures.
         """
         shares = np.asarray(fields, dtype=np.float64)
         if shares.ndim != 2 or shares.shape[1] != 2 or not np.all(np.abs(shares) <= 1.0):
@@ -179,8 +198,10 @@ class CameraOptics:
     def rays(self, fields: Sequence[Field] | np.ndarray, points: np.ndarray) -> LineRays:
         """Rays of fields (F, 2) through points (N, 2) of the stop, in units of its radius, at the line CCD.
 
-        Raises:
-            AimError, BeamMissedError: the state brings the light off the stop or off the line CCD's plane.
+        Raises
+        ------
+        AimError, BeamMissedError
+            The state brings the light off the stop or off the line CCD's plane.
         """
         return self.path.rays(self.path.coloured(self.state, self.wavelength), self.directions(fields), points)
 
@@ -284,13 +305,19 @@ class CameraOptics:
 
         In a state they stand to the line CCD as they do to the moved one, but this is where it was designed to be.
 
-        Args:
-            fields: where.
-            rings: of the quadrature over the stop.
+        Parameters
+        ----------
+        fields : Sequence[Field] | np.ndarray
+            where.
+        rings : int
+            Of the quadrature over the stop.
 
-        Raises:
-            AimError, BeamMissedError: as ``rays``.
-            InputError: edges stop all of a field's light.
+        Raises
+        ------
+        AimError, BeamMissedError
+            As ``rays``.
+        InputError
+            Edges stop all of a field's light.
         """
         places = tuple((float(x), float(y)) for x, y in np.asarray(fields, dtype=np.float64))
         if not self.state and not self.built:
@@ -318,8 +345,10 @@ class CameraOptics:
     def errors(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray:
         """Rms wavefront errors alone at fields (F, 2), piston and tilt taken out, waves of the design wavelength, (F,).
 
-        Raises:
-            AimError, BeamMissedError: as ``rays``.
+        Raises
+        ------
+        AimError, BeamMissedError
+            As ``rays``.
         """
         every, plane = np.asarray(fields, dtype=np.float64), FocalPlane.of(self.model.spec)
         step = max(1, MOST_RAYS // stop_nodes(self.model, RINGS, self.cut is not None).count)
@@ -332,9 +361,12 @@ class CameraOptics:
         They are about the places of the design wavelength's chief rays, whatever the light's: so the colours of an
         image that stand apart do so in its pupils.
 
-        Raises:
-            AimError, BeamMissedError: as ``rays``.
-            ValueError: a pupil that edges cut into too many pieces, or a wavefront too rough for its polynomials.
+        Raises
+        ------
+        AimError, BeamMissedError
+            As ``rays``.
+        ValueError
+            a pupil that edges cut into too many pieces, or a wavefront too rough for its polynomials.
         """
         light = self.directions(fields)
         places = self.path.places(self.state, light)
@@ -359,14 +391,21 @@ class CameraOptics:
     ) -> tuple[Mtf, ...]:
         """MTF at fields (F, 2).
 
-        Args:
-            fields: where.
-            frequency: cycles/m, (M,); by default 65 from 0 to the cut-off or twice Nyquist, whichever is less.
-            wavelengths: of the light, metres, (K,); default the design wavelength.
-            weights: of the wavelengths, (K,); default all alike.
+        Parameters
+        ----------
+        fields : Sequence[Field] | np.ndarray
+            where.
+        frequency : np.ndarray | None
+            cycles/m, (M,); by default 65 from 0 to the cut-off or twice Nyquist, whichever is less.
+        wavelengths : np.ndarray | None
+            Of the light, metres, (K,); default the design wavelength.
+        weights : np.ndarray | None
+            Of the wavelengths, (K,); default all alike.
 
-        Raises:
-            AimError, BeamMissedError, ValueError: as ``pupils``.
+        Raises
+        ------
+        AimError, BeamMissedError, ValueError
+            As ``pupils``.
         """
         colours = np.array([self.wavelength]) if wavelengths is None else np.asarray(wavelengths, float)
         shares = np.ones(len(colours)) if weights is None else np.asarray(weights, float)
@@ -432,8 +471,10 @@ class CameraOptics:
         """Pupils of every field (F, 2): of each one for every wavelength (K,), metres, or one alone that serves all,
         where the camera has no lenses.
 
-        Raises:
-            AimError, BeamMissedError, ValueError: as ``pupils``.
+        Raises
+        ------
+        AimError, BeamMissedError, ValueError
+            As ``pupils``.
         """
         if not lenses(self.model.spec):
             return [(pupil,) for pupil in self.at(float(np.min(wavelengths))).pupils(fields)]

@@ -36,29 +36,44 @@ MOST_ERROR = 1e6
 class Wavefront:
     """Wavefront error at one field.
 
-    Attributes:
-        field: where.
-        wavelength: metres; waves are of this.
-        x, y: coordinates of the map's columns and rows on the stop, in units of its radius, (n,); x runs along the
-            line, y along the track.
-        map: waves, (n, n); NaN where no light is.
-        coefficients: Zernike's circle terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the
-            light that comes through; their names are ``optics.geometry.zernike``'s.
-        parts: of the rms that each term makes, waves, (TERMS,): the coefficients, where all of the stop is lit; else
-            those of the same terms made orthonormal over what is lit, each without what the earlier ones hold. Over a
-            ring these are the annular Zernike terms (Mahajan, J. Opt. Soc. Am. 71, 75, 1981). Their squares and that of
-            ``residual`` sum to that of ``rms``.
-        rms: waves, exact for smooth wavefronts; ``accuracy`` says how far.
-        peak_to_valley: waves, over the map and the edge.
-        residual: rms that the Zernike terms leave, waves.
-        strehl: Strehl ratio, from the mean phasor over the stop.
-        vignetted: share of the stop's area whose light other apertures and bodies stop.
-        place: of the chief ray on the line CCD, (along the line, along the track), metres.
-        hole: radius of the hole of a pupil that is a ring about the stop's middle, in units of the stop's; 0 for a
-            whole one, NaN for any other.
-        accuracy: of a beam that edges cut: change of rms, as a share of it, or of the Strehl ratio by a finer
-            quadrature, whichever is larger; 2e-3 where the shadows of edges are not known and 10 000 rays stand for the
-            light. 0 for a free beam.
+    Attributes
+    ----------
+    field : Field
+        where.
+    wavelength : float
+        Metres; waves are of this.
+    x, y : np.ndarray
+        Coordinates of the map's columns and rows on the stop, in units of its radius, (n,); x runs along the line, y
+        along the track.
+    map : np.ndarray
+        Waves, (n, n); NaN where no light is.
+    coefficients : np.ndarray
+        Zernike's circle terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the light that comes
+        through; their names are ``optics.geometry.zernike``'s.
+    parts : np.ndarray
+        Of the rms that each term makes, waves, (TERMS,): the coefficients, where all of the stop is lit; else those of
+        the same terms made orthonormal over what is lit, each without what the earlier ones hold. Over a ring these are
+        the annular Zernike terms (Mahajan, J. Opt. Soc. Am. 71, 75, 1981). Their squares and that of ``residual`` sum
+        to that of ``rms``.
+    rms : float
+        Waves, exact for smooth wavefronts; ``accuracy`` says how far.
+    peak_to_valley : float
+        Waves, over the map and the edge.
+    residual : float
+        Rms that the Zernike terms leave, waves.
+    strehl : float
+        Strehl ratio, from the mean phasor over the stop.
+    vignetted : float
+        Share of the stop's area whose light other apertures and bodies stop.
+    place : tuple[float, float]
+        Of the chief ray on the line CCD, (along the line, along the track), metres.
+    hole : float
+        Radius of the hole of a pupil that is a ring about the stop's middle, in units of the stop's; 0 for a whole one,
+        NaN for any other.
+    accuracy : float
+        Of a beam that edges cut: change of rms, as a share of it, or of the Strehl ratio by a finer quadrature,
+        whichever is larger; 2e-3 where the shadows of edges are not known and 10 000 rays stand for the light. 0 for a
+        free beam.
     """
 
     field: Field
@@ -135,16 +150,25 @@ class Wavefront:
 class Spot:
     """Where the rays of one field meet the line CCD.
 
-    Attributes:
-        field: where.
-        rays: from the chief ray, (along the line, along the track), metres, (N, 2); hexapolar on the stop, the chief
-            ray first; those that an aperture stops are left out.
-        centroid: of all light from the chief ray, metres, (2,).
-        rms: rms distance from the centroid, metres, exact for smooth wavefronts.
-        rms_along: the same along the line and along the track, metres, (2,).
-        farthest: of the rays from the centroid, metres.
-        airy: radius of the Airy disk of the same numerical aperture, metres.
-        place: of the chief ray on the line CCD, (along the line, along the track), metres.
+    Attributes
+    ----------
+    field : Field
+        where.
+    rays : np.ndarray
+        From the chief ray, (along the line, along the track), metres, (N, 2); hexapolar on the stop, the chief ray
+        first; those that an aperture stops are left out.
+    centroid : np.ndarray
+        Of all light from the chief ray, metres, (2,).
+    rms : float
+        Rms distance from the centroid, metres, exact for smooth wavefronts.
+    rms_along : np.ndarray
+        The same along the line and along the track, metres, (2,).
+    farthest : float
+        Of the rays from the centroid, metres.
+    airy : float
+        Radius of the Airy disk of the same numerical aperture, metres.
+    place : tuple[float, float]
+        Of the chief ray on the line CCD, (along the line, along the track), metres.
     """
 
     field: Field
@@ -171,17 +195,27 @@ class Spot:
 class Mtf:
     """Modulation transfer at one field, of the optics alone.
 
-    Attributes:
-        field: where.
-        frequency: cycles/m, (M,).
-        values: along the line and along the track, (2, M).
-        limit: the same pupil without wavefront error, (2, M).
-        wavelengths: of the light, metres, (K,).
-        nyquist: of the pixels, cycles/m.
-        weights: signal at each wavelength, sum 1, (K,).
-        error: by how much the values change at most where more wavelengths are taken; 0 for lines.
-        accuracy: of a pupil that edges cut: change of the values by a third of the lines through it, at most; they are
-            right to a tenth of that. 0 for a free pupil.
+    Attributes
+    ----------
+    field : Field
+        where.
+    frequency : np.ndarray
+        cycles/m, (M,).
+    values : np.ndarray
+        Along the line and along the track, (2, M).
+    limit : np.ndarray
+        The same pupil without wavefront error, (2, M).
+    wavelengths : np.ndarray
+        Of the light, metres, (K,).
+    nyquist : float
+        Of the pixels, cycles/m.
+    weights : np.ndarray
+        Signal at each wavelength, sum 1, (K,).
+    error : float
+        By how much the values change at most where more wavelengths are taken; 0 for lines.
+    accuracy : float
+        Of a pupil that edges cut: change of the values by a third of the lines through it, at most; they are right to a
+        tenth of that. 0 for a free pupil.
     """
 
     field: Field
@@ -226,8 +260,10 @@ class Mtf:
 def hold_wavefront(wave: Wavefront) -> None:
     """Hold a wavefront's numbers to what any has.
 
-    Raises:
-        UnphysicalError: one cannot be; with what it is.
+    Raises
+    ------
+    UnphysicalError
+        One cannot be; with what it is.
     """
     hold_within("the share of a stop that is vignetted", wave.vignetted, 0.0, 1.0, ROUNDING)
     hold_within("a Strehl ratio", wave.strehl, 0.0, 1.0, ROUNDING)
@@ -245,8 +281,10 @@ def hold_wavefront(wave: Wavefront) -> None:
 def hold_mtf(mtf: Mtf) -> None:
     """Hold an MTF to what any has: by Schwarz' inequality no error raises one of the same light.
 
-    Raises:
-        UnphysicalError: it cannot be; with what it is.
+    Raises
+    ------
+    UnphysicalError
+        It cannot be; with what it is.
     """
     hold_within("an MTF", mtf.values, 0.0, 1.0, MTF_ROUNDING)
     hold_within("the MTF of a perfect wavefront", mtf.limit, 0.0, 1.0, MTF_ROUNDING)

@@ -65,10 +65,14 @@ QUALITY_FIELDS = (-1.0, 0.0, 1.0)
 class Refocus:
     """A focal plane found anew.
 
-    Attributes:
-        before, after: the plane of the file and the best one.
-        errors_before, errors_after: rms wavefront error at ``FIELDS``, waves.
-        tilt: whether it was turned, too.
+    Attributes
+    ----------
+    before, after : FocalPlane
+        The plane of the file and the best one.
+    errors_before, errors_after : np.ndarray
+        Rms wavefront error at ``FIELDS``, waves.
+    tilt : bool
+        Whether it was turned, too.
     """
 
     before: FocalPlane
@@ -82,12 +86,16 @@ class Refocus:
 class Perturbed:
     """What a perturbation does to a camera.
 
-    Attributes:
-        job: that says it, with the paths of the bodies.
-        change: of the camera's geometry, of one state.
-        errors: rms wavefront error before it at the fields of the run's map, waves, (A, B).
-        mtf: at Nyquist before it at MTF_FIELDS, along the line and along the track, (F, 2); empty where there is
-            none.
+    Attributes
+    ----------
+    job : JobSpec
+        That says it, with the paths of the bodies.
+    change : LineChange
+        Of the camera's geometry, of one state.
+    errors : np.ndarray
+        Rms wavefront error before it at the fields of the run's map, waves, (A, B).
+    mtf : np.ndarray
+        At Nyquist before it at MTF_FIELDS, along the line and along the track, (F, 2); empty where there is none.
     """
 
     job: JobSpec
@@ -106,24 +114,42 @@ class Perturbed:
 class CameraRun:
     """A judged camera.
 
-    Attributes:
-        setup: as it was given.
-        camera: the prescription that is judged: the refocused one, if that was asked for.
-        optics: it, ready to be looked at.
-        first_order: its data.
-        waves: wavefront errors at GRID.
-        spots: spots at GRID.
-        mtfs: MTF of the optics at MTF_FIELDS and the design wavelength; empty for a camera too blurred for it.
-        without_mtf: why there is none, empty where there is.
-        field: fields of the map of wavefront errors, (A, B, 2).
-        errors: rms wavefront error there, waves, (A, B).
-        distortion: over the field and along the line.
-        curves: along the line.
-        focus: through focus at MTF_FIELDS.
-        refocus: what refocusing did, None where nobody asked.
-        perturbed: what was done to it, None for a camera as designed.
-        quality: of a camera in an instrument: what its bodies take of the beam.
-        colours: over the light of its spectrum or band; None where neither is described.
+    Attributes
+    ----------
+    setup : CameraSetup
+        As it was given.
+    camera : CameraSpec
+        The prescription that is judged: the refocused one, if that was asked for.
+    optics : CameraOptics
+        It, ready to be looked at.
+    first_order : FirstOrderData
+        Its data.
+    waves : tuple[Wavefront, ...]
+        Wavefront errors at GRID.
+    spots : tuple[Spot, ...]
+        Spots at GRID.
+    mtfs : tuple[Mtf, ...]
+        MTF of the optics at MTF_FIELDS and the design wavelength; empty for a camera too blurred for it.
+    without_mtf : str
+        Why there is none, empty where there is.
+    field : np.ndarray
+        Fields of the map of wavefront errors, (A, B, 2).
+    errors : np.ndarray
+        Rms wavefront error there, waves, (A, B).
+    distortion : field_maps.Distortion
+        Over the field and along the line.
+    curves : field_maps.FieldCurves
+        Along the line.
+    focus : field_maps.ThroughFocus
+        Through focus at MTF_FIELDS.
+    refocus : Refocus | None
+        What refocusing did, None where nobody asked.
+    perturbed : Perturbed | None
+        What was done to it, None for a camera as designed.
+    quality : CameraQuality | None
+        Of a camera in an instrument: what its bodies take of the beam.
+    colours : Colours | None
+        Over the light of its spectrum or band; None where neither is described.
     """
 
     setup: CameraSetup
@@ -180,16 +206,25 @@ def run_camera(
 ) -> CameraRun:
     """Judge a camera.
 
-    Args:
-        setup: the camera.
-        backend: where to trace.
-        seed: of nothing; nothing is drawn.
-        advance: told what is being done.
-        refocus: find the best focal plane first and judge the camera with it.
-        tilt: let it turn about the line, too.
+    Parameters
+    ----------
+    setup : CameraSetup
+        The camera.
+    backend : Backend
+        Where to trace.
+    seed : int
+        Of nothing; nothing is drawn.
+    advance : Advance
+        Told what is being done.
+    refocus : bool
+        Find the best focal plane first and judge the camera with it.
+    tilt : bool
+        Let it turn about the line, too.
 
-    Raises:
-        InputError: light of the field does not come through, or has no focus after the last mirror.
+    Raises
+    ------
+    InputError
+        Light of the field does not come through, or has no focus after the last mirror.
     """
     advance("focus", 0, 1)
     camera, moved = setup.camera, None
@@ -277,8 +312,10 @@ def _nyquist(optics: CameraOptics) -> np.ndarray:
 def find_focus(camera: CameraSpec, backend: Backend, tilt: bool) -> Refocus:
     """The focal plane with the least mean square wavefront error over ``FIELDS``.
 
-    Raises:
-        InputError: light does not come through, or has no focus after the last mirror.
+    Raises
+    ------
+    InputError
+        Light does not come through, or has no focus after the last mirror.
     """
     beams = FieldBeams.trace(CameraOptics.alone(camera, backend).model, backend, FIELDS, 6)
     best, own = beams.best_plane(tilt), FocalPlane.of(camera)

@@ -47,12 +47,17 @@ WINDOW, PSF_POINTS = 24.0, 129
 class Psf:
     """Image of a point in all of its light, of the optics alone.
 
-    Attributes:
-        field: where.
-        place: of columns and rows, from the design wavelength's chief ray, metres, (N,); columns along the line, rows
-            along the track.
-        values: irradiance for unit light, 1/m^2, (N, N).
-        strehl: largest value over that of the same pupils without wavefront error, every wavelength in its place.
+    Attributes
+    ----------
+    field : Field
+        where.
+    place : np.ndarray
+        Of columns and rows, from the design wavelength's chief ray, metres, (N,); columns along the line, rows along
+        the track.
+    values : np.ndarray
+        Irradiance for unit light, 1/m^2, (N, N).
+    strehl : float
+        Largest value over that of the same pupils without wavefront error, every wavelength in its place.
     """
 
     field: Field
@@ -65,19 +70,30 @@ class Psf:
 class Colours:
     """A camera over its light.
 
-    Attributes:
-        spectrum: the light.
-        reference: wavelength from which colours count: that of the design where the light holds it, else the mean.
-        wavelengths: ascending, first and last those of the light, metres, (K,).
-        fields: F.
-        lateral: of chief rays from the reference's, along the line and along the track, metres, (F, K, 2); None for a
-            camera without lenses, which has none.
-        axial: best focus from the focal plane, along its normal of the prescription's z, positive downstream, metres,
-            (F, K); None likewise.
-        axial_reference: the same of the reference wavelength, (F,); None likewise.
-        mtfs: over the light, at the fields; empty where there is none.
-        psfs: likewise.
-        without_mtf: why there is none, empty where there is.
+    Attributes
+    ----------
+    spectrum : SpectrumSpec
+        The light.
+    reference : float
+        Wavelength from which colours count: that of the design where the light holds it, else the mean.
+    wavelengths : np.ndarray
+        Ascending, first and last those of the light, metres, (K,).
+    fields : tuple[Field, ...]
+        F.
+    lateral : np.ndarray | None
+        Of chief rays from the reference's, along the line and along the track, metres, (F, K, 2); None for a camera
+        without lenses, which has none.
+    axial : np.ndarray | None
+        Best focus from the focal plane, along its normal of the prescription's z, positive downstream, metres, (F, K);
+        None likewise.
+    axial_reference : np.ndarray | None
+        The same of the reference wavelength, (F,); None likewise.
+    mtfs : tuple[Mtf, ...]
+        Over the light, at the fields; empty where there is none.
+    psfs : tuple[Psf, ...]
+        likewise.
+    without_mtf : str
+        Why there is none, empty where there is.
     """
 
     spectrum: SpectrumSpec
@@ -130,12 +146,17 @@ def lateral_colour(
 ) -> np.ndarray:
     """Where chief rays of wavelengths (K,) meet the focal plane, from those of a reference wavelength, metres.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (F, K, 2), along the line and along the track.
 
-    Raises:
-        AimError, BeamMissedError: a chief ray is lost.
-        ValueError: a glass is not known at a wavelength.
+    Raises
+    ------
+    AimError, BeamMissedError
+        a chief ray is lost.
+    ValueError
+        a glass is not known at a wavelength.
     """
     light = optics.directions(fields)
 
@@ -151,12 +172,17 @@ def axial_colour(optics: CameraOptics, fields: Sequence[Field], wavelengths: np.
 
     It is along the prescription's z, on a plane with the focal plane's tilt; in a state as the focal plane has moved.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (F, K).
 
-    Raises:
-        AimError, BeamMissedError: light is lost.
-        ValueError: a glass is not known at a wavelength.
+    Raises
+    ------
+    AimError, BeamMissedError
+        Light is lost.
+    ValueError
+        a glass is not known at a wavelength.
     """
     own = FocalPlane.of(optics.model.spec)
     out = np.empty((len(fields), len(wavelengths)))
@@ -176,18 +202,27 @@ def spectral_mtfs(
 ) -> tuple[Mtf, ...]:
     """MTF over a spectrum at fields (F, 2), with as many wavelengths as it takes.
 
-    Args:
-        optics: the camera.
-        fields: where.
-        spectrum: the light.
-        frequency: as for ``CameraOptics.mtfs``.
+    Parameters
+    ----------
+    optics : CameraOptics
+        The camera.
+    fields : Sequence[Field] | np.ndarray
+        where.
+    spectrum : SpectrumSpec
+        The light.
+    frequency : np.ndarray | None
+        As for ``CameraOptics.mtfs``.
 
-    Returns:
+    Returns
+    -------
+    tuple[Mtf, ...]
         F, each with the change of its values by the rule before.
 
-    Raises:
-        AimError, BeamMissedError, ValueError: as ``CameraOptics.pupils``; also for light over which the MTF still
-            changes by more than ``WORST_CHANGE`` at ``LARGEST_RULE`` wavelengths.
+    Raises
+    ------
+    AimError, BeamMissedError, ValueError
+        As ``CameraOptics.pupils``; also for light over which the MTF still changes by more than ``WORST_CHANGE`` at
+        ``LARGEST_RULE`` wavelengths.
     """
     if frequency is None:
         # to the cut-off of the shortest wavelength, whatever the rule
@@ -210,8 +245,10 @@ def spectral_psfs(
 ) -> tuple[Psf, ...]:
     """Images of points over wavelengths (K,) with weights (K,) at fields (F, 2), on ``PSF_POINTS`` squared.
 
-    Raises:
-        AimError, BeamMissedError, ValueError: as ``CameraOptics.pupils``.
+    Raises
+    ------
+    AimError, BeamMissedError, ValueError
+        As ``CameraOptics.pupils``.
     """
     colours, shares = np.asarray(wavelengths, float), np.asarray(weights, float) / np.sum(weights)
     ends = (int(np.argmin(colours)), int(np.argmax(colours)))
@@ -264,8 +301,10 @@ def _sampled(pupil: PupilFunction, wavelength: float, half: float) -> PupilField
 def judge_colours(optics: CameraOptics, spectrum: SpectrumSpec, fields: tuple[Field, ...], sharp: bool) -> Colours:
     """Look at a camera over its light; without MTF for a camera that is not ``sharp``.
 
-    Raises:
-        AimError, BeamMissedError, InputError: light is lost at a wavelength.
+    Raises
+    ------
+    AimError, BeamMissedError, InputError
+        Light is lost at a wavelength.
     """
     reference, wavelengths = reference_wavelength(optics, spectrum), spectrum.even(CURVE_POINTS)
     out = Colours(spectrum, reference, wavelengths, fields, None, None, None)

@@ -42,11 +42,16 @@ _FINER_RINGS, _FINER_NODES = 4, 2
 class ExactFit:
     """What is known of a cut beam without a raster.
 
-    Attributes:
-        fit: of its wavefront.
-        light: share of the stop that comes through.
-        hole: of a ring, as of ``Wavefront``.
-        accuracy: as of ``Wavefront``.
+    Attributes
+    ----------
+    fit : PartFit
+        Of its wavefront.
+    light : float
+        Share of the stop that comes through.
+    hole : float
+        Of a ring, as of ``Wavefront``.
+    accuracy : float
+        As of ``Wavefront``.
     """
 
     fit: PartFit
@@ -66,21 +71,33 @@ def exact_fit(
 ) -> ExactFit | None:
     """Fit a wavefront over the light of a beam by a quadrature that ends at the edges.
 
-    Args:
-        path: of the camera.
-        state: of its assembly.
-        direction: of the light, world, (1, 3).
-        rings: of the quadrature over the whole stop.
-        light: share of the stop that traced rays come through.
-        to_sphere: optical paths of rays to their reference spheres, (1, N), metres.
-        terms: of Zernike.
+    Parameters
+    ----------
+    path : TargetPath
+        Of the camera.
+    state : State
+        Of its assembly.
+    direction : np.ndarray
+        Of the light, world, (1, 3).
+    rings : int
+        Of the quadrature over the whole stop.
+    light : float
+        Share of the stop that traced rays come through.
+    to_sphere : Callable[[LineRays], np.ndarray]
+        Optical paths of rays to their reference spheres, (1, N), metres.
+    terms : int
+        Of Zernike.
 
-    Returns:
+    Returns
+    -------
+    ExactFit | None
         None where the shadows are not known or not those of traced rays, rays in what is dark do not come to the image,
         or a finer quadrature tells other numbers.
 
-    Raises:
-        AimError, BeamMissedError: the beam is lost.
+    Raises
+    ------
+    AimError, BeamMissedError
+        The beam is lost.
     """
     try:
         pieces, error = path.shadows_on_stop(state, direction)
@@ -133,12 +150,18 @@ def _tamed(stop: LitStop, pieces: np.ndarray, rings: int, wave: np.ndarray) -> n
 def counted_fit(nodes: PupilNodes, weight: np.ndarray, flat: np.ndarray, terms: int, free: bool) -> PartFit:
     """Statistics of a levelled wavefront by the rays that come through.
 
-    Args:
-        nodes: of the stop, N.
-        weight: of the nodes, 0 where no light comes through, (N,).
-        flat: the wavefront without piston and tilt, waves, (N,).
-        terms: of Zernike.
-        free: whether none of the weights is 0.
+    Parameters
+    ----------
+    nodes : PupilNodes
+        Of the stop, N.
+    weight : np.ndarray
+        Of the nodes, 0 where no light comes through, (N,).
+    flat : np.ndarray
+        The wavefront without piston and tilt, waves, (N,).
+    terms : int
+        Of Zernike.
+    free : bool
+        Whether none of the weights is 0.
     """
     fit = fit_wavefront(nodes.x, nodes.y, weight, flat, terms)
     # over a part of the disk the terms share tilt among them; what is level there was taken out before

@@ -35,18 +35,30 @@ class Distortion:
     The perfect camera images a direction at c + f t, with t the tangents of its angles from the focal plane's normal,
     along the line and along the track: a plane parallel to the image, through which it is seen from one point.
 
-    Attributes:
-        fields: shares of the half field, (A, B, 2), along the line and then along the track.
-        places: of chief rays on the focal plane, along the line and along the track, metres, (A, B, 2).
-        ideal: of the best perfect camera, metres, (A, B, 2).
-        distance: its principal distance f, metres.
-        point: its principal point c, metres from the line's centre, (2,).
-        angle: W of places along the line, from the line of sight, radians, (M,).
-        position: L of these, metres, (M,).
-        line_distance: principal distance of the line, sum(L tan W) / sum(tan^2 W), metres.
-        line_point: principal point of the line when it is fitted, metres, and the distance that goes with it.
-        residual: L - f tan W with ``line_distance``, metres, (M,).
-        residual_with_point: with both, metres, (M,).
+    Attributes
+    ----------
+    fields : np.ndarray
+        Shares of the half field, (A, B, 2), along the line and then along the track.
+    places : np.ndarray
+        Of chief rays on the focal plane, along the line and along the track, metres, (A, B, 2).
+    ideal : np.ndarray
+        Of the best perfect camera, metres, (A, B, 2).
+    distance : float
+        Its principal distance f, metres.
+    point : np.ndarray
+        Its principal point c, metres from the line's centre, (2,).
+    angle : np.ndarray
+        W of places along the line, from the line of sight, radians, (M,).
+    position : np.ndarray
+        L of these, metres, (M,).
+    line_distance : float
+        Principal distance of the line, sum(L tan W) / sum(tan^2 W), metres.
+    line_point : tuple[float, float]
+        Principal point of the line when it is fitted, metres, and the distance that goes with it.
+    residual : np.ndarray
+        L - f tan W with ``line_distance``, metres, (M,).
+    residual_with_point : np.ndarray
+        With both, metres, (M,).
     """
 
     fields: np.ndarray
@@ -135,15 +147,23 @@ def distortion(optics: CameraOptics) -> Distortion:
 class FieldCurves:
     """Along the line, at the middle of the field along the track.
 
-    Attributes:
-        share: of half the field along the line, (M,).
-        focus_line, focus_track: best focus of the fans of rays along the line and along the track, from the focal
-            plane, positive downstream, metres, (M,).
-        focus: of the whole beam: least rms wavefront error, metres, (M,).
-        error: rms wavefront error there, waves, (M,).
-        illumination: solid angle of the beam as the focal plane sees it, over that of the middle, (M,).
-        vignetted: share of the beam that other apertures than the stop take, (M,).
-        mtf: at Nyquist, of the optics, along the line and along the track, (M, 2); NaN where there is none.
+    Attributes
+    ----------
+    share : np.ndarray
+        Of half the field along the line, (M,).
+    focus_line, focus_track : np.ndarray
+        Best focus of the fans of rays along the line and along the track, from the focal plane, positive downstream,
+        metres, (M,).
+    focus : np.ndarray
+        Of the whole beam: least rms wavefront error, metres, (M,).
+    error : np.ndarray
+        Rms wavefront error there, waves, (M,).
+    illumination : np.ndarray
+        Solid angle of the beam as the focal plane sees it, over that of the middle, (M,).
+    vignetted : np.ndarray
+        Share of the beam that other apertures than the stop take, (M,).
+    mtf : np.ndarray
+        At Nyquist, of the optics, along the line and along the track, (M, 2); NaN where there is none.
     """
 
     share: np.ndarray
@@ -194,12 +214,18 @@ def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCur
 class ThroughFocus:
     """At fields, along the light.
 
-    Attributes:
-        fields: F.
-        defocus: of the detector, positive downstream, metres, (Z,).
-        error: rms wavefront error, waves, (F, Z).
-        mtf: at Nyquist, along the line and along the track, (F, 2, Z); NaN where there is none.
-        best: with the least mean square error over the fields, metres; NaN where the light has no focus.
+    Attributes
+    ----------
+    fields : tuple[Field, ...]
+        F.
+    defocus : np.ndarray
+        Of the detector, positive downstream, metres, (Z,).
+    error : np.ndarray
+        Rms wavefront error, waves, (F, Z).
+    mtf : np.ndarray
+        At Nyquist, along the line and along the track, (F, 2, Z); NaN where there is none.
+    best : float
+        With the least mean square error over the fields, metres; NaN where the light has no focus.
     """
 
     fields: tuple[Field, ...]

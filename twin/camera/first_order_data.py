@@ -49,9 +49,12 @@ _RAYS = 4000
 class RayPaths:
     """Rays in the prescription frame.
 
-    Attributes:
-        names: what they meet, the image last, K.
-        points: where they begin and what they meet, (1 + K, F, N, 3), metres.
+    Attributes
+    ----------
+    names : tuple[str, ...]
+        What they meet, the image last, K.
+    points : np.ndarray
+        Where they begin and what they meet, (1 + K, F, N, 3), metres.
     """
 
     names: tuple[str, ...]
@@ -120,11 +123,13 @@ def _body(model: CameraModel, name: str, edge: Aperture) -> Aperture:
 class InTheWay:
     """What of a camera stands in its own light.
 
-    Attributes:
-        shares: body -> share of a beam that it takes, the largest over the field; a body that takes nothing is not
-            there.
-        holes: mirror -> least radius of the hole about its middle that light needs which goes through it, metres: of
-            mirrors whose file states no hole and that no light is reflected at there.
+    Attributes
+    ----------
+    shares : Mapping[str, float]
+        Body -> share of a beam that it takes, the largest over the field; a body that takes nothing is not there.
+    holes : Mapping[str, float]
+        Mirror -> least radius of the hole about its middle that light needs which goes through it, metres: of mirrors
+        whose file states no hole and that no light is reflected at there.
     """
 
     shares: Mapping[str, float]
@@ -252,18 +257,29 @@ _RIM = 48
 class FirstOrderData:
     """First-order data of a camera in one state, traced; lengths in metres, angles in radians.
 
-    Attributes:
-        spec: the camera.
-        paraxial: data about the axis.
-        entrance_pupil: diameter of the entrance pupil.
-        principal_distance_line, principal_distance_track: change of the image's place per angle in the middle of the
-            field, along the line and along the track, where the image plane stands.
-        aperture: numerical apertures along the line and along the track.
-        round_aperture: numerical aperture of the round beam with the same solid angle at the image.
-        image: length and width of the image of the whole field.
-        chief_ray_angle: of chief rays against the image's normal: in the middle, and the largest over the field.
-        length: distance along the parent axis between the outermost of the mirrors and the image.
-        obscuration: what of the camera, as designed, stands in its own beam.
+    Attributes
+    ----------
+    spec : CameraSpec
+        The camera.
+    paraxial : Paraxial
+        Data about the axis.
+    entrance_pupil : float
+        Diameter of the entrance pupil.
+    principal_distance_line, principal_distance_track : float
+        Change of the image's place per angle in the middle of the field, along the line and along the track, where the
+        image plane stands.
+    aperture : tuple[float, float]
+        Numerical apertures along the line and along the track.
+    round_aperture : float
+        Numerical aperture of the round beam with the same solid angle at the image.
+    image : tuple[float, float]
+        Length and width of the image of the whole field.
+    chief_ray_angle : tuple[float, float]
+        Of chief rays against the image's normal: in the middle, and the largest over the field.
+    length : float
+        Distance along the parent axis between the outermost of the mirrors and the image.
+    obscuration : InTheWay
+        What of the camera, as designed, stands in its own beam.
     """
 
     spec: CameraSpec
@@ -352,9 +368,12 @@ FIRST_ORDER: Record[FirstOrderData] = Record(
 def first_order_data(optics: CameraOptics) -> FirstOrderData:
     """Trace what the first-order data of a camera follow from, in its state.
 
-    Raises:
-        AimError, BeamMissedError: light does not come through.
-        AfocalError: the state brings it to no focus.
+    Raises
+    ------
+    AimError, BeamMissedError
+        Light does not come through.
+    AfocalError
+        The state brings it to no focus.
     """
     path, model, backend = optics.path, optics.model, optics.path.backend
     state = path.coloured(optics.state, optics.wavelength)

@@ -54,12 +54,16 @@ class RoughError(UnphysicalError):
 class BeamLight(NamedTuple):
     """Light of states at the line CCD.
 
-    Attributes:
-        paths: optical paths of the beams' rays less those of the chief rays, of all K traced wavelengths, (S, F, K N),
-            metres.
-        eikonals: likewise to planes, as transfer functions take them, (S, F, K N); the paths where they are not asked.
-        chiefs: directions of chief rays, (S, F, 3).
-        aimed: where rays start, (S, K, F, 1 + N, 3), world, metres.
+    Attributes
+    ----------
+    paths : np.ndarray
+        Optical paths of the beams' rays less those of the chief rays, of all K traced wavelengths, (S, F, K N), metres.
+    eikonals : np.ndarray
+        Likewise to planes, as transfer functions take them, (S, F, K N); the paths where they are not asked.
+    chiefs : np.ndarray
+        Directions of chief rays, (S, F, 3).
+    aimed : np.ndarray
+        Where rays start, (S, K, F, 1 + N, 3), world, metres.
     """
 
     paths: np.ndarray
@@ -71,27 +75,46 @@ class BeamLight(NamedTuple):
 class VariedBeams:
     """Beams of F fields through N points of the stop, in light of K wavelengths.
 
-    Args:
-        optics: the camera as designed.
-        fields: shares of the half field, (F, 2).
-        colours: wavelengths that are traced, metres, (K,); that of the design by default.
-        shares: of them, which sum to 1, (K,); all alike by default.
-        planes: whether eikonals are wanted.
+    Parameters
+    ----------
+    optics
+        The camera as designed.
+    fields
+        Shares of the half field, (F, 2).
+    colours
+        Wavelengths that are traced, metres, (K,); that of the design by default.
+    shares
+        Of them, which sum to 1, (K,); all alike by default.
+    planes
+        Whether eikonals are wanted.
 
-    Attributes:
-        directions: of the light, world, (F, 3).
-        start: where the designed camera's chief rays start, world, metres, (F, 3).
-        nodes: of the stop.
-        degree: of the polynomials in the pupil by which wavefronts are told.
-        solve: from values at the nodes to their coefficients, (T, N).
-        designed: light of the designed camera, of one state.
-        cosines: direction cosines (row, column) of its rays at the line CCD, (K, F, N, 2).
-        residual: rms that the polynomials leave of its wavefronts, waves.
-        pieces: polygons on the stop's unit disk that its beams lack, (F, P, V, 2).
+    Attributes
+    ----------
+    directions
+        Of the light, world, (F, 3).
+    start
+        Where the designed camera's chief rays start, world, metres, (F, 3).
+    nodes
+        Of the stop.
+    degree
+        Of the polynomials in the pupil by which wavefronts are told.
+    solve
+        From values at the nodes to their coefficients, (T, N).
+    designed
+        Light of the designed camera, of one state.
+    cosines
+        Direction cosines (row, column) of its rays at the line CCD, (K, F, N, 2).
+    residual
+        Rms that the polynomials leave of its wavefronts, waves.
+    pieces
+        Polygons on the stop's unit disk that its beams lack, (F, P, V, 2).
 
-    Raises:
-        CutError, RoughError: beams of which nothing can be told so.
-        AimError, BeamMissedError: the light of a field does not come through.
+    Raises
+    ------
+    CutError, RoughError
+        Beams of which nothing can be told so.
+    AimError, BeamMissedError
+        The light of a field does not come through.
     """
 
     def __init__(
@@ -154,8 +177,10 @@ class VariedBeams:
     def _aimed_at_stop(self, states: Sequence[State], placed: PlacedBodies) -> np.ndarray:
         """Where rays start that meet their points of the stop in coloured states, (S * K * F, 1 + N, 3).
 
-        Raises:
-            AimError: the light of some state does not reach the stop.
+        Raises
+        ------
+        AimError
+            The light of some state does not reach the stop.
         """
         path, count = self.optics.path, len(states) // len(self._glass)
         to_stop = assemble(path.assembly, [f"{path.name}/to_stop"], states, placed=placed)
@@ -169,8 +194,10 @@ class VariedBeams:
         """Position and direction (S, K, F, 1 + N, 3), path and validity (S, K, F, 1 + N) of the beams at the line CCD,
         chief rays first, and where their rays start, (S, K, F, 1 + N, 3), which is found where it is not given.
 
-        Raises:
-            AimError: the light of some state does not reach the stop.
+        Raises
+        ------
+        AimError
+            The light of some state does not reach the stop.
         """
         path, count = self.optics.path, len(states)
         coloured = self._coloured(states)
@@ -221,12 +248,17 @@ class VariedBeams:
     def light(self, states: Sequence[State], aimed: np.ndarray | None = None) -> BeamLight:
         """What the light of states comes to at the line CCD.
 
-        Args:
-            states: S of them.
-            aimed: where their rays start, as of ``BeamLight``; None to aim them.
+        Parameters
+        ----------
+        states : Sequence[State]
+            S of them.
+        aimed : np.ndarray | None
+            Where their rays start, as of ``BeamLight``; None to aim them.
 
-        Raises:
-            PhysicalError: the light of some state is lost.
+        Raises
+        ------
+        PhysicalError
+            The light of some state is lost.
         """
         found, step = [], max(1, AT_ONCE // len(self._glass))
         for start in range(0, len(states), step):
@@ -260,8 +292,10 @@ class VariedBeams:
         Metres rms, Noll's order, positive where the wavefront is ahead; axes of the stop. Of a cut pupil the terms are
         made orthonormal over its light one after the other: annular ones of a ring.
 
-        Args:
-            last: highest Noll index.
+        Parameters
+        ----------
+        last : int
+            Highest Noll index.
         """
         out = []
         for x, y, share in self.lit():

@@ -207,11 +207,16 @@ KIND = "compare"
 class Differences:
     """One run against the reference.
 
-    Attributes:
-        inputs: keys of config.yaml with different values: ``key``, ``reference``, ``other``; None where there is none.
-        numbers: results that are not the same to the tolerance.
-        arrays: images that are not the same to the tolerance of their peak.
-        compared: how many numbers and arrays both runs have.
+    Attributes
+    ----------
+    inputs : tuple[Mapping[str, Leaf], ...]
+        Keys of config.yaml with different values: ``key``, ``reference``, ``other``; None where there is none.
+    numbers : tuple[NumberDifference, ...]
+        Results that are not the same to the tolerance.
+    arrays : tuple[ArrayDifference, ...]
+        Images that are not the same to the tolerance of their peak.
+    compared : int
+        How many numbers and arrays both runs have.
     """
 
     inputs: tuple[Mapping[str, Leaf], ...]
@@ -241,8 +246,10 @@ class Run:
 def read_run(folder: Path) -> Run:
     """Read the manifest and config.yaml of a run folder.
 
-    Raises:
-        InputError: it is none, or config.yaml cannot be read.
+    Raises
+    ------
+    InputError
+        It is none, or config.yaml cannot be read.
     """
     manifest = finished_manifest(folder)
     config = read_yaml(folder / "config.yaml").data if "config.yaml" in manifest.sha256 else {}
@@ -252,17 +259,23 @@ def read_run(folder: Path) -> Run:
 def differences(reference: Run, other: Run, rtol: float, sigmas: float | None) -> Differences:
     """Compare two runs of one kind.
 
-    Args:
-        reference: the first.
-        other: the second.
-        rtol: numbers that agree to this part of the larger one are the same, and elements of arrays to this part of the
-            array's peak.
-        sigmas: where a number has a sigma in both runs, differences within so many of them do not count; sigmas
-            themselves and recorded frames, in which the noise is another draw, are then left out. None holds all to
-            ``rtol``.
+    Parameters
+    ----------
+    reference : Run
+        The first.
+    other : Run
+        The second.
+    rtol : float
+        Numbers that agree to this part of the larger one are the same, and elements of arrays to this part of the
+        array's peak.
+    sigmas : float | None
+        Where a number has a sigma in both runs, differences within so many of them do not count; sigmas themselves and
+        recorded frames, in which the noise is another draw, are then left out. None holds all to ``rtol``.
 
-    Raises:
-        InputError: they are of two kinds, or a file cannot be read.
+    Raises
+    ------
+    InputError
+        They are of two kinds, or a file cannot be read.
     """
     if reference.manifest.kind != other.manifest.kind:
         kinds = f"{reference.manifest.kind} and {other.manifest.kind}"
@@ -319,11 +332,16 @@ def _same_array(one: ArrayDifference, rtol: float) -> bool:
 class Comparison:
     """Runs of one kind beside each other.
 
-    Attributes:
-        runs: the first is the reference.
-        found: of every other one, what differs from the reference.
-        rtol: numbers that agree to this part are the same.
-        sigmas: differences within so many sigma do not count, None where all do.
+    Attributes
+    ----------
+    runs : tuple[Run, ...]
+        The first is the reference.
+    found : tuple[Differences, ...]
+        Of every other one, what differs from the reference.
+    rtol : float
+        Numbers that agree to this part are the same.
+    sigmas : float | None
+        Differences within so many sigma do not count, None where all do.
     """
 
     runs: tuple[Run, ...]
@@ -346,8 +364,10 @@ class Comparison:
 def compare(folders: Sequence[Path], rtol: float, sigmas: float | None) -> Comparison:
     """Read run folders and compare them with the first.
 
-    Raises:
-        InputError: fewer than two, no run folder, or runs of several kinds.
+    Raises
+    ------
+    InputError
+        Fewer than two, no run folder, or runs of several kinds.
     """
     if len(folders) < 2:
         raise InputError(Issue("a comparison needs two runs or more", found=f"{len(folders)}"))

@@ -52,11 +52,16 @@ _SERIES = 12
 class Content:
     """The content of a file.
 
-    Attributes:
-        numbers: key -> number or text.
-        arrays: name -> array.
-        statements: sentences that follow from the numbers.
-        drawn: whether it is a picture.
+    Attributes
+    ----------
+    numbers : Mapping[str, Leaf]
+        Key -> number or text.
+    arrays : Mapping[str, np.ndarray]
+        Name -> array.
+    statements : Mapping[str, Any]
+        Sentences that follow from the numbers.
+    drawn : bool
+        Whether it is a picture.
     """
 
     numbers: Mapping[str, Leaf]
@@ -69,14 +74,21 @@ class Content:
 class NumberDifference:
     """A number or text with different values.
 
-    Attributes:
-        file: in the run folder, ``recovered.json``.
-        key: in the file, which ends in its unit.
-        reference, other: both values; None where there is none.
-        sigma: standard deviation of the difference of two independent measurements, from both files' sigmas; None
-            where they state none.
-        sigma_of: the ``noise`` of the images alone, or ``stated``; empty without a sigma.
-        scale: largest number of its sort in both files.
+    Attributes
+    ----------
+    file : str
+        In the run folder, ``recovered.json``.
+    key : str
+        In the file, which ends in its unit.
+    reference, other : Leaf
+        Both values; None where there is none.
+    sigma : float | None
+        Standard deviation of the difference of two independent measurements, from both files' sigmas; None where they
+        state none.
+    sigma_of : str
+        The ``noise`` of the images alone, or ``stated``; empty without a sigma.
+    scale : float
+        Largest number of its sort in both files.
     """
 
     file: str
@@ -104,17 +116,28 @@ class NumberDifference:
 class ArrayDifference:
     """An image, or another array, with different values.
 
-    Attributes:
-        file: in the run folder.
-        name: of the variable; empty for an image.
-        shape, other_shape: of the reference's and of the other, None where there is none.
-        largest: absolute difference at most; None unless both are numbers of one shape.
-        rms: of the difference.
-        peak: largest absolute value of the reference.
-        share: of the elements that differ; None where the shapes do.
-        where: index of the element that differs most.
-        reference, other: its values.
-        depth: bytes of an element of an unsigned array, 0 for others.
+    Attributes
+    ----------
+    file : str
+        In the run folder.
+    name : str
+        Of the variable; empty for an image.
+    shape, other_shape : tuple[int, ...] | None
+        Of the reference's and of the other, None where there is none.
+    largest : float | None
+        Absolute difference at most; None unless both are numbers of one shape.
+    rms : float | None
+        Of the difference.
+    peak : float | None
+        Largest absolute value of the reference.
+    share : float | None
+        Of the elements that differ; None where the shapes do.
+    where : tuple[int, ...]
+        Index of the element that differs most.
+    reference, other : Leaf
+        Its values.
+    depth : int
+        Bytes of an element of an unsigned array, 0 for others.
     """
 
     file: str
@@ -140,13 +163,20 @@ class ArrayDifference:
 class FileDifference:
     """All that is not the same to the bit in a file of two run folders.
 
-    Attributes:
-        file: in the run folders.
-        numbers: numbers and texts.
-        arrays: images and other arrays.
-        statements: sentences that follow from the numbers.
-        common_numbers, common_arrays: how many are in both; of a file with the same bytes that is no JSON 0 and 1.
-        drawn: whether it is a picture.
+    Attributes
+    ----------
+    file : str
+        In the run folders.
+    numbers : tuple[NumberDifference, ...]
+        Numbers and texts.
+    arrays : tuple[ArrayDifference, ...]
+        Images and other arrays.
+    statements : tuple[NumberDifference, ...]
+        Sentences that follow from the numbers.
+    common_numbers, common_arrays : int
+        How many are in both; of a file with the same bytes that is no JSON 0 and 1.
+    drawn : bool
+        Whether it is a picture.
     """
 
     file: str
@@ -161,13 +191,19 @@ class FileDifference:
 def file_difference(name: str, reference: Path | None, other: Path | None) -> FileDifference:
     """Compare a file of two run folders.
 
-    Args:
-        name: in the run folders.
-        reference: the file in the first folder, None where it has none.
-        other: in the second.
+    Parameters
+    ----------
+    name : str
+        In the run folders.
+    reference : Path | None
+        The file in the first folder, None where it has none.
+    other : Path | None
+        In the second.
 
-    Raises:
-        InputError: one cannot be read.
+    Raises
+    ------
+    InputError
+        One cannot be read.
     """
     if reference is not None and other is not None and _same_bytes(reference, other):
         if ending(name) != "json":
@@ -181,10 +217,14 @@ def file_difference(name: str, reference: Path | None, other: Path | None) -> Fi
 def content_difference(name: str, reference: Content, other: Content) -> FileDifference:
     """Compare two contents.
 
-    Args:
-        name: of the file.
-        reference: the first.
-        other: the second.
+    Parameters
+    ----------
+    name : str
+        Of the file.
+    reference : Content
+        The first.
+    other : Content
+        The second.
     """
     one, two = reference.numbers, other.numbers
     scales = _scales(one, two)
@@ -208,11 +248,16 @@ def content_difference(name: str, reference: Content, other: Content) -> FileDif
 def array_difference(file: str, name: str, here: np.ndarray | None, there: np.ndarray | None) -> ArrayDifference | None:
     """Compare two arrays; None where they are the same to the bit.
 
-    Args:
-        file: that they are in.
-        name: of both.
-        here: the first, of any shape; None where there is none.
-        there: the second.
+    Parameters
+    ----------
+    file : str
+        That they are in.
+    name : str
+        Of both.
+    here : np.ndarray | None
+        The first, of any shape; None where there is none.
+    there : np.ndarray | None
+        The second.
     """
     if here is None or there is None or here.shape != there.shape:
         first, second = (None if array is None else array.shape for array in (here, there))
@@ -277,10 +322,14 @@ def sigma_of(reference: Mapping[str, Leaf], other: Mapping[str, Leaf], key: str)
     ``x_sigma_noise`` beside them in both runs, else as stated, from ``x_sigma`` or ``sigma``. The error of an
     estimator by the motions is the same in runs of the same motions, and does not scatter between them.
 
-    Args:
-        reference: key -> value of the first file.
-        other: of the second.
-        key: of the numbers.
+    Parameters
+    ----------
+    reference : Mapping[str, Leaf]
+        Key -> value of the first file.
+    other : Mapping[str, Leaf]
+        Of the second.
+    key : str
+        Of the numbers.
     """
     head, dot, last = key.rpartition(".")
     for name in (f"{last}_sigma_noise", f"{last}_sigma", *(("sigma",) if last == "value" else ())):
@@ -321,12 +370,17 @@ def _scales(*contents: Mapping[str, Leaf]) -> dict[str, float]:
 def content_of(path: Path, name: str) -> Content:
     """Read a file by what it is.
 
-    Args:
-        path: the file.
-        name: in the run folder, whose ending says what it is; others are texts.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    name : str
+        In the run folder, whose ending says what it is; others are texts.
 
-    Raises:
-        InputError: it cannot be read.
+    Raises
+    ------
+    InputError
+        It cannot be read.
     """
     try:
         content = path.read_bytes()
@@ -354,10 +408,14 @@ def plain(data: Any) -> Content:
 def leaves(data: Any, key: str = "", series: bool = True) -> Iterator[tuple[str, Any]]:
     """Keys and values of nested data, without those of `LEFT_OUT`.
 
-    Args:
-        data: mappings and lists.
-        key: of it; keys of what is in it follow.
-        series: whether long lists of numbers come whole, as arrays.
+    Parameters
+    ----------
+    data : Any
+        Mappings and lists.
+    key : str
+        Of it; keys of what is in it follow.
+    series : bool
+        Whether long lists of numbers come whole, as arrays.
     """
     if isinstance(data, Mapping):
         for name, value in data.items():

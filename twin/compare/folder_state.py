@@ -19,14 +19,22 @@ from twin.framework.run_folder import Manifest
 class FolderState:
     """A run folder against its manifest.
 
-    Attributes:
-        folder: of the run.
-        manifest: of the run.
-        changed: files that are not as the run wrote them.
-        missing: files of the run that are gone.
-        additional: files that the run did not write.
-        inputs_changed: files outside the folder that the run read and that hold something else now.
-        inputs_gone: those that are not there any more.
+    Attributes
+    ----------
+    folder : Path
+        Of the run.
+    manifest : Manifest
+        Of the run.
+    changed : tuple[str, ...]
+        Files that are not as the run wrote them.
+    missing : tuple[str, ...]
+        Files of the run that are gone.
+    additional : tuple[str, ...]
+        Files that the run did not write.
+    inputs_changed : tuple[str, ...]
+        Files outside the folder that the run read and that hold something else now.
+    inputs_gone : tuple[str, ...]
+        Those that are not there any more.
     """
 
     folder: Path
@@ -56,8 +64,10 @@ class FolderState:
 def folder_state(folder: Path) -> FolderState:
     """Look at every file of a run folder.
 
-    Raises:
-        InputError: it is none, or the run in it is not finished.
+    Raises
+    ------
+    InputError
+        It is none, or the run in it is not finished.
     """
     manifest = _manifest(folder)
     content = (folder / MANIFEST).read_bytes()
@@ -93,8 +103,10 @@ def _as_read(place: Path, known: str) -> str:
 def _manifest(folder: Path) -> Manifest:
     """Return the manifest of a finished run.
 
-    Raises:
-        InputError: there is none, with what the folder is instead.
+    Raises
+    ------
+    InputError
+        There is none, with what the folder is instead.
     """
     manifest = run_folder.read_manifest(folder)
     if manifest is not None:
@@ -118,10 +130,14 @@ def _manifest(folder: Path) -> Manifest:
 class Elsewhere:
     """Differences between where a run was made and where it was repeated.
 
-    Attributes:
-        program: the source, or packages: other numbers may be meant.
-        processor: what rounds otherwise, and nothing more: processor, linear algebra, C library.
-        known: whether the manifest says where the run was made.
+    Attributes
+    ----------
+    program : tuple[str, ...]
+        The source, or packages: other numbers may be meant.
+    processor : tuple[str, ...]
+        What rounds otherwise, and nothing more: processor, linear algebra, C library.
+    known : bool
+        Whether the manifest says where the run was made.
     """
 
     program: tuple[str, ...]
@@ -132,10 +148,14 @@ class Elsewhere:
 def elsewhere(manifest: Manifest, here: Provenance | None, now: Mapping[str, str]) -> Elsewhere:
     """Compare where a run was made with where it was repeated.
 
-    Args:
-        manifest: of the run.
-        here: where it was repeated.
-        now: versions that repeated it.
+    Parameters
+    ----------
+    manifest : Manifest
+        Of the run.
+    here : Provenance | None
+        Where it was repeated.
+    now : Mapping[str, str]
+        Versions that repeated it.
     """
     program, made = _changes(manifest.versions, now), manifest.provenance
     if made is None or here is None:

@@ -75,13 +75,19 @@ OF_GEOMETRY = 1e-6
 class Quantity:
     """A number, text or array that a repeated run gives otherwise.
 
-    Attributes:
-        key: in the file.
-        old, new: of the run and of the repeated one; of arrays the element that differs most.
-        relative: the difference over the largest number of its sort in the file, of arrays over the peak; None of what
-            is no number.
-        in_sigma: over the number's standard deviation, None where it has none.
-        rounding: whether it is rounding.
+    Attributes
+    ----------
+    key : str
+        In the file.
+    old, new : Leaf
+        Of the run and of the repeated one; of arrays the element that differs most.
+    relative : float | None
+        The difference over the largest number of its sort in the file, of arrays over the peak; None of what is no
+        number.
+    in_sigma : float | None
+        Over the number's standard deviation, None where it has none.
+    rounding : bool
+        Whether it is rounding.
     """
 
     key: str
@@ -96,12 +102,18 @@ class Quantity:
 class FileState:
     """A file of a run folder and of its repeated run.
 
-    Attributes:
-        file: in the folder.
-        state: SAME, ROUNDED or another text above.
-        quantities: that differ, the largest first, SHOWN at most.
-        count: how many do.
-        why: why it was left out, or cannot be read.
+    Attributes
+    ----------
+    file : str
+        In the folder.
+    state : str
+        SAME, ROUNDED or another text above.
+    quantities : tuple[Quantity, ...]
+        That differ, the largest first, SHOWN at most.
+    count : int
+        How many do.
+    why : str
+        Why it was left out, or cannot be read.
     """
 
     file: str
@@ -119,11 +131,16 @@ class FileState:
 def file_state(name: str, old: Path, new: Path, elsewhere: bool) -> FileState:
     """Compare a file of the run with that of the repeated one.
 
-    Args:
-        name: in the run folder.
-        old: the run's.
-        new: of the repeated run.
-        elsewhere: whether that was on another processor, which rounds otherwise; a few pixels may then differ.
+    Parameters
+    ----------
+    name : str
+        In the run folder.
+    old : Path
+        The run's.
+    new : Path
+        Of the repeated run.
+    elsewhere : bool
+        Whether that was on another processor, which rounds otherwise; a few pixels may then differ.
     """
     if not (old.is_file() and new.is_file()):
         return FileState(name, GONE if old.is_file() else NEW)
@@ -140,9 +157,12 @@ def file_state(name: str, old: Path, new: Path, elsewhere: bool) -> FileState:
 def judged(compared: FileDifference, elsewhere: bool = False) -> FileState:
     """Judge whether a file differs by rounding; where nothing differs only the way in which it is packed differs.
 
-    Args:
-        compared: its differences; sentences count where nothing else differs.
-        elsewhere: see `file_state`.
+    Parameters
+    ----------
+    compared : FileDifference
+        Its differences; sentences count where nothing else differs.
+    elsewhere : bool
+        See `file_state`.
     """
     every = [*(_number(one, elsewhere) for one in compared.numbers)]
     every += [_array(one, compared.drawn, elsewhere) for one in compared.arrays]
@@ -199,11 +219,16 @@ class CannotRepeat(Exception):
 class Repetition:
     """A repeated run.
 
-    Attributes:
-        files: every file of the folder that was compared.
-        elsewhere: differences to where the run was made.
-        seconds: that it took.
-        what: was repeated, where that is not the whole run.
+    Attributes
+    ----------
+    files : tuple[FileState, ...]
+        Every file of the folder that was compared.
+    elsewhere : Elsewhere
+        Differences to where the run was made.
+    seconds : float
+        That it took.
+    what : str
+        Was repeated, where that is not the whole run.
     """
 
     files: tuple[FileState, ...]
@@ -242,13 +267,19 @@ def obstacle(state: FolderState) -> str:
 def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
     """Repeat a whole run, and compare every file.
 
-    Args:
-        state: of its folder; there is no `obstacle`.
-        place: where to make it; does not exist.
-        quiet: print nothing meanwhile.
+    Parameters
+    ----------
+    state : FolderState
+        Of its folder; there is no `obstacle`.
+    place : Path
+        Where to make it; does not exist.
+    quiet : bool
+        Print nothing meanwhile.
 
-    Raises:
-        CannotRepeat: the command does not make it.
+    Raises
+    ------
+    CannotRepeat
+        The command does not make it.
     """
     manifest, began = state.manifest, time.monotonic()
     words = [str(state.folder.resolve() / CONFIG) if word == CONFIG else word for word in manifest.again]
@@ -288,8 +319,10 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
 def redrawn(files: Sequence[FileState]) -> Iterator[FileState]:
     """Pictures of numbers that are the same but for rounding are not different results.
 
-    Args:
-        files: of one run, as compared.
+    Parameters
+    ----------
+    files : Sequence[FileState]
+        Of one run, as compared.
     """
     numbers = {one.state for one in files if not one.drawn} - {SAME, LEFT_OUT}
     for one in files:
@@ -300,11 +333,15 @@ def redrawn(files: Sequence[FileState]) -> Iterator[FileState]:
 def repeat_block(state: FolderState) -> Repetition:
     """Repeat one block of a study, the one in the middle, and hold all blocks against the study's data set.
 
-    Args:
-        state: of its folder; there is no `obstacle`.
+    Parameters
+    ----------
+    state : FolderState
+        Of its folder; there is no `obstacle`.
 
-    Raises:
-        CannotRepeat: its blocks are not there, or not whole; config.yaml cannot be read.
+    Raises
+    ------
+    CannotRepeat
+        Its blocks are not there, or not whole; config.yaml cannot be read.
     """
     began, folder = time.monotonic(), state.folder
     try:
@@ -358,10 +395,14 @@ def _data_states(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[FileS
 class Verification:
     """A verified run folder.
 
-    Attributes:
-        state: of its files.
-        repetition: the repeated run, None where it was not.
-        obstacle: why it was not, empty where nobody asked for it.
+    Attributes
+    ----------
+    state : FolderState
+        Of its files.
+    repetition : Repetition | None
+        The repeated run, None where it was not.
+    obstacle : str
+        Why it was not, empty where nobody asked for it.
     """
 
     state: FolderState

@@ -47,11 +47,16 @@ _REMEDIES = {"envelope": "a larger envelope", "clearance": "a smaller clearance"
 class DesignRun:
     """An optimised camera.
 
-    Attributes:
-        setup: what its file says.
-        searched: what came of every start.
-        text: the new camera's file.
-        warnings: what its user should know.
+    Attributes
+    ----------
+    setup : camera_design.CameraDesignSetup
+        What its file says.
+    searched : Search
+        What came of every start.
+    text : str
+        The new camera's file.
+    warnings : tuple[str, ...]
+        What its user should know.
     """
 
     setup: camera_design.CameraDesignSetup
@@ -70,9 +75,12 @@ def run_design(
 ) -> DesignRun:
     """Optimise the camera; the seed is that of the starts that are drawn.
 
-    Raises:
-        InputError: the camera passes no light.
-        BenchError: the constraints cannot be held.
+    Raises
+    ------
+    InputError
+        The camera passes no light.
+    BenchError
+        The constraints cannot be held.
     """
     test, camera = setup.test, setup.camera
     start, beams = camera_design.prescription_of(camera), camera_design.beams_of(camera)
@@ -229,10 +237,14 @@ def verdict(run: DesignRun) -> str:
 def _held_text(held: tuple[Held, ...], start: str, across: float) -> str:
     """Return the dearest constraints, at most three, each with by how much.
 
-    Args:
-        held: the constraints.
-        start: name of the camera that the design starts from.
-        across: its principal distance across the line, metres, of which the anamorphism is a share.
+    Parameters
+    ----------
+    held : tuple[Held, ...]
+        The constraints.
+    start : str
+        Name of the camera that the design starts from.
+    across : float
+        Its principal distance across the line, metres, of which the anamorphism is a share.
     """
     parts = []
     for one in held[:3]:

@@ -43,10 +43,14 @@ that respond more than others, five standard deviations of both even with a few 
 class Seen:
     """What the spots of one beam say under one statement of disturbances; D = 8 coordinates, K cameras.
 
-    Attributes:
-        shared: (D, M) px by independent unit motions of the bodies that all beams share.
-        own: (D, D) px^2, covariance by the bodies of this beam alone, and by noise.
-        parameters: (4 K, M) of the cameras by the shared motions; the same for all beams.
+    Attributes
+    ----------
+    shared : np.ndarray
+        (D, M) px by independent unit motions of the bodies that all beams share.
+    own : np.ndarray
+        (D, D) px^2, covariance by the bodies of this beam alone, and by noise.
+    parameters : np.ndarray
+        (4 K, M) of the cameras by the shared motions; the same for all beams.
     """
 
     shared: np.ndarray
@@ -58,16 +62,25 @@ class Seen:
 class BeamFacts:
     """A beam that was tried alone.
 
-    Attributes:
-        beam: the beam.
-        refused: why it cannot stand, empty for one that can; nothing else is then known.
-        seen: by the names of the disturbances.
-        taken: imaging rays that its prisms take, packed bits of (cameras, 3, rays).
-        mass: of its prisms, kg.
-        bodies: corners (P, 3) of its prisms in the base frame, metres.
-        facets: of each channel, how far its facet leans along the base's X and Y (tangents) and stands from the apex,
-            metres, (channels, 4).
-        light: rays of its beams in front of the cameras, segments (N, K, 2, 3), metres.
+    Attributes
+    ----------
+    beam : monitor_layout.Beam
+        The beam.
+    refused : str
+        Why it cannot stand, empty for one that can; nothing else is then known.
+    seen : Mapping[str, Seen]
+        By the names of the disturbances.
+    taken : np.ndarray
+        Imaging rays that its prisms take, packed bits of (cameras, 3, rays).
+    mass : float
+        Of its prisms, kg.
+    bodies : tuple[np.ndarray, ...]
+        Corners (P, 3) of its prisms in the base frame, metres.
+    facets : np.ndarray
+        Of each channel, how far its facet leans along the base's X and Y (tangents) and stands from the apex, metres,
+        (channels, 4).
+    light : np.ndarray
+        Rays of its beams in front of the cameras, segments (N, K, 2, 3), metres.
     """
 
     beam: monitor_layout.Beam
@@ -89,18 +102,30 @@ class BeamFacts:
 class LayoutFacts:
     """A layout that was built as a whole.
 
-    Attributes:
-        beams: of it.
-        refused: why it cannot stand, empty for one that can; nothing else is then known.
-        sigmas: disturbances -> quantity -> what is left, SI.
-        before: likewise, without any measurement.
-        shares: disturbances -> goal -> cause -> variance that is left, SI.
-        shares_before: likewise, without any measurement.
-        pupil_share: of the imaging pupil that its prisms take.
-        mass: of its prisms, kg.
-        glass_path: longest way of a beam in glass, one way, metres.
-        spot_sigma: largest standard deviation of a spot's place, pixels.
-        brightest: how full every spot's brightest pixel is, (C,).
+    Attributes
+    ----------
+    beams : monitor_layout.Layout
+        Of it.
+    refused : str
+        Why it cannot stand, empty for one that can; nothing else is then known.
+    sigmas : Mapping[str, Mapping[str, float]]
+        Disturbances -> quantity -> what is left, SI.
+    before : Mapping[str, Mapping[str, float]]
+        Likewise, without any measurement.
+    shares : Mapping[str, Mapping[str, Mapping[str, float]]]
+        Disturbances -> goal -> cause -> variance that is left, SI.
+    shares_before : Mapping[str, Mapping[str, Mapping[str, float]]]
+        Likewise, without any measurement.
+    pupil_share : float
+        Of the imaging pupil that its prisms take.
+    mass : float
+        Of its prisms, kg.
+    glass_path : float
+        Longest way of a beam in glass, one way, metres.
+    spot_sigma : float
+        Largest standard deviation of a spot's place, pixels.
+    brightest : np.ndarray
+        How full every spot's brightest pixel is, (C,).
     """
 
     beams: monitor_layout.Layout
@@ -119,9 +144,12 @@ class LayoutFacts:
 class LayoutBench:
     """Tries beams and layouts of one design.
 
-    Args:
-        setup: the design.
-        backend: where to trace.
+    Parameters
+    ----------
+    setup
+        The design.
+    backend
+        Where to trace.
     """
 
     def __init__(self, setup: monitor_layout.MonitorDesignSetup, backend: Backend) -> None:
@@ -200,14 +228,21 @@ class LayoutBench:
     def judged(self, beams: monitor_layout.Layout, instrument: Instrument, limited: bool = True) -> LayoutFacts:
         """What an instrument is worth as a layout.
 
-        Args:
-            beams: that it has.
-            instrument: with them.
-            limited: whether it has to keep the design's limits.
+        Parameters
+        ----------
+        beams : monitor_layout.Layout
+            That it has.
+        instrument : Instrument
+            With them.
+        limited : bool
+            Whether it has to keep the design's limits.
 
-        Raises:
-            BeamMissedError, AimError: light does not come to its area CCDs.
-            _OutsideLimitsError: it does not keep a limit.
+        Raises
+        ------
+        BeamMissedError, AimError
+            Light does not come to its area CCDs.
+        _OutsideLimitsError
+            It does not keep a limit.
         """
         share, mass = monitor_layout.pupil_share(self.imaging.taken(instrument)), monitor_layout.prism_mass(instrument)
         if limited:
@@ -234,11 +269,16 @@ class LayoutBench:
     ) -> dict[str, Information]:
         """What an instrument's spots know, by the names of the disturbances.
 
-        Args:
-            instrument: a layout of this design.
-            beam: one of it, which names the area CCD.
-            alike: as of ``information_of``.
-            single: likewise.
+        Parameters
+        ----------
+        instrument : Instrument
+            a layout of this design.
+        beam : monitor_layout.Beam
+            One of it, which names the area CCD.
+        alike : bool
+            As of ``information_of``.
+        single : bool
+            likewise.
         """
         stated = self.setup.disturbances
         found = information_of(
@@ -320,9 +360,12 @@ def touching(one: BeamFacts, other: BeamFacts) -> bool:
     """Whether two beams cannot stand together: prisms stand in each other or in the other's light, or one's facet
     reaches over the edge of the other's.
 
-    Args:
-        one: a beam that was tried alone.
-        other: another one.
+    Parameters
+    ----------
+    one : BeamFacts
+        a beam that was tried alone.
+    other : BeamFacts
+        Another one.
     """
     # as scenes.models.monitor_chain.facet_places: of two in one corner the one that leans more stands farther out
     away = one.facets - other.facets
@@ -344,9 +387,12 @@ def touching(one: BeamFacts, other: BeamFacts) -> bool:
 def combined(facts: Sequence[BeamFacts], name: str) -> np.ndarray:
     """Covariance of the cameras' parameters that several beams together leave, (4 K, 4 K), rad and m.
 
-    Args:
-        facts: of the beams.
-        name: of the disturbances.
+    Parameters
+    ----------
+    facts : Sequence[BeamFacts]
+        Of the beams.
+    name : str
+        Of the disturbances.
     """
     seen = [one.seen[name] for one in facts]
     shared = np.concatenate([one.shared for one in seen])
@@ -364,8 +410,11 @@ def combined(facts: Sequence[BeamFacts], name: str) -> np.ndarray:
 def bench_of(config: str, backend: str) -> LayoutBench:
     """The bench of a design, of a worker process that keeps it from one piece of work to the next.
 
-    Args:
-        config: text of the design's config.yaml.
-        backend: where to trace.
+    Parameters
+    ----------
+    config : str
+        Text of the design's config.yaml.
+    backend : str
+        Where to trace.
     """
     return LayoutBench(validate(monitor_layout.MonitorDesignSetup, parse_yaml(config)), load_backend(backend))

@@ -54,9 +54,12 @@ Ask = Callable[[str, Sequence[Any]], list[Any]]
 def ratios(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> dict[tuple[str, str], float]:
     """Disturbances and quantity -> what is left of it over what is wanted, of all goals.
 
-    Args:
-        sigmas: disturbances -> quantity -> sigma, SI.
-        bench: of the design.
+    Parameters
+    ----------
+    sigmas : Mapping[str, Mapping[str, float]]
+        Disturbances -> quantity -> sigma, SI.
+    bench : LayoutBench
+        Of the design.
     """
     wanted = bench.setup.test.goal.wanted.items()
     return {
@@ -72,15 +75,24 @@ def refined(
 ) -> list[LayoutFacts]:
     """Layouts on the way from one to the best near it, each better than the one before.
 
-    Args:
-        bench: of the design.
-        ask: for slopes and layouts.
-        part: of the search, for the progress.
-        facts: of the layout to begin with, which can stand.
-        steps: gradients that are asked for, at most.
-        rng: source of all that is drawn to make room.
+    Parameters
+    ----------
+    bench : LayoutBench
+        Of the design.
+    ask : Ask
+        For slopes and layouts.
+    part : str
+        Of the search, for the progress.
+    facts : LayoutFacts
+        Of the layout to begin with, which can stand.
+    steps : int
+        Gradients that are asked for, at most.
+    rng : np.random.Generator
+        Source of all that is drawn to make room.
 
-    Returns:
+    Returns
+    -------
+    list[LayoutFacts]
         At least the first.
     """
     way, box = [facts], FIRST_BOX
@@ -210,11 +222,16 @@ against 0.02 J for order 6.
 class LayoutNumber:
     """One of the numbers of a layout.
 
-    Attributes:
-        beams: the layout.
-        beam: which of them, counted from 0.
-        name: of the number, one of ``monitor_layout.CONTINUOUS``.
-        order: of the differences, 2, 4 or 6.
+    Attributes
+    ----------
+    beams : Layout
+        The layout.
+    beam : int
+        Which of them, counted from 0.
+    name : str
+        Of the number, one of ``monitor_layout.CONTINUOUS``.
+    order : int
+        Of the differences, 2, 4 or 6.
     """
 
     beams: Layout
@@ -225,9 +242,12 @@ class LayoutNumber:
     def moved(self, bench: LayoutBench, by: float) -> Layout:
         """The layout with this number changed.
 
-        Args:
-            bench: of the design.
-            by: the change, SI.
+        Parameters
+        ----------
+        bench : LayoutBench
+            Of the design.
+        by : float
+            The change, SI.
         """
         own = self.beams[self.beam]
         value = number_of(bench.setup, own, self.name) + by
@@ -238,12 +258,18 @@ class LayoutNumber:
 class Slope:
     """Derivative of what a layout leaves by one of its numbers.
 
-    Attributes:
-        number: which.
-        refused: why it cannot be told, empty where it can; nothing else is then known.
-        values: disturbances -> quantity -> d(sigma)/d(number), SI.
-        errors: likewise, by how much each may be wrong; empty for differences of second order, below which is none.
-        brightest: derivative of how full the brightest pixel of each of C spots is, (C,), per SI unit.
+    Attributes
+    ----------
+    number : LayoutNumber
+        which.
+    refused : str
+        Why it cannot be told, empty where it can; nothing else is then known.
+    values : Mapping[str, Mapping[str, float]]
+        Disturbances -> quantity -> d(sigma)/d(number), SI.
+    errors : Mapping[str, Mapping[str, float]]
+        Likewise, by how much each may be wrong; empty for differences of second order, below which is none.
+    brightest : np.ndarray
+        Derivative of how full the brightest pixel of each of C spots is, (C,), per SI unit.
     """
 
     number: LayoutNumber
@@ -256,10 +282,14 @@ class Slope:
 def numbers_of(bench: LayoutBench, beams: Layout, order: int = ORDER) -> tuple[LayoutNumber, ...]:
     """All numbers of a layout that may vary.
 
-    Args:
-        bench: of the design.
-        beams: the layout.
-        order: of the differences.
+    Parameters
+    ----------
+    bench : LayoutBench
+        Of the design.
+    beams : Layout
+        The layout.
+    order : int
+        Of the differences.
     """
     names = [name for name, (low, high) in ranges(bench.setup).items() if high > low]
     return tuple(LayoutNumber(beams, k, name, order) for k in range(len(beams)) for name in names)
@@ -274,13 +304,19 @@ def _known_here(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
 def known_of(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
     """What a layout's spots know, by the names of the disturbances, whether or not its bodies have room.
 
-    Args:
-        bench: of the design.
-        beams: the layout.
+    Parameters
+    ----------
+    bench : LayoutBench
+        Of the design.
+    beams : Layout
+        The layout.
 
-    Raises:
-        InputError: its prisms or facets cannot be placed.
-        BeamMissedError, AimError: light does not come to its area CCDs.
+    Raises
+    ------
+    InputError
+        Its prisms or facets cannot be placed.
+    BeamMissedError, AimError
+        Light does not come to its area CCDs.
     """
     spec = layout_spec(bench.setup, beams)
     instrument = build_instrument(spec, bench.setup.cameras, bench.backend, free_beams=False, free_bodies=False)
@@ -290,9 +326,12 @@ def known_of(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
 def slope_of(bench: LayoutBench, number: LayoutNumber) -> Slope:
     """Derivative of all sigmas of a layout by one of its numbers.
 
-    Args:
-        bench: of the design.
-        number: of a layout.
+    Parameters
+    ----------
+    bench : LayoutBench
+        Of the design.
+    number : LayoutNumber
+        Of a layout.
     """
     low, high = ranges(bench.setup)[number.name]
     step, high_order, low_order = STEP * (high - low), _WEIGHTS[number.order], _WEIGHTS.get(number.order - 2, {})

@@ -40,9 +40,12 @@ ALIKE = 0.02
 class Candidate:
     """A combination of beams that were tried alone.
 
-    Attributes:
-        beams: their numbers among all that were tried, rising.
-        merit: what they promise: the largest ratio of what is left to what is wanted.
+    Attributes
+    ----------
+    beams : tuple[int, ...]
+        Their numbers among all that were tried, rising.
+    merit : float
+        What they promise: the largest ratio of what is left to what is wanted.
     """
 
     beams: tuple[int, ...]
@@ -53,16 +56,26 @@ class Candidate:
 class End:
     """Where one search came to.
 
-    Attributes:
-        name: of where it began: the instrument, or ``start 1``.
-        layouts: all that it built as a whole and that can stand, best first.
-        progress: best merit after the first draw and after each round.
-        refined: merits on the way by gradients; empty for none.
-        tried: beams.
-        standing: of these, that can stand alone.
-        compared: combinations whose merit was worked out.
-        built: of these, built as a whole.
-        refused: why beams and layouts cannot stand, with how many.
+    Attributes
+    ----------
+    name : str
+        Of where it began: the instrument, or ``start 1``.
+    layouts : tuple[LayoutFacts, ...]
+        All that it built as a whole and that can stand, best first.
+    progress : tuple[float, ...]
+        Best merit after the first draw and after each round.
+    refined : tuple[float, ...]
+        Merits on the way by gradients; empty for none.
+    tried : int
+        beams.
+    standing : int
+        Of these, that can stand alone.
+    compared : int
+        Combinations whose merit was worked out.
+    built : int
+        Of these, built as a whole.
+    refused : Mapping[str, int]
+        Why beams and layouts cannot stand, with how many.
     """
 
     name: str
@@ -80,11 +93,16 @@ class End:
 class Found:
     """What a search found, with all its starts.
 
-    Attributes:
-        start: the layout of the instrument that it started from.
-        layouts: all that were built as a whole and can stand, best first.
-        ends: of the search from it, and of those from beams at random.
-        seconds: that it took.
+    Attributes
+    ----------
+    start : LayoutFacts
+        The layout of the instrument that it started from.
+    layouts : tuple[LayoutFacts, ...]
+        All that were built as a whole and can stand, best first.
+    ends : tuple[End, ...]
+        Of the search from it, and of those from beams at random.
+    seconds : float
+        That it took.
     """
 
     start: LayoutFacts
@@ -124,9 +142,12 @@ class Found:
 def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> float:
     """Largest ratio of what is left to what is wanted, over all disturbances and goals; 1 or less reaches them all.
 
-    Args:
-        sigmas: disturbances -> quantity -> sigma, SI.
-        bench: of the design.
+    Parameters
+    ----------
+    sigmas : Mapping[str, Mapping[str, float]]
+        Disturbances -> quantity -> sigma, SI.
+    bench : LayoutBench
+        Of the design.
     """
     return max(ratios(sigmas, bench).values())
 
@@ -134,9 +155,12 @@ def merit(sigmas: Mapping[str, Mapping[str, float]], bench: LayoutBench) -> floa
 def optima(found: Found, bench: LayoutBench) -> list[list[End]]:
     """Searches by what they end with: each group's merits lie within ``ALIKE`` of its best, the best group first.
 
-    Args:
-        found: of a search; ends without a layout are left out.
-        bench: of the design.
+    Parameters
+    ----------
+    found : Found
+        Of a search; ends without a layout are left out.
+    bench : LayoutBench
+        Of the design.
     """
 
     def least(end: End) -> float:
@@ -158,9 +182,12 @@ Item = Beam | tuple[Beam, ...] | LayoutNumber
 def journal_of(file: Path | None, config: str) -> Journal:
     """The journal of a search.
 
-    Args:
-        file: of the journal, None to keep nothing.
-        config: what the search is about.
+    Parameters
+    ----------
+    file : Path | None
+        Of the journal, None to keep nothing.
+    config : str
+        What the search is about.
     """
     return Journal(file, config, "search", (Beam, BeamFacts, LayoutFacts, LayoutNumber, Seen, Slope))
 
@@ -168,14 +195,21 @@ def journal_of(file: Path | None, config: str) -> Journal:
 class Workers:
     """Context manager; inside it things can be asked for. Results do not depend on the number of processes.
 
-    Args:
-        bench: of the design.
-        count: processes beside this one, 0 for none.
-        journal: keeps what was tried.
-        advance: shows how far it is.
+    Parameters
+    ----------
+    bench
+        Of the design.
+    count
+        Processes beside this one, 0 for none.
+    journal
+        Keeps what was tried.
+    advance
+        Shows how far it is.
 
-    Raises:
-        RunFolderError: on entering, the journal is another search's, or cannot be written.
+    Raises
+    ------
+    RunFolderError
+        On entering, the journal is another search's, or cannot be written.
     """
 
     def __init__(self, bench: LayoutBench, count: int, journal: Journal, advance: Advance) -> None:
@@ -199,12 +233,17 @@ class Workers:
     def ask(self, part: str, items: Sequence[Item]) -> list[Any]:
         """What comes of every item, in their order; what the journal has is not worked out again.
 
-        Args:
-            part: of the search, for the progress.
-            items: beams to be tried alone, layouts to be built, numbers of layouts by which to differentiate.
+        Parameters
+        ----------
+        part : str
+            Of the search, for the progress.
+        items : Sequence[Item]
+            Beams to be tried alone, layouts to be built, numbers of layouts by which to differentiate.
 
-        Raises:
-            Incomplete: the processes died.
+        Raises
+        ------
+        Incomplete
+            The processes died.
         """
         known, names = self.journal.known, [repr(item) for item in items]
         missing = {name: item for name, item in zip(names, items, strict=True) if name not in known}
@@ -244,12 +283,18 @@ def _answer(bench: LayoutBench, item: Any) -> Any:
 class Search:
     """A search at work, with its starts.
 
-    Args:
-        bench: of the design.
-        workers: processes beside this one, 0 for none.
-        seed: of everything drawn.
-        journal: file that keeps what was tried, None for none.
-        advance: shows how far it is.
+    Parameters
+    ----------
+    bench
+        Of the design.
+    workers
+        Processes beside this one, 0 for none.
+    seed
+        Of everything drawn.
+    journal
+        File that keeps what was tried, None for none.
+    advance
+        Shows how far it is.
     """
 
     def __init__(self, bench: LayoutBench, workers: int, seed: int, journal: Path | None, advance: Advance) -> None:
@@ -282,9 +327,12 @@ def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
     """So many of ranked layouts: half of them the best, the others evenly over the rest. The best are often much alike,
     and have room for the same few others.
 
-    Args:
-        level: most promising first.
-        width: how many.
+    Parameters
+    ----------
+    level : Sequence[Candidate]
+        Most promising first.
+    width : int
+        How many.
     """
     best, rest = list(level[: (width + 1) // 2]), level[(width + 1) // 2 :]
     count = min(width - len(best), len(rest))
@@ -294,11 +342,16 @@ def spread(level: Sequence[Candidate], width: int) -> list[Candidate]:
 class _OneSearch:
     """A search from one set of beams.
 
-    Args:
-        bench: of the design.
-        ask: for beams, layouts and slopes.
-        rng: source of everything drawn.
-        name: of where it begins; empty for the instrument that the design starts from.
+    Parameters
+    ----------
+    bench
+        Of the design.
+    ask
+        For beams, layouts and slopes.
+    rng
+        Source of everything drawn.
+    name
+        Of where it begins; empty for the instrument that the design starts from.
     """
 
     def __init__(self, bench: LayoutBench, ask: Ask, rng: np.random.Generator, name: str) -> None:

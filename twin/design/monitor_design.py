@@ -36,10 +36,14 @@ REMARK = """Made by python -m twin.design monitor from {start}. What its spots l
 class Point:
     """A layout that is handed over.
 
-    Attributes:
-        name: of its instrument, and of its file.
-        facts: of it.
-        text: the instrument's file.
+    Attributes
+    ----------
+    name : str
+        Of its instrument, and of its file.
+    facts : LayoutFacts
+        Of it.
+    text : str
+        The instrument's file.
     """
 
     name: str
@@ -51,11 +55,16 @@ class Point:
 class MonitorDesignRun:
     """A search and what came of it.
 
-    Attributes:
-        setup: the design.
-        bench: on which layouts were tried.
-        found: by the search.
-        points: on the front of merit, pupil share and mass, the best first; empty where none is as good as the start.
+    Attributes
+    ----------
+    setup : monitor_layout.MonitorDesignSetup
+        The design.
+    bench : LayoutBench
+        On which layouts were tried.
+    found : Found
+        By the search.
+    points : tuple[Point, ...]
+        On the front of merit, pupil share and mass, the best first; empty where none is as good as the start.
     """
 
     setup: monitor_layout.MonitorDesignSetup
@@ -82,18 +91,29 @@ def run_monitor_design(
 ) -> MonitorDesignRun:
     """Search for layouts.
 
-    Args:
-        setup: the design.
-        backend: where to trace.
-        seed: of all that is drawn.
-        advance: shows how far it is.
-        workers: processes, 0 for none beside this one; the result is the same.
-        journal: file that keeps what was tried, to go on with; None for none.
+    Parameters
+    ----------
+    setup : monitor_layout.MonitorDesignSetup
+        The design.
+    backend : Backend
+        Where to trace.
+    seed : int
+        Of all that is drawn.
+    advance : Advance
+        Shows how far it is.
+    workers : int
+        Processes, 0 for none beside this one; the result is the same.
+    journal : Path | None
+        File that keeps what was tried, to go on with; None for none.
 
-    Raises:
-        InputError: the instrument that it starts from cannot stand, or throws ghosts on a spot that are not allowed.
-        BenchError: no beam and no layout that was tried can stand.
-        RunFolderError: the journal is another search's, or cannot be written.
+    Raises
+    ------
+    InputError
+        The instrument that it starts from cannot stand, or throws ghosts on a spot that are not allowed.
+    BenchError
+        No beam and no layout that was tried can stand.
+    RunFolderError
+        The journal is another search's, or cannot be written.
     """
     bench = LayoutBench(setup, backend)
     _check_start(setup, backend, seed, advance)
@@ -120,8 +140,10 @@ def run_monitor_design(
 def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
     """Refuse a start with ghosts, where they are to be traced: every layout has its prisms' tilts.
 
-    Raises:
-        InputError: at the tilt of the prism that throws the strongest one.
+    Raises
+    ------
+    InputError
+        At the tilt of the prism that throws the strongest one.
     """
     spec = setup.instrument
     for ghost in _traced_ghosts(setup, spec, setup.detector, backend, seed, advance):

@@ -48,11 +48,16 @@ _PLACES = (
 class RecordedFrames:
     """What a TIFF file of a run holds.
 
-    Attributes:
-        frames: (N, H, W) grey values as recorded.
-        pages: what each page says of itself (``FrameFacts.page``).
-        place: of a map, (longitude, latitude, per column, per row) of its first pixel's centre in degrees; else None.
-        heights: whether the values are heights in metres.
+    Attributes
+    ----------
+    frames : np.ndarray
+        (N, H, W) grey values as recorded.
+    pages : tuple[Mapping[str, Any], ...]
+        What each page says of itself (``FrameFacts.page``).
+    place : tuple[float, float, float, float] | None
+        Of a map, (longitude, latitude, per column, per row) of its first pixel's centre in degrees; else None.
+    heights : bool
+        Whether the values are heights in metres.
     """
 
     frames: np.ndarray
@@ -64,8 +69,10 @@ class RecordedFrames:
 def read_frames(path: Path) -> RecordedFrames:
     """Frames of a TIFF file that a run has written.
 
-    Raises:
-        ValueError, KeyError: it is not such a file.
+    Raises
+    ------
+    ValueError, KeyError
+        It is not such a file.
     """
     with tifffile.TiffFile(path) as file:
         frames = np.stack([page.asarray() for page in file.pages])
@@ -116,9 +123,12 @@ def detector_cards(job: ResolvedJob) -> list[Card]:
 def frames_fits(recorded: RecordedFrames, cards: Iterable[Card]) -> bytes:
     """A FITS file of recorded frames; the same frames give the same bytes.
 
-    Args:
-        recorded: the frames.
-        cards: of the header, beside those that the frames give.
+    Parameters
+    ----------
+    recorded : RecordedFrames
+        The frames.
+    cards : Iterable[Card]
+        Of the header, beside those that the frames give.
     """
     from astropy.io import fits
 
@@ -162,9 +172,12 @@ def frames_fits(recorded: RecordedFrames, cards: Iterable[Card]) -> bytes:
 def expected_fits(data: xr.Dataset, cards: Sequence[Card]) -> bytes:
     """A FITS file of expected images, photons per pixel and frame: of each channel an extension with all its states.
 
-    Args:
-        data: as irradiance.nc and course.nc hold it, (state or time, channel, row, column).
-        cards: of the first header.
+    Parameters
+    ----------
+    data : xr.Dataset
+        As irradiance.nc and course.nc hold it, (state or time, channel, row, column).
+    cards : Sequence[Card]
+        Of the first header.
     """
     from astropy.io import fits
 
@@ -240,12 +253,18 @@ _IMAGES = "images/"
 class ExportedFile:
     """A file that was written.
 
-    Attributes:
-        file: in the export's folder.
-        source: file, or files, of the run that it was made of.
-        what: is in it.
-        items: frames of images, rows of a table.
-        bytes: its size.
+    Attributes
+    ----------
+    file : str
+        In the export's folder.
+    source : str
+        File, or files, of the run that it was made of.
+    what : str
+        Is in it.
+    items : int
+        Frames of images, rows of a table.
+    bytes : int
+        Its size.
     """
 
     file: str
@@ -259,13 +278,20 @@ class ExportedFile:
 class Exported:
     """All that was written.
 
-    Attributes:
-        run: the run's folder.
-        manifest: of the run.
-        frames, tables: formats that were asked for.
-        files: that were written.
-        described: the tables, for what their columns say.
-        changed: files of the run that are not as their manifest says.
+    Attributes
+    ----------
+    run : Path
+        The run's folder.
+    manifest : Manifest
+        Of the run.
+    frames, tables : str
+        Formats that were asked for.
+    files : tuple[ExportedFile, ...]
+        That were written.
+    described : tuple[DataTable, ...]
+        The tables, for what their columns say.
+    changed : tuple[str, ...]
+        Files of the run that are not as their manifest says.
     """
 
     run: Path
@@ -295,8 +321,10 @@ class Exported:
 def read_source(folder: Path) -> Manifest:
     """The manifest of a run folder, all files of which are there.
 
-    Raises:
-        InputError: no run folder, or files of it are missing.
+    Raises
+    ------
+    InputError
+        No run folder, or files of it are missing.
     """
     manifest = finished_manifest(folder)
     missing = [name for name in manifest.sha256 if not is_file(folder / name)]
@@ -308,16 +336,25 @@ def read_source(folder: Path) -> Manifest:
 def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: RunFolder, advance: Advance) -> Exported:
     """Write everything that is asked for.
 
-    Args:
-        source: the run's folder.
-        manifest: of it.
-        frames: one of ``FRAMES``.
-        tables: of ``TABLE_FORMATS``, or none.
-        folder: open.
-        advance: shows how far it is.
+    Parameters
+    ----------
+    source : Path
+        The run's folder.
+    manifest : Manifest
+        Of it.
+    frames : str
+        One of ``FRAMES``.
+    tables : str
+        Of ``TABLE_FORMATS``, or none.
+    folder : RunFolder
+        open.
+    advance : Advance
+        Shows how far it is.
 
-    Raises:
-        InputError: the run has nothing of what is asked for, a file of it cannot be read, or a package is missing.
+    Raises
+    ------
+    InputError
+        The run has nothing of what is asked for, a file of it cannot be read, or a package is missing.
     """
     changed = tuple(altered(source, manifest))
     files: list[ExportedFile] = []

@@ -34,12 +34,18 @@ _HEAD = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]+)\]")
 class Nested:
     """A table within a JSON file: mappings by name, one within the other, and at the bottom numbers.
 
-    Attributes:
-        name: of the table.
-        file: of the run folder.
-        key: where the mappings begin.
-        levels: what the names of each mapping are.
-        title: of the table.
+    Attributes
+    ----------
+    name : str
+        Of the table.
+    file : str
+        Of the run folder.
+    key : str
+        Where the mappings begin.
+    levels : tuple[str, ...]
+        What the names of each mapping are.
+    title : str
+        Of the table.
     """
 
     name: str
@@ -123,13 +129,19 @@ _SIGMAS = {
 def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
     """All tables of a run.
 
-    Args:
-        folder: of the run.
-        files: of it, relative to it, as its manifest lists them.
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    files : Sequence[str]
+        Of it, relative to it, as its manifest lists them.
 
-    Raises:
-        InputError: a JSON file cannot be read.
-        ValueError: a JSON or CSV file is not what runs write.
+    Raises
+    ------
+    InputError
+        a JSON file cannot be read.
+    ValueError
+        a JSON or CSV file is not what runs write.
     """
     json_files = [name for name in files if name.endswith(".json") and name not in _OTHER_FILES]
     data = {name: read_json(folder / name) for name in json_files}

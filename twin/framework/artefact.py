@@ -38,10 +38,14 @@ def _typeset(text: str) -> str:
 def fixed(value: float, decimals: int, sign: bool = False) -> str:
     """A fixed-point number; what rounds to zero has no sign.
 
-    Args:
-        value: the number; infinities and NaN become a dash.
-        decimals: digits behind the point.
-        sign: whether numbers above zero have a plus sign.
+    Parameters
+    ----------
+    value : float
+        The number; infinities and NaN become a dash.
+    decimals : int
+        Digits behind the point.
+    sign : bool
+        Whether numbers above zero have a plus sign.
     """
     if not math.isfinite(value):
         return "\N{EM DASH}"
@@ -52,11 +56,16 @@ def fixed(value: float, decimals: int, sign: bool = False) -> str:
 def decimals_for(sigma: float, digits: int = 2, most: int = 7, default: int = 4) -> int:
     """Decimals that show ``sigma`` with that many digits.
 
-    Args:
-        sigma: standard deviation, in the unit in which numbers are shown.
-        digits: significant digits of it that are to be seen.
-        most: decimals at most.
-        default: decimals where sigma is zero or not finite.
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation, in the unit in which numbers are shown.
+    digits : int
+        Significant digits of it that are to be seen.
+    most : int
+        Decimals at most.
+    default : int
+        Decimals where sigma is zero or not finite.
     """
     if not (math.isfinite(sigma) and sigma > 0):
         return default
@@ -66,11 +75,16 @@ def decimals_for(sigma: float, digits: int = 2, most: int = 7, default: int = 4)
 def significant(value: float, digits: int = 3, floor: float = SAME, sign: bool = False) -> str:
     """A number with some significant digits, one less where a power of ten is written; below ``floor`` it is 0.
 
-    Args:
-        value: the number; infinities and NaN become a dash.
-        digits: significant digits.
-        floor: size below which a number is rounding and is shown as 0.
-        sign: whether numbers above zero have a plus sign.
+    Parameters
+    ----------
+    value : float
+        The number; infinities and NaN become a dash.
+    digits : int
+        Significant digits.
+    floor : float
+        Size below which a number is rounding and is shown as 0.
+    sign : bool
+        Whether numbers above zero have a plus sign.
     """
     if not math.isfinite(value):
         return "\N{EM DASH}"
@@ -88,9 +102,12 @@ def significant(value: float, digits: int = 3, floor: float = SAME, sign: bool =
 def plain(value: float, digits: int = 5) -> str:
     """A number that was given, without trailing zeros.
 
-    Args:
-        value: the number.
-        digits: significant digits at most.
+    Parameters
+    ----------
+    value : float
+        The number.
+    digits : int
+        Significant digits at most.
     """
     return _typeset(f"{value:.{digits}g}")
 
@@ -135,11 +152,16 @@ class OwnDecimals(float):
 class Marked(str):
     """A text of a table's cell that says more than itself.
 
-    Attributes:
-        below: a second, smaller line.
-        look: how it is set off, a class of the style sheet: ``truth``, ``near``, ``far``, ``wrong``, a verdict.
-        key: name by which programs find the cell in a page.
-        hint: shown to who points at the cell.
+    Attributes
+    ----------
+    below : str
+        a second, smaller line.
+    look : str
+        How it is set off, a class of the style sheet: ``truth``, ``near``, ``far``, ``wrong``, a verdict.
+    key : str
+        Name by which programs find the cell in a page.
+    hint : str
+        Shown to who points at the cell.
     """
 
     def __new__(cls, text: str, below: str = "", look: str = "", key: str = "", hint: str = "") -> Marked:
@@ -157,11 +179,16 @@ class Marked(str):
 def residual_cell(text: str, ratio: float | None, key: str, hint: str = "") -> Marked:
     """A reading with its departure from the truth in sigma below it, and a mark where that is beyond FAR.
 
-    Args:
-        text: the reading.
-        ratio: reading minus truth over sigma; None without noise.
-        key: name by which programs find the cell.
-        hint: shown to who points at the cell.
+    Parameters
+    ----------
+    text : str
+        The reading.
+    ratio : float | None
+        Reading minus truth over sigma; None without noise.
+    key : str
+        Name by which programs find the cell.
+    hint : str
+        Shown to who points at the cell.
     """
     far = ratio is not None and abs(ratio) > FAR
     return Marked(text, f"{'▲' if far else '●'} {residual_text(ratio)} σ", "far" if far else "near", key, hint)
@@ -171,13 +198,20 @@ def residual_cell(text: str, ratio: float | None, key: str, hint: str = "") -> M
 class Artefact:
     """Something to show beside the checks.
 
-    Attributes:
-        name: of its file, without ending: small letters, digits, - and _; unique in its group.
-        title: heading in the report; empty for none.
-        caption: what it shows, in sentences; words between backticks are shown as code.
-        kind: ending of its file: ``svg``, ``png``, ``csv``, ``json``.
-        within: file of the run folder that holds it; None for a file of its own, empty if only the page shows it.
-        full: table with all digits that a reader can take away from the page.
+    Attributes
+    ----------
+    name : str
+        Of its file, without ending: small letters, digits, - and _; unique in its group.
+    title : str
+        Heading in the report; empty for none.
+    caption : str
+        What it shows, in sentences; words between backticks are shown as code.
+    kind : str
+        Ending of its file: ``svg``, ``png``, ``csv``, ``json``.
+    within : str | None
+        File of the run folder that holds it; None for a file of its own, empty if only the page shows it.
+    full : Table | None
+        Table with all digits that a reader can take away from the page.
     """
 
     kind: ClassVar[str]
@@ -370,8 +404,10 @@ class Piece(Artefact):
 class Undrawn(Artefact):
     """A note in the place of a figure that could not be drawn.
 
-    Attributes:
-        why: the error.
+    Attributes
+    ----------
+    why : str
+        The error.
     """
 
     kind: ClassVar[str] = "txt"

@@ -54,15 +54,24 @@ Scheduler = Annotated[str | None, typer.Option(help=SCHEDULER_HELP)]
 class Options:
     """What the user chose: every field is an option of the commands that make a run folder, see `with_options`.
 
-    Attributes:
-        out: run folder, None for the next free one.
-        seed: None for the file's.
-        export: folder for what was measured, None for none.
-        backend: where to trace.
-        force: replace the run folder.
-        as_json: print the numbers as JSON.
-        quiet: print nothing.
-        strict: end with the exit code DOUBTFUL where a verdict on the result is negative.
+    Attributes
+    ----------
+    out : Out
+        Run folder, None for the next free one.
+    seed : Seed
+        None for the file's.
+    export : Export
+        Folder for what was measured, None for none.
+    backend : BackendName
+        Where to trace.
+    force : Force
+        Replace the run folder.
+    as_json : AsJson
+        Print the numbers as JSON.
+    quiet : Quiet
+        Print nothing.
+    strict : Strict
+        End with the exit code DOUBTFUL where a verdict on the result is negative.
     """
 
     out: Out = None
@@ -92,8 +101,10 @@ def program(**more: Any) -> typer.Typer:
 def unnamed(meant: Callable[[Sequence[str]], str]) -> type[TyperGroup]:
     """Return the class of a program whose subcommand need not be named.
 
-    Args:
-        meant: words after the program, of which the first is no subcommand -> the subcommand.
+    Parameters
+    ----------
+    meant : Callable[[Sequence[str]], str]
+        Words after the program, of which the first is no subcommand -> the subcommand.
     """
 
     class Group(TyperGroup):
@@ -111,8 +122,10 @@ def unnamed(meant: Callable[[Sequence[str]], str]) -> type[TyperGroup]:
 def with_options(*without: str) -> Callable[[Command], Command]:
     """Return what gives a command the options of `Options`, for its parameter ``options``, after its own.
 
-    Args:
-        without: fields of `Options` that are no options of the command.
+    Parameters
+    ----------
+    without : str
+        Fields of `Options` that are no options of the command.
     """
     hints = get_type_hints(Options, include_extras=True)
     chosen = {one.name: one.default for one in fields(Options) if one.name not in without}
@@ -139,12 +152,17 @@ def with_parameters(command: Command, parameters: Sequence[Parameter]) -> Comman
 def end_strictly(errors: Console, numbers: Any) -> None:
     """End with the exit code of a result whose sigmas do not hold.
 
-    Args:
-        errors: where the negative verdicts are named.
-        numbers: of the result, plain data.
+    Parameters
+    ----------
+    errors : Console
+        Where the negative verdicts are named.
+    numbers : Any
+        Of the result, plain data.
 
-    Raises:
-        typer.Exit: a verdict is negative, see `twin.framework.provenance.negative_verdicts`.
+    Raises
+    ------
+    typer.Exit
+        a verdict is negative, see `twin.framework.provenance.negative_verdicts`.
     """
     from twin.framework.owned_files import first_names
     from twin.framework.provenance import negative_verdicts
@@ -161,8 +179,10 @@ class InputErrorText(Exception):
 class Incomplete(Exception):
     """Work that could not be completed although nothing is wrong with what was asked; the message says why.
 
-    Attributes:
-        trace: traceback of a fault of the program in another process, as text.
+    Attributes
+    ----------
+    trace
+        Traceback of a fault of the program in another process, as text.
     """
 
     def __init__(self, message: str, trace: str = "") -> None:
@@ -173,8 +193,10 @@ class Incomplete(Exception):
 def require_one_of(option: str, value: str, allowed: Collection[str]) -> None:
     """Complain about a format that an option does not have.
 
-    Raises:
-        InputErrorText: the value is none of those allowed.
+    Raises
+    ------
+    InputErrorText
+        The value is none of those allowed.
     """
     if value not in allowed:
         near = nearest(value, allowed)
@@ -185,8 +207,10 @@ def require_one_of(option: str, value: str, allowed: Collection[str]) -> None:
 def check_backend(name: str) -> None:
     """Complain about an unknown backend before anything is started.
 
-    Raises:
-        InputErrorText: there is none of that name.
+    Raises
+    ------
+    InputErrorText
+        There is none of that name.
     """
     if name not in NAMES:
         raise InputErrorText(f"unknown backend {name!r}; choose {' or '.join(NAMES)}")
@@ -201,9 +225,12 @@ def nothing_kept() -> str:
 def explained(errors: Console, left: Callable[[], str] = nothing_kept) -> Iterator[None]:
     """Turn the errors that a user can cause into one sentence on ``errors`` and the command's exit code.
 
-    Args:
-        errors: where it is said.
-        left: what is left of the work when it is broken off.
+    Parameters
+    ----------
+    errors : Console
+        Where it is said.
+    left : Callable[[], str]
+        What is left of the work when it is broken off.
     """
     try:
         yield
@@ -254,11 +281,16 @@ TICK_SECONDS = 8.0
 def heartbeat(console: Console, says: Callable[[], str], silent: bool, seconds: float | None = None) -> Iterator[None]:
     """Inside the block a line now and then says how far a command is, where no terminal shows it.
 
-    Args:
-        console: where it is said; nothing is where it is a terminal, which shows progress itself.
-        says: one line.
-        silent: whether nothing shall be said.
-        seconds: from one line to the next, None for TICK_SECONDS.
+    Parameters
+    ----------
+    console : Console
+        Where it is said; nothing is where it is a terminal, which shows progress itself.
+    says : Callable[[], str]
+        One line.
+    silent : bool
+        Whether nothing shall be said.
+    seconds : float | None
+        From one line to the next, None for TICK_SECONDS.
     """
     if silent or console.is_terminal:
         yield

@@ -53,10 +53,14 @@ class ClusterError(cli.Incomplete):
 class Workers:
     """Worker processes of a command.
 
-    Attributes:
-        client: of Dask.
-        local: whether they are this command's own.
-        warnings: what the user should know.
+    Attributes
+    ----------
+    client : Client
+        Of Dask.
+    local : bool
+        Whether they are this command's own.
+    warnings : list[str]
+        What the user should know.
     """
 
     client: Client
@@ -78,11 +82,15 @@ class Workers:
     def next_finished(self, tick: Callable[[], None] = lambda: None) -> Any:
         """The next piece of work that is done, well or not.
 
-        Args:
-            tick: called about twice a second while waiting.
+        Parameters
+        ----------
+        tick : Callable[[], None]
+            Called about twice a second while waiting.
 
-        Raises:
-            ClusterError: the scheduler is gone, or all processes of this command and none has come back.
+        Raises
+        ------
+        ClusterError
+            The scheduler is gone, or all processes of this command and none has come back.
         """
         lost: float | None = None
         alone: float | None = None
@@ -110,16 +118,23 @@ class Workers:
     def each(self, work: Callable[[Any], Any], arguments: Iterable[Any]) -> Iterator[list[tuple[int, Any]]]:
         """Do a piece of work with every argument, never more than a few ahead.
 
-        Args:
-            work: function of one argument.
-            arguments: of the pieces.
+        Parameters
+        ----------
+        work : Callable[[Any], Any]
+            Function of one argument.
+        arguments : Iterable[Any]
+            Of the pieces.
 
-        Yields:
+        Yields
+        ------
+        list[tuple[int, Any]]
             Numbers of the arguments with the futures of their pieces that are done meanwhile, well or not; one at
             least.
 
-        Raises:
-            ClusterError: as of ``next_finished``.
+        Raises
+        ------
+        ClusterError
+            As of ``next_finished``.
         """
         left = enumerate(arguments)
         running: dict[Any, tuple[int, Any]] = {}
@@ -234,14 +249,20 @@ def _kept_environment() -> Iterator[None]:
 def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Workers]:
     """Workers of a running cluster.
 
-    Args:
-        address: of its scheduler, ``tls://host:port`` or ``tcp://host:port``. For TLS Dask is told the certificates by
-            its own configuration, ``distributed.comm.tls``.
-        tell: told that there are no workers yet.
+    Parameters
+    ----------
+    address : str
+        Of its scheduler, ``tls://host:port`` or ``tcp://host:port``. For TLS Dask is told the certificates by its own
+        configuration, ``distributed.comm.tls``.
+    tell : Callable[[str], None]
+        Told that there are no workers yet.
 
-    Raises:
-        InputErrorText: it cannot be reached, no certificates are named, or its workers do not have the twin.
-        ClusterError: it has no workers.
+    Raises
+    ------
+    InputErrorText
+        It cannot be reached, no certificates are named, or its workers do not have the twin.
+    ClusterError
+        It has no workers.
     """
     _check_address(address)
     import dask
@@ -278,15 +299,23 @@ def chosen_workers(
     """Workers that the user chose, inside the block: those of a running cluster, or processes of this machine, as many
     as fit into the memory.
 
-    Args:
-        count: of processes of this machine, None for one per core.
-        scheduler: address of a running cluster.
-        warn: told what the user should know.
-        limits: of the memory.
+    Parameters
+    ----------
+    count : int | None
+        Of processes of this machine, None for one per core.
+    scheduler : str | None
+        Address of a running cluster.
+    warn : Callable[[str], None]
+        Told what the user should know.
+    limits : LimitsSpec | None
+        Of the memory.
 
-    Raises:
-        InputErrorText: both are chosen, or a cluster that cannot be used.
-        ClusterError: a cluster without workers.
+    Raises
+    ------
+    InputErrorText
+        Both are chosen, or a cluster that cannot be used.
+    ClusterError
+        a cluster without workers.
     """
     refuse_both(count, scheduler)
     who: AbstractContextManager[Workers]
@@ -307,8 +336,10 @@ def chosen_workers(
 def refuse_both(workers: int | None, scheduler: str | None) -> None:
     """See that not both are asked for: processes of this machine, and a running cluster.
 
-    Raises:
-        InputErrorText: both are.
+    Raises
+    ------
+    InputErrorText
+        Both are.
     """
     if workers is not None and scheduler is not None:
         raise cli.InputErrorText("--workers and --scheduler exclude each other: a cluster has its own workers")
@@ -317,8 +348,10 @@ def refuse_both(workers: int | None, scheduler: str | None) -> None:
 def _check_address(address: str) -> None:
     """Whether a scheduler can be there at all, and what TLS needs to reach it.
 
-    Raises:
-        InputErrorText: no address, or no certificates.
+    Raises
+    ------
+    InputErrorText
+        No address, or no certificates.
     """
     try:
         parts = urlsplit(address)
@@ -358,8 +391,10 @@ def _wait_for_worker(workers: Workers, address: str, tell: Callable[[str], None]
 def _differences(client: Client) -> list[str]:
     """Versions of the workers that differ from ours: their numbers may differ in the last digits, or more.
 
-    Raises:
-        InputErrorText: they cannot import the twin, or have another one.
+    Raises
+    ------
+    InputErrorText
+        They cannot import the twin, or have another one.
     """
     try:
         theirs = client.run(_program, on_error="return")

@@ -32,11 +32,16 @@ if TYPE_CHECKING:
 class Result:
     """What a command tells in the terminal when its run folder is complete.
 
-    Attributes:
-        numbers: plain data, for ``--json``.
-        show: prints the result for a reader.
-        problem: why something asked for is not in the run folder, empty for nothing; the exit code is then 1.
-        code: exit code that the result itself asks for, of a command whose answer it is.
+    Attributes
+    ----------
+    numbers : Mapping[str, Any]
+        Plain data, for ``--json``.
+    show : Callable[[Console], None]
+        Prints the result for a reader.
+    problem : str
+        Why something asked for is not in the run folder, empty for nothing; the exit code is then 1.
+    code : int
+        Exit code that the result itself asks for, of a command whose answer it is.
     """
 
     numbers: Mapping[str, Any]
@@ -48,12 +53,18 @@ class Result:
 def finished(session: Session, kind: str, report: Report, numbers: Mapping[str, Any], **facts: Any) -> Result:
     """Write the run folder of a command that shows a report, and what it tells in the terminal.
 
-    Args:
-        session: the command at work.
-        kind: of the numbers, which stand in KIND.json.
-        report: of the run, with the exit code that it asks for.
-        numbers: of the run; the report's verdict is added to them.
-        facts: how it was run, as `twin.framework.page.RunFacts` takes them, beside what the session knows.
+    Parameters
+    ----------
+    session : Session
+        The command at work.
+    kind : str
+        Of the numbers, which stand in KIND.json.
+    report : Report
+        Of the run, with the exit code that it asks for.
+    numbers : Mapping[str, Any]
+        Of the run; the report's verdict is added to them.
+    facts : Any
+        How it was run, as `twin.framework.page.RunFacts` takes them, beside what the session knows.
     """
     from twin.framework import reference_frames
     from twin.framework.page import RunFacts, write_test
@@ -79,15 +90,23 @@ def run_command(
 ) -> None:
     """Read what is asked for, do it in a run folder and print what it gave.
 
-    Args:
-        stem: of the run folder's name where the user chose none.
-        options: what the user chose.
-        resolve: reads the files and checks what is asked for. Raises InputError, InputErrorText.
-        work: computes and writes all files of the run folder, the manifest last. Raises InputError.
-        kept: where the work is kept meanwhile; it goes when the run folder is complete.
+    Parameters
+    ----------
+    stem : str
+        Of the run folder's name where the user chose none.
+    options : cli.Options
+        What the user chose.
+    resolve : Callable[[], Given]
+        Reads the files and checks what is asked for. Raises InputError, InputErrorText.
+    work : Callable[[Given, Session], Result]
+        Computes and writes all files of the run folder, the manifest last. Raises InputError.
+    kept : KeptWork | None
+        Where the work is kept meanwhile; it goes when the run folder is complete.
 
-    Raises:
-        typer.Exit: with the exit code of a failure, which has been told.
+    Raises
+    ------
+    typer.Exit
+        With the exit code of a failure, which has been told.
     """
     errors = Console(stderr=True)
     with cli.explained(errors, cli.nothing_kept if kept is None else kept.left), kept or nullcontext():
@@ -126,9 +145,12 @@ def progress_shown(errors: Console, silent: bool) -> Iterator[Advance]:
     """Inside the block a terminal shows how far each part of the work is and how long it still takes; elsewhere a line
     now and then says it. Of a part that takes long it is said once in any case.
 
-    Args:
-        errors: where it is shown.
-        silent: whether nothing shall be.
+    Parameters
+    ----------
+    errors : Console
+        Where it is shown.
+    silent : bool
+        Whether nothing shall be.
     """
     standing, hidden = cli.Standing(), silent or not errors.is_terminal
 
@@ -165,10 +187,14 @@ def add_tests(app: typer.Typer, program: str, apart: Collection[str] = ()) -> No
 
     A test that exports has an option ``--export``.
 
-    Args:
-        app: of the program.
-        program: first word of the tests' names.
-        apart: commands that have options of their own and are added by the program itself.
+    Parameters
+    ----------
+    app : typer.Typer
+        Of the program.
+    program : str
+        First word of the tests' names.
+    apart : Collection[str]
+        Commands that have options of their own and are added by the program itself.
     """
     for name in PROCEDURES:
         of, _, command = name.partition(" ")
@@ -207,17 +233,27 @@ def run_test(
 ) -> None:
     """Read a test, run it, write its run folder and print what it gave.
 
-    Args:
-        name: of the test in `PROCEDURES`: program and subcommand.
-        file: of the test; the run folder is called like it.
-        options: what the user chose.
-        kept: see `run_command`.
-        read: reads the set-up, by options that this test alone has; None for that of the file. Raises InputError.
-        words: further options with which the run is made again from its config.yaml.
-        changes: attributes of the `Procedure` that are others by options that this test alone has.
+    Parameters
+    ----------
+    name : str
+        Of the test in `PROCEDURES`: program and subcommand.
+    file : Path
+        Of the test; the run folder is called like it.
+    options : cli.Options
+        What the user chose.
+    kept : KeptWork | None
+        See `run_command`.
+    read : Callable[[], Any] | None
+        Reads the set-up, by options that this test alone has; None for that of the file. Raises InputError.
+    words : tuple[str, ...]
+        Further options with which the run is made again from its config.yaml.
+    changes : Any
+        Attributes of the `Procedure` that are others by options that this test alone has.
 
-    Raises:
-        typer.Exit: with the exit code of a failure, which has been told.
+    Raises
+    ------
+    typer.Exit
+        With the exit code of a failure, which has been told.
     """
     procedure = replace(PROCEDURES[name], **changes)
     called = f"twin.{name}"
@@ -253,9 +289,12 @@ def run_test(
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
     """The folder of ``--export``, checked before anything is computed.
 
-    Raises:
-        InputError: the test names measurements, which are files already.
-        RunFolderError: the folder cannot be made.
+    Raises
+    ------
+    InputError
+        The test names measurements, which are files already.
+    RunFolderError
+        The folder cannot be made.
     """
     if "measured" in type(setup.test).model_fields:
         text = "measurements are files already; --export writes those of a simulated bench"

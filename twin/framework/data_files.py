@@ -53,10 +53,14 @@ Gridded = tuple[str | tuple[str, ...], Any, Mapping[str, Any]]
 class GridData:
     """Arrays on named axes, to be written without xarray, whose import takes longer than most files.
 
-    Attributes:
-        variables: name -> real numbers.
-        coords: name -> coordinates of the axes, real numbers or texts.
-        attrs: of all, ``title`` among them.
+    Attributes
+    ----------
+    variables : Mapping[str, Gridded]
+        Name -> real numbers.
+    coords : Mapping[str, Gridded]
+        Name -> coordinates of the axes, real numbers or texts.
+    attrs : Mapping[str, Any]
+        Of all, ``title`` among them.
     """
 
     variables: Mapping[str, Gridded]
@@ -73,9 +77,11 @@ class GridData:
 def netcdf(data: xr.Dataset | GridData) -> bytes:
     """A data set as the contents of a netCDF-4 file by CF 1.11; the same data give the same bytes.
 
-    Args:
-        data: with ``title`` among its attributes; of every variable ``long_name`` and of numbers ``units``, which are 1
-            where there are none.
+    Parameters
+    ----------
+    data : xr.Dataset | GridData
+        With ``title`` among its attributes; of every variable ``long_name`` and of numbers ``units``, which are 1 where
+        there are none.
     """
     if isinstance(data, GridData):
         return _grid_file(data)
@@ -129,8 +135,10 @@ def _axes(dims: str | tuple[str, ...]) -> tuple[str, ...]:
 def read_netcdf(content: bytes) -> xr.Dataset:
     """The data set in the bytes of a netCDF file, loaded whole; units of time stay as they are written.
 
-    Raises:
-        Exception: the file is damaged, in whatever way the libraries stumble over it; also where they would only warn.
+    Raises
+    ------
+    Exception
+        The file is damaged, in whatever way the libraries stumble over it; also where they would only warn.
     """
     import h5py
     import xarray as xr
@@ -213,10 +221,14 @@ class Placed(Protocol):
 class MapPlace:
     """Where the pixels of a map lie: longitude and latitude are linear in column and row.
 
-    Attributes:
-        longitude, latitude: of the middle of the first pixel, degrees.
-        per_column, per_row: degrees of longitude and of latitude, the latter below zero where rows go south.
-        heights: whether the values are heights above the ellipsoid of WGS 84.
+    Attributes
+    ----------
+    longitude, latitude : float
+        Of the middle of the first pixel, degrees.
+    per_column, per_row : float
+        Degrees of longitude and of latitude, the latter below zero where rows go south.
+    heights : bool
+        Whether the values are heights above the ellipsoid of WGS 84.
     """
 
     longitude: float
@@ -238,13 +250,20 @@ class MapPlace:
 class FrameFacts:
     """What recorded frames are, for whoever has nothing but their file.
 
-    Attributes:
-        camera: whose CCD it is, for people: ``forward, left area CCD``; empty if nobody says.
-        pitch: of the pixels, metres; None if nobody says, as the others.
-        exposure: of each frame, seconds.
-        times: of each frame in the course, seconds.
-        note: what else is to be known.
-        place: of a map, or of an image from orbit; the TIFF then is a GeoTIFF.
+    Attributes
+    ----------
+    camera : str
+        Whose CCD it is, for people: ``forward, left area CCD``; empty if nobody says.
+    pitch : float | None
+        Of the pixels, metres; None if nobody says, as the others.
+    exposure : float | None
+        Of each frame, seconds.
+    times : tuple[float, ...] | None
+        Of each frame in the course, seconds.
+    note : str
+        What else is to be known.
+    place : Placed | None
+        Of a map, or of an image from orbit; the TIFF then is a GeoTIFF.
     """
 
     camera: str = ""
@@ -278,9 +297,12 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes | memoryview:
     ImageDescription holds all as JSON; XResolution and YResolution are pixels per centimetre; Model is the camera,
     ExposureTime in seconds as in Exif. Row 0 is the first of the CCD.
 
-    Args:
-        frames: uint16 or float (N, H, W).
-        facts: what is known of them.
+    Parameters
+    ----------
+    frames : np.ndarray
+        uint16 or float (N, H, W).
+    facts : FrameFacts
+        What is known of them.
     """
     # made in memory: on a full disk NumPy's writer does not say why it failed
     stream = FileRoom(frames.nbytes) if in_file(frames) else io.BytesIO()
@@ -321,11 +343,16 @@ def frame_files(
 ) -> Iterator[tuple[str, bytes | memoryview]]:
     """(file, contents) of everything that a run folder has of recorded frames: all formats, and a picture to look at.
 
-    Args:
-        name: of the frames.
-        frames: uint16 (N, H, W).
-        facts: what is known of them.
-        stretch: of the picture, see ``preview``.
+    Parameters
+    ----------
+    name : str
+        Of the frames.
+    frames : np.ndarray
+        uint16 (N, H, W).
+    facts : FrameFacts
+        What is known of them.
+    stretch : float | None
+        Of the picture, see ``preview``.
     """
     for ending, contents in FRAME_FORMATS.items():
         yield f"images/{name}.{ending}", contents(frames, facts)
@@ -371,11 +398,16 @@ class MissingPackage(Exception):
 class DataColumn:
     """A column.
 
-    Attributes:
-        name: of it.
-        values: (N,) float64, where NaN is none; int64; or texts, where None is none.
-        unit: of the numbers as the program writes it, empty for pure numbers and texts.
-        description: what it holds.
+    Attributes
+    ----------
+    name : str
+        Of it.
+    values : np.ndarray
+        (N,) float64, where NaN is none; int64; or texts, where None is none.
+    unit : str
+        Of the numbers as the program writes it, empty for pure numbers and texts.
+    description : str
+        What it holds.
     """
 
     name: str
@@ -409,11 +441,16 @@ class DataColumn:
 class DataTable:
     """A table.
 
-    Attributes:
-        name: of it and of its file.
-        title: what it is.
-        columns: of one length, their names all different.
-        facts: what else is to be known: name -> text.
+    Attributes
+    ----------
+    name : str
+        Of it and of its file.
+    title : str
+        What it is.
+    columns : tuple[DataColumn, ...]
+        Of one length, their names all different.
+    facts : Mapping[str, str]
+        What else is to be known: name -> text.
     """
 
     name: str
@@ -435,8 +472,10 @@ class DataTable:
     def column(self, name: str) -> DataColumn:
         """The column of that name.
 
-        Raises:
-            KeyError: there is none.
+        Raises
+        ------
+        KeyError
+            There is none.
         """
         for column in self.columns:
             if column.name == name:

@@ -22,11 +22,15 @@ ULPS = 8
 def kernel(backend: str = "llvm") -> dict[str, Any]:
     """Run the float64 operations that abort under an LLVM older than 17, and compare them with numpy.
 
-    Args:
-        backend: "llvm" or "cuda".
+    Parameters
+    ----------
+    backend : str
+        "llvm" or "cuda".
 
-    Raises:
-        RuntimeError: the results differ from numpy's.
+    Raises
+    ------
+    RuntimeError
+        The results differ from numpy's.
     """
     import drjit as dr
 
@@ -55,8 +59,10 @@ def render(variant: str = "llvm_ad_mono") -> dict[str, Any]:
 
     Given several names Mitsuba would silently fall back to another variant; given one it does not.
 
-    Raises:
-        RuntimeError: the picture is not the uniform sky.
+    Raises
+    ------
+    RuntimeError
+        The picture is not the uniform sky.
     """
     import mitsuba as mi
 

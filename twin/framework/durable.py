@@ -65,11 +65,15 @@ def sync_tree(place: Path) -> None:
 def make_folders(place: Path) -> list[Path]:
     """Make a folder and those above it that are missing, so that they outlive a failure of the power.
 
-    Returns:
+    Returns
+    -------
+    list[Path]
         Those that were made, the deepest first.
 
-    Raises:
-        OSError: one cannot be made.
+    Raises
+    ------
+    OSError
+        One cannot be made.
     """
     missing = [folder for folder in (place, *place.parents) if not folder.exists()]
     for folder in reversed(missing):
@@ -83,12 +87,17 @@ def write_safely(place: Path, content: bytes) -> None:
 
     Until then it is a hidden file beside its place with a name as ``PARTIAL_NAME``.
 
-    Args:
-        place: of the file; its folder is there.
-        content: of the file.
+    Parameters
+    ----------
+    place : Path
+        Of the file; its folder is there.
+    content : bytes
+        Of the file.
 
-    Raises:
-        OSError: the disk is full, or gone.
+    Raises
+    ------
+    OSError
+        The disk is full, or gone.
     """
     write_all_safely([(place, content)])
 
@@ -96,8 +105,10 @@ def write_safely(place: Path, content: bytes) -> None:
 def write_all_safely(files: Iterable[tuple[Path, bytes]]) -> None:
     """Write several files with their contents as ``write_safely`` does; their folders are there.
 
-    Raises:
-        OSError: the disk is full, or gone; some may be there.
+    Raises
+    ------
+    OSError
+        The disk is full, or gone; some may be there.
     """
     every = list(files)
     with ThreadPoolExecutor(AT_ONCE) as pool:
@@ -124,11 +135,15 @@ def _write_one(file: tuple[Path, bytes]) -> None:
 def exchange(first: Path, second: Path) -> bool:
     """Let two folders of one file system change places in one step: at no time is either name without one.
 
-    Returns:
+    Returns
+    -------
+    bool
         Whether it was done; not where the system or the file system does not know it.
 
-    Raises:
-        OSError: one of them is not there, or must not be renamed.
+    Raises
+    ------
+    OSError
+        One of them is not there, or must not be renamed.
     """
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None:
@@ -147,13 +162,19 @@ def put_in_place(new: Path, target: Path, aside: Path) -> None:
     A program that is killed meanwhile leaves the target as it was, or as it shall be. Only where folders cannot change
     places in one step it may leave none there; both then stand beside it.
 
-    Args:
-        new: what shall stand at ``target``.
-        target: there is a folder.
-        aside: nothing is there.
+    Parameters
+    ----------
+    new : Path
+        What shall stand at ``target``.
+    target : Path
+        There is a folder.
+    aside : Path
+        Nothing is there.
 
-    Raises:
-        OSError: it cannot be done; all is as it was.
+    Raises
+    ------
+    OSError
+        It cannot be done; all is as it was.
     """
     if exchange(new, target):
         try:

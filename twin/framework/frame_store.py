@@ -35,12 +35,17 @@ def kept_bytes(size: float) -> float:
 def frame_room(shape: tuple[int, ...], kind: DTypeLike = np.uint16) -> NDArray[Any]:
     """Room for frames, (..., frames, H, W); what it holds is undefined.
 
-    Args:
-        shape: of them all.
-        kind: of the grey values.
+    Parameters
+    ----------
+    shape : tuple[int, ...]
+        Of them all.
+    kind : DTypeLike
+        Of the grey values.
 
-    Raises:
-        OSError: there is no room on the disk. ``TMPDIR`` names another place.
+    Raises
+    ------
+    OSError
+        There is no room on the disk. ``TMPDIR`` names another place.
     """
     size = np.dtype(kind).itemsize * math.prod(shape)
     if size <= IN_MEMORY:

@@ -29,19 +29,28 @@ class Journal:
     was half written when the power failed, or was damaged since, is seen and left out. The first line says what the
     work is about, and by which program it is done: numbers of two of them do not mix.
 
-    Args:
-        file: of the journal, made with the first piece; None keeps nothing.
-        about: all that the results depend on but for the program.
-        noun: what the work is, for messages.
-        classes: dataclasses that pieces consist of.
+    Parameters
+    ----------
+    file
+        Of the journal, made with the first piece; None keeps nothing.
+    about
+        All that the results depend on but for the program.
+    noun
+        What the work is, for messages.
+    classes
+        Dataclasses that pieces consist of.
 
-    Attributes:
-        known: key -> piece, those that the file held and those that were kept since.
-        damaged: number of lines that are not as they were written.
+    Attributes
+    ----------
+    known
+        Key -> piece, those that the file held and those that were kept since.
+    damaged
+        Number of lines that are not as they were written.
 
-    Raises:
-        RunFolderError: on entering, the file is about other work, or of another program; then and later, it cannot be
-            used.
+    Raises
+    ------
+    RunFolderError
+        On entering, the file is about other work, or of another program; then and later, it cannot be used.
     """
 
     def __init__(self, file: Path | None, about: str, noun: str, classes: Sequence[type[Any]]) -> None:
@@ -131,11 +140,16 @@ class Journal:
 def read_pieces(content: bytes, classes: Sequence[type[Any]]) -> tuple[Any, dict[str, Any], int]:
     """Read the content of a journal.
 
-    Args:
-        content: whole lines.
-        classes: dataclasses that pieces consist of.
+    Parameters
+    ----------
+    content : bytes
+        Whole lines.
+    classes : Sequence[type[Any]]
+        Dataclasses that pieces consist of.
 
-    Returns:
+    Returns
+    -------
+    tuple[Any, dict[str, Any], int]
         The first line, None where it is damaged; the pieces by their keys; number of damaged lines.
     """
     lines = [_parsed(line) for line in content.split(b"\n")[:-1]]

@@ -26,14 +26,21 @@ class LockError(Exception):
 class Locked:
     """One package of a lock file.
 
-    Attributes:
-        name: as the index has it, in lower case with hyphens.
-        version: the only one that is installed.
-        marker: for which Python and platform, as pip reads it; empty for all.
-        hashes: SHA-256 of the files that are accepted, hexadecimal.
-        asked_by: names of the packages that need it; the project's own stands for what pyproject.toml names;
-            empty for what is named in a list of its own.
-        layer: the file, one of `LAYERS`.
+    Attributes
+    ----------
+    name : str
+        As the index has it, in lower case with hyphens.
+    version : str
+        The only one that is installed.
+    marker : str
+        For which Python and platform, as pip reads it; empty for all.
+    hashes : tuple[str, ...]
+        SHA-256 of the files that are accepted, hexadecimal.
+    asked_by : tuple[str, ...]
+        Names of the packages that need it; the project's own stands for what pyproject.toml names; empty for what is
+        named in a list of its own.
+    layer : str
+        The file, one of `LAYERS`.
     """
 
     name: str
@@ -57,13 +64,19 @@ def normal(name: str) -> str:
 def read_layer(layer: str, folder: Path = FOLDER) -> tuple[Locked, ...]:
     """The packages of one file.
 
-    Args:
-        layer: one of `LAYERS`.
-        folder: of the lock files.
+    Parameters
+    ----------
+    layer : str
+        One of `LAYERS`.
+    folder : Path
+        Of the lock files.
 
-    Raises:
-        LockError: a line that is neither a pin, nor a hash, nor a comment; a pin without a hash.
-        OSError: no such file.
+    Raises
+    ------
+    LockError
+        a line that is neither a pin, nor a hash, nor a comment; a pin without a hash.
+    OSError
+        No such file.
     """
     file = folder / f"{layer}.txt"
     return parse(file.read_text("utf-8"), layer, str(file))
@@ -111,11 +124,16 @@ def read_lock(folder: Path = FOLDER, layers: Iterable[str] = LAYERS) -> tuple[Lo
 class Differences:
     """What this environment has other than the lock files.
 
-    Attributes:
-        equal: number of packages that are those of the lock.
-        missing: name==version of what the twin needs and is not there.
-        other: "name version, locked version".
-        unknown: names that no file has, and that nobody checked therefore.
+    Attributes
+    ----------
+    equal : int
+        Number of packages that are those of the lock.
+    missing : tuple[str, ...]
+        name==version of what the twin needs and is not there.
+    other : tuple[str, ...]
+        "name version, locked version".
+    unknown : tuple[str, ...]
+        Names that no file has, and that nobody checked therefore.
     """
 
     equal: int
@@ -127,12 +145,17 @@ class Differences:
 def differences(own: str, folder: Path = FOLDER) -> Differences:
     """Compare what is installed here with the lock. What only --live and --test install may be missing.
 
-    Args:
-        own: name of the project, which is in no lock.
-        folder: of the lock files.
+    Parameters
+    ----------
+    own : str
+        Name of the project, which is in no lock.
+    folder : Path
+        Of the lock files.
 
-    Raises:
-        LockError, OSError: as `read_layer`.
+    Raises
+    ------
+    LockError, OSError
+        As `read_layer`.
     """
     installed = {normal(d.name): d.version for d in importlib.metadata.distributions() if d.name}
     names, equal, missing, other = {own}, set(), [], []

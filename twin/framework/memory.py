@@ -40,8 +40,10 @@ def free_memory() -> float:
     """Bytes that this process may still take: those of the environment variable, else what the system has free for it
     and its control group and limits leave; infinite where nobody says.
 
-    Raises:
-        InputError: the variable holds something else.
+    Raises
+    ------
+    InputError
+        The variable holds something else.
     """
     named = os.environ.get(LIMIT)
     if named:
@@ -133,10 +135,14 @@ def amount_text(number: float) -> str:
 def largest(fits: Callable[[int], bool], most: int, least: int = 0) -> int:
     """The largest whole number that fits, below one that does not.
 
-    Args:
-        fits: whether a number does; if it does, all smaller ones do.
-        most: a number that does not.
-        least: one below which none is looked for; the result is this where even the next larger one does not fit.
+    Parameters
+    ----------
+    fits : Callable[[int], bool]
+        Whether a number does; if it does, all smaller ones do.
+    most : int
+        a number that does not.
+    least : int
+        One below which none is looked for; the result is this where even the next larger one does not fit.
     """
     low, high = least, most
     while high - low > 1:
@@ -157,12 +163,18 @@ class Owner(Protocol):
 class Lowered:
     """A number of a file or an option with which a job takes less memory.
 
-    Attributes:
-        owner, key: the file or the options, and where in it the number stands.
-        number: as it is.
-        unit: of the number, in words.
-        bytes: memory with another number.
-        least: that it may be.
+    Attributes
+    ----------
+    owner, key : Owner
+        The file or the options, and where in it the number stands.
+    number : int
+        As it is.
+    unit : str
+        Of the number, in words.
+    bytes : Callable[[int], float]
+        Memory with another number.
+    least : int
+        That it may be.
     """
 
     owner: Owner
@@ -178,15 +190,23 @@ def require_memory(
 ) -> None:
     """See whether a job fits into the memory that is free, and into what its own file lets it have.
 
-    Args:
-        lower: the number that decides most of the job's memory.
-        started: bytes beside what ``lower`` counts.
-        of_it: how much of the memory is for what, as a part of the message.
-        own: bytes that the job's own file lets it have.
-        own_key: where the file says so.
+    Parameters
+    ----------
+    lower : Lowered
+        The number that decides most of the job's memory.
+    started : float
+        Bytes beside what ``lower`` counts.
+    of_it : str
+        How much of the memory is for what, as a part of the message.
+    own : float
+        Bytes that the job's own file lets it have.
+    own_key : str
+        Where the file says so.
 
-    Raises:
-        InputError, InputErrorText: it does not; at the key or option, with the number that fits.
+    Raises
+    ------
+    InputError, InputErrorText
+        It does not; at the key or option, with the number that fits.
     """
     free = free_memory()
     # kernels of an earlier job are not free any more, and are taken over

@@ -30,9 +30,12 @@ NAMED = 5
 def first_names(names: Sequence[str], most: int = NAMED) -> str:
     """A list of names for a message: the first of them, and how many more there are.
 
-    Args:
-        names: all of them.
-        most: how many are named.
+    Parameters
+    ----------
+    names : Sequence[str]
+        All of them.
+    most : int
+        How many are named.
     """
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
@@ -49,12 +52,17 @@ def every_file(folder: Path) -> list[str]:
 def foreign_files(folder: Path, listed: Mapping[str, str]) -> list[str]:
     """Files in the folder of a run that it did not write, or not with these contents.
 
-    Args:
-        folder: to be looked at.
-        listed: files of the run and their SHA-256.
+    Parameters
+    ----------
+    folder : Path
+        To be looked at.
+    listed : Mapping[str, str]
+        Files of the run and their SHA-256.
 
-    Raises:
-        OSError: a file cannot be read.
+    Raises
+    ------
+    OSError
+        a file cannot be read.
     """
 
     def ours(name: str) -> bool:
@@ -77,9 +85,12 @@ def digest(place: Path) -> str:
 def remove_files(folder: Path, kept: set[str]) -> None:
     """Remove all files of a folder but some, and the folder if that was all. What says whose they are goes last.
 
-    Args:
-        folder: to be removed.
-        kept: files that stay, paths relative to it.
+    Parameters
+    ----------
+    folder : Path
+        To be removed.
+    kept : set[str]
+        Files that stay, paths relative to it.
     """
     names = [name for name in every_file(folder) if name not in kept]
     for name in sorted(names, key=lambda name: (name == MANIFEST, name)):
@@ -101,11 +112,15 @@ def _beside(target: Path, token: str) -> dict[str, Path]:
 class Unfinished:
     """Hidden names beside ``target`` that are this process's own until ``close``.
 
-    Args:
-        target: the folder that is being made; the one it stands in exists.
+    Parameters
+    ----------
+    target
+        The folder that is being made; the one it stands in exists.
 
-    Raises:
-        OSError: nothing can be written beside it.
+    Raises
+    ------
+    OSError
+        Nothing can be written beside it.
     """
 
     def __init__(self, target: Path) -> None:
@@ -130,8 +145,10 @@ def scratch(stem: str) -> Iterator[Path]:
     """A folder of this user alone for what ends with the block, where the system has such. What killed processes of
     this user left there goes first.
 
-    Raises:
-        OSError: it cannot be made.
+    Raises
+    ------
+    OSError
+        It cannot be made.
     """
     target = Path(tempfile.gettempdir()) / stem
     sweep(target.parent)
@@ -150,10 +167,13 @@ def sweep(folder: Path, replaced: Callable[[Path, Path], bool] = lambda former, 
 
     What was half written is removed. What was to be replaced is put back when nothing has taken its place.
 
-    Args:
-        folder: where runs stand.
-        replaced: given what was to be replaced and what has its place now; removes the former, if that is right, and
-            returns whether it did.
+    Parameters
+    ----------
+    folder : Path
+        Where runs stand.
+    replaced : Callable[[Path, Path], bool]
+        Given what was to be replaced and what has its place now; removes the former, if that is right, and returns
+        whether it did.
     """
     try:
         names = {(m["name"], m["token"]) for path in folder.iterdir() if (m := _NAME.fullmatch(path.name))}
@@ -190,15 +210,22 @@ def _clear(target: Path, places: dict[str, Path], replaced: Callable[[Path, Path
 def locked(place: Path, certain: bool = False) -> int | None:
     """Open a file, made where it is missing, and lock it.
 
-    Args:
-        place: of the file.
-        certain: also None where the file system has no locks.
+    Parameters
+    ----------
+    place : Path
+        Of the file.
+    certain : bool
+        Also None where the file system has no locks.
 
-    Returns:
+    Returns
+    -------
+    int | None
         The open file; None when another process has it.
 
-    Raises:
-        OSError: it cannot be opened.
+    Raises
+    ------
+    OSError
+        It cannot be opened.
     """
     while True:
         lock = os.open(place, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)

@@ -36,8 +36,10 @@ NOTHING: Mapping[str, str] = {"default-src": "'none'", "base-uri": "'none'", "fo
 def checksum(text: str) -> str:
     """The source expression of one inline script or style sheet.
 
-    Args:
-        text: all that stands between its tags.
+    Parameters
+    ----------
+    text : str
+        All that stands between its tags.
     """
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
 
@@ -45,9 +47,12 @@ def checksum(text: str) -> str:
 def page_policy(style: str, programs: Iterable[str] = ()) -> str:
     """The policy of a page that needs no other file.
 
-    Args:
-        style: its style sheet, all that stands between the tags.
-        programs: scripts that it holds, likewise, and scripts that these put in.
+    Parameters
+    ----------
+    style : str
+        Its style sheet, all that stands between the tags.
+    programs : Iterable[str]
+        Scripts that it holds, likewise, and scripts that these put in.
     """
     scripts = [checksum(program) for program in programs]
     return policy(
@@ -91,20 +96,32 @@ def reproduce(words: Sequence[str]) -> str:
 class RunFacts:
     """How a test was run.
 
-    Attributes:
-        config: the test with all it refers to, as YAML; it can be given in place of the test's file.
-        program: that ran it, as the user calls it.
-        started: seconds since the epoch.
-        seconds: that it took.
-        backend: where it was traced; empty where nothing was.
-        seed: of everything that is drawn; None where nothing is.
-        command: its subcommand.
-        options: further options of the command that runs it again.
-        again: words of the command that runs it again, program first, where it is not the test with the run's own
-            config.yaml.
-        named: plain data in which files stand that the run read, by their absolute paths.
-        given: further files and folders that it read, as the user gave them.
-        checks: what it checked of itself beside what stands in its numbers.
+    Attributes
+    ----------
+    config : str
+        The test with all it refers to, as YAML; it can be given in place of the test's file.
+    program : str
+        That ran it, as the user calls it.
+    started : float
+        Seconds since the epoch.
+    seconds : float
+        That it took.
+    backend : str
+        Where it was traced; empty where nothing was.
+    seed : int | None
+        Of everything that is drawn; None where nothing is.
+    command : str
+        Its subcommand.
+    options : tuple[str, ...]
+        Further options of the command that runs it again.
+    again : tuple[str, ...]
+        Words of the command that runs it again, program first, where it is not the test with the run's own config.yaml.
+    named : Any
+        Plain data in which files stand that the run read, by their absolute paths.
+    given : tuple[Path, ...]
+        Further files and folders that it read, as the user gave them.
+    checks : tuple[provenance.SelfCheck, ...]
+        What it checked of itself beside what stands in its numbers.
     """
 
     config: str
@@ -132,8 +149,10 @@ class RunFacts:
     def kept(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """What a manifest says of it: how to make it again, what was read, what it checked of itself.
 
-        Args:
-            numbers: of the run.
+        Parameters
+        ----------
+        numbers : Mapping[str, Any]
+            Of the run.
         """
         place = {"started_in": str(Path.cwd())} if self.given else {}
         checks = [check.to_dict() for check in self.checks or provenance.checks_in(numbers)]
@@ -148,9 +167,12 @@ class RunFacts:
 def write_artefacts(artefacts: Iterable[Artefact], folder: run_folder.RunFolder) -> None:
     """Write artefacts that have files of their own into an open run folder.
 
-    Args:
-        artefacts: of a report.
-        folder: open.
+    Parameters
+    ----------
+    artefacts : Iterable[Artefact]
+        Of a report.
+    folder : run_folder.RunFolder
+        open.
     """
     for artefact in artefacts:
         if artefact.within is None:
@@ -172,13 +194,20 @@ def report_page(
 ) -> str:
     """A report as one page that needs no other file.
 
-    Args:
-        report: what it says.
-        words: of the command that makes the run again, program first.
-        rows: of its last table, (label, text), before the versions.
-        config: all that was resolved, for readers; empty if the page does not show it.
-        programs: scripts of its own that the page may run, as the policy wants them.
-        scripts: the elements that hold them, written by this program.
+    Parameters
+    ----------
+    report : Report
+        What it says.
+    words : Sequence[str]
+        Of the command that makes the run again, program first.
+    rows : Sequence[tuple[str, str]]
+        Of its last table, (label, text), before the versions.
+    config : str
+        All that was resolved, for readers; empty if the page does not show it.
+    programs : Sequence[str]
+        Scripts of its own that the page may run, as the policy wants them.
+    scripts : str
+        The elements that hold them, written by this program.
     """
     return _template().render(
         report=report,
@@ -194,10 +223,14 @@ def report_page(
 def render_report(kind: str, report: Report, facts: RunFacts) -> str:
     """``report.html`` of a test as text; its numbers are in KIND.json.
 
-    Args:
-        kind: of the test.
-        report: what it says.
-        facts: how it was run.
+    Parameters
+    ----------
+    kind : str
+        Of the test.
+    report : Report
+        What it says.
+    facts : RunFacts
+        How it was run.
     """
     rows: list[tuple[str, str]] = [("Numbers", links((f"{kind}.json", "config.yaml")))]
     if report.images:
@@ -214,12 +247,18 @@ def write_test(
 ) -> None:
     """Write everything into an open run folder: config, numbers, report, artefacts, images, the manifest.
 
-    Args:
-        kind: of the test.
-        numbers: of its run; KIND.json gets them after their frames.
-        report: of the test.
-        facts: how it was run.
-        folder: open.
+    Parameters
+    ----------
+    kind : str
+        Of the test.
+    numbers : Mapping[str, Any]
+        Of its run; KIND.json gets them after their frames.
+    report : Report
+        Of the test.
+    facts : RunFacts
+        How it was run.
+    folder : run_folder.RunFolder
+        open.
     """
     report = replace(report, sections=(*report.sections, *further_sections(kind, numbers)))
     folder.write_text("config.yaml", facts.config)

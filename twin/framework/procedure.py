@@ -31,9 +31,12 @@ def silent(part: str, done: int, total: int) -> None:
 class BenchError(PhysicalError):
     """The test failed on the bench: what happened, which key of its file is to be changed, and how.
 
-    Attributes:
-        key: key path in the test's file.
-        remedy: what may be there instead.
+    Attributes
+    ----------
+    key
+        Key path in the test's file.
+    remedy
+        What may be there instead.
     """
 
     def __init__(self, problem: str, key: KeyPath, remedy: str) -> None:
@@ -47,19 +50,29 @@ def performed(
 ) -> tuple[Any, tuple[str, ...]]:
     """Run a test.
 
-    Args:
-        procedure: the test.
-        setup: what its file says.
-        backend: where to trace.
-        seed: of all that is drawn.
-        advance: told of the progress.
+    Parameters
+    ----------
+    procedure : Procedure
+        The test.
+    setup : ExperimentSetup[Any]
+        What its file says.
+    backend : Backend
+        Where to trace.
+    seed : int
+        Of all that is drawn.
+    advance : Advance
+        Told of the progress.
 
-    Returns:
+    Returns
+    -------
+    tuple[Any, tuple[str, ...]]
         Everything that was computed, and what the user should know of what the test was given.
 
-    Raises:
-        InputError: also for what fails on the bench, at the key that can change it; with what is wrong with what
-            the test was given, which may be the reason.
+    Raises
+    ------
+    InputError
+        Also for what fails on the bench, at the key that can change it; with what is wrong with what the test was
+        given, which may be the reason.
     """
     given: tuple[str, ...] = ()
     if procedure.judged:
@@ -79,10 +92,14 @@ def performed(
 def seeded(procedure: Procedure, setup: Any, seed: int | None) -> tuple[Any, int, dict[str, Any]]:
     """Return a set-up with the seed of its run, this seed, and what a run folder states of both.
 
-    Args:
-        procedure: the test.
-        setup: what its file says.
-        seed: in place of the file's; None for that.
+    Parameters
+    ----------
+    procedure : Procedure
+        The test.
+    setup : Any
+        What its file says.
+    seed : int | None
+        In place of the file's; None for that.
     """
     number = setup.seed if seed is None else seed
     made = setup.with_seed(number)
@@ -94,12 +111,18 @@ def seeded(procedure: Procedure, setup: Any, seed: int | None) -> tuple[Any, int
 class Session:
     """A command at work.
 
-    Attributes:
-        folder: its run folder, open.
-        backend: where to trace.
-        advance: shows the user how far it is.
-        started: seconds since the epoch.
-        clock: reading of the monotonic clock then.
+    Attributes
+    ----------
+    folder : RunFolder
+        Its run folder, open.
+    backend : Backend
+        Where to trace.
+    advance : Advance
+        Shows the user how far it is.
+    started : float
+        Seconds since the epoch.
+    clock : float
+        Reading of the monotonic clock then.
     """
 
     folder: RunFolder

@@ -152,11 +152,16 @@ SETTINGS = (LIMIT, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE
 class Blas(BaseModel):
     """A library of linear algebra that the process had loaded.
 
-    Attributes:
-        name: ``openblas``.
-        version: of it.
-        kernels: processor whose kernels it chose, ``Haswell``; it decides how sums are rounded.
-        threads: that it used.
+    Attributes
+    ----------
+    name : str
+        ``openblas``.
+    version : str
+        Of it.
+    kernels : str
+        Processor whose kernels it chose, ``Haswell``; it decides how sums are rounded.
+    threads : int
+        That it used.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -170,17 +175,27 @@ class Blas(BaseModel):
 class Provenance(BaseModel):
     """Where a run was made. What is added has a default: folders of earlier programs stay run folders.
 
-    Attributes:
-        source: SHA-256 of all files of the program, however it was installed.
-        system: operating system.
-        libc: C library, whose functions are not rounded alike in all versions.
-        processor: model that the operating system names.
-        cores: that the run could use.
-        simd: sets of instructions of the processor that NumPy uses.
-        blas: libraries of linear algebra, in the order of their names.
-        settings: variables of the environment that were set and matter.
-        packages: version of every package that the program asks for and whose numbers no result depends on: what reads,
-            writes and draws.
+    Attributes
+    ----------
+    source : Checksum
+        SHA-256 of all files of the program, however it was installed.
+    system : str
+        Operating system.
+    libc : str
+        C library, whose functions are not rounded alike in all versions.
+    processor : str
+        Model that the operating system names.
+    cores : int
+        That the run could use.
+    simd : list[str]
+        Sets of instructions of the processor that NumPy uses.
+    blas : list[Blas]
+        Libraries of linear algebra, in the order of their names.
+    settings : dict[str, str]
+        Variables of the environment that were set and matter.
+    packages : dict[str, str]
+        Version of every package that the program asks for and whose numbers no result depends on: what reads, writes
+        and draws.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -234,12 +249,18 @@ def _simd() -> list[str]:
 class SelfCheck:
     """Something that a run worked out to see whether its own numbers can be right.
 
-    Attributes:
-        name: what was checked.
-        value: what came out.
-        limit: what it must not exceed; None where nothing is refused for it, or the limit is another for every run.
-        unit: of both, empty for a pure number.
-        says: what it means that the limit holds, or not; in one sentence.
+    Attributes
+    ----------
+    name : str
+        What was checked.
+    value : float
+        What came out.
+    limit : float | None
+        What it must not exceed; None where nothing is refused for it, or the limit is another for every run.
+    unit : str
+        Of both, empty for a pure number.
+    says : str
+        What it means that the limit holds, or not; in one sentence.
     """
 
     name: str
@@ -274,8 +295,10 @@ def checks_in(numbers: Mapping[str, Any]) -> tuple[SelfCheck, ...]:
     """What stands in a run's own numbers of whether they can be right: chi-squares of fits, with their limits where
     these are stated, relative errors, and what converged, agrees or holds.
 
-    Args:
-        numbers: of the run, nested.
+    Parameters
+    ----------
+    numbers : Mapping[str, Any]
+        Of the run, nested.
     """
     return tuple(islice(_checks(numbers, ""), MOST_CHECKS))
 
@@ -301,8 +324,10 @@ def negative_verdicts(numbers: Mapping[str, Any]) -> list[str]:
     """Return the paths of all verdicts on a result that are False, such as ``disturbances.agrees``; those of CANDIDATES
     are left out.
 
-    Args:
-        numbers: of the result, nested plain data.
+    Parameters
+    ----------
+    numbers : Mapping[str, Any]
+        Of the result, nested plain data.
     """
     return [
         one.name for one in _checks(numbers, "") if one.says == _OF_TRUTH and one.value and not CANDIDATES(one.name)
@@ -314,11 +339,16 @@ def inputs_in(tree: Any, given: Iterable[Path] = ()) -> dict[str, str]:
 
     What is in the set-up itself, in full, is no input any more: neither the file of the test nor those of the library.
 
-    Args:
-        tree: the set-up as plain data; every text in it that is the absolute path of a file, or of a folder, is one.
-        given: further files and folders.
+    Parameters
+    ----------
+    tree : Any
+        The set-up as plain data; every text in it that is the absolute path of a file, or of a folder, is one.
+    given : Iterable[Path]
+        Further files and folders.
 
-    Returns:
+    Returns
+    -------
+    dict[str, str]
         Absolute path -> SHA-256, of a folder those of all its files.
     """
     out: dict[str, str] = {}

@@ -46,9 +46,12 @@ _SI: Mapping[str, float] = FrozenMap({"arcsec": ARCSEC, "arcmin": ARCMIN, "mas":
 def in_unit(value: Any, unit: str) -> Any:
     """A number or an array in SI units as so many of a unit; None and what has no unit stay as they are.
 
-    Args:
-        value: number, array, sequence or mapping of numbers, or None.
-        unit: as `scenes.specs.study.unit_of` reads it off a key; "mm2" and the like are squares, "1/mm" is an inverse.
+    Parameters
+    ----------
+    value : Any
+        Number, array, sequence or mapping of numbers, or None.
+    unit : str
+        As `scenes.specs.study.unit_of` reads it off a key; "mm2" and the like are squares, "1/mm" is an inverse.
     """
     if value is None or not unit:
         return value
@@ -69,18 +72,29 @@ def in_unit(value: Any, unit: str) -> Any:
 class Quantity(Generic[S]):
     """One number, text or array of a result, or a record within it.
 
-    Attributes:
-        key: its name in files; the ending names the unit.
-        of: source -> value in SI units, or, with a record, what that record is of: one source, a list or a mapping of
-            sources, or a mapping of such mappings; None where there is none.
-        meaning: what it is, for the reference and for the columns of other programs.
-        head: how tables of reports call it, without its unit; empty for the key's words.
-        decimals: that reports show, None for six significant digits.
-        record: of what stands below the key.
-        where_known: files have the key only where the value is not None.
-        converted: whether the source is in SI units; False where it already is in the unit of the key.
-        shown: unit in which reports have it, empty for that of the key: ``percent`` of a share.
-        warning: source -> the sentence that warns readers where the value is False; of a verdict on the result.
+    Attributes
+    ----------
+    key : str
+        Its name in files; the ending names the unit.
+    of : Callable[[S], Any]
+        Source -> value in SI units, or, with a record, what that record is of: one source, a list or a mapping of
+        sources, or a mapping of such mappings; None where there is none.
+    meaning : str
+        What it is, for the reference and for the columns of other programs.
+    head : str
+        How tables of reports call it, without its unit; empty for the key's words.
+    decimals : int | None
+        That reports show, None for six significant digits.
+    record : Record[Any] | None
+        Of what stands below the key.
+    where_known : bool
+        Files have the key only where the value is not None.
+    converted : bool
+        Whether the source is in SI units; False where it already is in the unit of the key.
+    shown : str
+        Unit in which reports have it, empty for that of the key: ``percent`` of a share.
+    warning : Callable[[S], str] | None
+        Source -> the sentence that warns readers where the value is False; of a verdict on the result.
     """
 
     key: str
@@ -146,9 +160,12 @@ class Record(Generic[S]):
 
     Called with a source it gives the plain data of a file.
 
-    Attributes:
-        meaning: what the record is.
-        quantities: of it, their keys all different.
+    Attributes
+    ----------
+    meaning
+        What the record is.
+    quantities
+        Of it, their keys all different.
     """
 
     def __init__(self, meaning: str, *quantities: Quantity[S]) -> None:
@@ -222,15 +239,23 @@ class Record(Generic[S]):
     ) -> Table:
         """A table of a report.
 
-        Args:
-            name: of its file.
-            title: heading.
-            caption: what it shows.
-            rows: as this record gives them, or the record that this one is `flat` of; or by name, which then is the
-                first column.
-            keys: of the columns, in their order; all if none are given.
-            label: head of the column of names.
-            digits: significant ones of numbers without decimals of their own.
+        Parameters
+        ----------
+        name : str
+            Of its file.
+        title : str
+            heading.
+        caption : str
+            What it shows.
+        rows : Sequence[Mapping[str, Any]] | Mapping[str, Mapping[str, Any]]
+            As this record gives them, or the record that this one is `flat` of; or by name, which then is the first
+            column.
+        keys : Sequence[str]
+            Of the columns, in their order; all if none are given.
+        label : str
+            Head of the column of names.
+        digits : int
+            Significant ones of numbers without decimals of their own.
         """
 
         def told(row: Mapping[str, Any]) -> list[Cell]:
@@ -250,10 +275,14 @@ class Record(Generic[S]):
     ) -> list[tuple[Cell, ...]]:
         """Rows of a report's table with a quantity each: head or meaning, value, sigma where one has a sigma, truth.
 
-        Args:
-            numbers: as this record gives them; a sigma stands beside its value, under the key with ``_sigma``.
-            keys: of the rows, in their order; all if none are given.
-            truth: true values by the same keys, None for a table without them.
+        Parameters
+        ----------
+        numbers : Mapping[str, Any]
+            As this record gives them; a sigma stands beside its value, under the key with ``_sigma``.
+        keys : Sequence[str]
+            Of the rows, in their order; all if none are given.
+        truth : Mapping[str, Any] | None
+            True values by the same keys, None for a table without them.
         """
 
         def cell(one: Quantity[S], value: Any) -> Cell:
@@ -288,15 +317,21 @@ def _below(row: Mapping[str, Any], key: str) -> Any:
 def plain_data(value: Any) -> Any:
     """What JSON can hold of a value.
 
-    Args:
-        value: None, a string, a truth value, a number, an array, a sequence, a mapping with strings as keys, or a
-            dataclass, whose fields are written in their order; all of them may be nested. Nothing is converted here.
+    Parameters
+    ----------
+    value : Any
+        None, a string, a truth value, a number, an array, a sequence, a mapping with strings as keys, or a dataclass,
+        whose fields are written in their order; all of them may be nested. Nothing is converted here.
 
-    Returns:
-        dict, list, str, int, float, bool or None.
+    Returns
+    -------
+    Any
+        Dict, list, str, int, float, bool or None.
 
-    Raises:
-        TypeError: anything else, a mapping with other keys, a complex number.
+    Raises
+    ------
+    TypeError
+        Anything else, a mapping with other keys, a complex number.
     """
     if value is None or isinstance(value, str | bool | np.bool_):
         return bool(value) if isinstance(value, np.bool_) else value

@@ -34,12 +34,17 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
 def described(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """The data of a file with its schema and its frames before them.
 
-    Args:
-        kind: of the file.
-        data: its contents, plain data.
+    Parameters
+    ----------
+    kind : str
+        Of the file.
+    data : Mapping[str, Any]
+        Its contents, plain data.
 
-    Raises:
-        KeyError: a kind without an entry in `FRAMES` or a test's `frames` of its own.
+    Raises
+    ------
+    KeyError
+        a kind without an entry in `FRAMES` or a test's `frames` of its own.
     """
     if (frames := FRAMES.get(kind)) is None:
         frames = {procedure.kind: procedure.frames for procedure in PROCEDURES.values()}[kind]

@@ -20,13 +20,20 @@ from twin.framework.provenance import SelfCheck
 class Section:
     """A heading with what belongs under it.
 
-    Attributes:
-        title: heading.
-        text: paragraphs, plain text.
-        artefacts: figures, tables and data in the order in which they are shown; their names are unique in a report.
-        folded: number of the last of them that a reader has to ask for.
-        name: by which the head of the page leads to it; empty for a section that is not listed there.
-        closed: a reader has to ask for all of it.
+    Attributes
+    ----------
+    title : str
+        heading.
+    text : tuple[str, ...]
+        Paragraphs, plain text.
+    artefacts : tuple[Artefact, ...]
+        Figures, tables and data in the order in which they are shown; their names are unique in a report.
+    folded : int
+        Number of the last of them that a reader has to ask for.
+    name : str
+        By which the head of the page leads to it; empty for a section that is not listed there.
+    closed : bool
+        a reader has to ask for all of it.
     """
 
     title: str
@@ -52,8 +59,10 @@ def sentence(statement: str) -> str:
 def answer(*statements: str) -> tuple[str, tuple[str, ...]]:
     """The verdict of a report, and the sentences that follow it in its lead.
 
-    Args:
-        statements: the most important first, each a sentence with or without its full stop; empty ones are left out.
+    Parameters
+    ----------
+    statements : str
+        The most important first, each a sentence with or without its full stop; empty ones are left out.
     """
     said = [sentence(one) for one in statements if one.strip()]
     return " ".join(said[:MOST_SENTENCES]), tuple(said[MOST_SENTENCES:])
@@ -63,20 +72,34 @@ def answer(*statements: str) -> tuple[str, tuple[str, ...]]:
 class Report:
     """What a finished test has to say.
 
-    Attributes:
-        title: of the report.
-        verdict: what was found and how well: at most two sentences, computed from the numbers.
-        lead: what limits it, where to look, what else was found: a few sentences.
-        facts: what was set up, (label, text).
-        summary: the main table, also printed in the terminal.
-        sections: the rest of the report.
-        images: name -> recorded frames, uint16 (frames, rows, columns).
-        warnings: what the user should know before using the numbers.
-        image_facts: name of images -> what is known of these frames; of some or all.
-        code: exit code of the command, of a test whose answer it is.
-        conclusions: what follows from the numbers, sentence by sentence, before all tables.
-        files: path in the run folder -> content, of files that no page shows.
-        checks: what the run checked of itself; none for what its numbers say.
+    Attributes
+    ----------
+    title : str
+        Of the report.
+    verdict : str
+        What was found and how well: at most two sentences, computed from the numbers.
+    lead : tuple[str, ...]
+        What limits it, where to look, what else was found: a few sentences.
+    facts : tuple[tuple[str, str], ...]
+        What was set up, (label, text).
+    summary : Table
+        The main table, also printed in the terminal.
+    sections : tuple[Section, ...]
+        The rest of the report.
+    images : Mapping[str, np.ndarray]
+        Name -> recorded frames, uint16 (frames, rows, columns).
+    warnings : tuple[str, ...]
+        What the user should know before using the numbers.
+    image_facts : Mapping[str, FrameFacts]
+        Name of images -> what is known of these frames; of some or all.
+    code : int
+        Exit code of the command, of a test whose answer it is.
+    conclusions : tuple[str, ...]
+        What follows from the numbers, sentence by sentence, before all tables.
+    files : Mapping[str, bytes]
+        Path in the run folder -> content, of files that no page shows.
+    checks : tuple[SelfCheck, ...]
+        What the run checked of itself; none for what its numbers say.
     """
 
     title: str
@@ -101,11 +124,15 @@ class Report:
     def told(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Return the numbers of the run with the verdict and the warnings beside them.
 
-        Args:
-            numbers: by their keys.
+        Parameters
+        ----------
+        numbers : Mapping[str, Any]
+            By their keys.
 
-        Raises:
-            ValueError: they have another verdict or other warnings, which would be lost.
+        Raises
+        ------
+        ValueError
+            They have another verdict or other warnings, which would be lost.
         """
         added = {"verdict": self.verdict, "warnings": list(self.warnings)}
         for key, value in added.items():
@@ -126,10 +153,14 @@ class Report:
 def numbers_only(title: str, file: str, error: Exception) -> Report:
     """What stands in the place of a report that could not be made: the numbers are in their file all the same.
 
-    Args:
-        title: of the report.
-        file: with the numbers.
-        error: why there is no more.
+    Parameters
+    ----------
+    title : str
+        Of the report.
+    file : str
+        With the numbers.
+    error : Exception
+        Why there is no more.
     """
     why = f"the report could not be made: {type(error).__name__}: {' '.join(str(error).split())}"
     caption = "What was computed, with all digits."
@@ -140,9 +171,12 @@ def numbers_only(title: str, file: str, error: Exception) -> Report:
 def with_warnings(report: Report, given: tuple[str, ...]) -> Report:
     """The report with further warnings before its own.
 
-    Args:
-        report: of a run.
-        given: warnings of what the run was given.
+    Parameters
+    ----------
+    report : Report
+        Of a run.
+    given : tuple[str, ...]
+        Warnings of what the run was given.
     """
     return replace(report, warnings=(*given, *report.warnings))
 
@@ -158,9 +192,12 @@ added here.
 def further_sections(kind: str, run: Any) -> tuple[Section, ...]:
     """The sections for a run of that kind, in the order of SECTIONS.
 
-    Args:
-        kind: of the run.
-        run: what the run gave.
+    Parameters
+    ----------
+    kind : str
+        Of the run.
+    run : Any
+        What the run gave.
     """
     found = (SECTIONS[name](run) for name in SECTIONS if name.partition(" ")[0] == kind)
     return tuple(section for section in found if section is not None)

@@ -34,9 +34,12 @@ class RunFolderError(Exception):
 class Numbered:
     """The first of STEM-001, STEM-002, ... that is free when the folder is put in place.
 
-    Attributes:
-        folder: where it shall stand.
-        stem: of its name.
+    Attributes
+    ----------
+    folder : Path
+        Where it shall stand.
+    stem : str
+        Of its name.
     """
 
     folder: Path
@@ -51,9 +54,12 @@ class Numbered:
 def chosen(out: Path | None, stem: str) -> Path | Numbered:
     """The folder that the user chose, else the next free one of that name below ``runs``.
 
-    Args:
-        out: of the option --out, None where it was not given.
-        stem: of the folder's name.
+    Parameters
+    ----------
+    out : Path | None
+        Of the option --out, None where it was not given.
+    stem : str
+        Of the folder's name.
     """
     return out if out is not None else Numbered(Path("runs"), stem)
 
@@ -64,14 +70,19 @@ class RunFolder:
     Inside the ``with`` block write files below ``path``; on success they appear as ``target`` in one rename, on any
     error, and on an interrupt, nothing is left behind. What a killed run left beside the target is removed.
 
-    Args:
-        target: where the folder shall stand. Of several runs that start together with the same ``Numbered``, each gets
-            a number of its own when it is complete.
-        force: replace an existing run folder, which stands until this one is complete. Only a folder that is empty, or
-            of which a run's manifest lists every file as it is, is ever replaced.
+    Parameters
+    ----------
+    target
+        Where the folder shall stand. Of several runs that start together with the same ``Numbered``, each gets a number
+        of its own when it is complete.
+    force
+        Replace an existing run folder, which stands until this one is complete. Only a folder that is empty, or of
+        which a run's manifest lists every file as it is, is ever replaced.
 
-    Raises:
-        RunFolderError: the target exists, or cannot be written.
+    Raises
+    ------
+    RunFolderError
+        The target exists, or cannot be written.
     """
 
     def __init__(self, target: Path | Numbered, force: bool = False) -> None:
@@ -232,29 +243,51 @@ class Manifest(BaseModel):
     """All that manifests say, in the order in which they say it; what has a default is said by some programs only.
     Other people's programs call their files manifest.json as well.
 
-    Attributes:
-        program: that made the folder, ``twin.render``.
-        test: kind of the test, ``focus``.
-        gradient: the run differentiates a study.
-        again: words of the command, without ``python -m``, that makes the run again from its own folder; none where no
-            command can.
-        started_in: absolute path of the folder where it was typed, if words of it are relative to that.
-        versions: of the twin and of what it uses.
-        provenance: source, processor and linear algebra that made it.
-        backend: where it was traced.
-        seed: of all that was drawn.
-        only, fast: the checks that were chosen, None for all; whether with fewer trials.
-        frames: per state.
-        runs, failed: of a study.
-        started_unix_s: when, seconds since the epoch.
-        wall_time_s: that it took.
-        workers: processes.
-        worst_relative: largest relative deviation of derivatives from differences, None where none was compared.
-        warnings: what the user was told.
-        checks: what the run checked of itself, as of `twin.framework.provenance.SelfCheck`.
-        inputs: absolute path of every file that the run read and that is not in its folder -> checksum.
-        sha256: checksum of every file of the run but this one, by its path in the folder.
-        digest: checksum of all else that stands here, see `seal`.
+    Attributes
+    ----------
+    program : str
+        That made the folder, ``twin.render``.
+    test : str
+        Kind of the test, ``focus``.
+    gradient : bool
+        The run differentiates a study.
+    again : list[str]
+        Words of the command, without ``python -m``, that makes the run again from its own folder; none where no command
+        can.
+    started_in : str
+        Absolute path of the folder where it was typed, if words of it are relative to that.
+    versions : dict[str, str]
+        Of the twin and of what it uses.
+    provenance : Provenance | None
+        Source, processor and linear algebra that made it.
+    backend : str
+        Where it was traced.
+    seed : int
+        Of all that was drawn.
+    only, fast : str | None
+        The checks that were chosen, None for all; whether with fewer trials.
+    frames : int
+        Per state.
+    runs, failed : int
+        Of a study.
+    started_unix_s : float
+        When, seconds since the epoch.
+    wall_time_s : float
+        That it took.
+    workers : int
+        processes.
+    worst_relative : float | None
+        Largest relative deviation of derivatives from differences, None where none was compared.
+    warnings : list[str]
+        What the user was told.
+    checks : list[dict[str, Any]]
+        What the run checked of itself, as of `twin.framework.provenance.SelfCheck`.
+    inputs : dict[str, Checksum]
+        Absolute path of every file that the run read and that is not in its folder -> checksum.
+    sha256 : dict[str, Checksum]
+        Checksum of every file of the run but this one, by its path in the folder.
+    digest : Checksum | None
+        Checksum of all else that stands here, see `seal`.
     """
 
     model_config = ConfigDict(extra="allow", strict=True, frozen=True)
@@ -308,15 +341,23 @@ class FilesOfRun(Protocol):
 def write_manifest(folder: FilesOfRun, program: str, started: float, seconds: float, **facts: Any) -> None:
     """Write the manifest, which lists every other file of the run; the last thing that is done in a folder.
 
-    Args:
-        folder: open.
-        program: that makes it, as the user calls it.
-        started: seconds since the epoch.
-        seconds: that it took.
-        facts: others that `Manifest` knows, in any order.
+    Parameters
+    ----------
+    folder : FilesOfRun
+        open.
+    program : str
+        That makes it, as the user calls it.
+    started : float
+        Seconds since the epoch.
+    seconds : float
+        That it took.
+    facts : Any
+        Others that `Manifest` knows, in any order.
 
-    Raises:
-        ValueError: a fact that it does not know.
+    Raises
+    ------
+    ValueError
+        a fact that it does not know.
     """
     entries = {
         **facts,
@@ -342,12 +383,17 @@ def seal(manifest: Mapping[str, Any]) -> str:
 def altered(folder: Path, manifest: Manifest) -> list[str]:
     """Files of a run that are not as it wrote them: other bytes, gone, or a link or folder in their place.
 
-    Args:
-        folder: of the run.
-        manifest: of it.
+    Parameters
+    ----------
+    folder : Path
+        Of the run.
+    manifest : Manifest
+        Of it.
 
-    Raises:
-        OSError: one cannot be read.
+    Raises
+    ------
+    OSError
+        One cannot be read.
     """
     return [name for name, known in manifest.sha256.items() if not owned_files.is_as_written(folder / name, {known})]
 
@@ -383,12 +429,17 @@ def unlisted(folder: Path) -> list[str] | None:
 def refuse_others(folder: Path, others: Sequence[str]) -> None:
     """Refuse to replace a folder with files in it that no run put there, or that were changed since.
 
-    Args:
-        folder: that is to be replaced.
-        others: files in it that are not the run's own.
+    Parameters
+    ----------
+    folder : Path
+        That is to be replaced.
+    others : Sequence[str]
+        Files in it that are not the run's own.
 
-    Raises:
-        RunFolderError: there are some.
+    Raises
+    ------
+    RunFolderError
+        There are some.
     """
     if not others:
         return
@@ -404,9 +455,12 @@ def refuse_others(folder: Path, others: Sequence[str]) -> None:
 def remove_run(old: Path, new: Path) -> None:
     """Remove the replaced folder of a run; files that were put into it or changed meanwhile move to the new one.
 
-    Args:
-        old: the replaced folder, under another name.
-        new: what stands in its place.
+    Parameters
+    ----------
+    old : Path
+        The replaced folder, under another name.
+    new : Path
+        What stands in its place.
     """
     others = unlisted(old)
     for name in owned_files.every_file(old) if others is None else others:
@@ -421,9 +475,12 @@ def remove_run(old: Path, new: Path) -> None:
 def remove_replaced(old: Path, new: Path) -> bool:
     """Remove what a killed process had replaced, if what it had in its place is complete.
 
-    Args:
-        old: what was to be replaced, under another name.
-        new: what stands in its place.
+    Parameters
+    ----------
+    old : Path
+        What was to be replaced, under another name.
+    new : Path
+        What stands in its place.
     """
     if not is_run_folder(new):
         return False
@@ -449,13 +506,20 @@ class KeptWork:
     Without ``--out`` a command that runs beside another one of the same name takes ``STEM.2.ENDING``, and so on. Files
     that no command of this program keeps there are never removed; a folder that holds some is refused.
 
-    Args:
-        out: the run folder that the user chose, None for one below ``runs``.
-        stem: name of the run folder where the user chose none.
-        ending: what is kept, ``samples`` for instance.
-        resume: go on with what is there.
-        force: else remove what is there; where this is false, refuse to begin anew.
-        command: words of the command that goes on, without ``--resume``.
+    Parameters
+    ----------
+    out
+        The run folder that the user chose, None for one below ``runs``.
+    stem
+        Name of the run folder where the user chose none.
+    ending
+        What is kept, ``samples`` for instance.
+    resume
+        Go on with what is there.
+    force
+        Else remove what is there; where this is false, refuse to begin anew.
+    command
+        Words of the command that goes on, without ``--resume``.
     """
 
     def __init__(
@@ -480,9 +544,10 @@ class KeptWork:
     def begin(self) -> Path:
         """Make or take up the folder, and return it.
 
-        Raises:
-            RunFolderError: another command uses the folder that the user chose, it holds files of somebody else, or it
-                cannot be made.
+        Raises
+        ------
+        RunFolderError
+            Another command uses the folder that the user chose, it holds files of somebody else, or it cannot be made.
         """
         try:
             for number in count(1):

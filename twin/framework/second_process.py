@@ -33,9 +33,12 @@ PATIENCE = 120.0
 class SecondProcess:
     """Use as a context: from its beginning on the process is there, if the machine has a core for it.
 
-    Args:
-        prepare: done in it at once, imports most of all.
-        wanted: False for none: everything is done here.
+    Parameters
+    ----------
+    prepare
+        Done in it at once, imports most of all.
+    wanted
+        False for none: everything is done here.
     """
 
     def __init__(self, prepare: Callable[[], object], wanted: bool = True) -> None:
@@ -62,13 +65,18 @@ class SecondProcess:
         """Let it begin with some tasks, beside those that it may have already. Tasks that cannot be pickled, because of
         what a user has added, are left to this process.
 
-        Args:
-            tasks: name -> what is to be done, the longest first. They see the values that they hold as they are now.
-            apart: names of tasks that the second process does first and alone where there is one: what they import it
-                has imported already, and this process need not import it as well.
+        Parameters
+        ----------
+        tasks : Mapping[str, Callable[[], Any]]
+            Name -> what is to be done, the longest first. They see the values that they hold as they are now.
+        apart : Collection[str]
+            Names of tasks that the second process does first and alone where there is one: what they import it has
+            imported already, and this process need not import it as well.
 
-        Raises:
-            ValueError: there are more than ``MOST_TASKS`` in all.
+        Raises
+        ------
+        ValueError
+            There are more than ``MOST_TASKS`` in all.
         """
         first = len(self._tasks)
         if first + len(tasks) > MOST_TASKS:

@@ -59,9 +59,12 @@ WIDTH = 10.6
 def new_figure(height: float, pads: dict[str, Any] | None = None) -> Figure:
     """An empty figure as wide as a page's column, arranged without overlap.
 
-    Args:
-        height: of the figure, inches.
-        pads: arguments of ``ConstrainedLayoutEngine``; None for the usual room between panels.
+    Parameters
+    ----------
+    height : float
+        Of the figure, inches.
+    pads : dict[str, Any] | None
+        Arguments of ``ConstrainedLayoutEngine``; None for the usual room between panels.
     """
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -160,10 +163,14 @@ def to_svg(figure: Figure) -> str:
 def drawn(name: str, draw: Callable[..., Figure], *given: Any) -> str:
     """The <svg> element of a figure.
 
-    Args:
-        name: of the figure, which makes its identifiers its own.
-        draw: makes the figure.
-        given: arguments of ``draw``.
+    Parameters
+    ----------
+    name : str
+        Of the figure, which makes its identifiers its own.
+    draw : Callable[..., Figure]
+        Makes the figure.
+    given : Any
+        Arguments of ``draw``.
     """
     with look(name):
         return to_svg(draw(*given))
@@ -172,9 +179,12 @@ def drawn(name: str, draw: Callable[..., Figure], *given: Any) -> str:
 def to_png(figure: Figure, dpi: int) -> bytes:
     """The figure as PNG.
 
-    Args:
-        figure: what is drawn.
-        dpi: dots per inch.
+    Parameters
+    ----------
+    figure : Figure
+        What is drawn.
+    dpi : int
+        Dots per inch.
     """
     out = BytesIO()
     figure.savefig(out, format="png", dpi=dpi)
@@ -189,9 +199,12 @@ def plain_axes(axes: Axes) -> None:
 def panels(heights: Sequence[float], wide: int) -> tuple[Figure, list[Axes]]:
     """A figure of panels in rows, each row as high as its highest panel.
 
-    Args:
-        heights: of the panels in their order, inches.
-        wide: number of panels beside each other; places that are left over stay empty.
+    Parameters
+    ----------
+    heights : Sequence[float]
+        Of the panels in their order, inches.
+    wide : int
+        Number of panels beside each other; places that are left over stay empty.
     """
     rows = [max(heights[k : k + wide]) for k in range(0, len(heights), wide)]
     figure = new_figure(sum(rows))
@@ -206,13 +219,20 @@ def interval_bars(
 ) -> None:
     """Error bars from the ends of intervals, which need not lie evenly about the values.
 
-    Args:
-        axes: where.
-        x: places of the values along x, (N,).
-        y: and along y, (N,).
-        ends: lower and upper ends of the intervals, (N, 2), in the units of the axis.
-        which: the axis along which the bars lie.
-        how: more for ``errorbar``; without ``fmt`` only the bars are drawn, in ink.
+    Parameters
+    ----------
+    axes : Axes
+        where.
+    x : np.ndarray
+        Places of the values along x, (N,).
+    y : np.ndarray
+        And along y, (N,).
+    ends : Any
+        Lower and upper ends of the intervals, (N, 2), in the units of the axis.
+    which : Literal['x', 'y']
+        The axis along which the bars lie.
+    how : Any
+        More for ``errorbar``; without ``fmt`` only the bars are drawn, in ink.
     """
     reach = np.abs(np.asarray(ends, np.float64).T - (x if which == "x" else y))
     bare: dict[str, Any] = {} if "fmt" in how else {"fmt": "none", "ecolor": INK, "elinewidth": 1.0}
@@ -222,9 +242,12 @@ def interval_bars(
 def gridded(axes: Axes, which: Literal["both", "x", "y"] = "both") -> None:
     """Light lines behind what is drawn, and only the left and the bottom axis line.
 
-    Args:
-        axes: where.
-        which: along which axis the lines are counted.
+    Parameters
+    ----------
+    axes : Axes
+        where.
+    which : Literal['both', 'x', 'y']
+        Along which axis the lines are counted.
     """
     axes.grid(axis=which, color=LIGHT, lw=0.5)
     axes.set_axisbelow(True)
@@ -236,12 +259,18 @@ def shared_legend(
 ) -> None:
     """A legend beside all panels, of what one of them shows.
 
-    Args:
-        figure: with all panels.
-        axes: the panel whose lines are named.
-        place: beside the panels, as Matplotlib names it.
-        columns: of the legend; None for one row.
-        how: more for ``legend``.
+    Parameters
+    ----------
+    figure : Figure
+        With all panels.
+    axes : Axes
+        The panel whose lines are named.
+    place : str
+        Beside the panels, as Matplotlib names it.
+    columns : int | None
+        Of the legend; None for one row.
+    how : Any
+        More for ``legend``.
     """
     handles, labels = axes.get_legend_handles_labels()
     outside: Any = f"outside {place}"
@@ -251,11 +280,16 @@ def shared_legend(
 def signed_map(axes: Axes, values: np.ndarray, most: float | None = None, **how: Any) -> AxesImage:
     """An image of (rows, columns) numbers with a sign, white at zero.
 
-    Args:
-        axes: where.
-        values: the numbers; NaN is left out.
-        most: size of the deepest colours; None for the largest number's.
-        how: more for ``imshow``.
+    Parameters
+    ----------
+    axes : Axes
+        where.
+    values : np.ndarray
+        The numbers; NaN is left out.
+    most : float | None
+        Size of the deepest colours; None for the largest number's.
+    how : Any
+        More for ``imshow``.
     """
     most = (float(np.nanmax(np.abs(values))) or 1.0) if most is None else most
     return axes.imshow(values, cmap=DIVERGING, vmin=-most, vmax=most, **how)

@@ -104,11 +104,16 @@ def round_trip(unit: int) -> str:
 class Bench:
     """The bench with its mirrors 2 theta apart.
 
-    Attributes:
-        spec: what the YAML says.
-        half_angle: theta, radians.
-        assembly: bodies, elements, sequences.
-        focal_length: of the autocollimators, paraxial, metres.
+    Attributes
+    ----------
+    spec : AutocollimatorTestSpec
+        What the YAML says.
+    half_angle : float
+        Theta, radians.
+    assembly : Assembly
+        Bodies, elements, sequences.
+    focal_length : float
+        Of the autocollimators, paraxial, metres.
     """
 
     spec: AutocollimatorTestSpec
@@ -143,9 +148,12 @@ def paraxial_focus(lens: LensSpec, wavelength: float) -> tuple[float, float]:
 def build_bench(spec: AutocollimatorTestSpec, half_angle: float) -> Bench:
     """Build the bench with the mirrors square to their autocollimators.
 
-    Args:
-        spec: the experiment.
-        half_angle: theta, radians.
+    Parameters
+    ----------
+    spec : AutocollimatorTestSpec
+        The experiment.
+    half_angle : float
+        Theta, radians.
     """
     collimator = spec.autocollimator
     lens = collimator.lens
@@ -217,9 +225,12 @@ TILE = 64
 class SpotWindows:
     """What two autocollimators see in S states.
 
-    Attributes:
-        photons: expected photons per pixel and frame, (2, S, window, window).
-        corner: (row, column) of each window's first pixel on the CCD, (2, S, 2).
+    Attributes
+    ----------
+    photons : np.ndarray
+        Expected photons per pixel and frame, (2, S, window, window).
+    corner : np.ndarray
+        (row, column) of each window's first pixel on the CCD, (2, S, 2).
     """
 
     photons: np.ndarray
@@ -229,13 +240,19 @@ class SpotWindows:
 class AutocollimatorPath:
     """Traces and images both autocollimators of one bench.
 
-    Args:
-        bench: the bench.
-        backend: where to trace.
-        nodes: on the mirror; by default a quadrature that makes the images right to 1e-6 of their peak.
+    Parameters
+    ----------
+    bench
+        The bench.
+    backend
+        Where to trace.
+    nodes
+        On the mirror; by default a quadrature that makes the images right to 1e-6 of their peak.
 
-    Raises:
-        InputError: area CCDs that do not sample the spots.
+    Raises
+    ------
+    InputError
+        Area CCDs that do not sample the spots.
     """
 
     def __init__(self, bench: Bench, backend: Backend, nodes: PupilNodes | None = None) -> None:
@@ -254,8 +271,10 @@ class AutocollimatorPath:
     def response(self) -> PixelResponse:
         """What a 1/FINE part of a pixel and the pinhole do to the image.
 
-        Raises:
-            InputError: the pixels are too coarse for the image, or the pinhole is too wide for them.
+        Raises
+        ------
+        InputError
+            The pixels are too coarse for the image, or the pinhole is too wide for them.
         """
         collimator = self.bench.spec.autocollimator
         cutoff = 2.0 * self.bench.numerical_aperture / collimator.wavelength
@@ -300,8 +319,10 @@ class AutocollimatorPath:
     def rays(self, states: Sequence[State]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Position, direction (2 S, N, 3), path, validity (2 S, N) at the CCDs in their frames, unit by unit.
 
-        Raises:
-            BeamMissedError, AimError: the light of a spot does not come back.
+        Raises
+        ------
+        BeamMissedError, AimError
+            The light of a spot does not come back.
         """
         rays = self._traced(self.bench.assembly.place(states), states)[1].numpy()
         require_some(rays[3], "the autocollimators")
@@ -332,8 +353,10 @@ class AutocollimatorPath:
     def windows(self, states: Sequence[State]) -> SpotWindows:
         """Images of both autocollimators in every state.
 
-        Raises:
-            BeamMissedError: a spot is too near its CCD's edge for its window; AimError.
+        Raises
+        ------
+        BeamMissedError
+            a spot is too near its CCD's edge for its window; AimError.
         """
         parts = list(self._pieces(states))
         return SpotWindows(*(np.concatenate([part[k] for part in parts], axis=1) for k in (0, 1)))
@@ -390,12 +413,18 @@ def window_pattern(
     """Fixed pattern of windows of one large CCD, (S, window, window): a pixel differs from its neighbours in the same
     way in whichever window it is read out.
 
-    Args:
-        detector: its data sheet.
-        corner: first pixels of the windows, (S, 2).
-        window: their side.
-        seed: of the run.
-        key: the CCD's number among the seed's streams.
+    Parameters
+    ----------
+    detector : EmvaDetector
+        Its data sheet.
+    corner : np.ndarray
+        First pixels of the windows, (S, 2).
+    window : int
+        Their side.
+    seed : int
+        Of the run.
+    key : tuple[int, ...]
+        The CCD's number among the seed's streams.
     """
     tiles: dict[tuple[int, int], FixedPattern] = {}
     gain, offset = np.empty((len(corner), window, window)), np.empty((len(corner), window, window))
@@ -438,11 +467,14 @@ class Series:
 class SeriesResult:
     """Readings of one series.
 
-    Attributes:
-        series: what was turned.
-        readings: (2 mirrors, rows, 2) turns about each autocollimator's own X and Y against its reading at zero,
-            radians.
-        sigma: (2, rows, 2) their standard deviations by the noise of the images alone, radians.
+    Attributes
+    ----------
+    series : Series
+        What was turned.
+    readings : np.ndarray
+        (2 mirrors, rows, 2) turns about each autocollimator's own X and Y against its reading at zero, radians.
+    sigma : np.ndarray
+        (2, rows, 2) their standard deviations by the noise of the images alone, radians.
     """
 
     series: Series
@@ -519,17 +551,27 @@ def run_autocollimator_test(
 ) -> ReadingTable:
     """Render and read the experiment.
 
-    Args:
-        setup: the experiment with its detector.
-        backend: where to trace.
-        series: what to turn; by default one series about each axis. Those of one half angle are traced together.
-        seed: of the bench's errors and the detectors' noise.
-        ideal: no errors of the bench, and images without noise or rounding.
-        reader: of an earlier run of the same setup, to save the calibration.
-        progress: told what is being done.
+    Parameters
+    ----------
+    setup : AutocollimatorSetup
+        The experiment with its detector.
+    backend : Backend
+        Where to trace.
+    series : Sequence[Series] | None
+        What to turn; by default one series about each axis. Those of one half angle are traced together.
+    seed : int
+        Of the bench's errors and the detectors' noise.
+    ideal : bool
+        No errors of the bench, and images without noise or rounding.
+    reader : Reader | None
+        Of an earlier run of the same setup, to save the calibration.
+    progress : Callable[[str], None] | None
+        Told what is being done.
 
-    Raises:
-        BeamMissedError: a turn takes a spot off its area CCD.
+    Raises
+    ------
+    BeamMissedError
+        a turn takes a spot off its area CCD.
     """
     wanted = tuple(series_per_axis(setup.spec) if series is None else series)
     say = progress or (lambda text: None)
@@ -591,12 +633,18 @@ def declared_spread(
 ) -> np.ndarray:
     """Mean differences of a series, (draws,), radians, under the errors that the scene declares, without images.
 
-    Args:
-        spec: the experiment.
-        series: one of its series.
-        image_sigma: standard deviation of one reading by the noise of the images, radians.
-        draws: number of benches.
-        seed: of the draws.
+    Parameters
+    ----------
+    spec : AutocollimatorTestSpec
+        The experiment.
+    series : Series
+        One of its series.
+    image_sigma : float
+        Standard deviation of one reading by the noise of the images, radians.
+    draws : int
+        Number of benches.
+    seed : int
+        Of the draws.
     """
     e, rng = spec.errors, np.random.default_rng(seed)
     between = 2.0 * series.half_angle
@@ -632,12 +680,17 @@ def _triple(vector: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
 class Reader:
     """Detectors and calibration of the two autocollimators, which are alike.
 
-    Args:
-        setup: the experiment with its detector.
-        backend: where to trace.
+    Parameters
+    ----------
+    setup
+        The experiment with its detector.
+    backend
+        Where to trace.
 
-    Attributes:
-        map: the calibration, from the place of a spot to the turn of the mirror.
+    Attributes
+    ----------
+    map
+        The calibration, from the place of a spot to the turn of the mirror.
     """
 
     def __init__(self, setup: AutocollimatorSetup, backend: Backend) -> None:

@@ -50,13 +50,20 @@ _RIM = np.pi * np.arange(16) / 16
 class PinholeImages:
     """Spots of a pinhole over the field.
 
-    Attributes:
-        reach: largest turn of the camera either way, radians.
-        fx, fy: frequencies along the line (half of them, from zero) and along the track, (U,), (V,), cycles/m.
-        spectra: at the nodes over the field, complex (nodes, V, U); a wide bright area would have level 1.
-        pitch: of the pixels, metres.
-        window: pixels of an image either way.
-        diameter: of the pinhole's geometric image along the line in the middle of the field, metres.
+    Attributes
+    ----------
+    reach : float
+        Largest turn of the camera either way, radians.
+    fx, fy : np.ndarray
+        Frequencies along the line (half of them, from zero) and along the track, (U,), (V,), cycles/m.
+    spectra : np.ndarray
+        At the nodes over the field, complex (nodes, V, U); a wide bright area would have level 1.
+    pitch : float
+        Of the pixels, metres.
+    window : int
+        Pixels of an image either way.
+    diameter : float
+        Of the pinhole's geometric image along the line in the middle of the field, metres.
     """
 
     reach: float
@@ -81,18 +88,29 @@ class PinholeImages:
     ) -> PinholeImages:
         """Work out the spectra.
 
-        Args:
-            path: from the target to the line CCD's plane.
-            state: of the camera.
-            directions: turns of the camera (M,) to directions of the light (M, 3), world.
-            reach: of the turns, radians.
-            target: the pinhole, one disk.
-            ccd: the line CCD.
-            window: pixels.
-            progress: told (done, total).
+        Parameters
+        ----------
+        path : TargetPath
+            From the target to the line CCD's plane.
+        state : State
+            Of the camera.
+        directions : Callable[[np.ndarray], np.ndarray]
+            Turns of the camera (M,) to directions of the light (M, 3), world.
+        reach : float
+            Of the turns, radians.
+        target : Target
+            The pinhole, one disk.
+        ccd : LineCcd
+            The line CCD.
+        window : int
+            pixels.
+        progress : Callable[[int, int], None]
+            Told (done, total).
 
-        Raises:
-            BeamMissedError, AimError, ValueError: the beam does not get through, or its wavefront is too bad for a fit.
+        Raises
+        ------
+        BeamMissedError, AimError, ValueError
+            The beam does not get through, or its wavefront is too bad for a fit.
         """
         light = directions(reach * _nodes())
         pupils = path.pupils(state, light, path.places(state, light))
@@ -120,11 +138,16 @@ class PinholeImages:
     def __call__(self, turn: float, place: np.ndarray) -> np.ndarray:
         """Images at one place of the field.
 
-        Args:
-            turn: of the camera, radians.
-            place: of the chief rays from the centre of the window's first pixel, (S, 2) (along, across), metres.
+        Parameters
+        ----------
+        turn : float
+            Of the camera, radians.
+        place : np.ndarray
+            Of the chief rays from the centre of the window's first pixel, (S, 2) (along, across), metres.
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             (S, window, window), rows along the track.
         """
         spectrum = np.tensordot(_share(turn / self.reach), self.spectra, 1)
@@ -204,13 +227,19 @@ _BENCH, _SETTING, _READING, _PATTERN, _NOISE = range(10, 15)
 class DistortionTruth:
     """What the analysis must not see, for N points and S sets.
 
-    Attributes:
-        zero: true angle of the table at which the line's middle is imaged, minus the one at which the table reads
-            ``camera_angle``, radians.
-        axis: of the table in the camera frame, unit, (3,).
-        turn: W of each exposure, (N, S), radians.
-        place: (along, across) of the chief ray, (N, S, 2), metres.
-        gross: exposures that a shock spoiled, (N, S).
+    Attributes
+    ----------
+    zero : float
+        True angle of the table at which the line's middle is imaged, minus the one at which the table reads
+        ``camera_angle``, radians.
+    axis : np.ndarray
+        Of the table in the camera frame, unit, (3,).
+    turn : np.ndarray
+        W of each exposure, (N, S), radians.
+    place : np.ndarray
+        (along, across) of the chief ray, (N, S, 2), metres.
+    gross : np.ndarray
+        Exposures that a shock spoiled, (N, S).
     """
 
     zero: float
@@ -224,10 +253,14 @@ class DistortionTruth:
 class DistortionRecord:
     """What a test leaves for the analysis: N points, S sets.
 
-    Attributes:
-        reading: of the table, (N, S), radians.
-        frames: uint16 (N, S, frames, rows, columns).
-        column: of the line, first of each region that was kept, (N, S).
+    Attributes
+    ----------
+    reading : np.ndarray
+        Of the table, (N, S), radians.
+    frames : np.ndarray
+        uint16 (N, S, frames, rows, columns).
+    column : np.ndarray
+        Of the line, first of each region that was kept, (N, S).
     """
 
     reading: np.ndarray
@@ -239,17 +272,27 @@ class DistortionRecord:
 class DistortionBench:
     """Everything that does not change from one test to the next.
 
-    Attributes:
-        setup: the test with all it refers to.
-        path: from the collimator to the image.
-        as_built: state of the camera.
-        ccd: of the band.
-        images: of the pinhole.
-        turn: nominal W of the points, (N,), radians, increasing.
-        middle: direction of the light that is imaged to the middle of the line, (3,).
-        design_offset: energy centroid minus chief ray along the line at the points, by the design, (N,), metres: known
-            to the analysis, as every laboratory has the prescription.
-        true_offset: the same of the as-built camera in this collimator; the analysis does not know it.
+    Attributes
+    ----------
+    setup : DistortionSetup
+        The test with all it refers to.
+    path : TargetPath
+        From the collimator to the image.
+    as_built : State
+        State of the camera.
+    ccd : LineCcd
+        Of the band.
+    images : PinholeImages
+        Of the pinhole.
+    turn : np.ndarray
+        Nominal W of the points, (N,), radians, increasing.
+    middle : np.ndarray
+        Direction of the light that is imaged to the middle of the line, (3,).
+    design_offset : np.ndarray
+        Energy centroid minus chief ray along the line at the points, by the design, (N,), metres: known to the
+        analysis, as every laboratory has the prescription.
+    true_offset : np.ndarray
+        The same of the as-built camera in this collimator; the analysis does not know it.
     """
 
     setup: DistortionSetup
@@ -266,10 +309,13 @@ class DistortionBench:
     def build(cls, setup: DistortionSetup, backend: Backend, advance: Advance = silent) -> DistortionBench:
         """Trace the camera and work out the spectra of its spots.
 
-        Raises:
-            InputError: ``as_built`` names what the camera does not have.
-            BenchError: the beam does not get through, the pinhole is too small or too large, or points lie beyond the
-                turntable's calibration.
+        Raises
+        ------
+        InputError
+            ``as_built`` names what the camera does not have.
+        BenchError
+            The beam does not get through, the pinhole is too small or too large, or points lie beyond the turntable's
+            calibration.
         """
         test = setup.test
         camera = build_camera_under_test(test, setup.camera, backend)
@@ -332,13 +378,19 @@ class DistortionBench:
     ) -> tuple[DistortionRecord, DistortionTruth]:
         """Carry out one test.
 
-        Args:
-            table: that turns the camera.
-            seed: of everything else that is drawn.
-            advance: told how many points are done.
+        Parameters
+        ----------
+        table : TurntableModel
+            That turns the camera.
+        seed : int
+            Of everything else that is drawn.
+        advance : Advance
+            Told how many points are done.
 
-        Raises:
-            BenchError: a spot falls beside the line.
+        Raises
+        ------
+        BenchError
+            a spot falls beside the line.
         """
         test, spec = self.setup.test, self.setup.turntable
         rng = {key: np.random.default_rng(stream(seed, key)) for key in (_BENCH, _READING)}

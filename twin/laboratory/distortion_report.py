@@ -281,8 +281,10 @@ ESTIMATES = {
 def _joint(joint: Mapping[str, Any]) -> Section:
     """The terms of one model that belong together, as they reproduce the spots and as a payload's file has them.
 
-    Args:
-        joint: of distortion.json.
+    Parameters
+    ----------
+    joint : Mapping[str, Any]
+        Of distortion.json.
     """
     text = ("Terms of one table belong together: with a radial term f is the slope in the middle of the field.",)
 

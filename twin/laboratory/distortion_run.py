@@ -66,10 +66,14 @@ _GREY, _SPOT_PIXEL = 2.0, 33.0
 class Estimate:
     """One way to f, p and distortion.
 
-    Attributes:
-        f, p: metres; p is zero where it is not fitted.
-        distortion: of the points, (N,), metres.
-        f_sigma, p_sigma: metres, None where an equation gives none.
+    Attributes
+    ----------
+    f, p : float
+        Metres; p is zero where it is not fitted.
+    distortion : Array
+        Of the points, (N,), metres.
+    f_sigma, p_sigma : float | None
+        Metres, None where an equation gives none.
     """
 
     f: float
@@ -83,20 +87,34 @@ class Estimate:
 class DistortionRun:
     """One test, on a simulated bench or on measured angles and spots.
 
-    Attributes:
-        test: what its file says.
-        seed: of what was drawn.
-        about: principal distance, about, metres; it serves to see the scatter between sets.
-        reading: of the turntable, (N, S), radians.
-        present: which exposures there are, (N, S).
-        calibration: of the turntable; None if angles count as read.
-        compensation: of its dividing error; None likewise.
-        spots: as located.
-        means: how sets are reduced.
-        raw, compensated: with angles as read, and freed from the dividing error; without a calibration the same.
-        stated: the smooth model's fit with nothing but the stated noise, for its chi-square.
-        readings: the table of spots as read from files; None for a simulated bench.
-        tables: of the turntable's calibration, as read from files.
+    Attributes
+    ----------
+    test : DistortionTestSpec | MeasuredDistortionSpec
+        What its file says.
+    seed : int
+        Of what was drawn.
+    about : float
+        Principal distance, about, metres; it serves to see the scatter between sets.
+    reading : Array
+        Of the turntable, (N, S), radians.
+    present : NDArray[np.bool_]
+        Which exposures there are, (N, S).
+    calibration : CalibrationSeries | None
+        Of the turntable; None if angles count as read.
+    compensation : DividingCompensation | None
+        Of its dividing error; None likewise.
+    spots : interior.Spots
+        As located.
+    means : interior.PointMeans
+        How sets are reduced.
+    raw, compensated : interior.Distortion
+        With angles as read, and freed from the dividing error; without a calibration the same.
+    stated : interior.InteriorOrientation
+        The smooth model's fit with nothing but the stated noise, for its chi-square.
+    readings : SpotReadings | None
+        The table of spots as read from files; None for a simulated bench.
+    tables : tuple[Comparisons, ...]
+        Of the turntable's calibration, as read from files.
     """
 
     test: DistortionTestSpec | MeasuredDistortionSpec
@@ -134,12 +152,18 @@ class DistortionRun:
 class SimulatedDistortion(DistortionRun):
     """A test on the simulated bench, which also knows the truth.
 
-    Attributes:
-        bench: with all that was set up.
-        record: what the analysis got.
-        truth: what it did not get.
-        table: the turntable; holds the truth of its dividing error.
-        calibration, compensation: there are always.
+    Attributes
+    ----------
+    bench : DistortionBench
+        With all that was set up.
+    record : DistortionRecord
+        What the analysis got.
+    truth : DistortionTruth
+        What it did not get.
+    table : TurntableModel
+        The turntable; holds the truth of its dividing error.
+    calibration, compensation : CalibrationSeries
+        There are always.
     """
 
     calibration: CalibrationSeries
@@ -207,8 +231,10 @@ def _calibrated(fit: interior.InteriorOrientation) -> Array:
 def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> SimulatedDistortion:
     """Calibrate the table, carry out the test and measure it.
 
-    Raises:
-        BenchError: what was recorded cannot be measured.
+    Raises
+    ------
+    BenchError
+        What was recorded cannot be measured.
     """
     setup = bench.setup
     table = TurntableModel(setup.turntable, seed)
@@ -253,21 +279,34 @@ def reduce(
 ) -> dict[str, Any]:
     """Readings and spots to interior orientation and distortion, whichever bench they come from.
 
-    Args:
-        reading: of the turntable, (N, S), radians.
-        spots: on the line.
-        zero: reading at which the middle of the line is imaged, radians.
-        about: principal distance, about, metres; it serves to see scatter only.
-        compensation: of the turntable; None for angles as read.
-        angle_sigma: of the angles as read without a compensation, radians.
-        reverse: readings rise where places on the line fall.
-        present: which exposures there are, (N, S); None for all.
+    Parameters
+    ----------
+    reading : Array
+        Of the turntable, (N, S), radians.
+    spots : interior.Spots
+        On the line.
+    zero : float
+        Reading at which the middle of the line is imaged, radians.
+    about : float
+        Principal distance, about, metres; it serves to see scatter only.
+    compensation : DividingCompensation | None
+        Of the turntable; None for angles as read.
+    angle_sigma : float
+        Of the angles as read without a compensation, radians.
+    reverse : bool
+        Readings rise where places on the line fall.
+    present : NDArray[np.bool_] | None
+        Which exposures there are, (N, S); None for all.
 
-    Returns:
+    Returns
+    -------
+    dict[str, Any]
         The attributes of a `DistortionRun` that follow from readings and spots.
 
-    Raises:
-        interior.OrientationError: fewer points than unknowns, or angles that do not determine them.
+    Raises
+    ------
+    interior.OrientationError
+        Fewer points than unknowns, or angles that do not determine them.
     """
     sense = -1.0 if reverse else 1.0
     read = sense * (reading - zero)
@@ -302,8 +341,10 @@ def reduce(
 def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
     """Read the angles and spots, and do the same with them.
 
-    Raises:
-        InputError: a table cannot be used, or does not determine what is asked for.
+    Raises
+    ------
+    InputError
+        a table cannot be used, or does not determine what is asked for.
     """
     files = spec.measured
     found = read_spots(files)
@@ -382,9 +423,12 @@ def run_distortion(
 ) -> DistortionRun:
     """``python -m twin.lab distortion``.
 
-    Raises:
-        InputError: ``as_built`` names what the camera does not have; a table of measurements cannot be used.
-        BenchError: the test cannot be carried out or measured as its file says.
+    Raises
+    ------
+    InputError
+        ``as_built`` names what the camera does not have; a table of measurements cannot be used.
+    BenchError
+        The test cannot be carried out or measured as its file says.
     """
     if isinstance(setup, MeasuredDistortionSetup):
         advance("read and fit", 0, 1)

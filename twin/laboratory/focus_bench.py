@@ -42,16 +42,25 @@ _SEARCH = 0.3e-3
 class Site:
     """One place of the focal plane where the edge is imaged.
 
-    Attributes:
-        band: whose line CCD.
-        field: share of half the line.
-        place: (X', Y') on the nominal focal plane, metres.
-        point, direction: of the chief ray in the focal-plane frame, (3,), metres and unit.
-        imagers: edge -> its images.
-        defocus_per_shift: edge -> defocus of the image per metre of the target's move, as the edge's direction sees it:
-            (f / collimator's f)^2 with the focal length in the direction of the edge's normal.
-        nominal_per_shift: the same of the prescription, which the analysis may know.
-        edge_focus: edge -> Z' at which its MTF at the Nyquist frequency is largest, metres.
+    Attributes
+    ----------
+    band : str
+        Whose line CCD.
+    field : float
+        Share of half the line.
+    place : np.ndarray
+        (X', Y') on the nominal focal plane, metres.
+    point, direction : np.ndarray
+        Of the chief ray in the focal-plane frame, (3,), metres and unit.
+    imagers : Mapping[str, EdgeImager]
+        Edge -> its images.
+    defocus_per_shift : Mapping[str, float]
+        Edge -> defocus of the image per metre of the target's move, as the edge's direction sees it: (f / collimator's
+        f)^2 with the focal length in the direction of the edge's normal.
+    nominal_per_shift : Mapping[str, float]
+        The same of the prescription, which the analysis may know.
+    edge_focus : Mapping[str, float]
+        Edge -> Z' at which its MTF at the Nyquist frequency is largest, metres.
     """
 
     band: str
@@ -101,11 +110,16 @@ class Site:
 class BudgetLine:
     """What makes a band's MTF at its Nyquist frequency, in the middle of the field and at best focus.
 
-    Attributes:
-        band: name.
-        edge: direction in which it is measured.
-        factors: effect -> its transfer there.
-        total: their product.
+    Attributes
+    ----------
+    band : str
+        name.
+    edge : str
+        Direction in which it is measured.
+    factors : Mapping[str, float]
+        Effect -> its transfer there.
+    total : float
+        Their product.
     """
 
     band: str
@@ -117,14 +131,21 @@ class BudgetLine:
 class FocusBench:
     """Everything of the bench that does not change from one alignment to the next.
 
-    Args:
-        setup: the test with all it refers to.
-        backend: where to trace.
-        advance: told how many of how many tables are done.
+    Parameters
+    ----------
+    setup
+        The test with all it refers to.
+    backend
+        Where to trace.
+    advance
+        Told how many of how many tables are done.
 
-    Raises:
-        InputError: the camera cannot be built as the file says.
-        AimError, BeamMissedError, ValueError: its beam is lost or vignetted.
+    Raises
+    ------
+    InputError
+        The camera cannot be built as the file says.
+    AimError, BeamMissedError, ValueError
+        Its beam is lost or vignetted.
     """
 
     def __init__(self, setup: FocusSetup, backend: Backend, advance: Advance = silent) -> None:
@@ -250,9 +271,12 @@ _ATTEMPTS = 3
 class Standing:
     """Where the focal-plane assembly and its chips stand.
 
-    Attributes:
-        pose: of the assembly in the nominal focal-plane frame.
-        heights: band -> height of its chip above the assembly, along Z', metres.
+    Attributes
+    ----------
+    pose : Pose
+        Of the assembly in the nominal focal-plane frame.
+    heights : Mapping[str, float]
+        Band -> height of its chip above the assembly, along Z', metres.
     """
 
     pose: Pose
@@ -263,13 +287,20 @@ class Standing:
 class SiteScan:
     """One site through focus.
 
-    Attributes:
-        shift: edge -> moves of the target, as moves of the image in the edge's direction, metres, (Z,).
-        mtf, sigma: edge -> MTF at the Nyquist frequency, (Z,); an infinite sigma where no edge could be measured.
-        vertex: edge -> its peak.
-        frames: edge -> one recorded frame near the peak; empty of a table of MTF values.
-        target: moves of the target itself, metres, (Z,); empty of measurements.
-        take: number of the exposure at its first position.
+    Attributes
+    ----------
+    shift : Mapping[str, np.ndarray]
+        Edge -> moves of the target, as moves of the image in the edge's direction, metres, (Z,).
+    mtf, sigma : Mapping[str, np.ndarray]
+        Edge -> MTF at the Nyquist frequency, (Z,); an infinite sigma where no edge could be measured.
+    vertex : Mapping[str, FocusVertex]
+        Edge -> its peak.
+    frames : Mapping[str, np.ndarray]
+        Edge -> one recorded frame near the peak; empty of a table of MTF values.
+    target : np.ndarray
+        Moves of the target itself, metres, (Z,); empty of measurements.
+    take : int
+        Number of the exposure at its first position.
     """
 
     shift: Mapping[str, np.ndarray]
@@ -295,9 +326,12 @@ class SiteScan:
 class NyquistMtf:
     """Edges of one site with the target at the collimator's focus.
 
-    Attributes:
-        by_edge: edge -> MTF at the Nyquist frequency and its sigma.
-        frames: edge -> recorded frames (frames, region, region).
+    Attributes
+    ----------
+    by_edge : Mapping[str, tuple[float, float]]
+        Edge -> MTF at the Nyquist frequency and its sigma.
+    frames : Mapping[str, np.ndarray]
+        Edge -> recorded frames (frames, region, region).
     """
 
     by_edge: Mapping[str, tuple[float, float]]
@@ -307,11 +341,16 @@ class NyquistMtf:
 class Recorder:
     """Records and measures edges of one standing of the assembly.
 
-    Args:
-        bench: the bench.
-        standing: of the assembly.
-        seed: of the noise and of where the edge happens to lie.
-        patterns: band -> columns' gains and offsets.
+    Parameters
+    ----------
+    bench
+        The bench.
+    standing
+        Of the assembly.
+    seed
+        Of the noise and of where the edge happens to lie.
+    patterns
+        Band -> columns' gains and offsets.
     """
 
     def __init__(
@@ -340,8 +379,10 @@ class Recorder:
     def measure(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray]:
         """MTF at the Nyquist frequency, its sigma, and the frames.
 
-        Raises:
-            EdgeError: no edge can be measured in the image.
+        Raises
+        ------
+        EdgeError
+            No edge can be measured in the image.
         """
         frames = self.frames(number, edge, shift, take)
         ccd = self.bench.ccds[self.bench.sites[number].band]
@@ -361,14 +402,20 @@ class Recorder:
 def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> tuple[SiteScan, ...]:
     """Measure all sites through focus.
 
-    Args:
-        recorder: of one standing.
-        advance: told how many of how many sites are done.
-        search: first look for the peak over the whole reach; without it the peak is taken to be near zero, and only
-            where it is not there is it looked for.
+    Parameters
+    ----------
+    recorder : Recorder
+        Of one standing.
+    advance : Advance
+        Told how many of how many sites are done.
+    search : bool
+        First look for the peak over the whole reach; without it the peak is taken to be near zero, and only where it is
+        not there is it looked for.
 
-    Raises:
-        BenchError: a peak lies outside of the scan.
+    Raises
+    ------
+    BenchError
+        a peak lies outside of the scan.
     """
     count = len(recorder.bench.sites)
     done: list[SiteScan] = []
@@ -382,8 +429,10 @@ def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> 
 def in_focus(recorder: Recorder) -> tuple[NyquistMtf, ...]:
     """MTF of every site with the target at the collimator's focus.
 
-    Raises:
-        BenchError: no edge can be measured there.
+    Raises
+    ------
+    BenchError
+        No edge can be measured there.
     """
 
     def site(number: int) -> NyquistMtf:

@@ -56,9 +56,12 @@ _GREY, _EDGE_PIXEL = 2.0, 57.0
 class FocusState:
     """The assembly as it stands, measured at N sites.
 
-    Attributes:
-        scans: through focus, site by site.
-        level: of the line by the theodolite; None if nobody read it.
+    Attributes
+    ----------
+    scans : tuple[SiteScan, ...]
+        Through focus, site by site.
+    level : LineLevel | None
+        Of the line by the theodolite; None if nobody read it.
     """
 
     scans: tuple[SiteScan, ...]
@@ -98,14 +101,22 @@ class FocusState:
 class SimulatedState(FocusState):
     """The assembly on the simulated bench, measured and true.
 
-    Attributes:
-        level: there is always one.
-        bench: where it stands.
-        standing: truth.
-        focus: MTF with the target at the collimator's focus, site by site; empty when it was not measured.
-        true_defocus: how far each site's CCD stands downstream of best focus, (N,), metres.
-        true_level: turn of the line about Z', radians.
-        shims: what led to it; None for the first standing.
+    Attributes
+    ----------
+    level : LineLevel
+        There is always one.
+    bench : FocusBench
+        Where it stands.
+    standing : Standing
+        truth.
+    focus : tuple[NyquistMtf, ...]
+        MTF with the target at the collimator's focus, site by site; empty when it was not measured.
+    true_defocus : np.ndarray
+        How far each site's CCD stands downstream of best focus, (N,), metres.
+    true_level : float
+        Turn of the line about Z', radians.
+    shims : Shimming | None
+        What led to it; None for the first standing.
     """
 
     level: LineLevel
@@ -148,10 +159,14 @@ class SimulatedState(FocusState):
 class Shimming:
     """One round's decision: the fitted plane and the shims.
 
-    Attributes:
-        plane, plan: as fitted and as decided.
-        vertex_error: that all vertices share, one sigma, metres.
-        vertex_trend: by how much it changes from the middle to the ends of the places, one sigma, metres.
+    Attributes
+    ----------
+    plane, plan : FocalPlaneFit
+        As fitted and as decided.
+    vertex_error : float
+        That all vertices share, one sigma, metres.
+    vertex_trend : float
+        By how much it changes from the middle to the ends of the places, one sigma, metres.
     """
 
     plane: FocalPlaneFit
@@ -203,14 +218,22 @@ class Shimming:
 class FocusRun:
     """One alignment, on a simulated bench or from a measured through-focus series.
 
-    Attributes:
-        test: what its file says.
-        seed: of what was drawn.
-        bands: whose CCD stands at each of the N sites; an empty name where a table does not say.
-        places: (X', Y') of the sites, (N, 2), metres.
-        states: the standings that were measured.
-        shimmings: what was decided after each of them; a simulated bench also measures what the last one leads to.
-        readings: as read from files; None for a simulated bench.
+    Attributes
+    ----------
+    test : FocusTestSpec | MeasuredFocusSpec
+        What its file says.
+    seed : int
+        Of what was drawn.
+    bands : tuple[str, ...]
+        Whose CCD stands at each of the N sites; an empty name where a table does not say.
+    places : np.ndarray
+        (X', Y') of the sites, (N, 2), metres.
+    states : tuple[FocusState, ...]
+        The standings that were measured.
+    shimmings : tuple[Shimming, ...]
+        What was decided after each of them; a simulated bench also measures what the last one leads to.
+    readings : FocusReadings | None
+        As read from files; None for a simulated bench.
     """
 
     test: FocusTestSpec | MeasuredFocusSpec
@@ -237,9 +260,12 @@ class FocusRun:
 class SimulatedFocus(FocusRun):
     """An alignment on the simulated bench, which also knows the truth.
 
-    Attributes:
-        bench: with all that was set up.
-        states: one more than there are shimmings.
+    Attributes
+    ----------
+    bench : FocusBench
+        With all that was set up.
+    states : tuple[SimulatedState, ...]
+        One more than there are shimmings.
     """
 
     bench: FocusBench
@@ -264,9 +290,12 @@ class SimulatedFocus(FocusRun):
 def run_focus(setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent) -> FocusRun:
     """``python -m twin.lab focus``.
 
-    Raises:
-        InputError: the camera cannot be built as the file says; a table of measurements cannot be used.
-        BenchError: what the file asks for cannot be done.
+    Raises
+    ------
+    InputError
+        The camera cannot be built as the file says; a table of measurements cannot be used.
+    BenchError
+        What the file asks for cannot be done.
     """
     if isinstance(setup, MeasuredFocusSetup):
         return align_files(setup.test, seed, advance)
@@ -294,14 +323,21 @@ def _require_memory(setup: FocusSetup) -> None:
 def align_files(spec: MeasuredFocusSpec, seed: int = 0, advance: Advance = silent) -> FocusRun:
     """Read the series, find best focus at every place, fit the plane and decide on shims.
 
-    Args:
-        spec: of the test.
-        seed: of the command; nothing is drawn.
-        advance: told of the progress.
+    Parameters
+    ----------
+    spec : MeasuredFocusSpec
+        Of the test.
+    seed : int
+        Of the command; nothing is drawn.
+    advance : Advance
+        Told of the progress.
 
-    Raises:
-        InputError: a table or an image cannot be used, or no best focus can be told from it.
-        BenchError: the mount does not allow the motion.
+    Raises
+    ------
+    InputError
+        a table or an image cannot be used, or no best focus can be told from it.
+    BenchError
+        The mount does not allow the motion.
     """
     found = read_focus(spec.measured, advance)
     level = None if spec.measured.level is None else LineLevel(spec.measured.level.angle, spec.measured.level.sigma)
@@ -341,8 +377,10 @@ def _check_light(bench: FocusBench) -> None:
 def align(bench: FocusBench, seed: int, advance: Advance = silent) -> SimulatedFocus:
     """Mis-set the focal plane at random and align it.
 
-    Raises:
-        BenchError: best focus lies outside of the scan, or the mount does not allow the motion.
+    Raises
+    ------
+    BenchError
+        Best focus lies outside of the scan, or the mount does not allow the motion.
     """
     test = bench.setup.test
     standing = misset(bench, seed)
@@ -379,16 +417,25 @@ def decide(
 ) -> Shimming:
     """The plane through best focus and the shims that bring the assembly there.
 
-    Args:
-        places: X', Y' of the sites, (N, 2), metres.
-        state: as measured; without a level of the line its turn stays as it is.
-        mount: where the shims are.
-        present: their thickness, (H,), metres.
-        vertex: error that all vertices share and its trend, metres.
+    Parameters
+    ----------
+    places : np.ndarray
+        X', Y' of the sites, (N, 2), metres.
+    state : FocusState
+        As measured; without a level of the line its turn stays as it is.
+    mount : Mount
+        Where the shims are.
+    present : np.ndarray
+        Their thickness, (H,), metres.
+    vertex : tuple[float, float]
+        Error that all vertices share and its trend, metres.
 
-    Raises:
-        ObservabilityError: the places do not tell a slope.
-        BenchError: the mount does not allow the motion.
+    Raises
+    ------
+    ObservabilityError
+        The places do not tell a slope.
+    BenchError
+        The mount does not allow the motion.
     """
     # the plane wants how far best focus lies downstream of the CCD
     plane = fit_focal_plane(places, -state.defocus, state.defocus_sigma, estimate_extra=True)
@@ -408,8 +455,10 @@ def misset(bench: FocusBench, seed: int) -> Standing:
 def mount_of(test: FocusTestSpec | MeasuredFocusSpec) -> Mount:
     """The mounting surface as its drawing has it, in the assembly's frame.
 
-    Raises:
-        BenchError: holes that cannot carry a tilt.
+    Raises
+    ------
+    BenchError
+        Holes that cannot carry a tilt.
     """
     spec = test.mount
     try:
@@ -421,8 +470,10 @@ def mount_of(test: FocusTestSpec | MeasuredFocusSpec) -> Mount:
 def plan_shims(correction: RigidMotion, mount: Mount, present: np.ndarray) -> ShimPlan:
     """Shims for a correction.
 
-    Raises:
-        BenchError: the mount does not allow the motion.
+    Raises
+    ------
+    BenchError
+        The mount does not allow the motion.
     """
     try:
         return shim_plan(correction, mount, present)
@@ -449,12 +500,18 @@ def recorder_of(
 ) -> Recorder:
     """What records the edges of a standing: the same frames whenever it is asked for the same ones.
 
-    Args:
-        bench: the bench.
-        standing: of the assembly.
-        seed: of the alignment.
-        number: of the round before it, 0 for none.
-        patterns: of the columns; None to draw them, always the same.
+    Parameters
+    ----------
+    bench : FocusBench
+        The bench.
+    standing : Standing
+        Of the assembly.
+    seed : int
+        Of the alignment.
+    number : int
+        Of the round before it, 0 for none.
+    patterns : Mapping[str, FixedPattern] | None
+        Of the columns; None to draw them, always the same.
     """
     drawn = _patterns(bench, seed) if patterns is None else patterns
     return Recorder(bench, standing, stream(seed, _SCAN, number), drawn)

@@ -57,10 +57,14 @@ _REGION = ("row", "column", "height", "width")
 class _Place:
     """One place of the focal plane with its rows of the table.
 
-    Attributes:
-        band: whose CCD; empty if the table does not say.
-        place: (X', Y'), metres.
-        rows: edge -> its rows of the table, by shift.
+    Attributes
+    ----------
+    band : str
+        Whose CCD; empty if the table does not say.
+    place : Array
+        (X', Y'), metres.
+    rows : Mapping[str, NDArray[np.intp]]
+        Edge -> its rows of the table, by shift.
     """
 
     band: str
@@ -85,15 +89,24 @@ class RowFault:
 class FocusReadings:
     """A measured through-focus series of N sites.
 
-    Attributes:
-        table: as read.
-        bands: of the sites; empty names if the table does not say.
-        places: (X', Y') of the sites, (N, 2), metres.
-        scans: curves through focus of the sites.
-        no_edge: images that could not be measured.
-        uneven: images with structure that their edge does not explain.
-        excluded: rows that disagree with the curve of all others and do not count.
-        file: the table's.
+    Attributes
+    ----------
+    table : Table
+        As read.
+    bands : tuple[str, ...]
+        Of the sites; empty names if the table does not say.
+    places : Array
+        (X', Y') of the sites, (N, 2), metres.
+    scans : tuple[SiteScan, ...]
+        Curves through focus of the sites.
+    no_edge : tuple[RowFault, ...]
+        Images that could not be measured.
+    uneven : tuple[RowFault, ...]
+        Images with structure that their edge does not explain.
+    excluded : tuple[RowFault, ...]
+        Rows that disagree with the curve of all others and do not count.
+    file : DataFile
+        The table's.
     """
 
     table: Table
@@ -109,12 +122,17 @@ class FocusReadings:
 def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
     """Read a through-focus series and find best focus at every place.
 
-    Args:
-        files: the section of the test's file.
-        advance: told of the progress.
+    Parameters
+    ----------
+    files : FocusFiles
+        The section of the test's file.
+    advance : Advance
+        Told of the progress.
 
-    Raises:
-        InputError: a table or an image cannot be used, or no best focus can be told from it.
+    Raises
+    ------
+    InputError
+        a table or an image cannot be used, or no best focus can be told from it.
     """
     advance("read the series", 0, 1)
     images = files.images is not None

@@ -92,11 +92,16 @@ class DataFile:
 class Comparisons:
     """A measured series.
 
-    Attributes:
-        series: for the analysis.
-        lines: of each comparison in the file, (N, repeats); 0 where none was made.
-        file: they stand in.
-        head: of its readings.
+    Attributes
+    ----------
+    series : CalibrationSeries
+        For the analysis.
+    lines : Places
+        Of each comparison in the file, (N, repeats); 0 where none was made.
+    file : DataFile
+        They stand in.
+    head : str
+        Of its readings.
     """
 
     series: CalibrationSeries
@@ -109,15 +114,24 @@ class Comparisons:
 class SpotReadings:
     """Measured spots: N points, S sets.
 
-    Attributes:
-        reading: of the turntable, (N, S), radians.
-        spots: on the line.
-        present: which were measured, (N, S); None for all.
-        across: of the spots across the line, (N, S), metres; None if the table has no such column.
-        lines: in the file, (N, S); 0 where nothing was measured.
-        file: they stand in.
-        head: of its readings.
-        numbered: the sets have numbers in the file.
+    Attributes
+    ----------
+    reading : Array
+        Of the turntable, (N, S), radians.
+    spots : Spots
+        On the line.
+    present : NDArray[np.bool_] | None
+        Which were measured, (N, S); None for all.
+    across : Array | None
+        Of the spots across the line, (N, S), metres; None if the table has no such column.
+    lines : Places
+        In the file, (N, S); 0 where nothing was measured.
+    file : DataFile
+        They stand in.
+    head : str
+        Of its readings.
+    numbered : bool
+        The sets have numbers in the file.
     """
 
     reading: Array
@@ -133,8 +147,10 @@ class SpotReadings:
 def read_turntable(files: TurntableFiles) -> tuple[Comparisons, ...]:
     """The calibration of a turntable and, if there is one, the series at held-out readings.
 
-    Raises:
-        InputError: a table that cannot be used, with file, line and column.
+    Raises
+    ------
+    InputError
+        a table that cannot be used, with file, line and column.
     """
     series = read_comparisons(files.comparisons, files.reference)
     if files.held_out is None:
@@ -182,14 +198,21 @@ def unwrapped(reading: Array, around: float | None = None) -> Array:
 def read_comparisons(path: str, reference_sigma: float, fewest: int = 4, around: float | None = None) -> Comparisons:
     """A table of comparisons of a turntable with a reference.
 
-    Args:
-        path: of the CSV file.
-        reference_sigma: of the reference's certificate, radians.
-        fewest: different angles.
-        around: as of `unwrapped`.
+    Parameters
+    ----------
+    path : str
+        Of the CSV file.
+    reference_sigma : float
+        Of the reference's certificate, radians.
+    fewest : int
+        Different angles.
+    around : float | None
+        As of `unwrapped`.
 
-    Raises:
-        InputError: with file, line and column.
+    Raises
+    ------
+    InputError
+        With file, line and column.
     """
     table = read_table(path, COMPARISON_COLUMNS, 2)
     if ("difference" in table) is ("reference" in table):
@@ -237,11 +260,15 @@ def read_comparisons(path: str, reference_sigma: float, fewest: int = 4, around:
 def read_spots(files: DistortionFiles) -> SpotReadings:
     """A table of readings and spots.
 
-    Args:
-        files: the section of the test's file.
+    Parameters
+    ----------
+    files : DistortionFiles
+        The section of the test's file.
 
-    Raises:
-        InputError: with file, line and column.
+    Raises
+    ------
+    InputError
+        With file, line and column.
     """
     table = read_table(files.spots, SPOT_COLUMNS, len(CALIBRATED))
     where, sigma, fixed = _places(table, files)
@@ -354,11 +381,16 @@ def _groups(table: Table) -> Places:
 class _Cells:
     """Rows of a table, sorted, as a matrix of groups and their members.
 
-    Args:
-        table: with the rows.
-        group: of the sorted rows, (rows,), not falling.
-        order: row of the table of each sorted row, (rows,).
-        slot: place of each sorted row among the columns; by default members of a group one after the other.
+    Parameters
+    ----------
+    table
+        With the rows.
+    group
+        Of the sorted rows, (rows,), not falling.
+    order
+        Row of the table of each sorted row, (rows,).
+    slot
+        Place of each sorted row among the columns; by default members of a group one after the other.
     """
 
     def __init__(self, table: Table, group: Places, order: Places, slot: Places | None = None) -> None:

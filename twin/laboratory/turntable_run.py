@@ -57,9 +57,12 @@ _FIXED_POINT_STEPS = 8
 class Harmonics:
     """sum_k cosine_k cos(k R) + sine_k sin(k R).
 
-    Attributes:
-        order: k, periods in a full turn, (K,).
-        cosine, sine: (K,), radians.
+    Attributes
+    ----------
+    order : NDArray[np.int64]
+        k, periods in a full turn, (K,).
+    cosine, sine : Array
+        (K,), radians.
     """
 
     order: NDArray[np.int64]
@@ -89,8 +92,10 @@ class Harmonics:
 class DividingError:
     """The true dividing error of one table, reading - true angle, as a function of the reading.
 
-    Attributes:
-        parts: axis, eccentricity, graduation, subdivision.
+    Attributes
+    ----------
+    parts : Mapping[str, Harmonics]
+        Axis, eccentricity, graduation, subdivision.
     """
 
     parts: Mapping[str, Harmonics]
@@ -123,9 +128,12 @@ class DividingError:
 class TurntableModel:
     """A table and the reference it is compared with.
 
-    Attributes:
-        spec: of the test.
-        seed: of everything that is random.
+    Attributes
+    ----------
+    spec : TurntableTestSpec
+        Of the test.
+    seed : int
+        Of everything that is random.
     """
 
     spec: TurntableTestSpec
@@ -139,9 +147,12 @@ class TurntableModel:
     def stand(self, reading: ArrayLike, rng: np.random.Generator | None = None) -> Array:
         """True angles at which the table stands when it reads this, in the shape of the readings, radians.
 
-        Args:
-            reading: radians.
-            rng: of the repeatability; None for a table that repeats perfectly.
+        Parameters
+        ----------
+        reading : ArrayLike
+            radians.
+        rng : np.random.Generator | None
+            Of the repeatability; None for a table that repeats perfectly.
         """
         at = np.asarray(reading, np.float64)
         return at - self.error(at) - self._scatter(at.shape, rng)
@@ -202,16 +213,26 @@ _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 class TurntableRun:
     """One turntable test, on a simulated bench or on measured readings.
 
-    Attributes:
-        spec: of the test.
-        seed: of all that is drawn: the simulated bench, and the network's starts.
-        series: comparisons at the calibrated readings.
-        held_out: comparisons at readings that no fit has seen; None if there are none.
-        choice: fits and their cross-validation.
-        compensation: of the chosen fit.
-        model: the simulated table and reference, which hold the truth; None for measurements.
-        tables: the series as read from files; empty for a simulated bench.
-        too_few: fits that need more angles than there are.
+    Attributes
+    ----------
+    spec : TurntableTestSpec | MeasuredTurntableSpec
+        Of the test.
+    seed : int
+        Of all that is drawn: the simulated bench, and the network's starts.
+    series : CalibrationSeries
+        Comparisons at the calibrated readings.
+    held_out : CalibrationSeries | None
+        Comparisons at readings that no fit has seen; None if there are none.
+    choice : Choice
+        Fits and their cross-validation.
+    compensation : DividingCompensation
+        Of the chosen fit.
+    model : TurntableModel | None
+        The simulated table and reference, which hold the truth; None for measurements.
+    tables : tuple[Comparisons, ...]
+        The series as read from files; empty for a simulated bench.
+    too_few : tuple[str, ...]
+        Fits that need more angles than there are.
     """
 
     spec: TurntableTestSpec | MeasuredTurntableSpec
@@ -297,14 +318,21 @@ def run_turntable(
 ) -> TurntableRun:
     """Simulate or read the comparisons, clean them, fit them, choose a fit and make the compensation of it.
 
-    Args:
-        spec: of the test.
-        seed: of all that is drawn; with the spec it determines everything.
-        progress: told what is being done.
-        names: of the fits; the network takes nearly all of the time.
+    Parameters
+    ----------
+    spec : TurntableTestSpec | MeasuredTurntableSpec
+        Of the test.
+    seed : int
+        Of all that is drawn; with the spec it determines everything.
+    progress : Callable[[str], None] | None
+        Told what is being done.
+    names : Sequence[str]
+        Of the fits; the network takes nearly all of the time.
 
-    Raises:
-        InputError: a table cannot be used, or there are fewer angles than a fit and its cross-validation need.
+    Raises
+    ------
+    InputError
+        a table cannot be used, or there are fewer angles than a fit and its cross-validation need.
     """
     say = progress or (lambda text: None)
     model: TurntableModel | None = None
@@ -348,8 +376,10 @@ def usable_fits(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The fits of which there are angles enough, and the others.
 
-    Raises:
-        InputError: there are enough for none.
+    Raises
+    ------
+    InputError
+        There are enough for none.
     """
     count = len(found.series.angle)
     left = angles_left(count, files.folds)
@@ -380,9 +410,12 @@ DOUBTFUL = 1e-3
 def likely(chi_square: float, degrees: int) -> bool | None:
     """Return whether a chi-square as large has a chance of DOUBTFUL at least; None without degrees of freedom.
 
-    Args:
-        chi_square: of residuals against their sigmas.
-        degrees: of freedom.
+    Parameters
+    ----------
+    chi_square : float
+        Of residuals against their sigmas.
+    degrees : int
+        Of freedom.
     """
     return bool(chance_beyond(chi_square, degrees) >= DOUBTFUL) if degrees else None
 

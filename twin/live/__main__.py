@@ -80,8 +80,10 @@ def main(
 def _readable(what: str, run: int | None) -> tuple[str, ...]:
     """What is to be opened, checked as far as reading it can tell, in words.
 
-    Raises:
-        InputError: it cannot be read, is not valid, or is nothing that can be opened.
+    Raises
+    ------
+    InputError
+        It cannot be read, is not valid, or is nothing that can be opened.
     """
     from twin.live.source import read_source
 
@@ -101,8 +103,10 @@ def _serve(
 ) -> None:
     """Build, listen, print the address, serve.
 
-    Raises:
-        InputErrorText: the extra is missing, the address is taken, or the instrument cannot be built.
+    Raises
+    ------
+    InputErrorText
+        The extra is missing, the address is taken, or the instrument cannot be built.
     """
     try:
         from twin.live.guard import BadToken, Guard, new_token

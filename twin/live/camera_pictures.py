@@ -30,8 +30,10 @@ UM = "\N{MICRO SIGN}m"
 class CameraPictures:
     """Pictures of an instrument's cameras beside what they are as designed; what does not change is kept.
 
-    Args:
-        experiment: the instrument.
+    Parameters
+    ----------
+    experiment
+        The instrument.
     """
 
     def __init__(self, experiment: MonitorExperiment) -> None:
@@ -41,17 +43,27 @@ class CameraPictures:
     def draw(self, view: str, camera: str, field: float, state: State, frames: int, seed: int) -> str:
         """A picture as SVG.
 
-        Args:
-            view: ``wavefront``, ``spot``, ``mtf``, ``focus`` or ``target``.
-            camera: name.
-            field: along the line, as a share of the half field; of a target the line's middle.
-            state: body -> motion.
-            frames: of the target.
-            seed: of their noise.
+        Parameters
+        ----------
+        view : str
+            ``wavefront``, ``spot``, ``mtf``, ``focus`` or ``target``.
+        camera : str
+            name.
+        field : float
+            Along the line, as a share of the half field; of a target the line's middle.
+        state : State
+            Body -> motion.
+        frames : int
+            Of the target.
+        seed : int
+            Of their noise.
 
-        Raises:
-            InputError: no such camera, or one that cannot image targets.
-            ValueError: a state in which its light is lost.
+        Raises
+        ------
+        InputError
+            No such camera, or one that cannot image targets.
+        ValueError
+            a state in which its light is lost.
         """
         instrument = self.experiment.instrument
         if camera not in instrument.cameras:
@@ -112,8 +124,10 @@ class CameraPictures:
 def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
     """The job with knife edges among its images, and so with the data sheets of its line CCDs.
 
-    Raises:
-        InputError: its cameras have none.
+    Raises
+    ------
+    InputError
+        Its cameras have none.
     """
     if resolved.line_detectors is not None:
         return resolved

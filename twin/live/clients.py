@@ -50,8 +50,10 @@ HALTED = (
 class Goodbye(Exception):
     """A page is sent away.
 
-    Attributes:
-        code: of the WebSocket; reason: for the page.
+    Attributes
+    ----------
+    code
+        Of the WebSocket; reason: for the page.
     """
 
     def __init__(self, code: int, reason: str) -> None:
@@ -63,9 +65,12 @@ class Goodbye(Exception):
 class _Wish:
     """Something that a page wants.
 
-    Attributes:
-        kind: the attribute of `Client` in which it stood, one of ``saves`` for "save".
-        asked: the message.
+    Attributes
+    ----------
+    kind : str
+        The attribute of `Client` in which it stood, one of ``saves`` for "save".
+    asked : Any
+        The message.
     """
 
     kind: str
@@ -76,10 +81,14 @@ class _Wish:
 class Client:
     """One page.
 
-    Attributes:
-        state: that it wants next; view: picture that it wants next.
-        shown: last state that was computed for it.
-        before: for which noise, frames and seed it has the images before.
+    Attributes
+    ----------
+    state : messages.AskedState | None
+        That it wants next; view: picture that it wants next.
+    shown : messages.AskedState | None
+        Last state that was computed for it.
+    before : BeforeKey | None
+        For which noise, frames and seed it has the images before.
     """
 
     state: messages.AskedState | None = None
@@ -124,8 +133,10 @@ class Client:
     def take(self, text: str | bytes) -> None:
         """Take a message of the page.
 
-        Raises:
-            Goodbye: too many, or too many that are none.
+        Raises
+        ------
+        Goodbye
+            Too many, or too many that are none.
         """
         now = time.monotonic()
         self._tokens = min(BURST, self._tokens + RATE * (now - self._refilled)) - 1.0
@@ -202,8 +213,10 @@ class Client:
     ) -> None:
         """Send for ever what there is to send.
 
-        Raises:
-            Goodbye: the page does not take it.
+        Raises
+        ------
+        Goodbye
+            The page does not take it.
         """
         while True:
             await self._to_send.wait()
@@ -230,8 +243,10 @@ def _hiding(state: messages.AskedState, seed: int) -> messages.BlindState:
 class Desk:
     """Hands the pages' wishes to the computer, one page after the other, states before pictures.
 
-    Args:
-        computer: that computes.
+    Parameters
+    ----------
+    computer
+        That computes.
     """
 
     def __init__(self, computer: Computer) -> None:
@@ -247,8 +262,10 @@ class Desk:
     def enter(self) -> Client:
         """A new page.
 
-        Raises:
-            Goodbye: there are too many.
+        Raises
+        ------
+        Goodbye
+            There are too many.
         """
         if len(self.clients) >= MOST_CLIENTS:
             raise Goodbye(TRY_AGAIN, f"{MOST_CLIENTS} pages are open already")
@@ -268,8 +285,10 @@ class Desk:
     async def work(self) -> None:
         """Answer for ever.
 
-        Raises:
-            CannotStart: the process that computes ended and cannot be started again.
+        Raises
+        ------
+        CannotStart
+            The process that computes ended and cannot be started again.
         """
         while True:
             if self.computer.condition == "ended":
@@ -307,8 +326,10 @@ class Desk:
         """The computer's answer. An answer that comes while the pages still believe the process stopped shows that it
         goes on, and they are told so before they get it, however long the next look at the process is away.
 
-        Raises:
-            ComputerLost: the process ended.
+        Raises
+        ------
+        ComputerLost
+            The process ended.
         """
         answer = await self.computer.ask(kind, question)
         if self.trouble and self.computer.condition == "runs":

@@ -39,14 +39,21 @@ KEPT = 3
 class Answers:
     """An instrument that is ready to answer.
 
-    Args:
-        what: as of `twin.live.source.read_source`.
-        backend: where to trace.
-        advance: told of each part of the preparation.
-        run: of a study, as of `twin.live.source.read_source`.
+    Parameters
+    ----------
+    what
+        As of `twin.live.source.read_source`.
+    backend
+        Where to trace.
+    advance
+        Told of each part of the preparation.
+    run
+        Of a study, as of `twin.live.source.read_source`.
 
-    Raises:
-        InputError, BackendUnavailable, LibraryMissing: it cannot be built.
+    Raises
+    ------
+    InputError, BackendUnavailable, LibraryMissing
+        It cannot be built.
     """
 
     def __init__(self, what: str, backend: str, advance: Callable[[str], None], run: int | None = None) -> None:
@@ -61,8 +68,10 @@ class Answers:
     ) -> tuple[LiveBench, CameraPictures, Opened]:
         """The instrument with these values of a study's factors, built if it is not.
 
-        Raises:
-            InputError: they cannot be.
+        Raises
+        ------
+        InputError
+            They cannot be.
         """
         key = json.dumps(dict(sorted(factors.items())))
         if key not in self._built:
@@ -162,10 +171,14 @@ class CannotStart(Exception):
 class Computer:
     """The process that computes, asked from an event loop; one question after the other.
 
-    Args:
-        what: as of `twin.live.source.read_source`.
-        backend: where to trace.
-        run: of a study, likewise.
+    Parameters
+    ----------
+    what
+        As of `twin.live.source.read_source`.
+    backend
+        Where to trace.
+    run
+        Of a study, likewise.
     """
 
     def __init__(self, what: str, backend: str, run: int | None = None) -> None:
@@ -182,11 +195,15 @@ class Computer:
     def start(self, advance: Callable[[str], None] = lambda part: None) -> None:
         """Start the process and wait until every kernel is compiled.
 
-        Args:
-            advance: told of each part when it begins.
+        Parameters
+        ----------
+        advance : Callable[[str], None]
+            Told of each part when it begins.
 
-        Raises:
-            CannotStart: why.
+        Raises
+        ------
+        CannotStart
+            why.
         """
         try:
             self._start(advance)
@@ -196,9 +213,12 @@ class Computer:
     def _start(self, advance: Callable[[str], None] = lambda part: None) -> None:
         """Start the process once and wait until it is ready, as `start` says.
 
-        Raises:
-            CannotStart: the instrument cannot be built.
-            ComputerLost: the process ended before it was.
+        Raises
+        ------
+        CannotStart
+            The instrument cannot be built.
+        ComputerLost
+            The process ended before it was.
         """
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
@@ -223,8 +243,10 @@ class Computer:
     def _start_again(self) -> None:
         """Start it as it was: with what was last made of a study's factors.
 
-        Raises:
-            CannotStart: why.
+        Raises
+        ------
+        CannotStart
+            why.
         """
         for attempt in range(1, ATTEMPTS + 1):
             try:
@@ -241,8 +263,10 @@ class Computer:
     async def start_again(self) -> None:
         """Start another process in place of one that ended, as that was.
 
-        Raises:
-            CannotStart: why.
+        Raises
+        ------
+        CannotStart
+            why.
         """
         async with self._turn:
             self._starting = True
@@ -254,8 +278,10 @@ class Computer:
     async def ask(self, kind: Kind, question: Any) -> Any:
         """The answer to a question.
 
-        Raises:
-            ComputerLost: the process ended.
+        Raises
+        ------
+        ComputerLost
+            The process ended.
         """
         async with self._turn:
             answer = await asyncio.get_running_loop().run_in_executor(None, self._exchange, kind, question)
@@ -344,11 +370,16 @@ def _stopped(pid: int) -> bool:
 def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
     """What the process does: build the instrument, then answer until the pipe is closed.
 
-    Args:
-        pipe: to the server.
-        what: as of `Computer`.
-        backend: likewise.
-        run: likewise.
+    Parameters
+    ----------
+    pipe : Connection
+        To the server.
+    what : str
+        As of `Computer`.
+    backend : str
+        likewise.
+    run : int | None
+        likewise.
     """
     # Ctrl-C goes to the whole group of the terminal; the server ends this process by closing the pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -57,11 +57,15 @@ class BadToken(ValueError):
 def new_token(variable: str) -> str:
     """The token of a server: random, or the environment's.
 
-    Args:
-        variable: of the environment, with a token that stays the same when the server is started again.
+    Parameters
+    ----------
+    variable : str
+        Of the environment, with a token that stays the same when the server is started again.
 
-    Raises:
-        BadToken: the environment's is too short, or has characters that a cookie cannot have.
+    Raises
+    ------
+    BadToken
+        The environment's is too short, or has characters that a cookie cannot have.
     """
     named = os.environ.get(variable, "")
     if not named:
@@ -75,10 +79,14 @@ def new_token(variable: str) -> str:
 class Guard:
     """What a request needs.
 
-    Attributes:
-        token: the secret.
-        hosts: names under which the server is called, with their port.
-        port: it listens on.
+    Attributes
+    ----------
+    token : str
+        The secret.
+    hosts : tuple[str, ...]
+        Names under which the server is called, with their port.
+    port : int
+        It listens on.
     """
 
     token: str
@@ -111,18 +119,23 @@ class Guard:
     def knows_cookie(self, headers: Mapping[str, str]) -> bool:
         """Whether a request brings the token as its cookie.
 
-        Args:
-            headers: of the request, names in small letters.
+        Parameters
+        ----------
+        headers : Mapping[str, str]
+            Of the request, names in small letters.
         """
         return any(map(self.knows, _cookies(headers.get("cookie", ""), self.cookie_name)))
 
     def refuses_host(self, headers: Mapping[str, str], reached: str = "") -> str:
         """Why a request's host or origin is not the server's own; empty if it is.
 
-        Args:
-            headers: of the request, names in small letters.
-            reached: number of this machine under which the request came here. A page elsewhere whose name resolves to
-                it calls it by that name.
+        Parameters
+        ----------
+        headers : Mapping[str, str]
+            Of the request, names in small letters.
+        reached : str
+            Number of this machine under which the request came here. A page elsewhere whose name resolves to it calls
+            it by that name.
         """
         host = headers.get("host", "").lower()
         plain = reached.removeprefix("::ffff:")
@@ -139,10 +152,14 @@ class Guard:
     def refuses(self, headers: Mapping[str, str], socket: bool = False, reached: str = "") -> str:
         """Why a request is refused; empty if it is not.
 
-        Args:
-            headers: of the request, names in small letters.
-            socket: whether it asks for a WebSocket, for which browsers always tell the origin.
-            reached: as of `refuses_host`.
+        Parameters
+        ----------
+        headers : Mapping[str, str]
+            Of the request, names in small letters.
+        socket : bool
+            Whether it asks for a WebSocket, for which browsers always tell the origin.
+        reached : str
+            As of `refuses_host`.
         """
         why = self.refuses_host(headers, reached)
         if not why and socket and "origin" not in headers:
@@ -194,8 +211,10 @@ UNREAD = 5.0
 class Connections:
     """All that are open and carry no WebSocket.
 
-    Args:
-        knows: whether a request's headers, names in small letters, hold the token.
+    Parameters
+    ----------
+    knows
+        Whether a request's headers, names in small letters, hold the token.
     """
 
     def __init__(self, knows: Callable[[Mapping[str, str]], bool]) -> None:

@@ -30,11 +30,16 @@ are rigid motions."""
 class _KnobKind:
     """What all knobs of one kind have in common.
 
-    Attributes:
-        key: of the perturbation in a job's file.
-        unit: of the values.
-        reach: largest value of the slider at first, either way.
-        limit: largest value that may be typed.
+    Attributes
+    ----------
+    key : str
+        Of the perturbation in a job's file.
+    unit : str
+        Of the values.
+    reach : float
+        Largest value of the slider at first, either way.
+    limit : float
+        Largest value that may be typed.
     """
 
     key: str
@@ -58,15 +63,24 @@ KINDS: Mapping[str, _KnobKind] = {
 class Knob:
     """One number that can be turned.
 
-    Attributes:
-        name: ``base/forward/M2 shift z``.
-        node: the body.
-        kind: one of ``KINDS``.
-        axis: ``x``, ``Z5``; empty where there is one only.
-        unit: of the values.
-        value: at the start.
-        reach: the slider's ends at the start, either way.
-        limit: largest value that may be typed.
+    Attributes
+    ----------
+    name : str
+        ``base/forward/M2 shift z``.
+    node : str
+        The body.
+    kind : str
+        One of ``KINDS``.
+    axis : str
+        ``x``, ``Z5``; empty where there is one only.
+    unit : str
+        Of the values.
+    value : float
+        At the start.
+    reach : float
+        The slider's ends at the start, either way.
+    limit : float
+        Largest value that may be typed.
     """
 
     name: str
@@ -94,9 +108,12 @@ def knob_name(node: str, kind: str, axis: str) -> str:
 def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
     """All knobs of an instrument by their names, set as a job perturbs it.
 
-    Args:
-        nodes: path -> what may be done to it.
-        job: whose ``perturb`` is where the knobs begin.
+    Parameters
+    ----------
+    nodes : Mapping[str, NodeInfo]
+        Path -> what may be done to it.
+    job : JobSpec
+        Whose ``perturb`` is where the knobs begin.
     """
     out = {}
     plain = job.plain().get("perturb", {})
@@ -143,14 +160,21 @@ def perturbation(
 ) -> dict[str, dict[str, Any]]:
     """What knobs come to: ``perturb`` of a job's file, for every body that any of them moves or that the job moves.
 
-    Args:
-        values: name of a knob -> its value; others stand at zero.
-        pivots: body -> name of the point about which it turns and grows; others keep the job's.
-        knobs: all of the instrument's.
-        first: ``perturb`` of the job in which the knobs begin, whose deformations by tables of nodes stay.
+    Parameters
+    ----------
+    values : Mapping[str, float]
+        Name of a knob -> its value; others stand at zero.
+    pivots : Mapping[str, str]
+        Body -> name of the point about which it turns and grows; others keep the job's.
+    knobs : Mapping[str, Knob]
+        All of the instrument's.
+    first : Mapping[str, Any]
+        ``perturb`` of the job in which the knobs begin, whose deformations by tables of nodes stay.
 
-    Raises:
-        InputError: no such knob, or a value beyond its limit.
+    Raises
+    ------
+    InputError
+        No such knob, or a value beyond its limit.
     """
     out: dict[str, dict[str, Any]] = {node: _kept(what) for node, what in first.items()}
     by_axis: dict[tuple[str, str], dict[str, float]] = {}
@@ -207,14 +231,21 @@ def _put(what: dict[str, Any], kind: str, numbers: Mapping[str, float], unit: st
 class FactorKnob:
     """A study's factor that is a number.
 
-    Attributes:
-        name: as the study calls it.
-        unit: of the numbers; empty for pure numbers.
-        low, high: the study's smallest and largest value.
-        value: where it begins: in the study's base, for a ratio 1, or in the run that was opened.
-        whole: whether it counts.
-        knobs: knob of a body -> how many of its units one of the factor's is; empty for what changes the instrument
-            itself, which is then built anew.
+    Attributes
+    ----------
+    name : str
+        As the study calls it.
+    unit : str
+        Of the numbers; empty for pure numbers.
+    low, high : float
+        The study's smallest and largest value.
+    value : float
+        Where it begins: in the study's base, for a ratio 1, or in the run that was opened.
+    whole : bool
+        Whether it counts.
+    knobs : Mapping[str, float]
+        Knob of a body -> how many of its units one of the factor's is; empty for what changes the instrument itself,
+        which is then built anew.
     """
 
     name: str
@@ -245,12 +276,17 @@ def factor_knobs(setup: StudySetup) -> tuple[FactorKnob, ...]:
 def base_with(setup: StudySetup, scalars: Mapping[str, Any]) -> Tree:
     """The study's base where factors have these values, and all that follows them does.
 
-    Args:
-        setup: the study.
-        scalars: factor -> value as a study's file writes it; the others leave the base as it is.
+    Parameters
+    ----------
+    setup : StudySetup
+        The study.
+    scalars : Mapping[str, Any]
+        Factor -> value as a study's file writes it; the others leave the base as it is.
 
-    Raises:
-        InputError: a value that cannot be.
+    Raises
+    ------
+    InputError
+        a value that cannot be.
     """
     factors = {name: _fixed(setup.study.factors[name], scalar) for name, scalar in scalars.items()}
     one = setup.study.model_copy(update={"factors": factors, "design": DesignSpec(kind="grid")})

@@ -61,8 +61,10 @@ IMAGES: Mapping[str, tuple[list[str], str]] = {
 class LiveBench:
     """An instrument on which knobs are turned. It keeps what was worked out, and no state of the knobs.
 
-    Args:
-        twin: the instrument, perturbed as the knobs stand at first.
+    Parameters
+    ----------
+    twin
+        The instrument, perturbed as the knobs stand at first.
     """
 
     def __init__(self, twin: InstrumentTwin) -> None:
@@ -111,8 +113,10 @@ class LiveBench:
     def warm(self, advance: Callable[[str], None] = lambda part: None) -> None:
         """Work out everything that does not depend on the knobs, and compile every kernel.
 
-        Args:
-            advance: told of each part when it begins.
+        Parameters
+        ----------
+        advance : Callable[[str], None]
+            Told of each part when it begins.
         """
         experiment = self.twin.experiment
         advance("trace the unperturbed instrument")
@@ -192,8 +196,10 @@ class LiveBench:
     def perturbed(self, asked: AskedState) -> InstrumentTwin:
         """The instrument as the knobs stand.
 
-        Raises:
-            InputError: no such knob, or a value that a job's file could not have.
+        Raises
+        ------
+        InputError
+            No such knob, or a value that a job's file could not have.
         """
         return self._standing(tuple(asked.knobs.items()), tuple(asked.pivots.items()))
 
@@ -209,10 +215,14 @@ class LiveBench:
     def state(self, asked: AskedState) -> tuple[dict[str, Any], np.ndarray | None]:
         """What a state of the knobs comes to.
 
-        Args:
-            asked: the state.
+        Parameters
+        ----------
+        asked : AskedState
+            The state.
 
-        Returns:
+        Returns
+        -------
+        tuple[dict[str, Any], np.ndarray | None]
             Plain data for the page, and the images after, uint16 (C, H, W); None where there are none. A state that
             cannot be has ``problem`` in place of readings.
         """
@@ -271,8 +281,10 @@ class LiveBench:
     def states(self, asked: AskedState) -> State:
         """Body -> motion of the knobs and of the course's time.
 
-        Raises:
-            InputError: as `perturbed`; TemperatureError: beyond what materials are known for.
+        Raises
+        ------
+        InputError
+            As `perturbed`; TemperatureError: beyond what materials are known for.
         """
         perturbed = self.perturbed(asked)
         job, experiment = perturbed.resolved.job, perturbed.experiment
@@ -437,12 +449,17 @@ GUESSED = (
 def job_text(bench: LiveBench, asked: AskedState) -> str:
     """A job file of one state, which needs no other file. Of a course it shows the time that was looked at.
 
-    Args:
-        bench: the instrument.
-        asked: the state.
+    Parameters
+    ----------
+    bench : LiveBench
+        The instrument.
+    asked : AskedState
+        The state.
 
-    Raises:
-        InputError: a value that a job's file could not have.
+    Raises
+    ------
+    InputError
+        a value that a job's file could not have.
     """
     resolved = bench.perturbed(asked).resolved.with_render(asked.frames, bench.seed_of(asked.seed))
     plain = resolved.plain()
@@ -455,12 +472,17 @@ def job_text(bench: LiveBench, asked: AskedState) -> str:
 def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> str:
     """A job file with a course: every recorded state at its time, to the millisecond.
 
-    Args:
-        bench: the instrument.
-        kept: (seconds since the recording began, state), in the order in which they were shown.
+    Parameters
+    ----------
+    bench : LiveBench
+        The instrument.
+    kept : Sequence[tuple[float, AskedState]]
+        (seconds since the recording began, state), in the order in which they were shown.
 
-    Raises:
-        ValueError: too few states, or something changed that a course cannot change.
+    Raises
+    ------
+    ValueError
+        Too few states, or something changed that a course cannot change.
     """
     steps = _thinned(kept)
     if len(steps) < FEWEST:
@@ -501,8 +523,10 @@ def _split(
 ) -> tuple[dict[str, float], dict[str, list[float]]]:
     """Knobs that stand still, and those that move with their value at each time.
 
-    Raises:
-        ValueError: a figure moves.
+    Raises
+    ------
+    ValueError
+        a figure moves.
     """
     names = dict.fromkeys(name for state in states for name in state)
     moving = {}

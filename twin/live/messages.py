@@ -36,15 +36,24 @@ class _Said(BaseModel):
 class AskedState(_Said):
     """A state of the knobs.
 
-    Attributes:
-        n: its number, counted by the page.
-        t: the page's clock when it was asked for, which is sent back.
-        knobs: name -> value, of those that are not at zero.
-        pivots: body -> name of the point about which it turns.
-        noise: frames with noise, or the expected image.
-        frames: of each exposure.
-        seed: of the noise.
-        time: number of a time of the job's course; None for the job's single state.
+    Attributes
+    ----------
+    n : int
+        Its number, counted by the page.
+    t : Number
+        The page's clock when it was asked for, which is sent back.
+    knobs : dict[Text, Number]
+        Name -> value, of those that are not at zero.
+    pivots : dict[Text, Text]
+        Body -> name of the point about which it turns.
+    noise : bool
+        Frames with noise, or the expected image.
+    frames : int
+        Of each exposure.
+    seed : int
+        Of the noise.
+    time : int | None
+        Number of a time of the job's course; None for the job's single state.
     """
 
     type: Literal["state"] = "state"
@@ -61,8 +70,10 @@ class AskedState(_Said):
 class BlindState(AskedState):
     """A state of the knobs while something is hidden. The program makes it; it is never read from a page.
 
-    Attributes:
-        blind: seed of what is drawn.
+    Attributes
+    ----------
+    blind : int
+        Seed of what is drawn.
     """
 
     blind: int
@@ -71,12 +82,18 @@ class BlindState(AskedState):
 class AskedView(_Said):
     """A picture of one camera in the last state.
 
-    Attributes:
-        n: its number.
-        state: of the knobs.
-        view: which picture.
-        camera: of which camera.
-        field: along the line, as a share of the half field.
+    Attributes
+    ----------
+    n : int
+        Its number.
+    state : AskedState
+        Of the knobs.
+    view : Literal['wavefront', 'spot', 'mtf', 'focus', 'target']
+        Which picture.
+    camera : Text
+        Of which camera.
+    field : float
+        Along the line, as a share of the half field.
     """
 
     type: Literal["view"] = "view"
@@ -90,8 +107,10 @@ class AskedView(_Said):
 class Factors(_Said):
     """Build the instrument with other values of a study's factors; for all pages.
 
-    Attributes:
-        values: factor -> number in its unit.
+    Attributes
+    ----------
+    values : dict[Text, Number]
+        Factor -> number in its unit.
     """
 
     type: Literal["factors"] = "factors"
@@ -101,8 +120,10 @@ class Factors(_Said):
 class Blind(_Said):
     """Hide motions that are drawn, or end it and show them.
 
-    Attributes:
-        on: begin, or reveal.
+    Attributes
+    ----------
+    on : bool
+        Begin, or reveal.
     """
 
     type: Literal["blind"] = "blind"
@@ -112,8 +133,10 @@ class Blind(_Said):
 class Record(_Said):
     """Begin to keep every state that is shown, or end.
 
-    Attributes:
-        on: begin (what was kept is forgotten), or end.
+    Attributes
+    ----------
+    on : bool
+        Begin (what was kept is forgotten), or end.
     """
 
     type: Literal["record"] = "record"
@@ -123,9 +146,12 @@ class Record(_Said):
 class Save(_Said):
     """A job file of a state, or a job with a course of what was recorded.
 
-    Attributes:
-        what: which.
-        state: of the knobs.
+    Attributes
+    ----------
+    what : Literal['job', 'course']
+        which.
+    state : AskedState
+        Of the knobs.
     """
 
     type: Literal["save"] = "save"
@@ -144,8 +170,10 @@ class BadMessage(ValueError):
 def read_message(text: str | bytes) -> Message:
     """A message of a page.
 
-    Raises:
-        BadMessage: it is none; the text says where.
+    Raises
+    ------
+    BadMessage
+        It is none; the text says where.
     """
     if len(text) > LARGEST_MESSAGE:
         raise BadMessage(f"the message has {len(text)} bytes, more than {LARGEST_MESSAGE}")
@@ -160,9 +188,12 @@ def read_message(text: str | bytes) -> Message:
 def packed(told: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
     """A binary message of the program.
 
-    Args:
-        told: plain data.
-        images: name -> uint16 (C, H, W).
+    Parameters
+    ----------
+    told : Mapping[str, Any]
+        Plain data.
+    images : Mapping[str, np.ndarray]
+        Name -> uint16 (C, H, W).
     """
     whole = {**told, "images": {name: list(image.shape) for name, image in images.items()}}
     text = json.dumps(whole, allow_nan=False, separators=(",", ":")).encode()
@@ -175,9 +206,12 @@ def packed(told: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
 class Opened:
     """An instrument that is ready.
 
-    Attributes:
-        greeting: what a page has to know.
-        scene: binary glTF of it as designed.
+    Attributes
+    ----------
+    greeting : dict[str, Any]
+        What a page has to know.
+    scene : bytes
+        Binary glTF of it as designed.
     """
 
     greeting: dict[str, Any]

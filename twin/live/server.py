@@ -53,10 +53,14 @@ class LiveServer:
     """One server. It ends with Ctrl-C or when the last page is closed, and raises CannotStart if the process that
     computes ended and cannot be started again.
 
-    Args:
-        computer: started.
-        guard: who may speak to it.
-        stay: go on when the last page is closed.
+    Parameters
+    ----------
+    computer
+        started.
+    guard
+        Who may speak to it.
+    stay
+        Go on when the last page is closed.
     """
 
     def __init__(self, computer: Computer, guard: Guard, stay: bool = False) -> None:
@@ -85,11 +89,15 @@ class LiveServer:
     def run(self, listening: socket.socket) -> None:
         """Serve until Ctrl-C, or until it is told to stop.
 
-        Args:
-            listening: bound and not yet accepting.
+        Parameters
+        ----------
+        listening : socket.socket
+            Bound and not yet accepting.
 
-        Raises:
-            BaseException: what ended one of its tasks.
+        Raises
+        ------
+        BaseException
+            What ended one of its tasks.
         """
         config = uvicorn.Config(
             self.app,
@@ -211,9 +219,12 @@ def _file(name: str) -> Response:
 class Gate:
     """Before everything else: refuses what the guard refuses, and gives every answer its headers.
 
-    Args:
-        app: behind it.
-        guard: who may pass.
+    Parameters
+    ----------
+    app
+        Behind it.
+    guard
+        Who may pass.
     """
 
     def __init__(self, app: ASGIApp, guard: Guard) -> None:
@@ -264,8 +275,10 @@ def _with_headers(send: Send) -> Callable[[Message], Awaitable[None]]:
 def listen(host: str, port: int) -> socket.socket:
     """A socket on a host and a port; port 0 takes a free one.
 
-    Raises:
-        OSError: somebody listens there already, or there is no such host.
+    Raises
+    ------
+    OSError
+        Somebody listens there already, or there is no such host.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     out = socket.socket(family, socket.SOCK_STREAM)
@@ -283,10 +296,14 @@ def listen(host: str, port: int) -> socket.socket:
 def addresses(host: str, port: int, words: str) -> list[str]:
     """Lines that a command prints: where its page is, from this machine and, if it listens everywhere, from others.
 
-    Args:
-        host: that was asked for.
-        port: on which it listens.
-        words: after the question mark of the address.
+    Parameters
+    ----------
+    host : str
+        That was asked for.
+    port : int
+        On which it listens.
+    words : str
+        After the question mark of the address.
     """
     everywhere = host in EVERYWHERE
     shown = "127.0.0.1" if everywhere else f"[{host}]" if ":" in host else host

@@ -42,15 +42,24 @@ NAMED = 3
 class Source:
     """What was opened.
 
-    Attributes:
-        resolved: the job.
-        name: of the file or run folder, with the number of a study's run; empty for an instrument of the library.
-        about: what it is, in a few words.
-        notes: in what the page differs from what was opened, sentences.
-        study: whose base, or run, it is; None for others.
-        factors: those of the study that are numbers.
-        scalars: factor -> its value in the run of the study that was opened; None for its base.
-        own_noise: that run has a seed of its own, which is the job's then.
+    Attributes
+    ----------
+    resolved : ResolvedJob
+        The job.
+    name : str
+        Of the file or run folder, with the number of a study's run; empty for an instrument of the library.
+    about : str
+        What it is, in a few words.
+    notes : tuple[str, ...]
+        In what the page differs from what was opened, sentences.
+    study : StudySetup | None
+        Whose base, or run, it is; None for others.
+    factors : tuple[FactorKnob, ...]
+        Those of the study that are numbers.
+    scalars : Mapping[str, Any] | None
+        Factor -> its value in the run of the study that was opened; None for its base.
+    own_noise : bool
+        That run has a seed of its own, which is the job's then.
     """
 
     resolved: ResolvedJob
@@ -65,11 +74,15 @@ class Source:
     def with_factors(self, values: Mapping[str, float]) -> ResolvedJob:
         """The job with other values of factors, as a run of the study has it, values that follow them included.
 
-        Args:
-            values: factor -> number in its unit; others keep those of the base, or of the run that was opened.
+        Parameters
+        ----------
+        values : Mapping[str, float]
+            Factor -> number in its unit; others keep those of the base, or of the run that was opened.
 
-        Raises:
-            InputError: no such factor, or a value that cannot be.
+        Raises
+        ------
+        InputError
+            No such factor, or a value that cannot be.
         """
         if self.study is None or not values:
             return self.resolved
@@ -85,13 +98,18 @@ class Source:
 def read_source(what: str, run: int | None = None) -> Source:
     """Read what the live twin is opened with.
 
-    Args:
-        what: name of an instrument or a camera in the library, or path of such a file, of a job, of a measurement, of a
-            study, of a run folder or of its config.yaml.
-        run: number of one of a study's runs, from 0; None for its base.
+    Parameters
+    ----------
+    what : str
+        Name of an instrument or a camera in the library, or path of such a file, of a job, of a measurement, of a
+        study, of a run folder or of its config.yaml.
+    run : int | None
+        Number of one of a study's runs, from 0; None for its base.
 
-    Raises:
-        InputError: it cannot be read, is not valid, or is nothing that can be opened.
+    Raises
+    ------
+    InputError
+        It cannot be read, is not valid, or is nothing that can be opened.
     """
     if what in (*library_names(INSTRUMENTS), *library_names(CAMERAS)):
         _no_runs(what, run)
@@ -132,10 +150,14 @@ def _no_config(folder: Path, manifest: Manifest | None) -> Issue:
 def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> Source:
     """From a file; a run's config.yaml is told by what it holds.
 
-    Args:
-        file: to be read.
-        run: of a study.
-        manifest: of the run folder that the file is the config.yaml of; None for any other file.
+    Parameters
+    ----------
+    file : Path
+        To be read.
+    run : int | None
+        Of a study.
+    manifest : Manifest | None
+        Of the run folder that the file is the config.yaml of; None for any other file.
     """
     data = read_yaml(file).data
     kind = kind_of(data)
@@ -221,8 +243,10 @@ def _of_orbit(file: Path) -> Source:
 def _with_motions(setup: MonitorSetup) -> ResolvedJob:
     """The job of a monitored orbit with the mounts' motions at each of its times, which its file gives as functions.
 
-    Raises:
-        InputError: a body turns about another pivot than under ``perturb``.
+    Raises
+    ------
+    InputError
+        a body turns about another pivot than under ``perturb``.
     """
     resolved, test = setup.resolved, setup.test
     if not test.motion:

@@ -32,19 +32,31 @@ from twin.uncertainty.monitor_limits import short_text, unseen_texts
 class MonitorReading:
     """One state's reading.
 
-    Attributes:
-        channels: camera and name of the channel of every spot, in the order of the spots.
-        cameras: what is calibrated of each.
-        ground: how a pair of known altitude sees the ground, else None.
-        disturbances: what is stated to move, None for nothing.
-        recovery: what the images say (one state).
-        crosstalk: camera -> response to elementary motions, by which a contradiction is explained; empty where no
-            instrument is modelled.
-        frames: of each spot after.
-        centroid: by which method the spots were found.
-        found_wrong: why sigma does not hold, as far as it was found before the spots were read.
-        truth: of the state, where it is simulated.
-        together: number of measurements, of which this is one, that have one false-alarm rate together.
+    Attributes
+    ----------
+    channels : tuple[tuple[str, str], ...]
+        Camera and name of the channel of every spot, in the order of the spots.
+    cameras : Mapping[str, CameraCalibration]
+        What is calibrated of each.
+    ground : GroundGeometry | None
+        How a pair of known altitude sees the ground, else None.
+    disturbances : Disturbances | None
+        What is stated to move, None for nothing.
+    recovery : Recovery
+        What the images say (one state).
+    crosstalk : Mapping[str, CameraCrosstalk]
+        Camera -> response to elementary motions, by which a contradiction is explained; empty where no instrument is
+        modelled.
+    frames : int
+        Of each spot after.
+    centroid : str
+        By which method the spots were found.
+    found_wrong : tuple[str, ...]
+        Why sigma does not hold, as far as it was found before the spots were read.
+    truth : Truth | None
+        Of the state, where it is simulated.
+    together : int
+        Number of measurements, of which this is one, that have one false-alarm rate together.
     """
 
     channels: tuple[tuple[str, str], ...]
@@ -171,8 +183,10 @@ class MonitorReading:
     def any_motions(self, stated: Disturbances) -> dict[str, np.ndarray]:
         """Body -> what its motions do to all spots, px per table unit, stated or not.
 
-        Args:
-            stated: for how many spots.
+        Parameters
+        ----------
+        stated : Disturbances
+            For how many spots.
         """
         columns: dict[tuple[str, str, int], np.ndarray] = {}
         for name, table in self.crosstalk.items():
@@ -188,9 +202,12 @@ class MonitorReading:
         """The state of a series whose shifts agree least with the prior, and its consistency. The limit is that of the
         largest value of all times, at the same false-alarm rate. None without a prior.
 
-        Args:
-            shifts: (T, 2 C) px.
-            covariance: (T, 2 C, 2 C) px^2 of these.
+        Parameters
+        ----------
+        shifts : np.ndarray
+            (T, 2 C) px.
+        covariance : np.ndarray
+            (T, 2 C, 2 C) px^2 of these.
         """
         stated, false_alarm = self.disturbances, FALSE_ALARM / len(shifts)
         if stated is None:
@@ -263,11 +280,16 @@ def contradicted(
 ) -> tuple[str, ...]:
     """A warning if the shifts of one measurement contradict the prior.
 
-    Args:
-        stated: what is stated to move, None for nothing.
-        found: whether its shifts agree with that.
-        when: which measurement it is, where there are several.
-        rate: of false alarms.
+    Parameters
+    ----------
+    stated : Disturbances | None
+        What is stated to move, None for nothing.
+    found : Consistency | None
+        Whether its shifts agree with that.
+    when : str
+        Which measurement it is, where there are several.
+    rate : str
+        Of false alarms.
     """
     if stated is None or found is None or found.agrees:
         return ()
@@ -305,9 +327,12 @@ def _fits(what: str, fits: FitStates) -> Iterator[SelfCheck]:
 def stated_check(name: str, told: Consistency) -> SelfCheck:
     """Whether shifts agree with what is stated to move.
 
-    Args:
-        name: of the check.
-        told: how they do.
+    Parameters
+    ----------
+    name : str
+        Of the check.
+    told : Consistency
+        How they do.
     """
     says = f"chi-square of {told.degrees} degrees; false-alarm rate {told.false_alarm:.2g}; a warning beyond it"
     return SelfCheck(name, told.chi_square, told.limit, "", says)
@@ -316,8 +341,10 @@ def stated_check(name: str, told: Consistency) -> SelfCheck:
 def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
     """The worst check of each name among several readings.
 
-    Args:
-        readings: of states or times.
+    Parameters
+    ----------
+    readings : Iterable[MonitorReading]
+        Of states or times.
     """
     out: dict[str, SelfCheck] = {}
     for check in (check for reading in readings for check in reading.checks):
@@ -356,9 +383,11 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
 
     What comes after says nothing, and it depends on the processor: on the order in which its linear algebra sums.
 
-    Args:
-        readings: nested; the sigma of ``x`` is ``x_sigma_noise`` or ``x_sigma`` beside it, the first that is
-            there. Other numbers stay as they are.
+    Parameters
+    ----------
+    readings : Mapping[str, Any]
+        Nested; the sigma of ``x`` is ``x_sigma_noise`` or ``x_sigma`` beside it, the first that is there. Other numbers
+        stay as they are.
     """
     out: dict[str, Any] = {}
     for key, value in readings.items():

@@ -41,15 +41,23 @@ _ALONG = dict(zip(DIRECTIONS, ("along line", "along track"), strict=True))
 def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed: int | None, picture: bool) -> Result:
     """Compute a job and write its run folder.
 
-    Args:
-        resolved: the job with all it refers to.
-        session: the command at work.
-        frames: of each state, None for as many as the job says.
-        seed: of all noise, None for the job's.
-        picture: also render pictures of the instrument.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job with all it refers to.
+    session : Session
+        The command at work.
+    frames : int | None
+        Of each state, None for as many as the job says.
+    seed : int | None
+        Of all noise, None for the job's.
+    picture : bool
+        Also render pictures of the instrument.
 
-    Raises:
-        InputError: the job cannot be: its perturbation, its targets.
+    Raises
+    ------
+    InputError
+        The job cannot be: its perturbation, its targets.
     """
     # a second thread of linear algebra would wait for a core that the second process has
     with SecondProcess(load_drawing) as beside, one_blas_thread():

@@ -38,9 +38,12 @@ def irradiance_file(run: RenderRun) -> bytes:
 def write_results(run: JobRun, folder: RunFolder) -> None:
     """Write everything that a run computed except irradiance.nc.
 
-    Args:
-        run: what to write.
-        folder: an open run folder.
+    Parameters
+    ----------
+    run : JobRun
+        What to write.
+    folder : RunFolder
+        An open run folder.
     """
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     folder.write_text("config.yaml", config_text(run.resolved))
@@ -274,9 +277,12 @@ def table_numbers(run: JobRun) -> dict[str, dict[str, Any]]:
 def deformation_warnings(faces: Mapping[str, NodalDeformation], planes: Collection[str] = ()) -> tuple[str, ...]:
     """What the user should know of the meshes.
 
-    Args:
-        faces: body -> what its table is.
-        planes: of these, faces of glass in a run with stray light, which takes them as planes.
+    Parameters
+    ----------
+    faces : Mapping[str, NodalDeformation]
+        Body -> what its table is.
+    planes : Collection[str]
+        Of these, faces of glass in a run with stray light, which takes them as planes.
     """
     bent = {path: 1e9 * faces[path].rms(faces[path].change) for path in planes}
     out = [

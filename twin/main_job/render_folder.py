@@ -55,13 +55,20 @@ from twin.pictures.scene_file import viewer_markup, viewer_programs, viewer_scri
 def write_run(run: JobRun, session: Session, picture: bool = False, beside: SecondProcess | None = None) -> str:
     """Write all files of a run: its data, then what they look like.
 
-    Args:
-        run: what was computed.
-        session: with the open run folder.
-        picture: also render pictures of the instrument.
-        beside: the process that helps with the drawing; None for one that begins now.
+    Parameters
+    ----------
+    run : JobRun
+        What was computed.
+    session : Session
+        With the open run folder.
+    picture : bool
+        Also render pictures of the instrument.
+    beside : SecondProcess | None
+        The process that helps with the drawing; None for one that begins now.
 
-    Returns:
+    Returns
+    -------
+    str
         What could not be drawn and why, empty where all was.
     """
     if beside is None:
@@ -131,12 +138,18 @@ def render_report(
 ) -> str:
     """The page as text.
 
-    Args:
-        run: the run.
-        sections: beside the report's own.
-        scene: contents of scene.glb, for the view that can be turned; None leaves it out.
-        pictures: files in PICTURES that were rendered.
-        drawn: name -> <svg> element of every figure of ``twin.main_job.render_folder``; None draws them.
+    Parameters
+    ----------
+    run : JobRun
+        The run.
+    sections : Sequence[Section]
+        Beside the report's own.
+    scene : bytes | None
+        Contents of scene.glb, for the view that can be turned; None leaves it out.
+    pictures : Sequence[Path]
+        Files in PICTURES that were rendered.
+    drawn : Mapping[str, Any] | None
+        Name -> <svg> element of every figure of ``twin.main_job.render_folder``; None draws them.
     """
     experiment, backend = run.experiment, run.experiment.backend.name
     if drawn is None:
@@ -246,11 +259,16 @@ FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"
 def begin_drawing(beside: SecondProcess, instrument: Instrument, backend: Backend, state: State) -> None:
     """Let the second process draw what is known before anything is measured, if it does not so already.
 
-    Args:
-        beside: the process.
-        instrument: of the run.
-        backend: where to trace its light.
-        state: that is shown.
+    Parameters
+    ----------
+    beside : SecondProcess
+        The process.
+    instrument : Instrument
+        Of the run.
+    backend : Backend
+        Where to trace its light.
+    state : State
+        That is shown.
     """
     if SCENE not in beside:
         beside.start(instrument_drawings(instrument, backend, state), LOADED)

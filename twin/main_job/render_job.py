@@ -88,20 +88,30 @@ def render_job(
     Of an instrument with a monitor the result is a `RenderRun`; one without is perturbed and traced, and its cameras'
     images are looked at.
 
-    Args:
-        resolved: the job.
-        backend: where to trace.
-        frames: per state; overrides the job's.
-        seed: of all noise; overrides the job's.
-        advance: told of each of STAGES and of QUALITY when it begins and ends, and of the long parts COURSE, STRAY and
-            TARGETS how many of how many times, paths or places are done.
-        experiment: the job's instrument where it has been built already; results are the same.
-        placed: told of a monitored instrument and of the state that is shown before the rest is computed, for who draws
-            it meanwhile.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job.
+    backend : Backend
+        Where to trace.
+    frames : int | None
+        Per state; overrides the job's.
+    seed : int | None
+        Of all noise; overrides the job's.
+    advance : Advance
+        Told of each of STAGES and of QUALITY when it begins and ends, and of the long parts COURSE, STRAY and TARGETS
+        how many of how many times, paths or places are done.
+    experiment : MonitorExperiment | None
+        The job's instrument where it has been built already; results are the same.
+    placed : Callable[[Instrument, Backend, State], object] | None
+        Told of a monitored instrument and of the state that is shown before the rest is computed, for who draws it
+        meanwhile.
 
-    Raises:
-        InputError: an unknown node, more memory than there is, or a perturbation so large that light misses the mirrors
-            or a spot its CCD.
+    Raises
+    ------
+    InputError
+        An unknown node, more memory than there is, or a perturbation so large that light misses the mirrors or a spot
+        its CCD.
     """
     count = resolved.frames if frames is None else frames
     number = resolved.job.render.seed if seed is None else seed
@@ -200,11 +210,15 @@ def render_job(
 def require_one_state(resolved: ResolvedJob) -> None:
     """Refuse what only a monitor gives in a job of an instrument without one.
 
-    Args:
-        resolved: the job.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job.
 
-    Raises:
-        InputError: a course, stray light or disturbances.
+    Raises
+    ------
+    InputError
+        a course, stray light or disturbances.
     """
     job = resolved.job
     for asked, key, what in (
@@ -228,8 +242,10 @@ def _without_monitor(
 ) -> JobRun:
     """The job of an instrument without a monitor: its state, the truth about it, and the cameras' images.
 
-    Raises:
-        InputError: as `render_job`; or the job asks for what only a monitor gives.
+    Raises
+    ------
+    InputError
+        As `render_job`; or the job asks for what only a monitor gives.
     """
     require_one_state(resolved)
     job = resolved.job
@@ -269,8 +285,10 @@ def _images(
 ) -> tuple[TargetRun | None, ImageQuality | None]:
     """Targets and image quality of the cameras, where the job asks for them.
 
-    Raises:
-        InputError: the light of the targets is lost.
+    Raises
+    ------
+    InputError
+        The light of the targets is lost.
     """
     render = resolved.job.render
     instrument, backend, targets = experiment.instrument, experiment.backend, None
@@ -321,8 +339,10 @@ def _stray(
 ) -> StrayPair:
     """Stray light before and after the perturbation.
 
-    Raises:
-        InputError: no light comes back to a CCD, or a table of a finish is not one for this instrument.
+    Raises
+    ------
+    InputError
+        No light comes back to a CCD, or a table of a finish is not one for this instrument.
     """
     assert resolved.job.render.stray is not None
     paths = resolved.job.render.stray.paths

@@ -55,15 +55,24 @@ class StrayPair:
 class JobRun:
     """What a job does to an instrument, whether it has a monitor or not.
 
-    Attributes:
-        resolved: the job with everything it names.
-        experiment: the instrument, with the calibration of its monitor if it has one.
-        state: what was perturbed.
-        frames, seed: of the exposures.
-        truth: by exact tracing.
-        warnings: what the user should know.
-        targets: test targets on the line CCDs, None if not asked for.
-        quality: image quality of the nominal and of the perturbed state, None if not asked for.
+    Attributes
+    ----------
+    resolved : ResolvedJob
+        The job with everything it names.
+    experiment : MonitorExperiment
+        The instrument, with the calibration of its monitor if it has one.
+    state : State
+        What was perturbed.
+    frames, seed : int
+        Of the exposures.
+    truth : Truth
+        By exact tracing.
+    warnings : tuple[str, ...]
+        What the user should know.
+    targets : TargetRun | None
+        Test targets on the line CCDs, None if not asked for.
+    quality : ImageQuality | None
+        Image quality of the nominal and of the perturbed state, None if not asked for.
     """
 
     resolved: ResolvedJob
@@ -128,13 +137,20 @@ class JobRun:
 class RenderRun(JobRun):
     """One job's outcome, of an instrument with a monitor: also what its spots say.
 
-    Attributes:
-        photons_before, photons_after: expected photons per pixel and frame, (C, rows, columns), stray light included.
-        before, after: grey values, uint16 (C, frames, rows, columns).
-        recovery: what the images say (one state).
-        crosstalk: camera -> response to elementary motions.
-        series: all times of the job's course, None if it has none; the rest is then about the time it shows.
-        stray: ghosts and stray light, None if not asked for.
+    Attributes
+    ----------
+    photons_before, photons_after : np.ndarray
+        Expected photons per pixel and frame, (C, rows, columns), stray light included.
+    before, after : np.ndarray
+        Grey values, uint16 (C, frames, rows, columns).
+    recovery : Recovery
+        What the images say (one state).
+    crosstalk : Mapping[str, CameraCrosstalk]
+        Camera -> response to elementary motions.
+    series : TimeSeries | None
+        All times of the job's course, None if it has none; the rest is then about the time it shows.
+    stray : StrayPair | None
+        Ghosts and stray light, None if not asked for.
     """
 
     photons_before: np.ndarray

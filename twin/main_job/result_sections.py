@@ -225,10 +225,14 @@ def _worst(run: RenderRun, series: TimeSeries) -> str:
 def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> tuple[Section, ...]:
     """Figures of a course, and its one time that the other sections show.
 
-    Args:
-        run: with a course.
-        drawn: name -> <svg> element of its figures.
-        shown: table of that time.
+    Parameters
+    ----------
+    run : RenderRun
+        With a course.
+    drawn : Mapping[str, str]
+        Name -> <svg> element of its figures.
+    shown : Table
+        Table of that time.
     """
     series = run.series
     assert series is not None

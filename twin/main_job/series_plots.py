@@ -31,8 +31,10 @@ UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.
 def time_unit(times: np.ndarray) -> tuple[float, str]:
     """A unit that suits a course's length, in seconds, and its name.
 
-    Args:
-        times: of the course, seconds, in order.
+    Parameters
+    ----------
+    times : np.ndarray
+        Of the course, seconds, in order.
     """
     span = float(times[-1] - times[0])
     return next((size, unit) for least, size, unit in UNITS if span >= least)
@@ -91,9 +93,12 @@ def temperatures_svg(series: TimeSeries) -> str:
 def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
     """True parameters as lines, recovered ones as marks, camera by camera, and the angle between two cameras.
 
-    Args:
-        series: the course.
-        names: estimator -> its name for readers.
+    Parameters
+    ----------
+    series : TimeSeries
+        The course.
+    names : dict[str, str]
+        Estimator -> its name for readers.
     """
     time, _ = _time_axis(series)
     return _changes_svg(series, "course", 1.5, lambda axes, same: _panel(axes, series, time, same, names))
@@ -103,8 +108,10 @@ def smoothed_svg(series: TimeSeries) -> str:
     """Errors of the smoothed changes with their total sigma, at the times of the course and between them: the band
     closes at each measurement and opens between two. Errors are known at the times of the course.
 
-    Args:
-        series: with smoothed changes.
+    Parameters
+    ----------
+    series : TimeSeries
+        With smoothed changes.
     """
     together = series.smoothed
     assert together is not None

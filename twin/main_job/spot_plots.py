@@ -153,8 +153,10 @@ _MARKS = (
 def marks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     """Estimator -> marker and colour: told apart by shape as well as by colour, while there are at most eight.
 
-    Args:
-        names: of the estimators in a figure; each has its mark whatever others are there.
+    Parameters
+    ----------
+    names : Iterable[str]
+        Of the estimators in a figure; each has its mark whatever others are there.
     """
     every = dict(zip(ESTIMATORS, cycle(_MARKS), strict=False))
     return {name: every[name] for name in names}

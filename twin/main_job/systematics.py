@@ -42,12 +42,17 @@ HEAT = "temperatures (expansion, bending, change of index)"
 class Systematics:
     """What the crosstalk tables make of a run's motions, for one camera.
 
-    Attributes:
-        bias: estimator -> (P,) reading minus truth, to first order, of every reading of the camera, in its unit.
-        outside: motions of this camera outside the family, as text with amounts.
-        parts: motion, as text with its amount -> its share of the judged estimator's bias, (P,); also motions of other
-            cameras where that estimator takes all spots together.
-        uncovered: what was moved but is in no row of the table.
+    Attributes
+    ----------
+    bias : dict[str, np.ndarray]
+        Estimator -> (P,) reading minus truth, to first order, of every reading of the camera, in its unit.
+    outside : tuple[str, ...]
+        Motions of this camera outside the family, as text with amounts.
+    parts : dict[str, np.ndarray]
+        Motion, as text with its amount -> its share of the judged estimator's bias, (P,); also motions of other cameras
+        where that estimator takes all spots together.
+    uncovered : tuple[str, ...]
+        What was moved but is in no row of the table.
     """
 
     bias: dict[str, np.ndarray]
@@ -163,8 +168,10 @@ def perturbed_unseen(run: RenderRun) -> tuple[str, ...]:
     """A warning for each perturbed body by which readings are wrong while the spots do not show it: what the
     perturbation of that body alone does to spots and cameras, traced, against what would be read of it.
 
-    Args:
-        run: of a state, or of the time of a course that is shown.
+    Parameters
+    ----------
+    run : RenderRun
+        Of a state, or of the time of a course that is shown.
     """
     job, noise = run.resolved.job, run.recovery.shift_covariance[0]
     shown = None if run.series is None else run.series.shown
@@ -263,9 +270,12 @@ def doubted(run: RenderRun) -> tuple[str, ...]:
 def course_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
     """Whether all measurements of a course agree with what is stated to move, and how it goes on in time; sentences.
 
-    Args:
-        together: the course.
-        times: of its measurements, seconds.
+    Parameters
+    ----------
+    together : SmoothedCourse
+        The course.
+    times : np.ndarray
+        Of its measurements, seconds.
     """
     return " ".join((_series_agrees(together, times), *_jumps_told(together)))
 
@@ -301,10 +311,14 @@ def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
 def combination(reading: MonitorReading, group: str, key: str) -> np.ndarray:
     """(4 x cameras,) what a change is made of: its unit per SI of all cameras' parameters, to first order.
 
-    Args:
-        reading: of the instrument.
-        group: whose change: a camera, or the group of what two read together.
-        key: of the change.
+    Parameters
+    ----------
+    reading : MonitorReading
+        Of the instrument.
+    group : str
+        Whose change: a camera, or the group of what two read together.
+    key : str
+        Of the change.
     """
     found = quantities(reading.cameras, reading.ground)
     return next(quantity.row for quantity in found if (quantity.group, quantity.key) == (group, key))
@@ -313,9 +327,12 @@ def combination(reading: MonitorReading, group: str, key: str) -> np.ndarray:
 def limits(reading: MonitorReading, one: Reading) -> tuple[str, float]:
     """What leaves most of the variance of a change's error, and its share: a body without the base, or NOISE.
 
-    Args:
-        reading: of the instrument, under stated disturbances.
-        one: the change, as the judged estimator reads it.
+    Parameters
+    ----------
+    reading : MonitorReading
+        Of the instrument, under stated disturbances.
+    one : Reading
+        The change, as the judged estimator reads it.
     """
     stated = reading.disturbances
     assert stated is not None

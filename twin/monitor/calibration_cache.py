@@ -100,11 +100,15 @@ def recomputed() -> Iterator[None]:
 class CacheEntry:
     """One entry of the cache.
 
-    Attributes:
-        key: its name, 64 hexadecimal digits; None for what is not kept.
-        backend: of the computation; the entry refers to it.
-        specs: specifications that the content refers to. An entry holds none: their error messages name the file that
-            they were read from, which is another for every reader.
+    Attributes
+    ----------
+    key : str | None
+        Its name, 64 hexadecimal digits; None for what is not kept.
+    backend : Backend
+        Of the computation; the entry refers to it.
+    specs : tuple[Spec, ...]
+        Specifications that the content refers to. An entry holds none: their error messages name the file that they
+        were read from, which is another for every reader.
     """
 
     key: str | None
@@ -115,10 +119,14 @@ class CacheEntry:
     def of(cls, backend: Backend, specs: Sequence[Spec], *inputs: Any) -> CacheEntry:
         """Return the entry of a computation.
 
-        Args:
-            backend: where it runs. Numbers of graphics cards are not kept, since no name of the card is known.
-            specs: specifications that it begins with.
-            inputs: all else that it depends on.
+        Parameters
+        ----------
+        backend : Backend
+            Where it runs. Numbers of graphics cards are not kept, since no name of the card is known.
+        specs : Sequence[Spec]
+            Specifications that it begins with.
+        inputs : Any
+            All else that it depends on.
         """
         registered = SAG_TERMS.data, REFLECTORS.data, NOISE_TERMS.data, dict(GLASSES), dict(MATERIALS)
         key = None if backend.name != "llvm" else _digest(_machine(), backend.name, registered, tuple(specs), inputs)

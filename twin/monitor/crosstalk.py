@@ -30,12 +30,17 @@ PRINTED |= {("paper_joint", k): "Table 1, joint" for k in range(4)}
 class FormulaFactor:
     """A printed formula's reading divided by what it should read, for the motion it was derived for.
 
-    Attributes:
-        formula: where it is printed; estimator, parameter: its names in the results.
-        motion: label of the motion.
-        by_model: reading / change in the paper's own model (thin lens: shift/f, turn, scale * f).
-        by_truth: reading / traced change of the real camera; differs from ``by_model`` by the camera's anamorphism and
-            distortion.
+    Attributes
+    ----------
+    formula : str
+        Where it is printed; estimator, parameter: its names in the results.
+    motion : str
+        Label of the motion.
+    by_model : float
+        Reading / change in the paper's own model (thin lens: shift/f, turn, scale * f).
+    by_truth : float
+        Reading / traced change of the real camera; differs from ``by_model`` by the camera's anamorphism and
+        distortion.
     """
 
     formula: str
@@ -50,14 +55,22 @@ class FormulaFactor:
 class CameraCrosstalk:
     """First-order response of one camera's monitor to M elementary motions, per table unit (arcsec, um, ppm).
 
-    Attributes:
-        motions: the four of the paper's own family first.
-        spot_shift: (2 n, M) px, row and column of one spot after the other.
-        true: (P, M) true change of every reading of a camera, in its unit.
-        readings: estimator -> (P, M), what it says.
-        factors: of the printed formulas.
-        observability: what the spots' coordinates can and cannot separate.
-        channels: names of the camera's channels.
+    Attributes
+    ----------
+    motions : tuple[ElementaryMotion, ...]
+        The four of the paper's own family first.
+    spot_shift : np.ndarray
+        (2 n, M) px, row and column of one spot after the other.
+    true : np.ndarray
+        (P, M) true change of every reading of a camera, in its unit.
+    readings : Mapping[str, np.ndarray]
+        Estimator -> (P, M), what it says.
+    factors : tuple[FormulaFactor, ...]
+        Of the printed formulas.
+    observability : ObservabilityReport
+        What the spots' coordinates can and cannot separate.
+    channels : tuple[str, ...]
+        Names of the camera's channels.
     """
 
     motions: tuple[ElementaryMotion, ...]
@@ -123,10 +136,14 @@ def estimator_gains(
 ) -> dict[str, np.ndarray]:
     """Estimator -> (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift, to first order.
 
-    Args:
-        cameras: what is calibrated of each.
-        stated: what is stated to move, None for nothing.
-        covariance: (2 x spots, 2 x spots) px^2 of their shifts, which weighs them; None for no noise.
+    Parameters
+    ----------
+    cameras : Mapping[str, CameraCalibration]
+        What is calibrated of each.
+    stated : Disturbances | None
+        What is stated to move, None for nothing.
+    covariance : np.ndarray | None
+        (2 x spots, 2 x spots) px^2 of their shifts, which weighs them; None for no noise.
     """
     spots = sum(len(camera.channels) for camera in cameras.values())
     still = np.zeros((1, spots, 2))
@@ -138,9 +155,12 @@ def estimator_gains(
 def crosstalk(experiment: MonitorExperiment, covariance: np.ndarray) -> dict[str, CameraCrosstalk]:
     """Work out the table for every camera; readings are those of spots without noise, the same for every measurement.
 
-    Args:
-        experiment: the instrument.
-        covariance: (2 C, 2 C) px^2 of the shifts of all spots, by which is told what they can separate.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    covariance : np.ndarray
+        (2 C, 2 C) px^2 of the shifts of all spots, by which is told what they can separate.
     """
     instrument = experiment.instrument
     sets = {name: (*line_family(name), *other_motions(instrument, name)) for name in instrument.cameras}

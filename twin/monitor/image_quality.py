@@ -63,11 +63,14 @@ class PupilMean:
     Polynomials continue the values into the shadows, where they are taken off. They stand for the rays in the dark of
     edges, too, which may pass the rims of lenses far outside.
 
-    Args:
-        nodes: N of the stop.
-        shadows: in B stops; None for free beams.
-        free: which nodes of each stop light comes through, (B, N); None where rays in the dark are as those in the
-            light.
+    Parameters
+    ----------
+    nodes
+        N of the stop.
+    shadows
+        In B stops; None for free beams.
+    free
+        Which nodes of each stop light comes through, (B, N); None where rays in the dark are as those in the light.
     """
 
     def __init__(self, nodes: PupilNodes, shadows: Shadows | None, free: np.ndarray | None = None) -> None:
@@ -153,9 +156,12 @@ AT_ONCE = 40
 class PupilOutline:
     """A pupil as the image sees it, in units of its mean radius; x along the line (Y'), y along the track (X').
 
-    Attributes:
-        axes: from the unit circle to its edge, (2, 2).
-        pieces: of the shadow in it, (K, V, 2).
+    Attributes
+    ----------
+    axes : np.ndarray
+        From the unit circle to its edge, (2, 2).
+    pieces : np.ndarray
+        Of the shadow in it, (K, V, 2).
     """
 
     axes: np.ndarray
@@ -167,17 +173,28 @@ class PupilOutline:
 class CameraQuality:
     """One camera in S states at F fields. NaN where it is not known; ``reasons`` says why.
 
-    Attributes:
-        wfe: rms wavefront error, piston and tilt removed, (S, F), waves.
-        wfe_refocused: the same at each field's own best focus, (S, F), waves.
-        defocus: best focus minus line CCD along its normal, positive downstream (away from the optics), (S, F), metres.
-        mtf_along_line, mtf_along_track: at the Nyquist frequency, (S, F).
-        light_lost: share of the light that bodies in the beam take, (S, F).
-        nyquist: cycles/m.
-        wavelengths: first and last of the light of the MTF, metres.
-        reasons: of every state; empty if all is known.
-        bodies: each body in the beam -> share of the stop's area that it takes by itself, (S, F).
-        pupils: how the pupils and the shadows in them look, state by state and field by field.
+    Attributes
+    ----------
+    wfe : np.ndarray
+        Rms wavefront error, piston and tilt removed, (S, F), waves.
+    wfe_refocused : np.ndarray
+        The same at each field's own best focus, (S, F), waves.
+    defocus : np.ndarray
+        Best focus minus line CCD along its normal, positive downstream (away from the optics), (S, F), metres.
+    mtf_along_line, mtf_along_track : np.ndarray
+        At the Nyquist frequency, (S, F).
+    light_lost : np.ndarray
+        Share of the light that bodies in the beam take, (S, F).
+    nyquist : float
+        cycles/m.
+    wavelengths : tuple[float, float]
+        First and last of the light of the MTF, metres.
+    reasons : tuple[str, ...]
+        Of every state; empty if all is known.
+    bodies : Mapping[str, np.ndarray]
+        Each body in the beam -> share of the stop's area that it takes by itself, (S, F).
+    pupils : tuple[tuple[PupilOutline, ...], ...]
+        How the pupils and the shadows in them look, state by state and field by field.
     """
 
     wfe: np.ndarray
@@ -198,11 +215,16 @@ class CameraQuality:
 class ImageQuality:
     """All cameras.
 
-    Attributes:
-        fields: shares of half the line, (F,).
-        wavelength: of the waves, metres.
-        cameras: by name.
-        obstruction: whether what stands in the beams is missing in the pupils.
+    Attributes
+    ----------
+    fields : tuple[float, ...]
+        Shares of half the line, (F,).
+    wavelength : float
+        Of the waves, metres.
+    cameras : Mapping[str, CameraQuality]
+        By name.
+    obstruction : bool
+        Whether what stands in the beams is missing in the pupils.
     """
 
     fields: tuple[float, ...]
@@ -293,21 +315,33 @@ def image_quality(
 ) -> ImageQuality:
     """Image quality of every camera in every state.
 
-    Args:
-        instrument: with its cameras.
-        backend: where to trace.
-        states: S states, traced together.
-        fields: shares of half the line, +1 at its left end (+Y'), from -1 to 1.
-        wavelength: of the waves in which wavefront errors are told, metres.
-        obstruction: whether the bodies in the beams count.
+    Parameters
+    ----------
+    instrument : Instrument
+        With its cameras.
+    backend : Backend
+        Where to trace.
+    states : Sequence[State]
+        S states, traced together.
+    fields : Sequence[float]
+        Shares of half the line, +1 at its left end (+Y'), from -1 to 1.
+    wavelength : float
+        Of the waves in which wavefront errors are told, metres.
+    obstruction : bool
+        Whether the bodies in the beams count.
 
-    Returns:
+    Returns
+    -------
+    ImageQuality
         Numbers of each state, which do not depend on the others but for rounding. A state whose beam is lost or cut has
         NaN and the reason.
 
-    Raises:
-        ValueError: no field, or one outside of the line.
-        UnphysicalError: a number that cannot be.
+    Raises
+    ------
+    ValueError
+        No field, or one outside of the line.
+    UnphysicalError
+        a number that cannot be.
     """
     if not fields or not np.all(np.abs(fields) <= 1.0):
         raise ValueError(f"fields from -1 to 1 expected, got {list(fields)}")
@@ -346,14 +380,22 @@ _COLUMNS = ("light_lost", "wfe", "wfe_refocused", "defocus", "mtf_along_line", "
 class _Traced:
     """Beams of B images.
 
-    Attributes:
-        rays: at the design wavelength.
-        size: of the line CCD in each, (B,).
-        origin: of its points on the line CCD, (B, 1, 3).
-        shadows: in them; None for free beams.
-        outlines: of edges and bodies on their stops; None for a camera whose surfaces have no edges.
-        free: nodes that no edge and no body takes, (B, N); None likewise.
-        again: the same beams in light of another wavelength, metres.
+    Attributes
+    ----------
+    rays : ImagingRays
+        At the design wavelength.
+    size : np.ndarray
+        Of the line CCD in each, (B,).
+    origin : np.ndarray
+        Of its points on the line CCD, (B, 1, 3).
+    shadows : shadow.Shadows | None
+        In them; None for free beams.
+    outlines : StopOutlines | None
+        Of edges and bodies on their stops; None for a camera whose surfaces have no edges.
+    free : np.ndarray | None
+        Nodes that no edge and no body takes, (B, N); None likewise.
+    again : Callable[[float], ImagingRays]
+        The same beams in light of another wavelength, metres.
     """
 
     rays: ImagingRays
@@ -451,8 +493,10 @@ class _CameraBench:
     def _trace(self, states: list[State]) -> _Traced:
         """Beams to the line CCD, state by state and field by field.
 
-        Raises:
-            AimError, BeamMissedError: the light of some state is lost.
+        Raises
+        ------
+        AimError, BeamMissedError
+            The light of some state is lost.
         """
         assembly, name = self.assembly, self.name
         placed = assembly.place(states)
@@ -588,8 +632,10 @@ class _CameraBench:
     def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: shadow.Shadows | None) -> None:
         """Hold numbers (V, B) of _COLUMNS to what any camera has.
 
-        Raises:
-            UnphysicalError: one cannot be; with the camera and what it is.
+        Raises
+        ------
+        UnphysicalError
+            One cannot be; with the camera and what it is.
         """
         # a beam that something cuts or all but stops is told by its reason, and not by numbers
         told = (dark == 0.0) & (values[0] <= _DARKEST)

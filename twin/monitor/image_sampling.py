@@ -63,11 +63,15 @@ LOST = 0.08
 class ImageChecks:
     """What was found in all images that a path has given so far; an image beyond a limit is never given.
 
-    Attributes:
-        images: number of them.
-        difference: of the two rules at most, of the peak; `WRONG` is the limit.
-        light: too much or too little at most, share of a channel's light beyond what rays and diffraction allow; 0 is
-            the limit.
+    Attributes
+    ----------
+    images : int
+        Number of them.
+    difference : float
+        Of the two rules at most, of the peak; `WRONG` is the limit.
+    light : float
+        Too much or too little at most, share of a channel's light beyond what rays and diffraction allow; 0 is the
+        limit.
     """
 
     images: int = 0
@@ -77,9 +81,12 @@ class ImageChecks:
     def add(self, difference: np.ndarray, light: np.ndarray) -> None:
         """Add the checks of further images.
 
-        Args:
-            difference: (B,) of the two rules.
-            light: (B,) beyond what is allowed, either sign.
+        Parameters
+        ----------
+        difference : np.ndarray
+            (B,) of the two rules.
+        light : np.ndarray
+            (B,) beyond what is allowed, either sign.
         """
         self.images += difference.size
         self.difference = max(self.difference, float(np.max(difference, initial=0.0)))
@@ -105,9 +112,12 @@ class UncertainImageError(BeamMissedError):
 class NodeClasses:
     """Sizes of pupil quadrature, from that of sharp spots near the middle of a CCD to the last that is tried.
 
-    Attributes:
-        phase_per_pixel: from the middle to the edge of the nominal pupil, radians for one pixel.
-        half: of the CCD (rows, columns), pixels.
+    Attributes
+    ----------
+    phase_per_pixel : float
+        From the middle to the edge of the nominal pupil, radians for one pixel.
+    half : tuple[float, float]
+        Of the CCD (rows, columns), pixels.
     """
 
     phase_per_pixel: float
@@ -147,11 +157,16 @@ class NodeClasses:
     ) -> np.ndarray:
         """Number of the first class that is right for all spots of each state, (S,); the number of classes for none.
 
-        Args:
-            place: middle of the spots (C, S, 2), pixels from the CCD's middle.
-            margin: extra pixels rendered on every side of the CCD.
-            blur: of the farthest rays from there, (C, S), pixels.
-            widening: of the beams' apertures against the nominal one, (C, S).
+        Parameters
+        ----------
+        place : np.ndarray
+            Middle of the spots (C, S, 2), pixels from the CCD's middle.
+        margin : int
+            Extra pixels rendered on every side of the CCD.
+        blur : np.ndarray | float
+            Of the farthest rays from there, (C, S), pixels.
+        widening : np.ndarray | float
+            Of the beams' apertures against the nominal one, (C, S).
         """
         half = np.array(self.half)
         wide = np.where(np.asarray(widening) > _WIDER_BEAM, widening, 1.0)
@@ -164,11 +179,16 @@ def disagreement(images: np.ndarray, second: PupilField, x: Grid, y: Grid) -> np
     """Largest difference of images from those of a second rule at their corners, on their peak and beside it, (B,), of
     the peak.
 
-    Args:
-        images: as of ``optics.waves.diffraction.image`` on the grid of columns x and rows y, (B, R, C).
-        second: pupils of the same beams at the nodes of the second rule.
-        x: of the images.
-        y: likewise.
+    Parameters
+    ----------
+    images : np.ndarray
+        As of ``optics.waves.diffraction.image`` on the grid of columns x and rows y, (B, R, C).
+    second : PupilField
+        Pupils of the same beams at the nodes of the second rule.
+    x : Grid
+        Of the images.
+    y : Grid
+        likewise.
     """
     count, rows, columns = images.shape
     top = np.argmax(images.reshape(count, -1), axis=-1)
@@ -190,12 +210,18 @@ def lost_or_gained(
     """How far the light of images lies outside what the traced rays allow, (B,): shares of the channel's light,
     negative for too little.
 
-    Args:
-        light: on the image, share of a channel's, (B,).
-        place: of rays from the middle of the image, (B, N, 2), (row, column) in pixels.
-        share: light of each, 0 for one that is lost, (B, N).
-        half: half sizes of the image (rows, columns), pixels.
-        wings: how far diffraction reaches, pixels, (B,).
+    Parameters
+    ----------
+    light : np.ndarray
+        On the image, share of a channel's, (B,).
+    place : np.ndarray
+        Of rays from the middle of the image, (B, N, 2), (row, column) in pixels.
+    share : np.ndarray
+        Light of each, 0 for one that is lost, (B, N).
+    half : np.ndarray
+        Half sizes of the image (rows, columns), pixels.
+    wings : np.ndarray
+        How far diffraction reaches, pixels, (B,).
     """
     outside = np.max(np.abs(place) - half, axis=-1)
     most = np.sum(share * (outside < wings[:, None]), axis=-1) + LOST

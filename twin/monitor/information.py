@@ -40,11 +40,16 @@ _PARAMETERS = 4
 class Information:
     """What a layout's spots know of its cameras.
 
-    Attributes:
-        disturbances: stated, with their derivatives: D spot coordinates, K cameras.
-        noise: (D, D) px^2 of the shifts, of the images before and after together.
-        quantities: name -> (n, 4 K) rows on all parameters; the quantity's variance is the mean of the rows'.
-        brightest: (C,) expected light of every spot's brightest pixel, as a share of what a pixel can hold.
+    Attributes
+    ----------
+    disturbances : Disturbances
+        Stated, with their derivatives: D spot coordinates, K cameras.
+    noise : np.ndarray
+        (D, D) px^2 of the shifts, of the images before and after together.
+    quantities : Mapping[str, np.ndarray]
+        Name -> (n, 4 K) rows on all parameters; the quantity's variance is the mean of the rows'.
+    brightest : np.ndarray
+        (C,) expected light of every spot's brightest pixel, as a share of what a pixel can hold.
     """
 
     disturbances: Disturbances
@@ -85,9 +90,12 @@ class Information:
     def shares(self, name: str, measured: bool = True) -> dict[str, float]:
         """Variance of a quantity by cause, SI; causes are independent of one another, so that shares add up.
 
-        Args:
-            name: of the quantity.
-            measured: what is left of it, with the noise; else before any measurement.
+        Parameters
+        ----------
+        name : str
+            Of the quantity.
+        measured : bool
+            What is left of it, with the noise; else before any measurement.
         """
         found = self.splits[name]
         shares = Split.by(found.after if measured else found.before, self.disturbances.causes)
@@ -111,18 +119,29 @@ def information_of(
 ) -> list[Information]:
     """What an instrument's spots know, one for each statement of what moves.
 
-    Args:
-        instrument: the instrument.
-        stated: disturbances files.
-        detector: of the area CCDs.
-        backend: where to trace.
-        ground: of a pair; the height is then one of the quantities.
-        alike: spots of one camera and one beam width are taken to have the same noise.
-        single: pictures of the spots in single precision, as all others; in double where they are differentiated.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    stated : Sequence[DisturbancesSpec]
+        Disturbances files.
+    detector : EmvaDetector
+        Of the area CCDs.
+    backend : Backend
+        Where to trace.
+    ground : GroundGeometry | None
+        Of a pair; the height is then one of the quantities.
+    alike : bool
+        Spots of one camera and one beam width are taken to have the same noise.
+    single : bool
+        Pictures of the spots in single precision, as all others; in double where they are differentiated.
 
-    Raises:
-        InputError: the disturbances name a body that the instrument does not have.
-        BeamMissedError, AimError: light does not come to the area CCDs.
+    Raises
+    ------
+    InputError
+        The disturbances name a body that the instrument does not have.
+    BeamMissedError, AimError
+        Light does not come to the area CCDs.
     """
     path, thermal = MonitorPath(instrument, backend), ThermalModel(instrument)
     noise, brightest = spot_noise(path, detector, alike, single)
@@ -161,8 +180,10 @@ def quantity_rows(instrument: Instrument, ground: GroundGeometry | None) -> dict
 def ground_of(instrument: Instrument) -> GroundGeometry | None:
     """How a pair of known altitude sees the ground, by the focal lengths along its lines; None for other instruments.
 
-    Raises:
-        InputError: its rays do not meet on the ground.
+    Raises
+    ------
+    InputError
+        Its rays do not meet on the ground.
     """
     distances = {name: model.line_principal_distance for name, model in instrument.cameras.items()}
     return ground_geometry(instrument, distances)
@@ -175,14 +196,21 @@ def spot_noise(
     no unbiased fit of its image can beat, with the light of its channel and the instrument's number of frames. And the
     share of what a pixel can hold that every spot's brightest one gets, (C,).
 
-    Args:
-        path: the monitor's light.
-        detector: of the area CCDs.
-        alike: spots of one camera and one beam width are taken to have one shape; their light is their own.
-        single: pictures of the spots in single precision.
+    Parameters
+    ----------
+    path : MonitorPath
+        The monitor's light.
+    detector : EmvaDetector
+        Of the area CCDs.
+    alike : bool
+        Spots of one camera and one beam width are taken to have one shape; their light is their own.
+    single : bool
+        Pictures of the spots in single precision.
 
-    Raises:
-        BeamMissedError, AimError: light does not come to the area CCDs.
+    Raises
+    ------
+    BeamMissedError, AimError
+        Light does not come to the area CCDs.
     """
     channels = path.channels
     groups = {(c.camera, c.aperture) if alike else c.key: c for c in reversed(channels)}
@@ -201,13 +229,19 @@ def built_noise(path: MonitorPath, detector: EmvaDetector, states: Sequence[Stat
     """Covariance of all shifts by the noise of images, px^2, (S, D, D), as of ``spot_noise``, of instruments that are
     built as S states say: both images of each are its own.
 
-    Args:
-        path: the monitor's light.
-        detector: of the area CCDs.
-        states: S of them.
+    Parameters
+    ----------
+    path : MonitorPath
+        The monitor's light.
+    detector : EmvaDetector
+        Of the area CCDs.
+    states : Sequence[State]
+        S of them.
 
-    Raises:
-        BeamMissedError, AimError: light does not come to the area CCDs, or no image can be made of it.
+    Raises
+    ------
+    BeamMissedError, AimError
+        Light does not come to the area CCDs, or no image can be made of it.
     """
     found = [_image_bounds(photons, path, detector)[0] for _, photons in path.iterate_photons(states, margin=_SLOPE)]
     return joint(2.0 * np.concatenate(found))

@@ -32,10 +32,14 @@ from twin.monitor.image_sampling import UncertainImageError
 class Aimed:
     """Rays from the pinholes, aimed at the nodes, for C channels x S states (channel-major).
 
-    Attributes:
-        position, direction: world, (C*S, N, 3).
-        axes: transverse axes of the aim parameters, (C*S, 1, 2, 3).
-        parameters: aim parameters (C*S, N, 2); jacobian: d(node)/d(parameters), (C*S, N, 2, 2).
+    Attributes
+    ----------
+    position, direction : np.ndarray
+        World, (C*S, N, 3).
+    axes : np.ndarray
+        Transverse axes of the aim parameters, (C*S, 1, 2, 3).
+    parameters : np.ndarray
+        Aim parameters (C*S, N, 2); jacobian: d(node)/d(parameters), (C*S, N, 2, 2).
     """
 
     position: np.ndarray
@@ -49,14 +53,22 @@ class Aimed:
 class CoarseTrace:
     """What a few rays say of C channels x S states (channel-major).
 
-    Attributes:
-        fan: of the rays from the pinholes.
-        outgoing, back: systems from the pinholes to the return face, and on to the CCDs.
-        uploaded: the latter where they are traced.
-        turn: change of the aim parameters against the nominal instrument, Zernike terms on the face, (2, C*S, T).
-        place: middle of the spots, (row, column) in pixels from the CCD's middle, (C, S, 2).
-        blur: distance of the farthest rays from there, estimated at the aperture's edge, pixels, (C, S).
-        aperture: numerical apertures of the beams, the largest half width, (C, S).
+    Attributes
+    ----------
+    fan : RayFan
+        Of the rays from the pinholes.
+    outgoing, back : SystemBatch
+        Systems from the pinholes to the return face, and on to the CCDs.
+    uploaded : UploadedSystems
+        The latter where they are traced.
+    turn : np.ndarray
+        Change of the aim parameters against the nominal instrument, Zernike terms on the face, (2, C*S, T).
+    place : np.ndarray
+        Middle of the spots, (row, column) in pixels from the CCD's middle, (C, S, 2).
+    blur : np.ndarray
+        Distance of the farthest rays from there, estimated at the aperture's edge, pixels, (C, S).
+    aperture : np.ndarray
+        Numerical apertures of the beams, the largest half width, (C, S).
     """
 
     fan: RayFan
@@ -84,13 +96,18 @@ class CoarseTrace:
 class CcdRays:
     """Rays at the CCDs in each CCD's frame.
 
-    Attributes:
-        position: on the chip, whose pixels grow with it: metres over ``size``, so that pixels have the nominal pitch,
-            (B, N, 3).
-        direction: unit, (B, N, 3).
-        path: optical path, metres, (B, N).
-        valid: (B, N).
-        size: of the CCD relative to nominal, (B,).
+    Attributes
+    ----------
+    position : np.ndarray
+        On the chip, whose pixels grow with it: metres over ``size``, so that pixels have the nominal pitch, (B, N, 3).
+    direction : np.ndarray
+        Unit, (B, N, 3).
+    path : np.ndarray
+        Optical path, metres, (B, N).
+    valid : np.ndarray
+        (B, N).
+    size : np.ndarray
+        Of the CCD relative to nominal, (B,).
     """
 
     position: np.ndarray
@@ -104,9 +121,12 @@ class CcdRays:
 class SpotFocus:
     """Sharpness of the unperturbed instrument's spots, channel by channel.
 
-    Attributes:
-        error: rms wavefront error of the returned beam about its best plane tilt, waves, (C,).
-        defocus: how far the focal plane would have to move along its Z for the sharpest spots, metres, (C,).
+    Attributes
+    ----------
+    error : np.ndarray
+        Rms wavefront error of the returned beam about its best plane tilt, waves, (C,).
+    defocus : np.ndarray
+        How far the focal plane would have to move along its Z for the sharpest spots, metres, (C,).
     """
 
     error: np.ndarray
@@ -141,11 +161,16 @@ _CLOSE_TOLERANCE = 0.01 * AIM_TOLERANCE
 class MonitorBeams:
     """Traces the beams of the monitor channels of one instrument.
 
-    Args:
-        instrument: the instrument.
-        backend: where to trace.
-        nodes: pupil quadrature, for all states.
-        cameras: whose channels; None for all. Numbers of a channel do not depend on which others there are.
+    Parameters
+    ----------
+    instrument
+        The instrument.
+    backend
+        Where to trace.
+    nodes
+        Pupil quadrature, for all states.
+    cameras
+        Whose channels; None for all. Numbers of a channel do not depend on which others there are.
     """
 
     def __init__(
@@ -211,8 +236,10 @@ class MonitorBeams:
     def area_ratio(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Determinant d(u, v)/d(x, y) of maps from the unit disk, given on the nodes, (..., N).
 
-        Raises:
-            UncertainImageError: a map that is too rough for all terms.
+        Raises
+        ------
+        UncertainImageError
+            a map that is too rough for all terms.
         """
         out, rest = _area_ratio(u, v, self._smooth)
         rough = rest > SMOOTH
@@ -262,12 +289,17 @@ class MonitorBeams:
     def coarse_trace(self, states: Sequence[State], placed: PlacedBodies | None = None) -> CoarseTrace:
         """Where the spots of S states fall, and how rays have to be turned to meet the face where they did.
 
-        Args:
-            states: S states.
-            placed: their bodies, when already placed.
+        Parameters
+        ----------
+        states : Sequence[State]
+            S states.
+        placed : PlacedBodies | None
+            Their bodies, when already placed.
 
-        Raises:
-            BeamMissedError, AimError: as ``rays``.
+        Raises
+        ------
+        BeamMissedError, AimError
+            As ``rays``.
         """
         scout, count = self.scout, len(states)
         placed = self.instrument.assembly.place(states) if placed is None else placed
@@ -310,13 +342,17 @@ class MonitorBeams:
     def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
         """Rays at the CCDs for C channels x S states, channel-major.
 
-        Args:
-            states: S states.
-            coarse: what ``coarse_trace`` says of them, if it is known.
+        Parameters
+        ----------
+        states : Sequence[State]
+            S states.
+        coarse : CoarseTrace | None
+            What ``coarse_trace`` says of them, if it is known.
 
-        Raises:
-            BeamMissedError, AimError: a perturbation moves a beam off the mirrors or a spot off its CCD, named in the
-                message.
+        Raises
+        ------
+        BeamMissedError, AimError
+            a perturbation moves a beam off the mirrors or a spot off its CCD, named in the message.
         """
         known = self.coarse_trace(states) if coarse is None else coarse
         start, slope = (np.repeat(a, len(states), axis=0) for a in (self.nominal.parameters, self.nominal.jacobian))
@@ -381,8 +417,10 @@ class MonitorBeams:
     def focus(self) -> SpotFocus:
         """How sharp the unperturbed instrument's spots are.
 
-        Raises:
-            BeamMissedError, AimError: as ``rays``.
+        Raises
+        ------
+        BeamMissedError, AimError
+            As ``rays``.
         """
         rays, weight = self.coarse.rays([{}]), self.coarse.nodes.weight
         paths = eikonal(rays.position, rays.direction, rays.path, np.zeros(3))

@@ -53,7 +53,9 @@ def _size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
 def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tuple[RayTangents, np.ndarray]:
     """Push motions forward through the traced path, about the unperturbed instrument; rays stay on their nodes.
 
-    Returns:
+    Returns
+    -------
+    tuple[RayTangents, np.ndarray]
         Derivatives for C channels x M motions (channel-major), in each CCD's frame, per radian, metre or unit, and
         those of the CCDs' sizes, (C*M,).
 
@@ -101,13 +103,20 @@ def hit_slopes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Exact derivative of where rays meet the last element by the directions in which they start.
 
-    Args:
-        backend: where to trace.
-        systems: B systems that carry no derivative.
-        position: launch points, world, (B, N, 3), metres.
-        direction: unit directions, (B, N, 3).
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    systems : SystemBatch
+        B systems that carry no derivative.
+    position : np.ndarray
+        Launch points, world, (B, N, 3), metres.
+    direction : np.ndarray
+        Unit directions, (B, N, 3).
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray]
         Two unit vectors square to each direction, (B, N, 2, 3), and d(hit x, y)/d(turn toward each), (B, N, 2, 2),
         metres per radian.
     """
@@ -122,11 +131,16 @@ def spot_jacobian(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> np
 
     The position is the mean of the rays over the aperture, which is the energy centroid of the diffraction image.
 
-    Args:
-        path: the monitor.
-        motions: M elementary motions.
+    Parameters
+    ----------
+    path : MonitorBeams
+        The monitor.
+    motions : Sequence[ElementaryMotion]
+        M elementary motions.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (C, 2, M): row and column, pixels per radian, metre or unit.
     """
     tangents, sizes = ray_tangents(path.coarse, motions)
@@ -146,19 +160,29 @@ def spot_gradient(
 ) -> np.ndarray:
     """Derivative of every spot's position by elementary motions, as ``twin.monitor.monitor_derivative.spot_jacobian``.
 
-    Args:
-        path: the monitor; all of its nodes are traced (``path.coarse`` is enough for the mean of a smooth spot).
-        motions: M elementary motions.
-        about: the state at which to differentiate, by default the unperturbed instrument. A motion is added to the
-            component of that name: the rotation vector's, the shift's, the scale's or the figure's.
-        chunk: rays of all channels together that are traced back at once; bounds the memory.
+    Parameters
+    ----------
+    path : MonitorBeams
+        The monitor; all of its nodes are traced (``path.coarse`` is enough for the mean of a smooth spot).
+    motions : Sequence[ElementaryMotion]
+        M elementary motions.
+    about : State | None
+        The state at which to differentiate, by default the unperturbed instrument. A motion is added to the component
+        of that name: the rotation vector's, the shift's, the scale's or the figure's.
+    chunk : int
+        Rays of all channels together that are traced back at once; bounds the memory.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (C, 2, M): row and column, pixels per radian, metre or unit.
 
-    Raises:
-        ValueError: a motion has another pivot than the state's motion of that body.
-        AimError: in the state ``about`` a beam does not reach its return face.
+    Raises
+    ------
+    ValueError
+        a motion has another pivot than the state's motion of that body.
+    AimError
+        In the state ``about`` a beam does not reach its return face.
     """
     about = {} if about is None else about
     launch, launched = _aimed(path, about)
@@ -290,15 +314,23 @@ def disturbances_of(
     are; temperatures and gradients of indices by central differences of the traced spots, since they reach light by
     many bodies at once, and so are radii, conic constants and indices, which few files state.
 
-    Args:
-        stated: the motions.
-        path: the monitor's light.
-        thermal: of the instrument.
-        instrument: nominal.
-        backend: where to trace.
+    Parameters
+    ----------
+    stated : StatedMotions
+        The motions.
+    path : MonitorPath
+        The monitor's light.
+    thermal : ThermalModel
+        Of the instrument.
+    instrument : Instrument
+        nominal.
+    backend : Backend
+        Where to trace.
 
-    Raises:
-        AimError, BeamMissedError: a step of a temperature loses the light.
+    Raises
+    ------
+    AimError, BeamMissedError
+        a step of a temperature loses the light.
     """
     spots = np.empty((2 * len(path.channels), len(stated.components)))
     parameters = np.empty((4 * len(instrument.cameras), len(stated.components)))
@@ -334,10 +366,14 @@ def _elementary(component: Component) -> ElementaryMotion:
 def single_states(components: Sequence[Component], amounts: np.ndarray, thermal: ThermalModel) -> list[State]:
     """M states, in each of which one component alone has its amount.
 
-    Args:
-        components: M of them.
-        amounts: (M,), SI.
-        thermal: of the instrument.
+    Parameters
+    ----------
+    components : Sequence[Component]
+        M of them.
+    amounts : np.ndarray
+        (M,), SI.
+    thermal : ThermalModel
+        Of the instrument.
     """
     warm = np.array([c.kind in STEPS for c in components], bool)
     heat = [c for c in components if c.kind in STEPS]
@@ -375,18 +411,28 @@ def derivative_changes(
 
     Both are one-sided differences of exact traces with the same steps, so that what is wrong with each cancels.
 
-    Args:
-        stated: the motions, M of them; they act about an instrument that is built otherwise.
-        path: the monitor's light, D spot coordinates.
-        sight: of the K line CCDs.
-        thermal: of the instrument.
-        built: Z states.
+    Parameters
+    ----------
+    stated : StatedMotions
+        The motions, M of them; they act about an instrument that is built otherwise.
+    path : MonitorPath
+        The monitor's light, D spot coordinates.
+    sight : LineSight
+        Of the K line CCDs.
+    thermal : ThermalModel
+        Of the instrument.
+    built : Sequence[State]
+        Z states.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray]
         Of spots, px, (Z, D, M), and of parameters, (Z, 4 K, M), for one standard deviation each.
 
-    Raises:
-        AimError, BeamMissedError: the light of one is lost.
+    Raises
+    ------
+    AimError, BeamMissedError
+        The light of one is lost.
     """
     components = stated.components
     steps = np.array([{**STEPS, **SMALL}[c.kind] for c in components])
@@ -454,13 +500,20 @@ def motion_models(
 ) -> dict[str, MotionModel]:
     """Estimator -> the motions by which it reads: the line families of all cameras, and what is stated to move.
 
-    Args:
-        path: the monitor's light.
-        sight: what the cameras see.
-        cameras: their calibration, in the order of the spots.
-        thermal: of the instrument.
-        stated: what moves, None for nothing.
-        disturbances: the same with its derivatives.
+    Parameters
+    ----------
+    path : MonitorPath
+        The monitor's light.
+    sight : LineSight
+        What the cameras see.
+    cameras : Mapping[str, CameraCalibration]
+        Their calibration, in the order of the spots.
+    thermal : ThermalModel
+        Of the instrument.
+    stated : StatedMotions | None
+        What moves, None for nothing.
+    disturbances : Disturbances | None
+        The same with its derivatives.
     """
     trace = partial(_traced, path, sight)
     out = {"model": _of_families(cameras, trace)}
@@ -535,13 +588,19 @@ def _traced(path: MonitorPath, sight: LineSight, states: Sequence[State]) -> Ret
 def traced_states(path: MonitorPath, sight: LineSight, states: Sequence[State]) -> Retraced:
     """Means of the rays on the area CCDs against those at rest, and what the line CCDs see.
 
-    Args:
-        path: the monitor's light.
-        sight: what the cameras see.
-        states: S states.
+    Parameters
+    ----------
+    path : MonitorPath
+        The monitor's light.
+    sight : LineSight
+        What the cameras see.
+    states : Sequence[State]
+        S states.
 
-    Raises:
-        AimError, BeamMissedError: light of one of them is lost.
+    Raises
+    ------
+    AimError, BeamMissedError
+        Light of one of them is lost.
     """
     placed = path.instrument.assembly.place(states)
     shifts = np.moveaxis(path.coarse_trace(states, placed).place - path.place_at_rest, 1, 0).reshape(len(states), -1)

@@ -77,14 +77,20 @@ class MonitorExperiment:
     Of an instrument without a monitor there are states, their truth and the cameras' images; whatever is about spots
     raises InputError.
 
-    Args:
-        resolved: the job with everything it names; its perturbation is not used here.
-        backend: where to trace.
-        free_beams: as of ``build_instrument``.
+    Parameters
+    ----------
+    resolved
+        The job with everything it names; its perturbation is not used here.
+    backend
+        Where to trace.
+    free_beams
+        As of ``build_instrument``.
 
-    Raises:
-        InputError: a part that cannot be where it is, area CCDs that do not sample the spots, or whose images need more
-            memory than there is.
+    Raises
+    ------
+    InputError
+        a part that cannot be where it is, area CCDs that do not sample the spots, or whose images need more memory than
+        there is.
     """
 
     def __init__(self, resolved: ResolvedJob, backend: Backend, free_beams: bool = True) -> None:
@@ -147,8 +153,10 @@ class MonitorExperiment:
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
         """Experiment on the same instrument, with everything computed for it, under the prior of another job.
 
-        Args:
-            resolved: the job; its instrument, cameras and detector must be this one's.
+        Parameters
+        ----------
+        resolved : ResolvedJob
+            The job; its instrument, cameras and detector must be this one's.
         """
         other = copy(self)
         other.resolved = resolved
@@ -159,8 +167,10 @@ class MonitorExperiment:
     def with_instrument(self, instrument: Instrument) -> MonitorExperiment:
         """Return an experiment on another instrument with the same detectors, of which nothing is calibrated yet.
 
-        Args:
-            instrument: may differ from what the job's files describe, so its calibration is not kept on disk.
+        Parameters
+        ----------
+        instrument : Instrument
+            May differ from what the job's files describe, so its calibration is not kept on disk.
         """
         other = copy(self)
         for name in (*_CALIBRATED, "stated", "disturbances", "motion_models", "thermal"):
@@ -186,36 +196,47 @@ class MonitorExperiment:
     def state(self, job: JobSpec, progress: Callable[[str], None] = lambda path: None) -> State:
         """The perturbed state that a job describes.
 
-        Args:
-            job: its perturbation, checked by ``scenes.specs.job.checked_nodes``.
-            progress: called with the path of each body whose thermo-elastic solution begins.
+        Parameters
+        ----------
+        job : JobSpec
+            Its perturbation, checked by ``scenes.specs.job.checked_nodes``.
+        progress : Callable[[str], None]
+            Called with the path of each body whose thermo-elastic solution begins.
 
-        Raises:
-            InputError: a temperature at or below 0 K, or one at which a glass's index is not known.
+        Raises
+        ------
+        InputError
+            a temperature at or below 0 K, or one at which a glass's index is not known.
         """
         return job_state(job, self.thermal, progress, self.motions(job), self.heated(job))
 
     def motions(self, job: JobSpec, time: int | None = None) -> State:
         """The state that a job describes without its ``fields``: ``motions_of`` on top of its bodies' deformations.
 
-        Raises:
-            InputError: a table of nodes that does not describe its body.
+        Raises
+        ------
+        InputError
+            a table of nodes that does not describe its body.
         """
         return on_deformed(self.instrument, self.deformed(job), motions_of(job, time), self.heated(job))
 
     def fields(self, job: JobSpec, time: int | None = None) -> dict[str, Temperature]:
         """Linear temperatures of a job's bodies, those of its tables added, at time number ``time`` of its course.
 
-        Raises:
-            InputError: a table of temperatures that does not describe its body.
+        Raises
+        ------
+        InputError
+            a table of temperatures that does not describe its body.
         """
         return with_heat(job.fields(time), self.heated(job))
 
     def heated(self, job: JobSpec) -> Mapping[str, HeatedBody]:
         """Body -> what the table of temperatures is that warms it; kept, since many states may have the same.
 
-        Raises:
-            InputError: a table that does not describe its body.
+        Raises
+        ------
+        InputError
+            a table that does not describe its body.
         """
         out = {}
         for path, what in job.perturb.items():
@@ -231,8 +252,10 @@ class MonitorExperiment:
     def deformed(self, job: JobSpec) -> Mapping[str, NodalDeformation]:
         """Body -> what the table of nodes is that deforms it; kept, since many states may have the same.
 
-        Raises:
-            InputError: a table that does not describe its body.
+        Raises
+        ------
+        InputError
+            a table that does not describe its body.
         """
         out = {}
         for path, what in job.perturb.items():
@@ -253,8 +276,10 @@ class MonitorExperiment:
     def nominal_focus(self) -> SpotFocus:
         """Sharpness of the unperturbed instrument's spots.
 
-        Raises:
-            BeamMissedError, AimError: they do not come to their CCDs, or cannot be worked out.
+        Raises
+        ------
+        BeamMissedError, AimError
+            They do not come to their CCDs, or cannot be worked out.
         """
         focus = self.path.focus
         self.nominal_truth  # noqa: B018 - the line's light, too, has to arrive
@@ -317,8 +342,10 @@ class MonitorExperiment:
     def ground(self) -> GroundGeometry | None:
         """How a pair of known altitude sees the ground; None for other instruments.
 
-        Raises:
-            InputError: its rays do not meet on the ground.
+        Raises
+        ------
+        InputError
+            Its rays do not meet on the ground.
         """
         return ground_geometry(self.instrument, self.nominal_truth.principal_distance)
 
@@ -326,8 +353,10 @@ class MonitorExperiment:
     def stated(self) -> StatedMotions | None:
         """What the job states to move, component by component; None for nothing.
 
-        Raises:
-            InputError: a body that the instrument does not have, or that cannot move or be warmed so.
+        Raises
+        ------
+        InputError
+            a body that the instrument does not have, or that cannot move or be warmed so.
         """
         stated = stated_motions(self.resolved, self.instrument)
         if stated is not None:
@@ -397,10 +426,14 @@ class MonitorExperiment:
     def frames_before(self, frames: int, seed: int | Sequence[int], stray: np.ndarray | float = 0.0) -> np.ndarray:
         """Frames of the nominal state with the given stray photons, uint16 (C, frames, rows, columns).
 
-        Args:
-            frames: of each CCD.
-            seed: of CCDs and noise. Of several seeds the frames of each, (seeds, C, frames, rows, columns).
-            stray: photons beside those of the spots.
+        Parameters
+        ----------
+        frames : int
+            Of each CCD.
+        seed : int | Sequence[int]
+            Of CCDs and noise. Of several seeds the frames of each, (seeds, C, frames, rows, columns).
+        stray : np.ndarray | float
+            Photons beside those of the spots.
         """
         photons = self.nominal_photons + stray
         if not isinstance(seed, Sequence):
@@ -413,12 +446,17 @@ class MonitorExperiment:
     ) -> np.ndarray:
         """Frames of perturbed states, uint16 (S, C, frames, rows, columns).
 
-        Args:
-            photons: expected photons per pixel and frame, (S, C, rows, columns).
-            frames: per state.
-            seed: as for ``frames_before``, or one for each state; state number first + s draws from a stream of its
-                own, so that the frames of a state do not depend on how a series is cut into pieces.
-            first: number of the first state, or of each, (S,).
+        Parameters
+        ----------
+        photons : np.ndarray
+            Expected photons per pixel and frame, (S, C, rows, columns).
+        frames : int
+            Per state.
+        seed : int | Sequence[int]
+            As for ``frames_before``, or one for each state; state number first + s draws from a stream of its own, so
+            that the frames of a state do not depend on how a series is cut into pieces.
+        first : int | np.ndarray
+            Number of the first state, or of each, (S,).
         """
         numbers = first if isinstance(first, np.ndarray) else first + np.arange(len(photons))
         seeds = seed if isinstance(seed, Sequence) else [seed] * len(photons)

@@ -32,8 +32,10 @@ LARGEST_FRAMES = 200_000_000
 def largest_piece(each: int) -> int:
     """How many states of a series are rendered at once.
 
-    Args:
-        each: pixels of all frames of one.
+    Parameters
+    ----------
+    each : int
+        Pixels of all frames of one.
     """
     return max(1, min(CHUNK, LARGEST_FRAMES // each))
 
@@ -41,9 +43,12 @@ def largest_piece(each: int) -> int:
 def pieces(count: int, each: int) -> Iterator[slice]:
     """States of a series whose frames are worked on at once.
 
-    Args:
-        count: states.
-        each: pixels of all frames of one.
+    Parameters
+    ----------
+    count : int
+        states.
+    each : int
+        Pixels of all frames of one.
     """
     size = largest_piece(each)
     for start in range(0, count, size):
@@ -73,13 +78,20 @@ _OF_STATE = 24.0
 class MonitorSize:
     """Numbers that decide what a monitor takes.
 
-    Attributes:
-        spots: channels of all cameras.
-        rows, columns: of an area CCD.
-        phase: from the middle to the edge of the pupil for one pixel, radians.
-        frames: of each state.
-        times: of a course, 0 for none.
-        pictures: pixels of the frames of all other images.
+    Attributes
+    ----------
+    spots : int
+        Channels of all cameras.
+    rows, columns : int
+        Of an area CCD.
+    phase : float
+        From the middle to the edge of the pupil for one pixel, radians.
+    frames : int
+        Of each state.
+    times : int
+        Of a course, 0 for none.
+    pictures : int
+        Pixels of the frames of all other images.
     """
 
     spots: int
@@ -94,14 +106,21 @@ class MonitorSize:
     def stated(cls, resolved: ResolvedJob, frames: int, times: int = 0, pictures: int = 0) -> MonitorSize:
         """What the files of an instrument say, before it is built.
 
-        Args:
-            resolved: the job.
-            frames: of each state.
-            times: of a course, 0 for none.
-            pictures: pixels of the frames of all other images.
+        Parameters
+        ----------
+        resolved : ResolvedJob
+            The job.
+        frames : int
+            Of each state.
+        times : int
+            Of a course, 0 for none.
+        pictures : int
+            Pixels of the frames of all other images.
 
-        Raises:
-            InputError: the instrument has no monitor.
+        Raises
+        ------
+        InputError
+            The instrument has no monitor.
         """
         monitor, ccd = resolved.instrument.autocollimator, resolved.instrument.autocollimator.area_ccd
         focal_length = min(camera.focal_length for camera in resolved.cameras.values())
@@ -118,8 +137,10 @@ class MonitorSize:
     def parts(self, detector: EmvaDetector) -> Mapping[str, float]:
         """What the CCDs, frames, times and other pictures take, bytes.
 
-        Args:
-            detector: of the area CCDs.
+        Parameters
+        ----------
+        detector : EmvaDetector
+            Of the area CCDs.
         """
         image = self.rows * self.columns
         every, frames = self.spots * image, self.frames
@@ -137,8 +158,10 @@ class MonitorSize:
     def bytes(self, detector: EmvaDetector) -> float:
         """Memory of all parts together, in addition to the imported program.
 
-        Args:
-            detector: of the area CCDs.
+        Parameters
+        ----------
+        detector : EmvaDetector
+            Of the area CCDs.
         """
         parts = self.parts(detector)
         every = self.spots * self.rows * self.columns
@@ -151,13 +174,19 @@ class MonitorSize:
 def require_memory(resolved: ResolvedJob, size: MonitorSize, detector: EmvaDetector) -> None:
     """See whether a job fits into the memory that is free.
 
-    Args:
-        resolved: the job, for what its files say of its numbers.
-        size: of it.
-        detector: of its area CCDs.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job, for what its files say of its numbers.
+    size : MonitorSize
+        Of it.
+    detector : EmvaDetector
+        Of its area CCDs.
 
-    Raises:
-        InputError: it does not; at the key of what takes most, with the number that would fit.
+    Raises
+    ------
+    InputError
+        It does not; at the key of what takes most, with the number that would fit.
     """
     parts = size.parts(detector)
     worst = max(parts, key=lambda name: parts[name])

@@ -45,16 +45,23 @@ one."""
 class MonitorPath(MonitorBeams):
     """Traces and images the monitor channels of one instrument.
 
-    Args:
-        instrument: the instrument.
-        backend: where to trace.
-        nodes: pupil quadrature, then used for all states and not checked; by default one that is right to 1e-6 of the
-            peak for the unperturbed instrument's spots anywhere in the last of ``SPOT_RANGES`` of the CCD, out to the
-            far corner, and for images those of ``class_beams``.
-        cameras: whose channels; None for all. Numbers of a channel do not depend on which others there are.
+    Parameters
+    ----------
+    instrument
+        The instrument.
+    backend
+        Where to trace.
+    nodes
+        Pupil quadrature, then used for all states and not checked; by default one that is right to 1e-6 of the peak for
+        the unperturbed instrument's spots anywhere in the last of ``SPOT_RANGES`` of the CCD, out to the far corner,
+        and for images those of ``class_beams``.
+    cameras
+        Whose channels; None for all. Numbers of a channel do not depend on which others there are.
 
-    Attributes:
-        checked: what the checks of all images found that it has given.
+    Attributes
+    ----------
+    checked
+        What the checks of all images found that it has given.
     """
 
     def __init__(
@@ -83,8 +90,10 @@ class MonitorPath(MonitorBeams):
     def nodes(self) -> PupilNodes:
         """Pupil quadrature of the unperturbed instrument's spots, wherever on their CCDs.
 
-        Raises:
-            BeamMissedError, AimError: as ``rays``; UncertainImageError: no quadrature would do.
+        Raises
+        ------
+        BeamMissedError, AimError
+            As ``rays``; UncertainImageError: no quadrature would do.
         """
         if self._nodes is None:
             self._nodes = self.node_classes.nodes(self._own_class)
@@ -108,9 +117,12 @@ class MonitorPath(MonitorBeams):
     def class_of(self, known: CoarseTrace, margin: int = 0) -> np.ndarray:
         """Number of the class of nodes that is right for all spots of each state, (S,), as far as a few rays can tell.
 
-        Args:
-            known: of the states.
-            margin: extra pixels rendered on every side of the CCD.
+        Parameters
+        ----------
+        known : CoarseTrace
+            Of the states.
+        margin : int
+            Extra pixels rendered on every side of the CCD.
         """
         if not self._sized:
             return np.zeros(known.place.shape[1], np.intp)
@@ -136,8 +148,10 @@ class MonitorPath(MonitorBeams):
         """What pixel and pinhole do to the unperturbed instrument's images; a pinhole is taken to grow with the CCD
         beside it.
 
-        Raises:
-            UnsampledImageError: the pixels are too coarse or the pinhole is too wide for them.
+        Raises
+        ------
+        UnsampledImageError
+            The pixels are too coarse or the pinhole is too wide for them.
         """
         return self._response(0)
 
@@ -152,8 +166,10 @@ class MonitorPath(MonitorBeams):
     def _response_of(self, known: CoarseTrace) -> PixelResponse:
         """What pixel and pinhole do to the images of some states.
 
-        Raises:
-            UncertainImageError: they are too fine for the pixels.
+        Raises
+        ------
+        UncertainImageError
+            They are too fine for the pixels.
         """
         widening = max(float(np.max(known.aperture)) / self.numerical_aperture, 1.0)
         try:
@@ -167,13 +183,20 @@ class MonitorPath(MonitorBeams):
     ) -> np.ndarray:
         """Expected photons per pixel and frame.
 
-        Args:
-            states: S states.
-            margin: extra pixels rendered on every side of the CCD.
-            chunk: states done at once, to bound memory.
-            single: in single precision, see ``optics.waves.diffraction.image``.
+        Parameters
+        ----------
+        states : Sequence[State]
+            S states.
+        margin : int
+            Extra pixels rendered on every side of the CCD.
+        chunk : int
+            States done at once, to bound memory.
+        single : bool
+            In single precision, see ``optics.waves.diffraction.image``.
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             (S, C, rows + 2 margin, columns + 2 margin).
         """
         out = np.empty((len(states), len(self.channels), self.shape[0] + 2 * margin, self.shape[1] + 2 * margin))
@@ -196,13 +219,19 @@ class MonitorPath(MonitorBeams):
 
         The same as ``expected_photons``, to the bit; channels of cameras whose bodies all stay are rendered once.
 
-        Args:
-            state: the state.
-            placed: its bodies, when already placed.
-            single: in single precision, see ``optics.waves.diffraction.image``.
+        Parameters
+        ----------
+        state : State
+            The state.
+        placed : PlacedBodies | None
+            Its bodies, when already placed.
+        single : bool
+            In single precision, see ``optics.waves.diffraction.image``.
 
-        Raises:
-            BeamMissedError, AimError: as ``rays``.
+        Raises
+        ------
+        BeamMissedError, AimError
+            As ``rays``.
         """
         with one_blas_thread():
             placed = self.instrument.assembly.place([state]) if placed is None else placed
@@ -225,9 +254,12 @@ class MonitorPath(MonitorBeams):
     def moved_cameras(self, state: State, placed: PlacedBodies | None = None) -> tuple[str, ...]:
         """Cameras of whose channels' light some body is moved or otherwise changed.
 
-        Args:
-            state: the state.
-            placed: its bodies, when already placed.
+        Parameters
+        ----------
+        state : State
+            The state.
+        placed : PlacedBodies | None
+            Its bodies, when already placed.
         """
         assembly = self.instrument.assembly
         touched = touched_bodies(assembly, [state], assembly.place([state]) if placed is None else placed)
@@ -268,8 +300,10 @@ class MonitorPath(MonitorBeams):
         """Expected photons (S, C, rows + 2 margin, columns + 2 margin), each state with the nodes of its class, and
         these classes, (S,).
 
-        Raises:
-            UncertainImageError: an image is not right whatever the nodes.
+        Raises
+        ------
+        UncertainImageError
+            An image is not right whatever the nodes.
         """
         coarse = self.coarse_trace(states) if coarse is None else coarse
         for channel, place, aperture in zip(self.channels, coarse.place, coarse.aperture, strict=True):
@@ -298,8 +332,10 @@ class MonitorPath(MonitorBeams):
         A larger class where two rules disagree. The last one for a beam that is cut: at its edge each rule has an
         error of its own, and two may agree by chance.
 
-        Raises:
-            UncertainImageError: an image is not right with the most nodes, or its light is not that of its rays.
+        Raises
+        ------
+        UncertainImageError
+            An image is not right with the most nodes, or its light is not that of its rays.
         """
         beams, response = self.class_beams(number), self._response_of(known)
         y, x = (self.grid(axis, margin + response.reach) for axis in (0, 1))

@@ -21,12 +21,18 @@ FIGURE_TERMS = {4: "power", 5: "astigmatism", 6: "astigmatism", 7: "coma", 8: "c
 class ElementaryMotion:
     """One component of the motion of one body.
 
-    Attributes:
-        body: its path.
-        kind: ``rotate``, ``shift``, ``scale`` or ``figure``.
-        axis: 0, 1, 2 of the body's own frame (0 for a scale); the Noll index of a figure term.
-        pivot: point that a rotation or a scale leaves in place.
-        label: short name for tables.
+    Attributes
+    ----------
+    body : str
+        Its path.
+    kind : str
+        ``rotate``, ``shift``, ``scale`` or ``figure``.
+    axis : int
+        0, 1, 2 of the body's own frame (0 for a scale); the Noll index of a figure term.
+    pivot : str
+        Point that a rotation or a scale leaves in place.
+    label : str
+        Short name for tables.
     """
 
     body: str

@@ -39,16 +39,25 @@ before that are measured already; and after, (S, C, frames, rows, columns).
 class Observing:
     """How states are observed.
 
-    Attributes:
-        record: exposes the detectors.
-        centroid: as of ``analysis.monitor.recovery.recover``.
-        chunk: states that are done at once; the last digits of a state depend on which they are.
-        single: render in single precision.
-        leave: told of each state that is lost, by its number, and why: its light does not arrive, or a spot cannot be
-            measured. It is then left out; with None the error is raised.
-        stated: know what the experiment states to move, and trace its motions again; else there is noise alone.
-        keep_parts: of the noise, which are large.
-        frames: of which each recorded image is the mean; None where frames are recorded one by one.
+    Attributes
+    ----------
+    record : Record
+        Exposes the detectors.
+    centroid : str
+        As of ``analysis.monitor.recovery.recover``.
+    chunk : int
+        States that are done at once; the last digits of a state depend on which they are.
+    single : bool
+        Render in single precision.
+    leave : Callable[[int, str], None] | None
+        Told of each state that is lost, by its number, and why: its light does not arrive, or a spot cannot be
+        measured. It is then left out; with None the error is raised.
+    stated : bool
+        Know what the experiment states to move, and trace its motions again; else there is noise alone.
+    keep_parts : bool
+        Of the noise, which are large.
+    frames : int | None
+        Of which each recorded image is the mean; None where frames are recorded one by one.
     """
 
     record: Record
@@ -66,11 +75,16 @@ class Observing:
 class Light:
     """What comes of S states to the area CCDs.
 
-    Attributes:
-        numbers: (S,) of the states.
-        placed: their bodies.
-        truth: of them.
-        photons: expected photons per pixel and frame, (S, C, rows, columns).
+    Attributes
+    ----------
+    numbers : np.ndarray
+        (S,) of the states.
+    placed : PlacedBodies
+        Their bodies.
+    truth : Truth
+        Of them.
+    photons : np.ndarray
+        Expected photons per pixel and frame, (S, C, rows, columns).
     """
 
     numbers: np.ndarray
@@ -84,11 +98,16 @@ class Light:
 class Observation:
     """What S states do and what their images say.
 
-    Attributes:
-        light: of all states that were recorded.
-        measured: (S,) which of these could be measured.
-        after: what was recorded of all of ``light``, as of `Record`.
-        recovery: of those that were measured.
+    Attributes
+    ----------
+    light : Light
+        Of all states that were recorded.
+    measured : np.ndarray
+        (S,) which of these could be measured.
+    after : np.ndarray
+        What was recorded of all of ``light``, as of `Record`.
+    recovery : Recovery
+        Of those that were measured.
     """
 
     light: Light
@@ -115,18 +134,28 @@ def observe(
 ) -> Iterator[Observation]:
     """Trace, render, expose and recover states, piece by piece.
 
-    Args:
-        experiment: the instrument.
-        states: to be observed.
-        how: the policies.
-        numbers: of the states, by which random streams are chosen; None to count from 0.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    states : Sequence[State]
+        To be observed.
+    how : Observing
+        The policies.
+    numbers : Sequence[int] | np.ndarray | None
+        Of the states, by which random streams are chosen; None to count from 0.
 
-    Yields:
+    Yields
+    ------
+    Observation
         Observations of ``how.chunk`` states, without those that are left out; none of a piece that is lost as a whole.
 
-    Raises:
-        BeamMissedError, AimError: light is lost on its way, or a spot is not on its CCD.
-        SpotError: a spot cannot be measured.
+    Raises
+    ------
+    BeamMissedError, AimError
+        Light is lost on its way, or a spot is not on its CCD.
+    SpotError
+        a spot cannot be measured.
     """
     every = np.arange(len(states)) if numbers is None else np.asarray(numbers)
     for first in range(0, len(states), how.chunk):
@@ -158,15 +187,23 @@ def light_of(
 ) -> Light:
     """Trace and render states together.
 
-    Args:
-        experiment: the instrument.
-        states: S states.
-        numbers: (S,) of these.
-        single: render in single precision.
-        photons: (S, C, rows, columns) of the states, where they are rendered already.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    states : Sequence[State]
+        S states.
+    numbers : np.ndarray
+        (S,) of these.
+    single : bool
+        Render in single precision.
+    photons : np.ndarray | None
+        (S, C, rows, columns) of the states, where they are rendered already.
 
-    Raises:
-        BeamMissedError, AimError: light is lost on its way, or a spot is not on its CCD.
+    Raises
+    ------
+    BeamMissedError, AimError
+        Light is lost on its way, or a spot is not on its CCD.
     """
     with one_blas_thread(), one_kernel_thread():
         placed = experiment.instrument.assembly.place(states)
@@ -190,13 +227,19 @@ def why_lost(experiment: MonitorExperiment, state: State) -> str:
 def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observation | None:
     """Expose and recover states; None where all are left out since their spots cannot be measured.
 
-    Args:
-        experiment: the instrument.
-        light: of the states.
-        how: the policies.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    light : Light
+        Of the states.
+    how : Observing
+        The policies.
 
-    Raises:
-        SpotError: a spot cannot be measured.
+    Raises
+    ------
+    SpotError
+        a spot cannot be measured.
     """
     before, after = how.record(light.photons, light.numbers)
     images, count = after, how.frames
@@ -241,11 +284,16 @@ def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observa
 def one_detector(experiment: MonitorExperiment, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> Record:
     """Every state is exposed by the same detectors, against one nominal measurement.
 
-    Args:
-        experiment: the instrument.
-        frames: of each exposure.
-        seed: of the detectors and of all noise; each state has a stream of its own.
-        stray: photons beside those of the nominal spots.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    frames : int
+        Of each exposure.
+    seed : int
+        Of the detectors and of all noise; each state has a stream of its own.
+    stray : np.ndarray | float
+        Photons beside those of the nominal spots.
     """
     before = experiment.frames_before(frames, seed, stray)
     return lambda photons, numbers: (before, experiment.frames_after(photons, frames, seed, numbers))
@@ -254,11 +302,16 @@ def one_detector(experiment: MonitorExperiment, frames: int, seed: int, stray: n
 class StateReader:
     """Reads states of an instrument that is built and calibrated once.
 
-    Args:
-        experiment: the instrument, with its job's stated disturbances.
-        frames: of each exposure.
-        seed: of all noise.
-        centroid: as of ``analysis.monitor.recovery.recover``.
+    Parameters
+    ----------
+    experiment
+        The instrument, with its job's stated disturbances.
+    frames
+        Of each exposure.
+    seed
+        Of all noise.
+    centroid
+        As of ``analysis.monitor.recovery.recover``.
     """
 
     def __init__(self, experiment: MonitorExperiment, frames: int, seed: int, centroid: str = "ml") -> None:
@@ -281,16 +334,24 @@ class StateReader:
     def read(self, state: State, noise: bool = True, number: int = 0, single: bool = False) -> Observation:
         """Trace, render and recover a state.
 
-        Args:
-            state: body -> motion, as of ``MonitorExperiment.state``.
-            noise: expose frames; else the expected images, (1, C, rows, columns), are measured, and sigmas are those
-                that the noise of the frames would give.
-            number: of the state, each of which has a random stream of its own; of a course that of the time.
-            single: render in single precision, as all times of a course are.
+        Parameters
+        ----------
+        state : State
+            Body -> motion, as of ``MonitorExperiment.state``.
+        noise : bool
+            Expose frames; else the expected images, (1, C, rows, columns), are measured, and sigmas are those that the
+            noise of the frames would give.
+        number : int
+            Of the state, each of which has a random stream of its own; of a course that of the time.
+        single : bool
+            Render in single precision, as all times of a course are.
 
-        Raises:
-            BeamMissedError, AimError: light is lost on its way, or a spot is not on its CCD; where, is in the message.
-            SpotError: a spot cannot be measured.
+        Raises
+        ------
+        BeamMissedError, AimError
+            Light is lost on its way, or a spot is not on its CCD; where, is in the message.
+        SpotError
+            a spot cannot be measured.
         """
         experiment = self.experiment
 

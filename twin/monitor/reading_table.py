@@ -32,15 +32,24 @@ class Reading:
     Numbers are arrays over the states (S,), or floats of one state. Over a course as a whole they are root mean
     squares.
 
-    Attributes:
-        group: the camera, or the group of what two cameras read together.
-        parameter: which change.
-        estimator: who reads it.
-        true: by the exact trace; NaN of a measurement.
-        value: what is read.
-        error: value minus true.
-        sigma: total standard deviation of the error.
-        noise: of it what the noise of the images does.
+    Attributes
+    ----------
+    group : str
+        The camera, or the group of what two cameras read together.
+    parameter : Parameter
+        Which change.
+    estimator : str
+        Who reads it.
+    true : Any
+        By the exact trace; NaN of a measurement.
+    value : Any
+        What is read.
+    error : Any
+        Value minus true.
+    sigma : Any
+        Total standard deviation of the error.
+    noise : Any
+        Of it what the noise of the images does.
     """
 
     group: str
@@ -89,9 +98,12 @@ class Reading:
     def shown(self, value: float, sign: bool = False) -> str:
         """A number of this reading with the digits that its sigma deserves.
 
-        Args:
-            value: the number, in the parameter's unit.
-            sign: whether a plus is written.
+        Parameters
+        ----------
+        value : float
+            The number, in the parameter's unit.
+        sign : bool
+            Whether a plus is written.
         """
         return fixed(value, decimals_for(self.sigma), sign)
 
@@ -103,16 +115,20 @@ class Reading:
     def place(self, nested: dict[str, Any]) -> dict[str, Any]:
         """Its group in JSON files as `ReadingTable.groups` nests them, which is made if it is not there.
 
-        Args:
-            nested: groups, with ``cameras`` among them.
+        Parameters
+        ----------
+        nested : dict[str, Any]
+            Groups, with ``cameras`` among them.
         """
         return nested["cameras"].setdefault(self.camera, {}) if self.camera else nested.setdefault(self.group, {})
 
     def each(self, of: Callable[[Any], Any]) -> Reading:
         """Row of the same reading with its numbers replaced.
 
-        Args:
-            of: array of a number over the states -> what takes its place.
+        Parameters
+        ----------
+        of : Callable[[Any], Any]
+            Array of a number over the states -> what takes its place.
         """
         numbers = of(self.true), of(self.value), of(self.error), of(self.sigma), of(self.noise)
         return Reading(self.group, self.parameter, self.estimator, *numbers)
@@ -122,10 +138,13 @@ class Reading:
 class ReadingTable:
     """All readings of S states.
 
-    Attributes:
-        rows: group by group, of each change by change, of each estimator by estimator.
-        left: estimator -> what correcting by its readings leaves on the ground, RMS over the line, (S,): further keys
-            of its group in files.
+    Attributes
+    ----------
+    rows : tuple[Reading, ...]
+        Group by group, of each change by change, of each estimator by estimator.
+    left : Mapping[str, Mapping[str, Any]]
+        Estimator -> what correcting by its readings leaves on the ground, RMS over the line, (S,): further keys of its
+        group in files.
     """
 
     rows: tuple[Reading, ...]
@@ -138,8 +157,10 @@ class ReadingTable:
     def at(self, state: int) -> ReadingTable:
         """The table of one state, whose numbers are floats.
 
-        Args:
-            state: its number.
+        Parameters
+        ----------
+        state : int
+            Its number.
         """
         left = {e: {key: float(value[state]) for key, value in own.items()} for e, own in self.left.items()}
         return ReadingTable(tuple(row.each(lambda number: float(number[state])) for row in self.rows), left)
@@ -153,8 +174,10 @@ class ReadingTable:
     def of(self, estimator: str) -> tuple[Reading, ...]:
         """Return the rows of what one estimator reads.
 
-        Args:
-            estimator: its name.
+        Parameters
+        ----------
+        estimator : str
+            Its name.
         """
         return tuple(row for row in self.rows if row.estimator == estimator and not np.all(np.isnan(row.sigma)))
 
@@ -168,10 +191,14 @@ class ReadingTable:
     def row(self, group: str, key: str, estimator: str) -> Reading:
         """One row.
 
-        Args:
-            group: of the change.
-            key: of the change.
-            estimator: who reads it.
+        Parameters
+        ----------
+        group : str
+            Of the change.
+        key : str
+            Of the change.
+        estimator : str
+            Who reads it.
         """
         wanted = (group, key, estimator)
         return next(row for row in self.rows if (row.group, row.parameter.key, row.estimator) == wanted)
@@ -180,8 +207,10 @@ class ReadingTable:
         """The table as JSON files nest it: ``cameras`` by name, ``intersection_angle`` and ``ground``; in each the
         estimators with their numbers.
 
-        Args:
-            truth: key under which the true changes stand beside the estimators; empty to leave them out.
+        Parameters
+        ----------
+        truth : str
+            Key under which the true changes stand beside the estimators; empty to leave them out.
         """
         out: dict[str, Any] = {"cameras": {}}
         for row in self.rows:
@@ -208,8 +237,10 @@ class ReadingTable:
     def joined(parts: Sequence[ReadingTable]) -> ReadingTable:
         """One table of the states of several.
 
-        Args:
-            parts: with the same rows.
+        Parameters
+        ----------
+        parts : Sequence[ReadingTable]
+            With the same rows.
         """
         names = ("true", "value", "error", "sigma", "noise")
         rows = tuple(
@@ -239,12 +270,18 @@ def reading_table(
 ) -> ReadingTable:
     """The table of what was estimated. Of a change that no motion of the prior makes there is no posterior: NaN.
 
-    Args:
-        found: by all estimators.
-        cameras: what is calibrated of each.
-        truth: of the same states; None of a measurement.
-        ground: how a pair of known altitude sees the ground, for the truth there.
-        prior: on which the estimators rest that need one; None for none.
+    Parameters
+    ----------
+    found : Estimates | Recovery
+        By all estimators.
+    cameras : Mapping[str, CameraCalibration]
+        What is calibrated of each.
+    truth : Truth | None
+        Of the same states; None of a measurement.
+    ground : GroundGeometry | None
+        How a pair of known altitude sees the ground, for the truth there.
+    prior : Disturbances | None
+        On which the estimators rest that need one; None for none.
     """
     rows: list[Reading] = []
     fixed_changes = frozenset() if prior is None else unmoved(prior, cameras, ground)

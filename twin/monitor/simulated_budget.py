@@ -43,13 +43,20 @@ Progress = Callable[[float, str], None]
 class BudgetLine:
     """One line as simulated.
 
-    Attributes:
-        name: CENTROID or a cause.
-        three_sigma: three times the rms of a spot's angle error per axis, radians.
-        sigma: standard deviation of ``three_sigma``, radians.
-        by_axis: the same for the spots' rows (along Y) and columns (along X), radians.
-        value, unit: the input, 3 sigma; 1 "times stated" where a cause's components have several.
-        allowed: input at which the line would be 0.1 arcsec, in the unit of ``value``.
+    Attributes
+    ----------
+    name : str
+        CENTROID or a cause.
+    three_sigma : float
+        Three times the rms of a spot's angle error per axis, radians.
+    sigma : float
+        Standard deviation of ``three_sigma``, radians.
+    by_axis : tuple[float, float]
+        The same for the spots' rows (along Y) and columns (along X), radians.
+    value, unit : float
+        The input, 3 sigma; 1 "times stated" where a cause's components have several.
+    allowed : float
+        Input at which the line would be 0.1 arcsec, in the unit of ``value``.
     """
 
     name: str
@@ -65,11 +72,14 @@ class BudgetLine:
 class Together:
     """All causes at once, T trials.
 
-    Attributes:
-        spot: three sigma of a spot's angle error per axis and its standard deviation, radians.
-        parameters: estimator -> parameter -> (three sigma, its standard deviation) of reading - truth, radians and
-            metres, over trials and both cameras. Where the focal plane's temperature changes the camera itself, which
-            it does as its line CCD grows, the reading of that is no error.
+    Attributes
+    ----------
+    spot : tuple[float, float]
+        Three sigma of a spot's angle error per axis and its standard deviation, radians.
+    parameters : Mapping[str, Mapping[str, tuple[float, float]]]
+        Estimator -> parameter -> (three sigma, its standard deviation) of reading - truth, radians and metres, over
+        trials and both cameras. Where the focal plane's temperature changes the camera itself, which it does as its
+        line CCD grows, the reading of that is no error.
     """
 
     spot: tuple[float, float]
@@ -79,16 +89,22 @@ class Together:
 class ErrorBudget:
     """Simulates an error budget.
 
-    Args:
-        spec: its inputs.
-        resolved: a job on its instrument without perturbation, with its disturbances (``resolve_budget``); the
-            budget's light and angle errors are applied here.
-        backend: where to trace.
-        seed: of all random numbers.
+    Parameters
+    ----------
+    spec
+        Its inputs.
+    resolved
+        a job on its instrument without perturbation, with its disturbances (``resolve_budget``); the budget's light and
+        angle errors are applied here.
+    backend
+        Where to trace.
+    seed
+        Of all random numbers.
 
-    Raises:
-        InputError: the disturbances are not of this instrument, or one of their causes is called as a line that is
-            there anyway.
+    Raises
+    ------
+    InputError
+        The disturbances are not of this instrument, or one of their causes is called as a line that is there anyway.
     """
 
     def __init__(self, spec: ErrorBudgetSpec, resolved: ResolvedJob, backend: Backend, seed: int) -> None:
@@ -123,8 +139,10 @@ class ErrorBudget:
     def line(self, name: str, progress: Progress = lambda fraction, text: None) -> BudgetLine:
         """Simulate one line.
 
-        Raises:
-            ValueError: no such line.
+        Raises
+        ------
+        ValueError
+            No such line.
         """
         if name == _CENTROID:
             return self._centroid_line()
@@ -147,10 +165,14 @@ class ErrorBudget:
     def states(self, causes: Sequence[str], trials: int, stream: int) -> list[State]:
         """Random states in which these causes act, each by itself.
 
-        Args:
-            causes: which.
-            trials: how many.
-            stream: number of the random stream.
+        Parameters
+        ----------
+        causes : Sequence[str]
+            which.
+        trials : int
+            How many.
+        stream : int
+            Number of the random stream.
         """
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(7, stream)))
         stated = self.stated.of_causes(causes)
@@ -160,8 +182,10 @@ class ErrorBudget:
     def grown_focal_planes(self, warmer: float) -> tuple[float, float]:
         """True change of d_f when every focal plane is warmer, and what paper 001, eq. (7) reads, metres.
 
-        Args:
-            warmer: by how much, kelvin.
+        Parameters
+        ----------
+        warmer : float
+            By how much, kelvin.
         """
         experiment, change = self.experiment, Temperature(warmer)
         names = list(experiment.instrument.cameras)
@@ -177,10 +201,14 @@ class ErrorBudget:
         The rhomboids take over half of the transfer. The same gradients across the prism, once along its y and once
         along its z, act on both instruments.
 
-        Args:
-            slope: of the temperature, K/m.
+        Parameters
+        ----------
+        slope : float
+            Of the temperature, K/m.
 
-        Returns:
+        Returns
+        -------
+        tuple[float, float, float]
             Glass path before and after, metres (mean over the channels), and the ratio of the rms spot displacements.
         """
         whole = self.experiment

@@ -40,22 +40,38 @@ LARGEST_SERIES = 200_000_000
 class TimeSeries:
     """What a course of T times gave.
 
-    Attributes:
-        times: (T,) seconds.
-        temperatures: node path -> its change of temperature at each time, perturbation included.
-        motions: node path -> its motion at each time, perturbation included; of the nodes that the course moves.
-        shown: number of the time that the rest of the run shows in full.
-        angle: between two cameras in the nominal state, radians; NaN unless there are two.
-        readings: true changes and what is read of them at all times, against one nominal measurement.
-        smoothed: all measurements together; None where nothing is stated to move.
-        shift: (T, 2 C) of the spots, in their order, px; shift_covariance: (T, 2 C, 2 C), px^2.
-        photons: expected photons per pixel and frame, float32 (T, C, rows, columns).
-        shown_photons: those of the time that is shown, as they were exposed, (C, rows, columns).
-        frames: the first frame of each time, uint16 (T, C, rows, columns).
-        warnings: what the user should know.
-        evidence: what the fits of all spots say.
-        curvature: estimator -> whether its motions are small enough to be linear, at all times.
-        agrees: (T,) whether the shifts of each time agree with the prior; the false-alarm rate is that of all times.
+    Attributes
+    ----------
+    times : np.ndarray
+        (T,) seconds.
+    temperatures : Mapping[str, tuple[Temperature, ...]]
+        Node path -> its change of temperature at each time, perturbation included.
+    motions : Mapping[str, tuple[Motion, ...]]
+        Node path -> its motion at each time, perturbation included; of the nodes that the course moves.
+    shown : int
+        Number of the time that the rest of the run shows in full.
+    angle : float
+        Between two cameras in the nominal state, radians; NaN unless there are two.
+    readings : ReadingTable
+        True changes and what is read of them at all times, against one nominal measurement.
+    smoothed : SmoothedCourse | None
+        All measurements together; None where nothing is stated to move.
+    shift : np.ndarray
+        (T, 2 C) of the spots, in their order, px; shift_covariance: (T, 2 C, 2 C), px^2.
+    photons : np.ndarray
+        Expected photons per pixel and frame, float32 (T, C, rows, columns).
+    shown_photons : np.ndarray
+        Those of the time that is shown, as they were exposed, (C, rows, columns).
+    frames : np.ndarray
+        The first frame of each time, uint16 (T, C, rows, columns).
+    warnings : tuple[str, ...]
+        What the user should know.
+    evidence : SpotEvidence
+        What the fits of all spots say.
+    curvature : Mapping[str, Curvature]
+        Estimator -> whether its motions are small enough to be linear, at all times.
+    agrees : np.ndarray
+        (T,) whether the shifts of each time agree with the prior; the false-alarm rate is that of all times.
     """
 
     times: np.ndarray
@@ -87,8 +103,10 @@ class TimeSeries:
         """Where sigma does not hold, and which readings were worked out anew since they are not linear; sentences
         without their end.
 
-        Args:
-            spots: their names.
+        Parameters
+        ----------
+        spots : Sequence[str]
+            Their names.
         """
         out = [] if self.smoothed is None else list(self.smoothed.contradiction)
         told = self.evidence.course_doubt([moment(time) for time in self.times.tolist()], spots)
@@ -117,8 +135,10 @@ class TimeSeries:
     def group(self, name: str) -> dict[str, Any] | None:
         """A group of readings as course.json has it, filtered and smoothed ones included; None where there is none.
 
-        Args:
-            name: ``cameras``, ``intersection_angle`` or ``ground``.
+        Parameters
+        ----------
+        name : str
+            ``cameras``, ``intersection_angle`` or ``ground``.
         """
         found, more = self.readings.groups("true"), {} if self.smoothed is None else self.smoothed.changes.groups()
         if name == "cameras":
@@ -171,12 +191,17 @@ COURSE: Record[TimeSeries] = Record(
 def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
     """The state at each time of a job's course.
 
-    Args:
-        experiment: the instrument.
-        job: with a course, checked by ``scenes.specs.job.checked_nodes``.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    job : JobSpec
+        With a course, checked by ``scenes.specs.job.checked_nodes``.
 
-    Raises:
-        InputError: a temperature at or below 0 K at some time, or one at which a glass's index is not known.
+    Raises
+    ------
+    InputError
+        a temperature at or below 0 K at some time, or one at which a glass's index is not known.
     """
     course = _course(job)
     out = []
@@ -201,14 +226,21 @@ def run_series(
 ) -> TimeSeries:
     """Trace, render, expose and recover all times of a course against one nominal measurement.
 
-    Args:
-        experiment: the instrument.
-        resolved: a job with a course; its frames and seed are used.
-        states: of ``series_states``.
-        advance: called with the number of times that are done, first with 0.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    resolved : ResolvedJob
+        a job with a course; its frames and seed are used.
+    states : Sequence[State]
+        Of ``series_states``.
+    advance : Callable[[int], None]
+        Called with the number of times that are done, first with 0.
 
-    Raises:
-        InputError: at some time light misses the mirrors or a spot cannot be measured, or there are too many pixels.
+    Raises
+    ------
+    InputError
+        At some time light misses the mirrors or a spot cannot be measured, or there are too many pixels.
     """
     job, frames, seed = resolved.job, resolved.frames, resolved.job.render.seed
     course = _course(job)
@@ -335,15 +367,22 @@ MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
 class SmoothedCourse:
     """What all measurements of a course say together, by the laws in time of what is stated to move.
 
-    Attributes:
-        name: of the stated disturbances.
-        changes: at all times of the course, by the estimators `filtered`, from the measurements up to each time, and
-            `smoothed`, from all.
-        times: (F,) between those of the course, seconds; between: the changes there, likewise.
-        innovations: (T,) chi-square of each measurement against what those before it say; each: its degrees of freedom.
-        consistency: chi-square of the whole series.
-        jumps: that were found; None where nothing is stated to jump; jump_false_alarm: chance that a series without any
-            has one.
+    Attributes
+    ----------
+    name : str
+        Of the stated disturbances.
+    changes : ReadingTable
+        At all times of the course, by the estimators `filtered`, from the measurements up to each time, and `smoothed`,
+        from all.
+    times : np.ndarray
+        (F,) between those of the course, seconds; between: the changes there, likewise.
+    innovations : np.ndarray
+        (T,) chi-square of each measurement against what those before it say; each: its degrees of freedom.
+    consistency : Consistency
+        Chi-square of the whole series.
+    jumps : tuple[Jump, ...] | None
+        That were found; None where nothing is stated to jump; jump_false_alarm: chance that a series without any has
+        one.
     """
 
     name: str
@@ -401,8 +440,10 @@ class SmoothedCourse:
 def jump_text(one: Jump) -> str:
     """What jumped, when and how far; a sentence without its end.
 
-    Args:
-        one: a jump that was found.
+    Parameters
+    ----------
+    one : Jump
+        a jump that was found.
     """
     body = one.body
     sizes = ", ".join(
@@ -420,11 +461,16 @@ def jump_text(one: Jump) -> str:
 class CourseSmoother:
     """Collects shifts and noise of all measurements, then reads them together.
 
-    Args:
-        stated: what moves, and how it goes on in time; None for nothing, of which nothing is smoothed.
-        cameras: what is calibrated of each.
-        ground: of a pair whose altitude is known, else None.
-        times: of the measurements, seconds, in order.
+    Parameters
+    ----------
+    stated
+        What moves, and how it goes on in time; None for nothing, of which nothing is smoothed.
+    cameras
+        What is calibrated of each.
+    ground
+        Of a pair whose altitude is known, else None.
+    times
+        Of the measurements, seconds, in order.
     """
 
     def __init__(
@@ -442,8 +488,10 @@ class CourseSmoother:
     def add(self, found: Recovery) -> Recovery:
         """Take what is needed of some states, and give them back without the maps.
 
-        Args:
-            found: the next states, with the parts of their noise.
+        Parameters
+        ----------
+        found : Recovery
+            The next states, with the parts of their noise.
         """
         if found.parts is None:
             return found
@@ -453,10 +501,14 @@ class CourseSmoother:
     def take(self, shift: np.ndarray, before: NoiseParts, after: NoiseParts) -> None:
         """Take the shifts and the noise of states that were measured elsewhere.
 
-        Args:
-            shift: (S, 2 C) after - before of the next states, px.
-            before: noise of the C spots before, the same at every call.
-            after: of the S C spots after, state by state.
+        Parameters
+        ----------
+        shift : np.ndarray
+            (S, 2 C) after - before of the next states, px.
+        before : NoiseParts
+            Noise of the C spots before, the same at every call.
+        after : NoiseParts
+            Of the S C spots after, state by state.
         """
         if self._noise is None:
             self._noise = SeriesNoise(before, window_of(shift.shape[1]))

@@ -32,12 +32,18 @@ ACROSS = np.array([0.0, 1.0, 0.0])
 class Truth:
     """True changes of every camera for S states.
 
-    Attributes:
-        cameras: camera -> changes, arrays of shape (S,).
-        principal_distance: camera -> nominal principal distance, metres.
-        angle: angle between the two lines of sight in the nominal state, radians (NaN unless there are two cameras).
-        angle_change: its change, (S,), radians.
-        lines: lines of sight in the base frame, unit vectors (cameras, 1 + S, 3); entry 0 is the nominal one.
+    Attributes
+    ----------
+    cameras : dict[str, LineChange]
+        Camera -> changes, arrays of shape (S,).
+    principal_distance : dict[str, float]
+        Camera -> nominal principal distance, metres.
+    angle : float
+        Angle between the two lines of sight in the nominal state, radians (NaN unless there are two cameras).
+    angle_change : np.ndarray
+        Its change, (S,), radians.
+    lines : np.ndarray
+        Lines of sight in the base frame, unit vectors (cameras, 1 + S, 3); entry 0 is the nominal one.
     """
 
     cameras: dict[str, LineChange]
@@ -49,8 +55,10 @@ class Truth:
     def at(self, states: slice | np.ndarray) -> Truth:
         """The truth of some of the states.
 
-        Args:
-            states: which.
+        Parameters
+        ----------
+        states : slice | np.ndarray
+            which.
         """
         each = [field.name for field in fields(LineChange) if field.name != "nominal_distance"]
         cameras = {
@@ -63,16 +71,20 @@ class Truth:
     def vector(self, camera: str) -> np.ndarray:
         """(S, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) of a camera.
 
-        Args:
-            camera: its name.
+        Parameters
+        ----------
+        camera : str
+            Its name.
         """
         return self.cameras[camera].vector
 
     def ground_error(self, geometry: GroundGeometry) -> np.ndarray:
         """Errors (S, 3) along the track, across it and up of points that are located by the nominal cameras, metres.
 
-        Args:
-            geometry: of the pair over the ground.
+        Parameters
+        ----------
+        geometry : GroundGeometry
+            Of the pair over the ground.
         """
         lines = np.moveaxis(self.lines, 0, 1)
         return geometry.found(lines[1:], lines[:1])
@@ -81,9 +93,12 @@ class Truth:
 def half_fields(instrument: Instrument, distance: Mapping[str, float]) -> dict[str, float]:
     """Camera -> tangent of half the field along its line CCD.
 
-    Args:
-        instrument: the instrument.
-        distance: camera -> principal distance, metres.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    distance : Mapping[str, float]
+        Camera -> principal distance, metres.
     """
     lines = {name: model.spec.line for name, model in instrument.cameras.items()}
     return {name: 0.5 * line.pixels * line.pitch / distance[name] for name, line in lines.items()}
@@ -92,12 +107,17 @@ def half_fields(instrument: Instrument, distance: Mapping[str, float]) -> dict[s
 def ground_geometry(instrument: Instrument, distance: Mapping[str, float]) -> GroundGeometry | None:
     """How a pair of known altitude sees the ground; None for other instruments.
 
-    Args:
-        instrument: the instrument.
-        distance: camera -> principal distance, metres.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    distance : Mapping[str, float]
+        Camera -> principal distance, metres.
 
-    Raises:
-        InputError: the rays of the two do not meet on the ground.
+    Raises
+    ------
+    InputError
+        The rays of the two do not meet on the ground.
     """
     spec, names = instrument.spec, list(instrument.cameras)
     if spec.altitude is None or len(names) != 2:
@@ -129,9 +149,12 @@ def line_in_world(instrument: Instrument, camera: str, placed: PlacedBodies) -> 
 class LineSight:
     """Traces what the points of the line CCDs see; of the unperturbed instrument once.
 
-    Args:
-        instrument: the instrument.
-        backend: where to trace.
+    Parameters
+    ----------
+    instrument
+        The instrument.
+    backend
+        Where to trace.
     """
 
     def __init__(self, instrument: Instrument, backend: Backend) -> None:
@@ -141,12 +164,17 @@ class LineSight:
     def trace(self, states: Sequence[State], placed: PlacedBodies | None = None) -> np.ndarray:
         """Object-space directions of the line CCDs' points toward the scene, world, (cameras, S, LINE_POINTS, 3).
 
-        Args:
-            states: S states.
-            placed: their bodies, when already placed.
+        Parameters
+        ----------
+        states : Sequence[State]
+            S states.
+        placed : PlacedBodies | None
+            Their bodies, when already placed.
 
-        Raises:
-            AimError, BeamMissedError: a perturbation moves the image off the mirrors.
+        Raises
+        ------
+        AimError, BeamMissedError
+            a perturbation moves the image off the mirrors.
         """
         instrument, names = self.instrument, list(self.instrument.cameras)
         placed = instrument.assembly.place(states) if placed is None else placed
@@ -159,12 +187,17 @@ class LineSight:
     def truth(self, states: Sequence[State], placed: PlacedBodies | None = None) -> Truth:
         """What states do to all cameras.
 
-        Args:
-            states: S states.
-            placed: their bodies, when already placed.
+        Parameters
+        ----------
+        states : Sequence[State]
+            S states.
+        placed : PlacedBodies | None
+            Their bodies, when already placed.
 
-        Raises:
-            AimError, BeamMissedError: as `trace`.
+        Raises
+        ------
+        AimError, BeamMissedError
+            As `trace`.
         """
         return self.told_by(self.trace(states, placed) if states else self.nominal[:, :0])
 
@@ -242,7 +275,9 @@ def truth_jacobian(
     """Derivative of the true parameters of every camera by elementary motions, by central differences of the exact
     trace.
 
-    Returns:
+    Returns
+    -------
+    dict[str, np.ndarray]
         Camera -> (4, M): d_alpha, d_beta, d_gamma (rad) and d_f (m) per radian, metre or unit of scale.
     """
     states = [m.state(_DIFFERENCE) for m in motions] + [m.state(-_DIFFERENCE) for m in motions]

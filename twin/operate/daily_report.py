@@ -66,12 +66,18 @@ def dates(times: np.ndarray) -> np.ndarray:
 def courses_svg(name: str, overview: Overview, trend: Trend, quantities: Sequence[Quantity], wide: int = 1) -> str:
     """Courses of quantities over one span, a panel each.
 
-    Args:
-        name: of the figure.
-        overview: of the operation, for requirements, jumps and events.
-        trend: of all quantities.
-        quantities: that are drawn.
-        wide: panels beside each other.
+    Parameters
+    ----------
+    name : str
+        Of the figure.
+    overview : Overview
+        Of the operation, for requirements, jumps and events.
+    trend : Trend
+        Of all quantities.
+    quantities : Sequence[Quantity]
+        That are drawn.
+    wide : int
+        Panels beside each other.
     """
     with svg.look(f"operate-{name}"):
         height = 2.3 if wide == 1 else 1.9
@@ -184,10 +190,14 @@ _NOT = "\N{EM DASH}"
 def daily_report(history: History, overview: Overview, end: int) -> Report:
     """What there is to say of a day.
 
-    Args:
-        history: the record.
-        overview: of it, at the day's end.
-        end: of the day, microseconds of TAI since 2000.
+    Parameters
+    ----------
+    history : History
+        The record.
+    overview : Overview
+        Of it, at the day's end.
+    end : int
+        Of the day, microseconds of TAI since 2000.
     """
     told = overview.following
     begin = end - DAY
@@ -230,8 +240,10 @@ def daily_report(history: History, overview: Overview, end: int) -> Report:
 def end_of_day(text: str | None, newest: int) -> int:
     """The end of a day of UTC, microseconds of TAI since 2000; by default of the newest reading's.
 
-    Raises:
-        Problem: not a date.
+    Raises
+    ------
+    Problem
+        Not a date.
     """
     name = day_text(newest) if text is None else text.strip()
     allowed = "a date of UTC: 2028-03-05"

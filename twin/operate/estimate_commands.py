@@ -241,16 +241,25 @@ def write_report(
 ) -> Report:
     """Write the report of a day.
 
-    Args:
-        call: the command.
-        history: its record, or that as it was.
-        operation: the estimate from it.
-        end: of the day, microseconds of TAI since 2000.
-        words: after ``twin.operate report``, of the command that makes it again.
-        out: file, which is replaced.
+    Parameters
+    ----------
+    call : Call
+        The command.
+    history : History
+        Its record, or that as it was.
+    operation : Operation
+        The estimate from it.
+    end : int
+        Of the day, microseconds of TAI since 2000.
+    words : Sequence[str]
+        After ``twin.operate report``, of the command that makes it again.
+    out : Path
+        File, which is replaced.
 
-    Raises:
-        typer.Exit: it cannot be written, which has been told.
+    Raises
+    ------
+    typer.Exit
+        It cannot be written, which has been told.
     """
     from twin.framework.page import report_page
     from twin.operate.daily_report import daily_report
@@ -279,10 +288,14 @@ def alarm_line(row: Mapping[str, Any]) -> str:
 def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], console: Console) -> None:
     """The head of the estimate: now, predictions and whether they came true, jumps, sensors, what was left out, alarms.
 
-    Args:
-        following: what is known after all readings.
-        rows: alarms of the record.
-        console: the terminal.
+    Parameters
+    ----------
+    following : Following
+        What is known after all readings.
+    rows : Sequence[Mapping[str, Any]]
+        Alarms of the record.
+    console : Console
+        The terminal.
     """
     from twin.operate.record.entries import utc_text
 

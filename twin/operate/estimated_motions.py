@@ -36,10 +36,14 @@ TURNS = ("rotate", "scale")
 class EstimatedMotions:
     """All stated motions at one time.
 
-    Attributes:
-        components: M of them, as they are stated.
-        mean: (M,) estimated amounts, SI.
-        covariance: (M, M) of their errors, SI.
+    Attributes
+    ----------
+    components : tuple[Component, ...]
+        M of them, as they are stated.
+    mean : Array
+        (M,) estimated amounts, SI.
+    covariance : Array
+        (M, M) of their errors, SI.
     """
 
     components: tuple[Component, ...]
@@ -50,13 +54,19 @@ class EstimatedMotions:
     def in_units(cls, components: Sequence[Component], mean: Array, covariance: Array) -> EstimatedMotions:
         """From numbers in the units in which people read components.
 
-        Args:
-            components: M of them.
-            mean: (M,) in the components' units.
-            covariance: (M, M) likewise.
+        Parameters
+        ----------
+        components : Sequence[Component]
+            M of them.
+        mean : Array
+            (M,) in the components' units.
+        covariance : Array
+            (M, M) likewise.
 
-        Raises:
-            ValueError: not as many numbers as components.
+        Raises
+        ------
+        ValueError
+            Not as many numbers as components.
         """
         size = np.array([one.unit_size for one in components])
         if mean.shape != size.shape or covariance.shape != (len(size),) * 2:
@@ -73,12 +83,18 @@ class EstimatedMotions:
 class LeftOut:
     """A component that a file does not have.
 
-    Attributes:
-        name: of it.
-        amount: what is not there: of a state the estimated amount, of a prior the standard deviation, SI.
-        unit: in which people read it.
-        unit_size: that unit in SI.
-        share: of the largest share of the variance of a spot or a parameter that goes with it; of a prior only.
+    Attributes
+    ----------
+    name : str
+        Of it.
+    amount : float
+        What is not there: of a state the estimated amount, of a prior the standard deviation, SI.
+    unit : str
+        In which people read it.
+    unit_size : float
+        That unit in SI.
+    share : float | None
+        Of the largest share of the variance of a spot or a parameter that goes with it; of a prior only.
     """
 
     name: str
@@ -92,9 +108,12 @@ def perturbation(found: EstimatedMotions, thermal: ThermalModel) -> dict[str, Pe
     """The estimated amounts as `perturb` of a job: what `scenes.models.disturbances.state_of` makes of them, but for
     components of kinds `UNSAID`.
 
-    Args:
-        found: at one time.
-        thermal: of the instrument.
+    Parameters
+    ----------
+    found : EstimatedMotions
+        At one time.
+    thermal : ThermalModel
+        Of the instrument.
     """
     said = [k for k, one in enumerate(found.components) if one.kind not in (*HEAT, *UNSAID)]
     moves = state_of(found.mean[said], [found.components[k] for k in said], thermal)
@@ -130,12 +149,18 @@ def state_file(
 ) -> tuple[str, tuple[LeftOut, ...]]:
     """Text of the job of the estimated state, and what of it a job cannot say.
 
-    Args:
-        found: at one time.
-        thermal: of the instrument.
-        instrument: its name, or absolute path of its file.
-        disturbances: likewise of the file on which sigmas rest.
-        remark: at the top of the file, lines of comment.
+    Parameters
+    ----------
+    found : EstimatedMotions
+        At one time.
+    thermal : ThermalModel
+        Of the instrument.
+    instrument : str
+        Its name, or absolute path of its file.
+    disturbances : str
+        Likewise of the file on which sigmas rest.
+    remark : str
+        At the top of the file, lines of comment.
     """
     job = JobSpec.model_construct(instrument=instrument, perturb=FrozenMap(perturbation(found, thermal)))
     plain = {"instrument": instrument, "perturb": _short(job.plain()["perturb"])}
@@ -160,9 +185,12 @@ def _short(perturb: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, o
 def merged(found: EstimatedMotions, instrument: Instrument) -> tuple[tuple[Component, ...], Array]:
     """Every component of every body once, and what of them each stated motion is, (J, M).
 
-    Args:
-        found: M motions.
-        instrument: of them.
+    Parameters
+    ----------
+    found : EstimatedMotions
+        M motions.
+    instrument : Instrument
+        Of them.
     """
     nodes, bodies = instrument.nodes, {one.path: one for one in instrument.assembly.tree.bodies}
     components: list[Component] = []
@@ -198,11 +226,16 @@ def _away(body: Body, one: Component, pivot: str) -> Array:
 class Prior:
     """What is still uncertain of a state, as a file of disturbances.
 
-    Attributes:
-        files: name -> text; a table of correlations beside the file where there are many components.
-        components: J that the file has.
-        table: (J, M) what of them each stated motion is.
-        left_out: what it does not have.
+    Attributes
+    ----------
+    files : Mapping[str, str]
+        Name -> text; a table of correlations beside the file where there are many components.
+    components : tuple[Component, ...]
+        J that the file has.
+    table : Array
+        (J, M) what of them each stated motion is.
+    left_out : tuple[LeftOut, ...]
+        What it does not have.
     """
 
     files: Mapping[str, str]
@@ -219,13 +252,20 @@ def prior_files(
     A file holds `MOST_JOINT` components at most. Of more, those stay that make the largest share of the variance of
     some spot or parameter, were they alone.
 
-    Args:
-        found: M motions at one time.
-        stated: the same motions with what they do to spots and parameters.
-        instrument: of them.
-        stem: name of the file.
-        reason: where its numbers come from.
-        remark: at its top, lines of comment.
+    Parameters
+    ----------
+    found : EstimatedMotions
+        M motions at one time.
+    stated : Disturbances
+        The same motions with what they do to spots and parameters.
+    instrument : Instrument
+        Of them.
+    stem : str
+        Name of the file.
+    reason : str
+        Where its numbers come from.
+    remark : str
+        At its top, lines of comment.
     """
     components, table = merged(found, instrument)
     covariance = table @ found.covariance @ table.T
@@ -253,9 +293,12 @@ def prior_files(
 def largest_shares(found: EstimatedMotions, stated: Disturbances) -> Array:
     """(M,) largest share of the variance of a spot or a parameter that each motion would make if it were alone.
 
-    Args:
-        found: M motions at one time.
-        stated: what one standard deviation of each does.
+    Parameters
+    ----------
+    found : EstimatedMotions
+        M motions at one time.
+    stated : Disturbances
+        What one standard deviation of each does.
     """
     size = np.array([one.unit_size for one in found.components]) * stated.sigmas
     rows = np.concatenate([stated.spots, stated.parameters]) / np.where(size > 0.0, size, np.inf)

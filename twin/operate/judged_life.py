@@ -57,16 +57,26 @@ class Estimate:
 class JudgedLife:
     """Four ways to know a simulated instrument, and the truth.
 
-    Attributes:
-        times: (T,) microseconds of TAI since 2000 of the readings.
-        quantities: Q of them.
-        true: (T, Q) in each quantity's unit.
-        ways: as `WAYS` -> what it says.
-        horizon: of the forecasts, seconds.
-        forecast: made at each reading for the first reading that is not nearer than the horizon, (T, Q).
-        came: (T, Q) what then was; NaN where the life is over before.
-        interrupted: (T,) whether an event came in between, which no forecast knows of.
-        following: after the last reading.
+    Attributes
+    ----------
+    times : NDArray[np.int64]
+        (T,) microseconds of TAI since 2000 of the readings.
+    quantities : tuple[Quantity, ...]
+        Q of them.
+    true : Array
+        (T, Q) in each quantity's unit.
+    ways : Mapping[str, Estimate | Course]
+        As `WAYS` -> what it says.
+    horizon : float
+        Of the forecasts, seconds.
+    forecast : Estimate
+        Made at each reading for the first reading that is not nearer than the horizon, (T, Q).
+    came : Array
+        (T, Q) what then was; NaN where the life is over before.
+    interrupted : NDArray[np.bool_]
+        (T,) whether an event came in between, which no forecast knows of.
+    following : Following
+        After the last reading.
     """
 
     times: NDArray[np.int64]
@@ -86,9 +96,12 @@ class JudgedLife:
     def number(self, group: str, key: str) -> int:
         """Of a quantity.
 
-        Args:
-            group: camera, ``intersection_angle`` or ``ground``.
-            key: which of its readings.
+        Parameters
+        ----------
+        group : str
+            Camera, ``intersection_angle`` or ``ground``.
+        key : str
+            Which of its readings.
         """
         return next(k for k, one in enumerate(self.quantities) if (one.group, one.key) == (group, key))
 
@@ -96,11 +109,16 @@ class JudgedLife:
 def judged(plan: OperationSetup, files: Path, truth: Mapping[str, Any], advance: Advance) -> JudgedLife:
     """Follow a life in a record of its own, reading by reading.
 
-    Args:
-        plan: of the operation.
-        files: that says what the tables of the life hold.
-        truth: of the life, plain data of its file.
-        advance: told of the progress.
+    Parameters
+    ----------
+    plan : OperationSetup
+        Of the operation.
+    files : Path
+        That says what the tables of the life hold.
+    truth : Mapping[str, Any]
+        Of the life, plain data of its file.
+    advance : Advance
+        Told of the progress.
     """
     with tempfile.TemporaryDirectory() as place:
         initialised(place, plan.model, simulated=True)
@@ -157,9 +175,12 @@ def _prior(operation: Operation, times: NDArray[np.int64]) -> Estimate:
 class Steps:
     """The files of a life, taken into a record up to one moment after the other.
 
-    Args:
-        history: the record.
-        file: that says what the tables hold.
+    Parameters
+    ----------
+    history
+        The record.
+    file
+        That says what the tables hold.
     """
 
     def __init__(self, history: History, file: Path) -> None:
@@ -174,8 +195,10 @@ class Steps:
     def take(self, until: int) -> None:
         """Take what came since the last time.
 
-        Args:
-            until: microseconds of TAI since 2000.
+        Parameters
+        ----------
+        until : int
+            Microseconds of TAI since 2000.
         """
         for given in self._given:
             own = [one for one in _entries(given) if self._taken < one.time <= until]
@@ -191,10 +214,14 @@ def _entries(given: Given) -> list[Entry]:
 def true_changes(truth: Mapping[str, Any], quantities: Sequence[Quantity], times: NDArray[np.int64]) -> Array:
     """(T, Q) true changes in each quantity's unit.
 
-    Args:
-        truth: plain data of a life's file.
-        quantities: Q of them.
-        times: (T,) at which it is known, microseconds of TAI since 2000.
+    Parameters
+    ----------
+    truth : Mapping[str, Any]
+        Plain data of a life's file.
+    quantities : Sequence[Quantity]
+        Q of them.
+    times : NDArray[np.int64]
+        (T,) at which it is known, microseconds of TAI since 2000.
     """
     at = {moment: k for k, moment in enumerate(truth["times_us"])}
     own = [at[moment] for moment in times.tolist()]
@@ -219,10 +246,14 @@ def _single(readings: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity
 def covered(error: Array, sigma: Array, times: float) -> tuple[int, int]:
     """How many errors lie within so many sigmas, and of how many; NaN is left out.
 
-    Args:
-        error: of any shape.
-        sigma: likewise.
-        times: sigmas.
+    Parameters
+    ----------
+    error : Array
+        Of any shape.
+    sigma : Array
+        likewise.
+    times : float
+        sigmas.
     """
     ratio = np.abs(error / sigma)
     known = np.isfinite(ratio)
@@ -252,8 +283,10 @@ def judged_numbers(life: JudgedLife) -> dict[str, Any]:
     one and two sigmas, those of the forecasts, and what the operation said of its predictions, of temperatures, sensors
     and jumps.
 
-    Args:
-        life: that was followed.
+    Parameters
+    ----------
+    life : JudgedLife
+        That was followed.
     """
     told: dict[str, dict[str, Any]] = {}
     for number, one in enumerate(life.quantities):
@@ -305,9 +338,12 @@ def _rounded(values: Any) -> list[float | None]:
 def likely_shares(count: int, times: float) -> tuple[float, float]:
     """Least and largest share of independent normal numbers within so many sigmas, but for a chance of ``CHANCE``.
 
-    Args:
-        count: of the numbers.
-        times: sigmas.
+    Parameters
+    ----------
+    count : int
+        Of the numbers.
+    times : float
+        sigmas.
     """
     low, high = binom.ppf([0.5 * CHANCE, 1.0 - 0.5 * CHANCE], count, SHARES[times])
     return float(low) / count, float(high) / count
@@ -316,9 +352,12 @@ def likely_shares(count: int, times: float) -> tuple[float, float]:
 def judged_report(life: JudgedLife, name: str) -> Report:
     """The report.
 
-    Args:
-        life: that was followed.
-        name: of the instrument.
+    Parameters
+    ----------
+    life : JudgedLife
+        That was followed.
+    name : str
+        Of the instrument.
     """
     numbers = judged_numbers(life)
     shown = _shown(life)
@@ -399,9 +438,12 @@ def _short(value: float | None) -> str:
 def judged_svg(life: JudgedLife, quantities: Sequence[tuple[str, str]]) -> str:
     """Errors of some quantities by four ways to know them, with one and two sigmas, over the years.
 
-    Args:
-        life: that was followed.
-        quantities: group and key of each, one column for each.
+    Parameters
+    ----------
+    life : JudgedLife
+        That was followed.
+    quantities : Sequence[tuple[str, str]]
+        Group and key of each, one column for each.
     """
     with svg.look("operation"):
         figure = svg.new_figure(8.4)

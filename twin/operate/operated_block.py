@@ -42,11 +42,16 @@ if TYPE_CHECKING:
 class Posterior:
     """Mean and covariance of Q quantities at T times.
 
-    Attributes:
-        times: (T,) microseconds of TAI since 2000.
-        quantities: Q, each with its group (a camera, `intersection_angle` or `ground`), key and unit.
-        mean: (T, Q) changes since the calibration, in each one's unit, with the signs of docs/conventions.md.
-        covariance: (T, Q, T, Q) of their errors, those of one time with those of another, in these units.
+    Attributes
+    ----------
+    times : NDArray[np.int64]
+        (T,) microseconds of TAI since 2000.
+    quantities : tuple[Quantity, ...]
+        Q, each with its group (a camera, `intersection_angle` or `ground`), key and unit.
+    mean : Array
+        (T, Q) changes since the calibration, in each one's unit, with the signs of docs/conventions.md.
+    covariance : Array
+        (T, Q, T, Q) of their errors, those of one time with those of another, in these units.
     """
 
     times: NDArray[np.int64]
@@ -77,16 +82,21 @@ def posterior(
     The work is that of one look at the past, and T^2 times the square of the states beside it: some hundred times of a
     pass are a matter of seconds.
 
-    Args:
-        operation: that follows the record.
-        times_us: (T,) microseconds of TAI since 2000, each later than the one before and none before the first reading;
-            `twin.operate.record.entries.micros` makes them of UTC. Of times after the newest reading it is the
-            forecast.
-        names: quantities by group and key, as a plan of operation names them: ``forward d_alpha_arcsec``. By default
-            d_alpha, d_beta, d_gamma and d_f of all cameras.
+    Parameters
+    ----------
+    operation : Operation
+        That follows the record.
+    times_us : Sequence[int] | NDArray[np.int64]
+        (T,) microseconds of TAI since 2000, each later than the one before and none before the first reading;
+        `twin.operate.record.entries.micros` makes them of UTC. Of times after the newest reading it is the forecast.
+    names : Sequence[str] | None
+        Quantities by group and key, as a plan of operation names them: ``forward d_alpha_arcsec``. By default d_alpha,
+        d_beta, d_gamma and d_f of all cameras.
 
-    Raises:
-        Problem: times out of order or before all readings, or a quantity that is not read.
+    Raises
+    ------
+    Problem
+        Times out of order or before all readings, or a quantity that is not read.
     """
     times = np.asarray(times_us, np.int64)
     late = np.flatnonzero(np.diff(times) <= 0)
@@ -117,16 +127,25 @@ def run_operated_block(
 ) -> BlockRun:
     """Draw or read a block and adjust it, with the record of its monitor where the file names one.
 
-    Args:
-        setup: what the file says.
-        backend: not used.
-        seed: of all that is drawn.
-        advance: told of the progress.
-        pool: processes that reduce the points; None for this one alone.
+    Parameters
+    ----------
+    setup : AnyAdjust
+        What the file says.
+    backend : Backend | None
+        Not used.
+    seed : int
+        Of all that is drawn.
+    advance : Advance
+        Told of the progress.
+    pool : Pool | None
+        Processes that reduce the points; None for this one alone.
 
-    Raises:
-        InputError: tables or a record that cannot be used.
-        BenchError: no such orbit, or a block that cannot be adjusted.
+    Raises
+    ------
+    InputError
+        Tables or a record that cannot be used.
+    BenchError
+        No such orbit, or a block that cannot be adjusted.
     """
     spec = setup.test.monitor_record
     if spec is None:
@@ -184,10 +203,14 @@ def _recorded(
 def cameras_of(said: Posterior, cameras: Sequence[str], passes: Sequence[int]) -> CamerasKnowledge:
     """What is said of cameras, as a block of scenes takes it.
 
-    Args:
-        said: d_alpha, d_beta, d_gamma and d_f of each camera in turn.
-        cameras: C names.
-        passes: (P,) number of the time of each pass.
+    Parameters
+    ----------
+    said : Posterior
+        d_alpha, d_beta, d_gamma and d_f of each camera in turn.
+    cameras : Sequence[str]
+        C names.
+    passes : Sequence[int]
+        (P,) number of the time of each pass.
     """
     scale = np.tile(UNITS, len(cameras))
     where = np.array(passes)

@@ -52,13 +52,20 @@ def span_of(history: History) -> tuple[int, int]:
 def readings(history: History, begin: int, end: int, most: int) -> list[dict[str, Any]]:
     """Readings of the monitor in a span, in the order of time; evenly chosen if there are more than ``most``.
 
-    Args:
-        history: the record.
-        begin: microseconds of TAI since 2000.
-        end: likewise; both ends belong to the span.
-        most: readings.
+    Parameters
+    ----------
+    history : History
+        The record.
+    begin : int
+        Microseconds of TAI since 2000.
+    end : int
+        Likewise; both ends belong to the span.
+    most : int
+        readings.
 
-    Returns:
+    Returns
+    -------
+    list[dict[str, Any]]
         Rows as `History.entries` yields them, with ``content`` as plain data.
     """
     c = ENTRY.c
@@ -103,13 +110,20 @@ def minute_text(time: int) -> str:
 class Coverage:
     """How many components of readings lay within so many sigmas of their predictions.
 
-    Attributes:
-        sigmas: 1 or 2.
-        expected: share where predictions are right.
-        count: components.
-        share: of them within; NaN without any.
-        low: end of the interval within which the share is known with `CONFIDENCE`, of Clopper and Pearson.
-        high: its other end.
+    Attributes
+    ----------
+    sigmas : int
+        1 or 2.
+    expected : float
+        Share where predictions are right.
+    count : int
+        components.
+    share : float
+        Of them within; NaN without any.
+    low : float
+        End of the interval within which the share is known with `CONFIDENCE`, of Clopper and Pearson.
+    high : float
+        Its other end.
     """
 
     sigmas: int
@@ -128,10 +142,14 @@ class Coverage:
 def coverage(sigmas: int, within: int, count: int) -> Coverage:
     """The share of components within so many sigmas, with its exact binomial interval.
 
-    Args:
-        sigmas: 1 or 2.
-        within: components that lay within.
-        count: all components.
+    Parameters
+    ----------
+    sigmas : int
+        1 or 2.
+    within : int
+        Components that lay within.
+    count : int
+        All components.
     """
     low, high = share_interval(within, count, CONFIDENCE)
     return Coverage(sigmas, WITHIN[sigmas], count, within / count if count else math.nan, low, high)
@@ -141,10 +159,14 @@ def coverage(sigmas: int, within: int, count: int) -> Coverage:
 class Points:
     """What single readings say of the quantities, each by itself.
 
-    Attributes:
-        times: (N,) microseconds of TAI since 2000.
-        values: (N, Q) in each quantity's unit; NaN where a reading does not have it.
-        sigmas: (N, Q) standard deviations that the readings state, likewise.
+    Attributes
+    ----------
+    times : np.ndarray
+        (N,) microseconds of TAI since 2000.
+    values : np.ndarray
+        (N, Q) in each quantity's unit; NaN where a reading does not have it.
+    sigmas : np.ndarray
+        (N, Q) standard deviations that the readings state, likewise.
     """
 
     times: np.ndarray
@@ -155,9 +177,12 @@ class Points:
 def points_of(entries: Sequence[Mapping[str, Any]], quantities: Sequence[Quantity]) -> Points:
     """Readings of the monitor as points.
 
-    Args:
-        entries: of kind ``monitor``, with ``content`` as plain data.
-        quantities: Q of them.
+    Parameters
+    ----------
+    entries : Sequence[Mapping[str, Any]]
+        Of kind ``monitor``, with ``content`` as plain data.
+    quantities : Sequence[Quantity]
+        Q of them.
     """
     values = np.full((len(entries), len(quantities)), np.nan)
     sigmas = values.copy()
@@ -181,11 +206,16 @@ def spread(begin: int, end: int, count: int) -> np.ndarray:
 class Happening:
     """Something that happened at a time.
 
-    Attributes:
-        time: microseconds of TAI since 2000.
-        kind: ``jump``, ``event``, ``sensor``, ``alarm`` or ``left out``.
-        text: what.
-        again: whether another one says the same, as of a jump and of its alarm.
+    Attributes
+    ----------
+    time : int
+        Microseconds of TAI since 2000.
+    kind : str
+        ``jump``, ``event``, ``sensor``, ``alarm`` or ``left out``.
+    text : str
+        what.
+    again : bool
+        Whether another one says the same, as of a jump and of its alarm.
     """
 
     time: int
@@ -198,12 +228,18 @@ class Happening:
 class Overview:
     """The state of an operation as readers are told it.
 
-    Attributes:
-        operation: the estimate.
-        following: what it says now.
-        alarms: of the record, as `History.alarms` tells them.
-        events: all of the record, (time_us, name, causes that may have stepped then).
-        begin: time of the first reading of the monitor, microseconds of TAI since 2000.
+    Attributes
+    ----------
+    operation : Operation
+        The estimate.
+    following : Following
+        What it says now.
+    alarms : tuple[Mapping[str, Any], ...]
+        Of the record, as `History.alarms` tells them.
+    events : tuple[tuple[int, str, tuple[str, ...]], ...]
+        All of the record, (time_us, name, causes that may have stepped then).
+    begin : int
+        Time of the first reading of the monitor, microseconds of TAI since 2000.
     """
 
     operation: Operation
@@ -298,10 +334,14 @@ class Overview:
     def change_sentence(self, begin: int, end: int, when: str) -> str:
         """What changed in a span, counted by sort.
 
-        Args:
-            begin: of the span, microseconds of TAI since 2000.
-            end: which does not belong to it.
-            when: how the sentence calls it.
+        Parameters
+        ----------
+        begin : int
+            Of the span, microseconds of TAI since 2000.
+        end : int
+            Which does not belong to it.
+        when : str
+            How the sentence calls it.
         """
         found = self.changed(begin, end)
         counts = {kind: sum(one.kind == kind for one in found) for kind in _COUNTED}
@@ -398,10 +438,14 @@ def carried_text(overview: Overview, jump: FoundJump) -> str:
 class Trend:
     """The course of all quantities over a span.
 
-    Attributes:
-        past: with all readings, up to the newest.
-        future: forecast from there; None where the span ends before.
-        points: single readings, some of them where there are too many.
+    Attributes
+    ----------
+    past : Course
+        With all readings, up to the newest.
+    future : Course | None
+        Forecast from there; None where the span ends before.
+    points : Points
+        Single readings, some of them where there are too many.
     """
 
     past: Course
@@ -416,12 +460,18 @@ MOST_POINTS = 600
 def trend(history: History, overview: Overview, begin: int, end: int, count: int = 240) -> Trend:
     """The course over a span.
 
-    Args:
-        history: the record.
-        overview: of it.
-        begin: microseconds of TAI since 2000.
-        end: likewise; what lies after the newest reading is forecast.
-        count: times at most, of past and future each.
+    Parameters
+    ----------
+    history : History
+        The record.
+    overview : Overview
+        Of it.
+    begin : int
+        Microseconds of TAI since 2000.
+    end : int
+        Likewise; what lies after the newest reading is forecast.
+    count : int
+        Times at most, of past and future each.
     """
     operation, now = overview.operation, overview.time
     edges = [t for jump in overview.following.jumps for t in (jump.after_us, jump.until_us)]

@@ -65,9 +65,12 @@ that does not."""
 class Mark:
     """What an estimate does not hold across.
 
-    Attributes:
-        time: microseconds of TAI since 2000.
-        reason: in words.
+    Attributes
+    ----------
+    time : int
+        Microseconds of TAI since 2000.
+    reason : str
+        In words.
     """
 
     time: int
@@ -78,9 +81,12 @@ class Mark:
 class Validity:
     """Span in which an estimate holds.
 
-    Attributes:
-        since, until: microseconds of TAI since 2000.
-        since_reason, until_reason: why it does not hold before and after.
+    Attributes
+    ----------
+    since, until : int
+        Microseconds of TAI since 2000.
+    since_reason, until_reason : str
+        Why it does not hold before and after.
     """
 
     since: int
@@ -99,13 +105,20 @@ def validity(
 ) -> Validity:
     """The span in which the estimate of a time holds.
 
-    Args:
-        estimates: at times in ascending order.
-        time: of the estimate.
-        first: from when on there are estimates.
-        last: until when.
-        marks: what lies between; one at the time itself counts as before it.
-        beside: the estimate just beside the time, in place of that at it.
+    Parameters
+    ----------
+    estimates : Callable[[Sequence[int]], Course]
+        At times in ascending order.
+    time : int
+        Of the estimate.
+    first : Mark
+        From when on there are estimates.
+    last : Mark
+        Until when.
+    marks : Sequence[Mark]
+        What lies between; one at the time itself counts as before it.
+    beside : Course | None
+        The estimate just beside the time, in place of that at it.
     """
     low = max((one for one in (first, *marks) if one.time <= time), key=lambda one: one.time)
     high = min((one for one in (last, *marks) if one.time > time), key=lambda one: one.time, default=last)
@@ -141,11 +154,16 @@ def _looked_at(
     """Where the estimate ceases to hold, by the sign of the side: the last distance at which it holds and the first at
     which it does not, microseconds, and why; sides on which it holds are missing.
 
-    Args:
-        estimates: asked once for the times of all sides.
-        here: the estimate.
-        time: of it.
-        sides: sign -> a distance at which it holds, and those to look at, (T,), increasing.
+    Parameters
+    ----------
+    estimates : Callable[[Sequence[int]], Course]
+        Asked once for the times of all sides.
+    here : Course
+        The estimate.
+    time : int
+        Of it.
+    sides : Mapping[int, tuple[int, NDArray[np.int64]]]
+        Sign -> a distance at which it holds, and those to look at, (T,), increasing.
     """
     times = np.unique(np.concatenate([np.empty(0, np.int64), *(time + sign * own for sign, (_, own) in sides.items())]))
     if not len(times):
@@ -179,20 +197,34 @@ APART = 60 * MICRO
 class Products:
     """All products of one time.
 
-    Attributes:
-        history: the record.
-        time: of the estimate, microseconds of TAI since 2000.
-        scene_time: when the scene was taken, likewise; None without a scene.
-        following: what the estimate says now, with the readings that it rests on.
-        version: SHA-256 of the last entry of the record, of the plan and of the program's version.
-        course: the estimate at that time.
-        validity: span in which it holds.
-        changes: camera -> its estimated change.
-        export: camera models of the scene; None without one.
-        state: text of the job of the estimated state.
-        state_left_out: what a job cannot say.
-        prior: what is uncertain of the state.
-        warnings: in words.
+    Attributes
+    ----------
+    history : History
+        The record.
+    time : int
+        Of the estimate, microseconds of TAI since 2000.
+    scene_time : int | None
+        When the scene was taken, likewise; None without a scene.
+    following : Following
+        What the estimate says now, with the readings that it rests on.
+    version : str
+        SHA-256 of the last entry of the record, of the plan and of the program's version.
+    course : Course
+        The estimate at that time.
+    validity : Validity
+        Span in which it holds.
+    changes : Mapping[str, EstimatedChange]
+        Camera -> its estimated change.
+    export : Export | None
+        Camera models of the scene; None without one.
+    state : str
+        Text of the job of the estimated state.
+    state_left_out : tuple[LeftOut, ...]
+        What a job cannot say.
+    prior : Prior
+        What is uncertain of the state.
+    warnings : tuple[str, ...]
+        In words.
     """
 
     history: History
@@ -213,11 +245,15 @@ class Products:
 def scene_time(scene: ExportSource) -> int:
     """When a scene was taken, microseconds of TAI since 2000.
 
-    Args:
-        scene: as `twin.orbit.export.export_run.read_source` reads it.
+    Parameters
+    ----------
+    scene : ExportSource
+        As `twin.orbit.export.export_run.read_source` reads it.
 
-    Raises:
-        Problem: it is not one moment.
+    Raises
+    ------
+    Problem
+        It is not one moment.
     """
     setup = scene.setup
     if not isinstance(setup, AngleSetup):
@@ -228,16 +264,25 @@ def scene_time(scene: ExportSource) -> int:
 def made(operation: Operation, history: History, time: int, scene: ExportSource | None, backend: Backend) -> Products:
     """The products of a time.
 
-    Args:
-        operation: that follows the record.
-        history: the record.
-        time: microseconds of TAI since 2000.
-        scene: whose camera models are wanted; None for none.
-        backend: where the cameras' lines are traced.
+    Parameters
+    ----------
+    operation : Operation
+        That follows the record.
+    history : History
+        The record.
+    time : int
+        Microseconds of TAI since 2000.
+    scene : ExportSource | None
+        Whose camera models are wanted; None for none.
+    backend : Backend
+        Where the cameras' lines are traced.
 
-    Raises:
-        Problem: nothing is known of that time, or the scene is of another instrument.
-        InputError: the scene cannot be flown or modelled.
+    Raises
+    ------
+    Problem
+        Nothing is known of that time, or the scene is of another instrument.
+    InputError
+        The scene cannot be flown or modelled.
     """
     at = None if scene is None else scene_time(scene)
     if scene is not None:
@@ -493,8 +538,10 @@ PRODUCTS: Record[Products] = Record(
 def product_files(one: Products) -> tuple[dict[str, bytes], dict[str, Any]]:
     """Path in the folder -> contents, and the numbers of `NUMBERS`, which tells the checksums of all others.
 
-    Args:
-        one: all products of a time.
+    Parameters
+    ----------
+    one : Products
+        All products of a time.
     """
     files: dict[str, bytes] = {} if one.export is None else export_files(one.export)
     files[f"{STATE}.yaml"] = one.state.encode()

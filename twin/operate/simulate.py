@@ -51,12 +51,18 @@ it does."""
 class Step:
     """Motions that stepped at one moment.
 
-    Attributes:
-        time: microseconds of TAI since 2000.
-        cause: of the disturbances file.
-        body: whose motions; empty where those of all bodies of the cause stepped, by an event.
-        event: that made them step; empty for a jump at a time that nobody knows.
-        sizes: (M,) SI, zero for what did not step.
+    Attributes
+    ----------
+    time : int
+        Microseconds of TAI since 2000.
+    cause : str
+        Of the disturbances file.
+    body : str
+        Whose motions; empty where those of all bodies of the cause stepped, by an event.
+    event : str
+        That made them step; empty for a jump at a time that nobody knows.
+    sizes : Array
+        (M,) SI, zero for what did not step.
     """
 
     time: int
@@ -70,13 +76,20 @@ class Step:
 class Life:
     """What every stated motion of an instrument does at T times.
 
-    Attributes:
-        times: (T,) microseconds of TAI since 2000, rising.
-        components: M of them.
-        drawn: (T, M) SI, as the laws say and without steps.
-        steps: in the order of time.
-        dates: when which event came: microseconds, name.
-        coefficients: body with a temperature -> by which part its temperature does more to light than is computed.
+    Attributes
+    ----------
+    times : Moments
+        (T,) microseconds of TAI since 2000, rising.
+    components : tuple[Component, ...]
+        M of them.
+    drawn : Array
+        (T, M) SI, as the laws say and without steps.
+    steps : tuple[Step, ...]
+        In the order of time.
+    dates : tuple[tuple[int, str], ...]
+        When which event came: microseconds, name.
+    coefficients : Mapping[str, float]
+        Body with a temperature -> by which part its temperature does more to light than is computed.
     """
 
     times: Moments
@@ -123,15 +136,22 @@ def drawn_life(
 ) -> Life:
     """Draw what every motion does.
 
-    Args:
-        stated: the motions and their laws of time.
-        times: (T,) microseconds of TAI since 2000, rising.
-        zero: from which the laws count their seconds, likewise.
-        seed: of everything that is drawn; what one cause draws does not depend on the others.
-        causes: event -> names of the causes whose motions step when it comes.
-        dates: when which event comes; None to draw one date for each.
-        coefficient_error: standard deviation of what a body's temperature does to light beyond what is computed,
-            relative.
+    Parameters
+    ----------
+    stated : StatedMotions
+        The motions and their laws of time.
+    times : Moments
+        (T,) microseconds of TAI since 2000, rising.
+    zero : int
+        From which the laws count their seconds, likewise.
+    seed : int
+        Of everything that is drawn; what one cause draws does not depend on the others.
+    causes : Mapping[str, Sequence[str]]
+        Event -> names of the causes whose motions step when it comes.
+    dates : Sequence[tuple[int, str]] | None
+        When which event comes; None to draw one date for each.
+    coefficient_error : float
+        Standard deviation of what a body's temperature does to light beyond what is computed, relative.
     """
     seconds = (times - zero) / MICRO
     drawn = drawn_motions(stated, seconds, lambda number: np.random.default_rng(stream(seed, _MOTIONS, number)))
@@ -198,19 +218,30 @@ _KELVIN = 4
 class Simulation:
     """What is simulated.
 
-    Attributes:
-        start: of the first reading, microseconds of TAI since 2000; the laws of time count from it.
-        seconds: that the life takes.
-        every: from one reading of the monitor to the next, seconds; the temperatures are read with it.
-        seed: of everything that is drawn.
-        frames: of each exposure.
-        coefficient_error: standard deviation, from body to body, of what a temperature does to light beyond what is
-            computed, relative.
-        sensor_sigma: of a sensor of temperature, kelvin.
-        sensors: bodies that have one; None for all that are stated to get warmer.
-        dead: body -> moment from which on its sensor says nothing; stuck: from which on it repeats what it said last.
-        dates: when which event came; None to draw one date for each of the plan's.
-        words: by which a command asks for it, all but the seed.
+    Attributes
+    ----------
+    start : int
+        Of the first reading, microseconds of TAI since 2000; the laws of time count from it.
+    seconds : float
+        That the life takes.
+    every : float
+        From one reading of the monitor to the next, seconds; the temperatures are read with it.
+    seed : int
+        Of everything that is drawn.
+    frames : int
+        Of each exposure.
+    coefficient_error : float
+        Standard deviation, from body to body, of what a temperature does to light beyond what is computed, relative.
+    sensor_sigma : float
+        Of a sensor of temperature, kelvin.
+    sensors : tuple[str, ...] | None
+        Bodies that have one; None for all that are stated to get warmer.
+    dead : Mapping[str, int]
+        Body -> moment from which on its sensor says nothing; stuck: from which on it repeats what it said last.
+    dates : tuple[tuple[int, str], ...] | None
+        When which event came; None to draw one date for each of the plan's.
+    words : tuple[str, ...]
+        By which a command asks for it, all but the seed.
     """
 
     start: int
@@ -237,12 +268,18 @@ class Simulation:
 class Recorded:
     """What came of a simulated life.
 
-    Attributes:
-        life: as it was drawn.
-        times: (R,) microseconds of TAI since 2000 of the readings of the monitor.
-        readings: what recovered.json has of each.
-        truth: what the cameras truly did at these times, as JSON files nest it.
-        lost: moment of a reading that could not be, and why.
+    Attributes
+    ----------
+    life : Life
+        As it was drawn.
+    times : np.ndarray
+        (R,) microseconds of TAI since 2000 of the readings of the monitor.
+    readings : tuple[dict[str, Any], ...]
+        What recovered.json has of each.
+    truth : Mapping[str, Any]
+        What the cameras truly did at these times, as JSON files nest it.
+    lost : tuple[tuple[int, str], ...]
+        Moment of a reading that could not be, and why.
     """
 
     life: Life
@@ -255,11 +292,16 @@ class Recorded:
 def recorded(plan: OperationSetup, experiment: MonitorExperiment, what: Simulation, advance: Advance) -> Recorded:
     """Draw a life, trace and render its states, and recover what the monitor reads of them.
 
-    Args:
-        plan: of the operation: what moves, and what events do.
-        experiment: on its instrument, with its disturbances.
-        what: is simulated.
-        advance: told of the progress.
+    Parameters
+    ----------
+    plan : OperationSetup
+        Of the operation: what moves, and what events do.
+    experiment : MonitorExperiment
+        On its instrument, with its disturbances.
+    what : Simulation
+        Is simulated.
+    advance : Advance
+        Told of the progress.
     """
     motions = experiment.stated
     assert motions is not None  # a plan states them
@@ -312,12 +354,18 @@ def write_simulated(
 ) -> None:
     """Write what the instrument would send down, and a file that says what its tables hold; not the truth.
 
-    Args:
-        folder: open.
-        plan: of the operation.
-        experiment: on its instrument.
-        what: was simulated.
-        found: what came of it.
+    Parameters
+    ----------
+    folder : RunFolder
+        open.
+    plan : OperationSetup
+        Of the operation.
+    experiment : MonitorExperiment
+        On its instrument.
+    what : Simulation
+        Was simulated.
+    found : Recorded
+        What came of it.
     """
     folder.write_text(CONFIG, dump_yaml(plan.plain()))
     seconds = ((found.times - found.times[0]) / MICRO).tolist()
@@ -347,10 +395,14 @@ def write_simulated(
 def sensed_temperatures(reference: float, what: Simulation, life: Life) -> dict[str, np.ndarray]:
     """Body -> (T,) what its sensor says, kelvin; NaN where it says nothing.
 
-    Args:
-        reference: temperature of the instrument, kelvin.
-        what: is simulated.
-        life: as it was drawn.
+    Parameters
+    ----------
+    reference : float
+        Temperature of the instrument, kelvin.
+    what : Simulation
+        Is simulated.
+    life : Life
+        As it was drawn.
     """
     out: dict[str, np.ndarray] = {}
     for number, (body, change) in enumerate(life.temperatures.items()):
@@ -372,10 +424,14 @@ def truth_numbers(plan: OperationSetup, what: Simulation, found: Recorded) -> di
     """What only the simulation knows, as plain data: changes of cameras, angle and ground by the exact trace, steps,
     coefficients and temperatures.
 
-    Args:
-        plan: of the operation.
-        what: was simulated.
-        found: what came of it.
+    Parameters
+    ----------
+    plan : OperationSetup
+        Of the operation.
+    what : Simulation
+        Was simulated.
+    found : Recorded
+        What came of it.
     """
     life = found.life
     steps = [

@@ -43,15 +43,21 @@ DAY = 86_400.0
 def simulation(options: Mapping[str, str], several: Mapping[str, Sequence[str]], seed: int) -> Simulation:
     """What the options of the command ask for.
 
-    Args:
-        options: by name, as they were written: ``--from``, ``--days``, ``--every``, ``--frames``,
-            ``--coefficient-error``, ``--sensor-sigma``.
-        several: likewise those that may be given more than once: ``--sensor`` BODY, ``--dead`` and ``--stuck``
-            BODY@UTC, ``--event`` NAME@UTC.
-        seed: of everything that is drawn.
+    Parameters
+    ----------
+    options : Mapping[str, str]
+        By name, as they were written: ``--from``, ``--days``, ``--every``, ``--frames``, ``--coefficient-error``,
+        ``--sensor-sigma``.
+    several : Mapping[str, Sequence[str]]
+        Likewise those that may be given more than once: ``--sensor`` BODY, ``--dead`` and ``--stuck`` BODY@UTC,
+        ``--event`` NAME@UTC.
+    seed : int
+        Of everything that is drawn.
 
-    Raises:
-        InputErrorText: an option that means nothing, by its name.
+    Raises
+    ------
+    InputErrorText
+        An option that means nothing, by its name.
     """
     every, days = options["--every"], float(options["--days"])
     step = _quantity("--every", every, MOMENT)
@@ -130,24 +136,37 @@ def simulate_into(
 ) -> dict[str, Any]:
     """Simulate a life, write its files and take them into a record, which is made where there is none.
 
-    Args:
-        file: plan of the operation, which the record keeps; or config.yaml of a life, which holds all that a plan
-            refers to.
-        record: folder, or address of a database; None for the files alone.
-        out: folder for what the instrument would send down; None for one in the record's, or the next free run folder.
-        truth: file for what only the simulation knows; None for one in that folder, ``none`` for no file.
-        force: replace the folder, if it is that of such files.
-        what: is simulated.
-        backend: where to trace.
-        advance: told of the progress.
+    Parameters
+    ----------
+    file : Path
+        Plan of the operation, which the record keeps; or config.yaml of a life, which holds all that a plan refers to.
+    record : str | None
+        Folder, or address of a database; None for the files alone.
+    out : Path | None
+        Folder for what the instrument would send down; None for one in the record's, or the next free run folder.
+    truth : Path | None
+        File for what only the simulation knows; None for one in that folder, ``none`` for no file.
+    force : bool
+        Replace the folder, if it is that of such files.
+    what : Simulation
+        Is simulated.
+    backend : Backend
+        Where to trace.
+    advance : Advance
+        Told of the progress.
 
-    Returns:
+    Returns
+    -------
+    dict[str, Any]
         What was done, as plain data.
 
-    Raises:
-        InputErrorText: a record that holds readings already, or is not of simulated ones; no place for the files; an
-            unknown body; more memory than there is.
-        InputError, RunFolderError, NotARecord, RecordFailed: of the plan, the instrument, the folder, the record.
+    Raises
+    ------
+    InputErrorText
+        a record that holds readings already, or is not of simulated ones; no place for the files; an unknown body; more
+        memory than there is.
+    InputError, RunFolderError, NotARecord, RecordFailed
+        Of the plan, the instrument, the folder, the record.
     """
     started, clock = time.time(), time.monotonic()
     text = read_yaml(file)
@@ -219,9 +238,12 @@ def _again(truth: Path | None, what: Simulation, backend: Backend) -> Iterator[s
 def take_files(history: History, file: Path) -> list[Taken]:
     """Take all tables that a file names into a record.
 
-    Args:
-        history: the record.
-        file: that says what the tables hold.
+    Parameters
+    ----------
+    history : History
+        The record.
+    file : Path
+        That says what the tables hold.
     """
     spec = read_telemetry(file, history)
     every = ((table, path) for table in spec.readings for path in tables_of(spec, table))

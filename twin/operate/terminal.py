@@ -68,12 +68,17 @@ def problems_of(what: str = "") -> Iterator[None]:
 def moment_said(option: str, text: str) -> int:
     """Microseconds of TAI since 2000 of a UTC that a command was given.
 
-    Args:
-        option: with its dashes.
-        text: after it.
+    Parameters
+    ----------
+    option : str
+        With its dashes.
+    text : str
+        After it.
 
-    Raises:
-        InputErrorText: not a date and time.
+    Raises
+    ------
+    InputErrorText
+        Not a date and time.
     """
     from twin.operate.record.entries import micros
 
@@ -84,11 +89,16 @@ def moment_said(option: str, text: str) -> int:
 def tell(errors: Console, options: cli.Options, data: Any, show: Callable[[Console], None]) -> None:
     """Print a result, as JSON or as a reader wants it.
 
-    Args:
-        errors: where it is told that standard output is gone.
-        options: whether ``data`` are printed, or nothing is.
-        data: plain data.
-        show: prints it for a reader.
+    Parameters
+    ----------
+    errors : Console
+        Where it is told that standard output is gone.
+    options : cli.Options
+        Whether ``data`` are printed, or nothing is.
+    data : Any
+        Plain data.
+    show : Callable[[Console], None]
+        Prints it for a reader.
     """
     with to_stdout(errors, "the record is as it was told"):
         if options.as_json:
@@ -116,11 +126,16 @@ def show_table(console: Console, heads: Sequence[str], rows: Iterable[Sequence[s
 class Call:
     """A command at work on a record.
 
-    Attributes:
-        place: folder or address of the record.
-        history: the record.
-        errors: where errors and the progress are told.
-        options: ``as_json`` and ``quiet``.
+    Attributes
+    ----------
+    place : str
+        Folder or address of the record.
+    history : History
+        The record.
+    errors : Console
+        Where errors and the progress are told.
+    options : cli.Options
+        ``as_json`` and ``quiet``.
     """
 
     place: str
@@ -147,12 +162,17 @@ class Call:
     def followed(self, setup: OperationSetup, history: History | None = None) -> Operation:
         """Return the estimate of the record under a plan, with all readings; how far it is is told now and then.
 
-        Args:
-            setup: the plan.
-            history: the record as it was at an earlier time, in place of the command's.
+        Parameters
+        ----------
+        setup : OperationSetup
+            The plan.
+        history : History | None
+            The record as it was at an earlier time, in place of the command's.
 
-        Raises:
-            InputErrorText: there is no reading of the monitor.
+        Raises
+        ------
+        InputErrorText
+            There is no reading of the monitor.
         """
         from twin.operate.estimate.operation_filter import Operation
 
@@ -178,13 +198,19 @@ class Call:
     def write_new(self, out: Path, files: Mapping[str, bytes], what: str) -> None:
         """Write files into a new folder.
 
-        Args:
-            out: the folder, see `require_new`.
-            files: path in it -> content.
-            what: they are.
+        Parameters
+        ----------
+        out : Path
+            The folder, see `require_new`.
+        files : Mapping[str, bytes]
+            Path in it -> content.
+        what : str
+            They are.
 
-        Raises:
-            typer.Exit: they cannot be written, which has been told.
+        Raises
+        ------
+        typer.Exit
+            They cannot be written, which has been told.
         """
         try:
             for folder in sorted({out, *((out / name).parent for name in files)}):
@@ -204,9 +230,11 @@ def require_new(out: Path) -> None:
 def on_record(work: Callable[..., None]) -> Callable[..., None]:
     """Return the command that opens a record and does some work on it.
 
-    Args:
-        work: called with a `Call` and with the options of its signature; the record comes before them, ``--json`` and
-            ``--quiet`` after them.
+    Parameters
+    ----------
+    work : Callable[..., None]
+        Called with a `Call` and with the options of its signature; the record comes before them, ``--json`` and
+        ``--quiet`` after them.
     """
 
     def command(record: str, options: cli.Options, **given: Any) -> None:

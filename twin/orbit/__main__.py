@@ -232,8 +232,10 @@ def export(
 def _sigma(name: str, given: str | float) -> float:
     """A standard deviation in SI units; pixels stay pixels.
 
-    Raises:
-        InputErrorText: none, or one that is too large.
+    Raises
+    ------
+    InputErrorText
+        None, or one that is too large.
     """
     if not isinstance(given, str):
         return float(given)
@@ -254,8 +256,10 @@ _SIGMAS = {"position": (DISTANCE, 1e5, "1 m"), "attitude": (ANGLE, 0.1, "2 arcse
 def _ground(lowest: str | None, highest: str | None) -> tuple[float, float] | None:
     """Heights that were asked for, metres; None where none were.
 
-    Raises:
-        InputErrorText: they are no heights, or only one of them is given.
+    Raises
+    ------
+    InputErrorText
+        They are no heights, or only one of them is given.
     """
     if lowest is None and highest is None:
         return None

@@ -33,12 +33,18 @@ PLACES = 4
 class Patch:
     """A clear aperture and a box around it.
 
-    Attributes:
-        surface: its number, -1 of a source; aperture: which of the surface's.
-        middle: on the surface, world, metres; normal: there, unit, toward +z of the surface.
-        corners: of the box, world, (8, 3), metres.
-        normals: of the surface's triangles, world, (T, 3).
-        solid: glass body, None for none.
+    Attributes
+    ----------
+    surface : int
+        Its number, -1 of a source; aperture: which of the surface's.
+    middle : np.ndarray
+        On the surface, world, metres; normal: there, unit, toward +z of the surface.
+    corners : np.ndarray
+        Of the box, world, (8, 3), metres.
+    normals : np.ndarray
+        Of the surface's triangles, world, (T, 3).
+    solid : str | None
+        Glass body, None for none.
     """
 
     surface: int
@@ -76,12 +82,17 @@ class Patch:
 class Way:
     """From a clear aperture to the next one of a family.
 
-    Attributes:
-        start: number of the surface that light leaves, -1 for the source.
-        place: from where: 2 * (number of the aperture) + (1 where it leaves toward -z).
-        end: where it arrives.
-        after: position in the list of the way that the family takes next, -1 for none, and ``behind``, 1 where that
-            leaves the end toward -z.
+    Attributes
+    ----------
+    start : int
+        Number of the surface that light leaves, -1 for the source.
+    place : int
+        From where: 2 * (number of the aperture) + (1 where it leaves toward -z).
+    end : Patch
+        Where it arrives.
+    after : int
+        Position in the list of the way that the family takes next, -1 for none, and ``behind``, 1 where that leaves the
+        end toward -z.
     """
 
     start: int
@@ -94,12 +105,17 @@ class Way:
 class ClearWays:
     """The ways along families of paths, up to their detectors, between whose ends nothing stands.
 
-    Args:
-        scenery: all surfaces.
-        families: detector -> codes of the events before it.
+    Parameters
+    ----------
+    scenery
+        All surfaces.
+    families
+        Detector -> codes of the events before it.
 
-    Attributes:
-        ways: of all families.
+    Attributes
+    ----------
+    ways
+        Of all families.
     """
 
     def __init__(self, scenery: Scenery, families: Mapping[str, Sequence[int]]) -> None:
@@ -136,17 +152,22 @@ class ClearWays:
         """The apertures that a family meets, up to its detector, each with the position of the way that leads there in
         the list of ways, -1 for none; empty where nothing is known of it.
 
-        Args:
-            family: its detector, None for the first one.
+        Parameters
+        ----------
+        family : str | None
+            Its detector, None for the first one.
         """
         return self._lines.get(family or next(iter(self._lines), ""), [])
 
     def from_source(self, start: Patch, family: str | None = None) -> Way | None:
         """The way from a source to the first surface of a family, None where there is none.
 
-        Args:
-            start: the source's disk of places.
-            family: its detector, None for the first one.
+        Parameters
+        ----------
+        start : Patch
+            The source's disk of places.
+        family : str | None
+            Its detector, None for the first one.
         """
         line = self.line(family)
         way = self._between(start, line[0][1]) if line else None

@@ -45,12 +45,18 @@ def near_density(distance: Any) -> Any:
 class Leaving:
     """A path that leaves a surface: Dr.Jit arrays.
 
-    Attributes:
-        direction: specular or refracted direction; normal: unit, either side.
-        index: refractive index on the side it leaves to.
-        event: what happened; weight: its weight.
-        toward: cosine of the arriving direction with ``normal``.
-        diffusing: whether it is diffused.
+    Attributes
+    ----------
+    direction : Any
+        Specular or refracted direction; normal: unit, either side.
+    index : Any
+        Refractive index on the side it leaves to.
+    event : Any
+        What happened; weight: its weight.
+    toward : Any
+        Cosine of the arriving direction with ``normal``.
+    diffusing : Any
+        Whether it is diffused.
     """
 
     direction: Any
@@ -66,9 +72,12 @@ class Leaving:
 class TableDraw:
     """Measured scattering of the surfaces that paths leave.
 
-    Attributes:
-        tables: of the scene; marks: of the paths' finishes.
-        cosine: of incidence.
+    Attributes
+    ----------
+    tables : Any
+        Of the scene; marks: of the paths' finishes.
+    cosine : Any
+        Of incidence.
     """
 
     tables: Any
@@ -81,16 +90,26 @@ def divide(
 ) -> tuple[Any, Any]:
     """Draw which paths are scattered.
 
-    Args:
-        rng: random numbers.
-        met: paths that are at a surface.
-        specular: those of them that are reflected or transmitted.
-        share: of the light that is scattered.
-        floor: smallest probability of it where there is some.
-        weight: of the paths.
-        all_of_it: whether a surface may scatter all of the light.
+    Parameters
+    ----------
+    rng : Any
+        Random numbers.
+    met : Any
+        Paths that are at a surface.
+    specular : Any
+        Those of them that are reflected or transmitted.
+    share : Any
+        Of the light that is scattered.
+    floor : Any
+        Smallest probability of it where there is some.
+    weight : Any
+        Of the paths.
+    all_of_it : bool
+        Whether a surface may scatter all of the light.
 
-    Returns:
+    Returns
+    -------
+    tuple[Any, Any]
         Which are scattered, and the weights.
     """
     import drjit as dr
@@ -116,18 +135,30 @@ def spread(
 ) -> tuple[Any, Any, Any, Any]:
     """Draw the direction of light that is diffused or scattered into the lobe around the specular direction.
 
-    Args:
-        backend: array types.
-        rng: random numbers, drawn from here on.
-        met: paths that are at a surface.
-        share: of the light for which a direction is drawn from a lobe.
-        lobe: looks the lobe of active paths up: scale, exponent, kind, area.
-        floor: smallest probability of drawing from a lobe that there is.
-        near: share of the directions that are drawn with ``near_distance``, None for none.
-        leaving: the paths as they would go on without.
-        drawn: measured scattering, None where there is none; ``share`` is then theirs.
+    Parameters
+    ----------
+    backend : Backend
+        Array types.
+    rng : Any
+        Random numbers, drawn from here on.
+    met : Any
+        Paths that are at a surface.
+    share : Any
+        Of the light for which a direction is drawn from a lobe.
+    lobe : Callable[[Any], Sequence[Any]]
+        Looks the lobe of active paths up: scale, exponent, kind, area.
+    floor : Any
+        Smallest probability of drawing from a lobe that there is.
+    near : Any
+        Share of the directions that are drawn with ``near_distance``, None for none.
+    leaving : Leaving
+        The paths as they would go on without.
+    drawn : TableDraw | None
+        Measured scattering, None where there is none; ``share`` is then theirs.
 
-    Returns:
+    Returns
+    -------
+    tuple[Any, Any, Any, Any]
         Direction, event, weight, and rng.
     """
     import drjit as dr
@@ -204,10 +235,14 @@ AT_ONCE = 0.15
 class Thinning:
     """Probability of following paths that turn away from nominal light.
 
-    Attributes:
-        kept: by the number of surfaces passed.
-        first: number of the first path that may be left out.
-        seed: of the random numbers; what happens to a path depends on it and on the path's number alone.
+    Attributes
+    ----------
+    kept : np.ndarray
+        By the number of surfaces passed.
+    first : int
+        Number of the first path that may be left out.
+    seed : int
+        Of the random numbers; what happens to a path depends on it and on the path's number alone.
     """
 
     kept: np.ndarray
@@ -235,10 +270,14 @@ class Thinning:
 class Followed:
     """What a launch has done, path by path.
 
-    Attributes:
-        passed: surfaces of the nominal way, (N,).
-        turned: whether the path turned away there, (N,); else it missed the next one or came to the detector.
-        steps: surfaces met after that, (N,).
+    Attributes
+    ----------
+    passed : np.ndarray
+        Surfaces of the nominal way, (N,).
+    turned : np.ndarray
+        Whether the path turned away there, (N,); else it missed the next one or came to the detector.
+    steps : np.ndarray
+        Surfaces met after that, (N,).
     """
 
     passed: np.ndarray
@@ -249,10 +288,13 @@ class Followed:
 def learn(seen: Sequence[tuple[Followed, np.ndarray, np.ndarray]], seed: int) -> Thinning:
     """Probabilities by what the first paths of a run have brought.
 
-    Args:
-        seen: launches of these paths, numbered from 0: what they have done, numbers of those that brought light off the
-            nominal way to a detector, with repetitions, and the weights of that light.
-        seed: of the random numbers that are drawn with them.
+    Parameters
+    ----------
+    seen : Sequence[tuple[Followed, np.ndarray, np.ndarray]]
+        Launches of these paths, numbered from 0: what they have done, numbers of those that brought light off the
+        nominal way to a detector, with repetitions, and the weights of that light.
+    seed : int
+        Of the random numbers that are drawn with them.
     """
     passed, turned, steps = (
         np.concatenate([getattr(done, name) for done, _, _ in seen]) for name in ("passed", "turned", "steps")

@@ -36,17 +36,28 @@ most two; escaped to infinity. A path with none of them goes the way of its neig
 class Features:
     """What decides the kernel's code.
 
-    Attributes:
-        form: what the surfaces' shapes consist of.
-        ways: there are clear ways.
-        glass: there are glass bodies.
-        branching: some finish does more than one thing with light that goes on.
-        bare: some glass is bare.
-        measured: some finish has a table, of its coating or of its scattering.
-        roulette: weak paths are ended at random.
-        near: some scattered directions are drawn close to the specular one.
-        keep_nominal: detections of the nominal family are recorded as well.
-        log: the events of every path are written down.
+    Attributes
+    ----------
+    form : layout.SurfaceForm
+        What the surfaces' shapes consist of.
+    ways : bool
+        There are clear ways.
+    glass : bool
+        There are glass bodies.
+    branching : bool
+        Some finish does more than one thing with light that goes on.
+    bare : bool
+        Some glass is bare.
+    measured : bool
+        Some finish has a table, of its coating or of its scattering.
+    roulette : bool
+        Weak paths are ended at random.
+    near : bool
+        Some scattered directions are drawn close to the specular one.
+    keep_nominal : bool
+        Detections of the nominal family are recorded as well.
+    log : bool
+        The events of every path are written down.
     """
 
     form: layout.SurfaceForm
@@ -65,14 +76,21 @@ class Features:
 class Limits:
     """Numbers of one launch as opaque arrays of width 1.
 
-    Attributes:
-        steps: largest number of steps.
-        room: of the records.
-        floors: smallest probability of going each of the ways that there are, after none, one, and more unlikely ways;
-            0: as the power goes.
-        scatter_floors: likewise of drawing a direction from a scatter lobe.
-        near: share of these directions that are drawn close to the specular one.
-        weak: weight below which a path may be ended by roulette.
+    Attributes
+    ----------
+    steps : Any
+        Largest number of steps.
+    room : Any
+        Of the records.
+    floors : Sequence[Any]
+        Smallest probability of going each of the ways that there are, after none, one, and more unlikely ways; 0: as
+        the power goes.
+    scatter_floors : Sequence[Any]
+        Likewise of drawing a direction from a scatter lobe.
+    near : Any
+        Share of these directions that are drawn close to the specular one.
+    weak : Any
+        Weight below which a path may be ended by roulette.
     """
 
     steps: Any
@@ -87,17 +105,28 @@ class Limits:
 class Launch:
     """Paths at their start, or some surfaces after it. Neighbours should be alike.
 
-    Attributes:
-        position, direction: ``Vector3``.
-        weight: power.
-        path: number of the path.
-        rng: its random generator.
-        way: number of the way that it is on, 0 for none.
-        length: optical path so far, metres.
-        body: glass body that it is in, 0 for none.
-        ahead: how far ahead the search for the next surface starts, metres.
-        signature: of its events so far.
-        steps: how many these are.
+    Attributes
+    ----------
+    position, direction : Any
+        ``Vector3``.
+    weight : Any
+        power.
+    path : Any
+        Number of the path.
+    rng : Any
+        Its random generator.
+    way : Any
+        Number of the way that it is on, 0 for none.
+    length : Any
+        Optical path so far, metres.
+    body : Any
+        Glass body that it is in, 0 for none.
+    ahead : Any
+        How far ahead the search for the next surface starts, metres.
+    signature : Any
+        Of its events so far.
+    steps : Any
+        How many these are.
     """
 
     position: Any
@@ -128,7 +157,9 @@ def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: 
 
     The weight that escapes to infinity and the weight still under way at the step limit go to the sinks as well.
 
-    Returns:
+    Returns
+    -------
+    Any
         Steps that each path has taken from its start on.
     """
     import drjit as dr
@@ -283,12 +314,17 @@ def _by_number(number: Any, values: Sequence[Any]) -> Any:
 class Shares:
     """What becomes of light that meets a surface: Dr.Jit arrays.
 
-    Attributes:
-        reflected, transmitted, diffused: shares.
-        scattered: share of what is reflected or transmitted for which a scattered direction is drawn.
-        ratio, bent: refractive index before over that behind, and cosine of the angle of refraction, 0 for total
-            reflection; None where there is no glass.
-        marks: of measured finishes.
+    Attributes
+    ----------
+    reflected, transmitted, diffused : Any
+        shares.
+    scattered : Any
+        Share of what is reflected or transmitted for which a scattered direction is drawn.
+    ratio, bent : Any
+        Refractive index before over that behind, and cosine of the angle of refraction, 0 for total reflection; None
+        where there is no glass.
+    marks : Sequence[Any]
+        Of measured finishes.
     """
 
     reflected: Any
@@ -315,10 +351,14 @@ class Shares:
 class Choice:
     """Which way paths go at a surface: Dr.Jit arrays.
 
-    Attributes:
-        reflecting, through, diffusing: masks.
-        weight: with which they go on.
-        unlikely: whether a floor made the way more likely than its share of the light.
+    Attributes
+    ----------
+    reflecting, through, diffusing : Any
+        masks.
+    weight : Any
+        With which they go on.
+    unlikely : Any
+        Whether a floor made the way more likely than its share of the light.
     """
 
     reflecting: Any

@@ -76,8 +76,10 @@ def nominal_codes(scenery: Scenery, assembly: Assembly, sequence: str) -> tuple[
 
     Elements that only mark a place are left out.
 
-    Raises:
-        KeyError: an element of the sequence is on no surface of the scene.
+    Raises
+    ------
+    KeyError
+        An element of the sequence is on no surface of the scene.
     """
     parts = scenery.parts
     out = []
@@ -118,9 +120,12 @@ def family_name(family: tuple[Touch, ...], nominal: tuple[Touch, ...]) -> str:
     First come the reflections at faces that nominal light passes, and how many they are, then what is scattered and
     what else is met, then on which side of the nominal turning point it happens, or that this is not reached.
 
-    Args:
-        family: its events in order; empty when nobody looked them up.
-        nominal: those of the nominal family of the same detector.
+    Parameters
+    ----------
+    family : tuple[Touch, ...]
+        Its events in order; empty when nobody looked them up.
+    nominal : tuple[Touch, ...]
+        Those of the nominal family of the same detector.
     """
     if not family:
         return "not looked up"

@@ -24,15 +24,24 @@ CLASSES = 3
 class Sinks:
     """Targets of a launch.
 
-    Attributes:
-        absorbed: (rows of finishes,) weight, detected light included.
-        left: (3,) weight escaped to infinity, weight still under way at the step limit, weight at the start.
-        sums: (detectors * NOMINAL_SUMS) count, weight, its square, weighted x, y, x^2, y^2 of the nominal family.
-        images: (CLASSES * pixels of all detectors) weight.
-        counter: (1,) number of records asked for.
-        records: ``signature``, ``path``, ``detector``, ``x``, ``y``, ``weight``, ``length``, ``kind``, each (room,).
-        log: (paths * steps) code of every event, or None.
-        room: of the records.
+    Attributes
+    ----------
+    absorbed : Any
+        (rows of finishes,) weight, detected light included.
+    left : Any
+        (3,) weight escaped to infinity, weight still under way at the step limit, weight at the start.
+    sums : Any
+        (detectors * NOMINAL_SUMS) count, weight, its square, weighted x, y, x^2, y^2 of the nominal family.
+    images : Any
+        (CLASSES * pixels of all detectors) weight.
+    counter : Any
+        (1,) number of records asked for.
+    records : dict[str, Any]
+        ``signature``, ``path``, ``detector``, ``x``, ``y``, ``weight``, ``length``, ``kind``, each (room,).
+    log : Any
+        (paths * steps) code of every event, or None.
+    room : int
+        Of the records.
     """
 
     absorbed: Any
@@ -133,14 +142,22 @@ def record(
 class Family:
     """All paths that reached a detector by the same events in the same order.
 
-    Attributes:
-        detector: its name.
-        touches: the events before it; empty when it was not looked up.
-        kind: ``nominal``, ``ghost`` (another way without scattering) or ``stray`` (scattered or diffused somewhere).
-        energy: detected share of the emitted power; error: its standard error.
-        count: paths.
-        centroid: x, y in the detector's frame, metres.
-        rms: root-mean-square size along x and y about the centroid, metres.
+    Attributes
+    ----------
+    detector : str
+        Its name.
+    touches : tuple[Touch, ...]
+        The events before it; empty when it was not looked up.
+    kind : str
+        ``nominal``, ``ghost`` (another way without scattering) or ``stray`` (scattered or diffused somewhere).
+    energy : float
+        Detected share of the emitted power; error: its standard error.
+    count : int
+        paths.
+    centroid : tuple[float, float]
+        x, y in the detector's frame, metres.
+    rms : tuple[float, float]
+        Root-mean-square size along x and y about the centroid, metres.
     """
 
     detector: str
@@ -165,10 +182,14 @@ KINDS = {NOMINAL: "nominal", GHOST: "ghost", STRAY: "stray"}
 class Balance:
     """Where the emitted power went.
 
-    Attributes:
-        emitted: sum of the paths' weights at their start.
-        absorbed: part -> power absorbed in it; detected: detector -> power detected.
-        escaped: to infinity; under_way: still on its way at the step limit.
+    Attributes
+    ----------
+    emitted : float
+        Sum of the paths' weights at their start.
+    absorbed : Mapping[str, float]
+        Part -> power absorbed in it; detected: detector -> power detected.
+    escaped : float
+        To infinity; under_way: still on its way at the step limit.
     """
 
     emitted: float
@@ -188,11 +209,16 @@ class Balance:
 class Detections:
     """Single detections: arrays of one entry each.
 
-    Attributes:
-        path: number of the path; detector: index of the detector.
-        place: (N, 2) x, y in the detector's frame, metres.
-        weight: detected power; length: optical path, metres.
-        signature: of the family; kind: ``NOMINAL``, ``GHOST`` or ``STRAY``.
+    Attributes
+    ----------
+    path : np.ndarray
+        Number of the path; detector: index of the detector.
+    place : np.ndarray
+        (N, 2) x, y in the detector's frame, metres.
+    weight : np.ndarray
+        Detected power; length: optical path, metres.
+    signature : np.ndarray
+        Of the family; kind: ``NOMINAL``, ``GHOST`` or ``STRAY``.
     """
 
     path: np.ndarray
@@ -208,12 +234,18 @@ class Detections:
 class PathResult:
     """Outcome of a run, in shares of the emitted power.
 
-    Attributes:
-        families: by falling energy; nominal families first.
-        images: detector -> (3, rows, columns) power per pixel: nominal, ghost, stray.
-        balance: of the power.
-        paths: number traced.
-        detections: single detections that were kept: all but the nominal families', or all.
+    Attributes
+    ----------
+    families : tuple[Family, ...]
+        By falling energy; nominal families first.
+    images : Mapping[str, np.ndarray]
+        Detector -> (3, rows, columns) power per pixel: nominal, ghost, stray.
+    balance : Balance
+        Of the power.
+    paths : int
+        Number traced.
+    detections : Detections
+        Single detections that were kept: all but the nominal families', or all.
     """
 
     families: tuple[Family, ...]
@@ -229,8 +261,10 @@ class PathResult:
     def nominal(self, detector: str) -> Family:
         """The nominal family of a detector.
 
-        Raises:
-            LookupError: no path came to it by the nominal way.
+        Raises
+        ------
+        LookupError
+            No path came to it by the nominal way.
         """
         found = self.of(detector, "nominal")
         if not found:
@@ -254,10 +288,14 @@ class Key:
 class Collector:
     """Adds up what launches have written; one per run.
 
-    Args:
-        scenery: the scene.
-        nominal: signature of the nominal family of each detector, 0 for none.
-        keep: whether to keep single detections.
+    Parameters
+    ----------
+    scenery
+        The scene.
+    nominal
+        Signature of the nominal family of each detector, 0 for none.
+    keep
+        Whether to keep single detections.
     """
 
     def __init__(self, scenery: Scenery, nominal: Sequence[int], keep: bool = False) -> None:

@@ -46,15 +46,24 @@ _MULTIPLIER = 0x5851F42D4C957F2D
 class Step:
     """One surface of the way of nominal light.
 
-    Attributes:
-        surface: its number; aperture: the one of its clear apertures that is met.
-        way: number of the clear way that leads to it, as in ``tables.way_table``, 0 for none.
-        code: of the event there.
-        detects: whether it is the detector at the end.
-        front: whether it is met from +z.
-        body: number of the glass body in which the path arrives, 0 in the open; after: in which it leaves.
-        clearance: how far beyond it a leaving path looks for the next surface, metres.
-        form: its shape; finish: on the side that is met.
+    Attributes
+    ----------
+    surface : int
+        Its number; aperture: the one of its clear apertures that is met.
+    way : int
+        Number of the clear way that leads to it, as in ``tables.way_table``, 0 for none.
+    code : int
+        Of the event there.
+    detects : bool
+        Whether it is the detector at the end.
+    front : bool
+        Whether it is met from +z.
+    body : int
+        Number of the glass body in which the path arrives, 0 in the open; after: in which it leaves.
+    clearance : float
+        How far beyond it a leaving path looks for the next surface, metres.
+    form : layout.SurfaceForm
+        Its shape; finish: on the side that is met.
     """
 
     surface: int
@@ -117,11 +126,16 @@ def steps_of(
 ) -> tuple[Step, ...]:
     """The steps along nominal light that all paths can take in the same way.
 
-    Args:
-        scenery: the surfaces.
-        line: numbers of the ways to the apertures that nominal light meets, see ``Step``, and these apertures.
-        codes: of the family's events.
-        source: where its middle is, world, metres, (3,).
+    Parameters
+    ----------
+    scenery : Scenery
+        The surfaces.
+    line : Sequence[tuple[int, Patch]]
+        Numbers of the ways to the apertures that nominal light meets, see ``Step``, and these apertures.
+    codes : Sequence[int]
+        Of the family's events.
+    source : np.ndarray
+        Where its middle is, world, metres, (3,).
     """
     out: list[Step] = []
     bodies = layout.glass_bodies(scenery.surfaces)
@@ -154,11 +168,16 @@ def steps_of(
 class Stretch:
     """Paths where they have left the nominal way: Dr.Jit arrays.
 
-    Attributes:
-        launch: as they were after the last surface; their random numbers are ``draws`` behind.
-        passed: how many surfaces each has passed.
-        why: ``ENDED``, ``MISSED`` or ``TURNED``.
-        draws: steps of the random generator that are still to be taken, by the surfaces passed.
+    Attributes
+    ----------
+    launch : Launch
+        As they were after the last surface; their random numbers are ``draws`` behind.
+    passed : Any
+        How many surfaces each has passed.
+    why : Any
+        ``ENDED``, ``MISSED`` or ``TURNED``.
+    draws : tuple[int, ...]
+        Steps of the random generator that are still to be taken, by the surfaces passed.
     """
 
     launch: Launch
@@ -224,14 +243,21 @@ class _Along:
     def step(self, place: int, state: tuple[Any, ...], rng: Any, pending: int) -> tuple[tuple[Any, ...], int]:
         """One surface.
 
-        Args:
-            place: of the step.
-            state: position, direction, weight, length, state of the random generator, surfaces passed, why a path has
-                left, and which are on their way.
-            rng: the paths' random generator.
-            pending: steps that it still has to take.
+        Parameters
+        ----------
+        place : int
+            Of the step.
+        state : tuple[Any, ...]
+            Position, direction, weight, length, state of the random generator, surfaces passed, why a path has left,
+            and which are on their way.
+        rng : Any
+            The paths' random generator.
+        pending : int
+            Steps that it still has to take.
 
-        Returns:
+        Returns
+        -------
+        tuple[tuple[Any, ...], int]
             The state after it and the steps that the generator of paths that go on still has to take.
         """
         import drjit as dr
@@ -384,11 +410,16 @@ class OneSurface:
 class Left:
     """Paths that have left the nominal way, those beside each other that do alike.
 
-    Attributes:
-        passed: surfaces passed by each path of the launch, (N,).
-        turned: whether it turned away there, (N,).
-        chosen: places in the launch of the paths that go on.
-        chances: with which they were chosen.
+    Attributes
+    ----------
+    passed : np.ndarray
+        Surfaces passed by each path of the launch, (N,).
+    turned : np.ndarray
+        Whether it turned away there, (N,).
+    chosen : np.ndarray
+        Places in the launch of the paths that go on.
+    chances : np.ndarray
+        With which they were chosen.
     """
 
     passed: np.ndarray
@@ -402,12 +433,18 @@ class Left:
     ) -> Left:
         """Choose among the paths of a stretch that is evaluated.
 
-        Args:
-            steps: of the nominal way.
-            stretch: the paths.
-            numbers: of the paths in the run, (N,).
-            thinning: how many are followed, None for all.
-            again: they are known to be followed.
+        Parameters
+        ----------
+        steps : Sequence[Step]
+            Of the nominal way.
+        stretch : Stretch
+            The paths.
+        numbers : np.ndarray
+            Of the paths in the run, (N,).
+        thinning : Thinning | None
+            How many are followed, None for all.
+        again : bool
+            They are known to be followed.
         """
         passed, why = stretch.passed.numpy(), stretch.why.numpy()
         # at the end of a way that does not end at a detector nothing has turned away

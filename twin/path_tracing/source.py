@@ -25,14 +25,22 @@ class DiskSource:
     then carries the weight (density of the wide cone) / (density it was drawn with), so that the expected power of
     every direction stays the same. All weights add up to 1 on average.
 
-    Attributes:
-        centre: of the disk of places, world, metres, (3,).
-        axis: of the cone, unit, (3,).
-        across: two unit vectors square to the axis, (2, 3); the disk of places lies in their plane.
-        radius: of the disk of places, metres.
-        cone: sine of the cone's half angle; 0 is a collimated beam.
-        narrow: centre in the plane of ``across`` and radius of the narrow cone, direction cosines; within the wide.
-        share: of the paths that are aimed into the narrow cone.
+    Attributes
+    ----------
+    centre : np.ndarray
+        Of the disk of places, world, metres, (3,).
+    axis : np.ndarray
+        Of the cone, unit, (3,).
+    across : np.ndarray
+        Two unit vectors square to the axis, (2, 3); the disk of places lies in their plane.
+    radius : float
+        Of the disk of places, metres.
+    cone : float
+        Sine of the cone's half angle; 0 is a collimated beam.
+    narrow : tuple[float, float, float] | None
+        Centre in the plane of ``across`` and radius of the narrow cone, direction cosines; within the wide.
+    share : float
+        Of the paths that are aimed into the narrow cone.
     """
 
     centre: np.ndarray
@@ -64,10 +72,14 @@ class DiskSource:
     def aimed_at(self, directions: np.ndarray, room: float = 1.05, share: float = 0.5) -> DiskSource:
         """Give the source a narrow cone around given directions (N, 3).
 
-        Args:
-            directions: unit vectors.
-            room: radius of the narrow cone relative to the smallest one about their middle.
-            share: of the paths that go there.
+        Parameters
+        ----------
+        directions : np.ndarray
+            Unit vectors.
+        room : float
+            Radius of the narrow cone relative to the smallest one about their middle.
+        share : float
+            Of the paths that go there.
         """
         place = np.asarray(directions) @ self.across.T
         middle = 0.5 * (place.min(axis=0) + place.max(axis=0))
@@ -140,12 +152,18 @@ def random_streams(backend: Backend, numbers: Any, seed: int) -> Any:
 def start(backend: Backend, source: Source, chosen: np.ndarray, total: int, seed: int) -> Launch:
     """Light at the start of some paths of a run.
 
-    Args:
-        backend: where to trace.
-        source: where the paths start.
-        chosen: their numbers in the run, (N,).
-        total: paths of the run.
-        seed: of the random numbers.
+    Parameters
+    ----------
+    backend : Backend
+        Where to trace.
+    source : Source
+        Where the paths start.
+    chosen : np.ndarray
+        Their numbers in the run, (N,).
+    total : int
+        Paths of the run.
+    seed : int
+        Of the random numbers.
     """
     numbers = backend.opaque(chosen, backend.UInt)
     if isinstance(source, DiskSource):

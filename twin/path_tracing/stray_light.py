@@ -49,11 +49,15 @@ class NominalPathLost(PhysicalError, RuntimeError):
 class StrayResult:
     """Stray light of some monitor channels in one state.
 
-    Attributes:
-        photons: area CCD (``<camera>/<channel>/area_ccd``) -> (rows, columns) expected photons per pixel and frame from
-            all traced sources, without the nominal families.
-        runs: channel -> all that its source's light did.
-        photons_per_power: channel -> photons per frame for a detected share 1 of the source's power.
+    Attributes
+    ----------
+    photons : Mapping[str, np.ndarray]
+        Area CCD (``<camera>/<channel>/area_ccd``) -> (rows, columns) expected photons per pixel and frame from all
+        traced sources, without the nominal families.
+    runs : Mapping[str, PathResult]
+        Channel -> all that its source's light did.
+    photons_per_power : Mapping[str, float]
+        Channel -> photons per frame for a detected share 1 of the source's power.
     """
 
     photons: Mapping[str, np.ndarray]
@@ -76,11 +80,16 @@ class StrayResult:
 class ListedFamily:
     """A family beside the nominal one of its source.
 
-    Attributes:
-        family: which.
-        share: its light over that of the nominal family at the source's own area CCD.
-        sigma: of this share, by the number of paths.
-        nominal: events of the nominal family.
+    Attributes
+    ----------
+    family : Family
+        which.
+    share : float
+        Its light over that of the nominal family at the source's own area CCD.
+    sigma : float
+        Of this share, by the number of paths.
+    nominal : tuple[Touch, ...]
+        Events of the nominal family.
     """
 
     family: Family
@@ -101,13 +110,20 @@ def pinhole(
 
     Half of the paths are aimed at the return face.
 
-    Args:
-        instrument: the instrument.
-        backend: where to aim.
-        state: what is perturbed.
-        channel: which channel.
-        cone: sine of the cone's half angle; by default that of the pupil with ``CONE_ROOM``.
-        aimed: all channels' nominal rays to the return faces, by default worked out here.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    backend : Backend
+        Where to aim.
+    state : State
+        What is perturbed.
+    channel : Channel
+        Which channel.
+    cone : float | None
+        Sine of the cone's half angle; by default that of the pupil with ``CONE_ROOM``.
+    aimed : Aimed | None
+        All channels' nominal rays to the return faces, by default worked out here.
     """
     placed = instrument.assembly.place([state])
     model = instrument.cameras[channel.camera]
@@ -150,22 +166,37 @@ def trace_stray(
 ) -> StrayResult:
     """Trace the light of monitor channels, one after the other.
 
-    Args:
-        instrument: the instrument.
-        backend: where to trace.
-        state: what is perturbed.
-        paths: of every channel.
-        seed: of the random numbers; the channels' are independent of each other.
-        channels: which sources shine; by default all.
-        finishes: what surfaces do with light.
-        baffles: what else stands there.
-        sampling: how paths are drawn.
-        cone: sine of the half angle into which the pinholes shine, see ``pinhole``.
-        chunk: paths of one launch.
-        progress: told the paths done, of all channels together.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    backend : Backend
+        Where to trace.
+    state : State
+        What is perturbed.
+    paths : int
+        Of every channel.
+    seed : int
+        Of the random numbers; the channels' are independent of each other.
+    channels : Sequence[Channel] | None
+        Which sources shine; by default all.
+    finishes : Finishes | None
+        What surfaces do with light.
+    baffles : Iterable[Plate]
+        What else stands there.
+    sampling : Sampling
+        How paths are drawn.
+    cone : float | None
+        Sine of the half angle into which the pinholes shine, see ``pinhole``.
+    chunk : int
+        Paths of one launch.
+    progress : Progress | None
+        Told the paths done, of all channels together.
 
-    Raises:
-        NominalPathLost: too few paths, or the perturbation moves a beam off.
+    Raises
+    ------
+    NominalPathLost
+        Too few paths, or the perturbation moves a beam off.
     """
     chosen = tuple(instrument.channels if channels is None else channels)
     scenery = build_scenery(instrument, state, finishes, baffles)
@@ -213,10 +244,14 @@ some times the centroid's noise."""
 class StrayLight:
     """Stray light of one state.
 
-    Attributes:
-        photons: expected photons per pixel and frame beside the nominal spot, (C, rows, columns).
-        traced: the path tracer's result.
-        paths: traced for every source.
+    Attributes
+    ----------
+    photons : np.ndarray
+        Expected photons per pixel and frame beside the nominal spot, (C, rows, columns).
+    traced : StrayResult
+        The path tracer's result.
+    paths : int
+        Traced for every source.
     """
 
     photons: np.ndarray
@@ -271,16 +306,25 @@ def stray_light(
 ) -> StrayLight:
     """Trace the stray light of all channels in one state.
 
-    Args:
-        experiment: the instrument.
-        state: what is perturbed.
-        paths: of every source.
-        seed: of the random numbers.
-        progress: told the paths done and in all.
-        finishes: what surfaces do with light, None for the built-in ones.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    state : State
+        What is perturbed.
+    paths : int
+        Of every source.
+    seed : int
+        Of the random numbers.
+    progress : Callable[[int, int], None] | None
+        Told the paths done and in all.
+    finishes : Finishes | None
+        What surfaces do with light, None for the built-in ones.
 
-    Raises:
-        NominalPathLost: too few paths, or the perturbation moves a beam off.
+    Raises
+    ------
+    NominalPathLost
+        Too few paths, or the perturbation moves a beam off.
     """
     from scipy.signal import fftconvolve  # takes long, and most jobs trace no stray light
 
@@ -304,12 +348,17 @@ def diffraction_spots(experiment: MonitorExperiment) -> np.ndarray:
 class Ghost:
     """Ghosts on one area CCD that have more than GHOSTS of its own spot's light.
 
-    Attributes:
-        channel: whose area CCD it is.
-        source: channel that the strongest comes from, ``<camera>/<channel>``.
-        body: path of the prism that throws it, the first whose face reflects what it should let pass; None where it
-            comes from nothing but nominal surfaces in another order.
-        text: all in words.
+    Attributes
+    ----------
+    channel : Channel
+        Whose area CCD it is.
+    source : str
+        Channel that the strongest comes from, ``<camera>/<channel>``.
+    body : str | None
+        Path of the prism that throws it, the first whose face reflects what it should let pass; None where it comes
+        from nothing but nominal surfaces in another order.
+    text : str
+        All in words.
     """
 
     channel: Channel
@@ -335,9 +384,12 @@ def _thrower(family: Family, usual: tuple[Touch, ...]) -> str | None:
 def ghosts(experiment: MonitorExperiment, light: StrayLight) -> tuple[Ghost, ...]:
     """Area CCDs on which ghosts of any source have more than GHOSTS of their own spot's light.
 
-    Args:
-        experiment: the monitor.
-        light: traced.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The monitor.
+    light : StrayLight
+        traced.
     """
     out, traced = [], light.traced
     for channel in experiment.path.channels:

@@ -50,11 +50,15 @@ class Flight:
 class Next:
     """The surfaces that paths meet next: Dr.Jit arrays.
 
-    Attributes:
-        near: about how far it is; surface: its number.
-        hit: which paths meet one.
-        tried: which paths are only thought to meet it, by the way that they take; way: the way after it and where it
-            ends, see ``tables.way_table``.
+    Attributes
+    ----------
+    near : Any
+        About how far it is; surface: its number.
+    hit : Any
+        Which paths meet one.
+    tried : Any
+        Which paths are only thought to meet it, by the way that they take; way: the way after it and where it ends, see
+        ``tables.way_table``.
     """
 
     near: Any
@@ -141,15 +145,24 @@ def _nearest_face(
 class Place:
     """Where paths meet their surfaces: Dr.Jit arrays.
 
-    Attributes:
-        distance: along the path.
-        x, y: in the surface's frame.
-        normal: unit vector in the world, toward +z of the surface.
-        cosine: of the path's direction with it.
-        first, second: whether inside the first and the second clear aperture.
-        exact: whether the surface is there, to rounding.
-        kind: bits of the surface.
-        row: numbers of its geometry.
+    Attributes
+    ----------
+    distance : Any
+        Along the path.
+    x, y : Any
+        In the surface's frame.
+    normal : Any
+        Unit vector in the world, toward +z of the surface.
+    cosine : Any
+        Of the path's direction with it.
+    first, second : Any
+        Whether inside the first and the second clear aperture.
+    exact : Any
+        Whether the surface is there, to rounding.
+    kind : Any
+        Bits of the surface.
+    row : list[Any]
+        Numbers of its geometry.
     """
 
     distance: Any
@@ -174,13 +187,20 @@ def locate(
 ) -> Place:
     """Find exactly where paths meet the surfaces that are about ``near`` away.
 
-    Args:
-        backend: array types.
-        tables: of the scene.
-        form: what its surfaces consist of.
-        flight: the paths; ``active`` are those that meet a surface.
-        near: about how far it is.
-        surface: its number.
+    Parameters
+    ----------
+    backend : Backend
+        Array types.
+    tables : layout.SceneTables
+        Of the scene.
+    form : layout.SurfaceForm
+        What its surfaces consist of.
+    flight : Flight
+        The paths; ``active`` are those that meet a surface.
+    near : Any
+        About how far it is.
+    surface : Any
+        Its number.
     """
     import drjit as dr
 

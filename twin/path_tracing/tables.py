@@ -32,11 +32,16 @@ reflects is what the table scatters."""
 class FinishTables:
     """Measured finishes of a scene (Dr.Jit arrays).
 
-    Attributes:
-        marks: (surfaces * 3 * MARKS).
-        coatings: (coatings * (STEPS + 1) * 2) reflectance and transmittance.
-        headers: (scatter tables * _HEADER); numbers: what they point to.
-        most_rings, most_sectors: of all tables.
+    Attributes
+    ----------
+    marks : Any
+        (surfaces * 3 * MARKS).
+    coatings : Any
+        (coatings * (STEPS + 1) * 2) reflectance and transmittance.
+    headers : Any
+        (scatter tables * _HEADER); numbers: what they point to.
+    most_rings, most_sectors : int
+        Of all tables.
     """
 
     backend: Backend
@@ -69,13 +74,20 @@ class FinishTables:
     def draw(self, marks: Sequence[Any], cosine: Any, specular: Any, side: Any, u: Sequence[Any], active: Any) -> Any:
         """A scattered direction of paths whose finish has a table.
 
-        Args:
-            marks: of their finishes.
-            cosine: of incidence.
-            specular: unit vector of the specular direction.
-            side: unit normal on the side to which the light leaves.
-            u: four random numbers.
-            active: which paths.
+        Parameters
+        ----------
+        marks : Sequence[Any]
+            Of their finishes.
+        cosine : Any
+            Of incidence.
+        specular : Any
+            Unit vector of the specular direction.
+        side : Any
+            Unit normal on the side to which the light leaves.
+        u : Sequence[Any]
+            Four random numbers.
+        active : Any
+            Which paths.
         """
         import drjit as dr
 
@@ -236,13 +248,20 @@ class Kind:
 class SurfaceForm:
     """What the shapes of a scene's surfaces consist of, and with it the kernel's code.
 
-    Attributes:
-        even: number of aspheric terms.
-        terms: kinds of further terms of the sag.
-        figure_order: highest order of a polynomial figure, -1 when there is none.
-        grid: some surface has a figure on a grid.
-        flat: all surfaces are planes without figure.
-        mixed: some are and some are not.
+    Attributes
+    ----------
+    even : int
+        Number of aspheric terms.
+    terms : tuple[type[SagTerm], ...]
+        Kinds of further terms of the sag.
+    figure_order : int
+        Highest order of a polynomial figure, -1 when there is none.
+    grid : bool
+        Some surface has a figure on a grid.
+    flat : bool
+        All surfaces are planes without figure.
+    mixed : bool
+        Some are and some are not.
     """
 
     even: int
@@ -268,19 +287,32 @@ class SurfaceForm:
 class SceneTables:
     """Numbers of a scene (Dr.Jit arrays).
 
-    Attributes:
-        rows: (surfaces * ROW) geometry; finishes: (surfaces * 3 * FINISH_ROW).
-        curves: (surfaces * CURVES * BLOCK) curvature, conic and aspheric terms.
-        terms: (surfaces * 4 * blocks) numbers of all kinds of further terms; width 1 when there are none.
-        figures: (surfaces * 4 * blocks) centre and coefficients of polynomial figures; width 1 when there are none.
-        grids, samples: (surfaces * GRID_ROW) numbers of grid figures and the coefficients of all; likewise.
-        planes: (surfaces * 4) world normal and offset of flat faces.
-        body_first, body_faces: (bodies + 1,) first surface and number of faces of each glass body.
-        detectors: (detectors * 8) pixels per metre in x and y, columns, rows, first pixel.
-        nominal: (detectors,) signature of the nominal family.
-        pixels: of all detectors together.
-        ways: ((2 + ways) * WAY) see ``way_table``.
-        measured: tables of measured finishes, None where there are none.
+    Attributes
+    ----------
+    rows : Any
+        (surfaces * ROW) geometry; finishes: (surfaces * 3 * FINISH_ROW).
+    curves : Any
+        (surfaces * CURVES * BLOCK) curvature, conic and aspheric terms.
+    terms : Any
+        (surfaces * 4 * blocks) numbers of all kinds of further terms; width 1 when there are none.
+    figures : Any
+        (surfaces * 4 * blocks) centre and coefficients of polynomial figures; width 1 when there are none.
+    grids, samples : Any
+        (surfaces * GRID_ROW) numbers of grid figures and the coefficients of all; likewise.
+    planes : Any
+        (surfaces * 4) world normal and offset of flat faces.
+    body_first, body_faces : Any
+        (bodies + 1,) first surface and number of faces of each glass body.
+    detectors : Any
+        (detectors * 8) pixels per metre in x and y, columns, rows, first pixel.
+    nominal : Any
+        (detectors,) signature of the nominal family.
+    pixels : Any
+        Of all detectors together.
+    ways : Any
+        ((2 + ways) * WAY) see ``way_table``.
+    measured : FinishTables | None
+        Tables of measured finishes, None where there are none.
     """
 
     rows: Any
@@ -362,14 +394,21 @@ def glass_bodies(surfaces: Sequence[SceneSurface]) -> list[str]:
 def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int], ways: Sequence[Way] = ()) -> SceneTables:
     """Tables of a scene.
 
-    Args:
-        backend: where to.
-        scenery: the surfaces.
-        nominal: detector name -> signature of its nominal family.
-        ways: that light can take without a search.
+    Parameters
+    ----------
+    backend : Backend
+        Where to.
+    scenery : Scenery
+        The surfaces.
+    nominal : Mapping[str, int]
+        Detector name -> signature of its nominal family.
+    ways : Sequence[Way]
+        That light can take without a search.
 
-    Raises:
-        ValueError: too many bodies, detectors or aspheric terms.
+    Raises
+    ------
+    ValueError
+        Too many bodies, detectors or aspheric terms.
     """
     import drjit as dr
 

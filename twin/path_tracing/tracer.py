@@ -30,8 +30,10 @@ class VariantUnavailable(RuntimeError):
 def load_mitsuba(backend: Backend) -> Any:
     """The mitsuba module with exactly the backend's variant set.
 
-    Raises:
-        VariantUnavailable: it could not be set (Mitsuba itself would take another one silently from a list).
+    Raises
+    ------
+    VariantUnavailable
+        It could not be set (Mitsuba itself would take another one silently from a list).
     """
     import mitsuba as mi  # after optics, which has named the LLVM library
 
@@ -49,12 +51,17 @@ def load_mitsuba(backend: Backend) -> Any:
 def build_scene(mi: Any, scenery: Scenery) -> Any:
     """A ``mi.Scene`` of the triangles; Mitsuba's index of a shape is the number of the surface.
 
-    Args:
-        mi: mitsuba with its variant set.
-        scenery: the surfaces; their triangles are moved to the world in float64 and rounded once.
+    Parameters
+    ----------
+    mi : Any
+        Mitsuba with its variant set.
+    scenery : Scenery
+        The surfaces; their triangles are moved to the world in float64 and rounded once.
 
-    Raises:
-        AssertionError: Mitsuba has put the shapes in another order.
+    Raises
+    ------
+    AssertionError
+        Mitsuba has put the shapes in another order.
     """
     names = [f"surface{i:05d}" for i in range(len(scenery.surfaces))]
     # robust: rays do not slip through between two triangles
@@ -78,22 +85,30 @@ def build_scene(mi: Any, scenery: Scenery) -> Any:
 class Sampling:
     """How paths are drawn.
 
-    Attributes:
-        steps: at which a path ends, whatever it carries.
-        floor: smallest probability of each way that a path can go at a surface. 0: as the power goes, and the balance
-            of the power is exact in every run. Above 0 weak ways are drawn more often and carry less each, which finds
-            faint ghosts; the balance then holds on average.
-        second: the floor of paths that have gone one way that a floor made more likely, and ``further`` of those that
-            have gone more of them or have been scattered; None for ``floor``. A ghost comes of two weak reflections:
-            after the first the second is worth drawing, and after the second nothing is.
-        scatter_floor: the floor of scattering out of the specular direction; where ``second`` is given it ends with the
-            first weak way.
-        near: share of scattered directions whose distance from the specular one is drawn even in its logarithm: a small
-            detector in the specular light's focus sees the innermost part of a lobe alone.
-        roulette: relative to a path's mean weight at the start: below it a path is ended at random, and those that go
-            on carry more; 0: never.
-        first: share of the paths from which a run learns where it is worth following paths that turn away from nominal
-            light (``thinning``); 0: all are followed.
+    Attributes
+    ----------
+    steps : int
+        At which a path ends, whatever it carries.
+    floor : float
+        Smallest probability of each way that a path can go at a surface. 0: as the power goes, and the balance of the
+        power is exact in every run. Above 0 weak ways are drawn more often and carry less each, which finds faint
+        ghosts; the balance then holds on average.
+    second : float | None
+        The floor of paths that have gone one way that a floor made more likely, and ``further`` of those that have gone
+        more of them or have been scattered; None for ``floor``. A ghost comes of two weak reflections: after the first
+        the second is worth drawing, and after the second nothing is.
+    scatter_floor : float
+        The floor of scattering out of the specular direction; where ``second`` is given it ends with the first weak
+        way.
+    near : float
+        Share of scattered directions whose distance from the specular one is drawn even in its logarithm: a small
+        detector in the specular light's focus sees the innermost part of a lobe alone.
+    roulette : float
+        Relative to a path's mean weight at the start: below it a path is ended at random, and those that go on carry
+        more; 0: never.
+    first : float
+        Share of the paths from which a run learns where it is worth following paths that turn away from nominal light
+        (``thinning``); 0: all are followed.
     """
 
     steps: int = 96
@@ -138,10 +153,14 @@ FAINT = Sampling(floor=0.1, second=0.5, further=0.0, scatter_floor=0.02, near=0.
 class Along:
     """How the paths of a launch take the nominal way.
 
-    Attributes:
-        steps: its surfaces.
-        numbers: of the paths in the run, (N,).
-        thinning: of the paths that leave it, None for none.
+    Attributes
+    ----------
+    steps : Sequence[Step]
+        Its surfaces.
+    numbers : np.ndarray
+        Of the paths in the run, (N,).
+    thinning : Thinning | None
+        Of the paths that leave it, None for none.
     """
 
     steps: Sequence[Step]
@@ -160,7 +179,9 @@ def launch(
 ) -> Followed | None:
     """Trace paths in float64 to their end and write what they meet to the sinks.
 
-    Returns:
+    Returns
+    -------
+    Followed | None
         What the paths have done along the nominal way and after it, None without one.
     """
     import drjit as dr
@@ -208,15 +229,23 @@ Progress = Callable[[int, int], None]
 class PathTracer:
     """A scene made ready for tracing.
 
-    Args:
-        backend: where to trace.
-        scenery: the surfaces.
-        nominal: detector -> codes of the events of its nominal family.
-        sampling: how paths are drawn.
-        ways: paths take clear ways; without, every flight is a search. The paths are the same.
+    Parameters
+    ----------
+    backend
+        Where to trace.
+    scenery
+        The surfaces.
+    nominal
+        Detector -> codes of the events of its nominal family.
+    sampling
+        How paths are drawn.
+    ways
+        Paths take clear ways; without, every flight is a search. The paths are the same.
 
-    Raises:
-        ValueError: a nominal family of a detector that the scenery does not have.
+    Raises
+    ------
+    ValueError
+        a nominal family of a detector that the scenery does not have.
     """
 
     def __init__(
@@ -271,15 +300,23 @@ class PathTracer:
     ) -> PathResult:
         """Trace paths from a source.
 
-        Args:
-            source: where they start.
-            paths: how many; all rays of a ``RaySource``.
-            seed: of the random numbers; the same seed gives the same paths, whatever the chunk.
-            keep: keep the single detections (memory grows with the number of paths).
-            chunk: paths of one launch; bounds the memory.
-            progress: told after each launch.
-            toward: detector whose nominal family the source's light mostly belongs to, which saves time; by default
-                the first one.
+        Parameters
+        ----------
+        source : Source
+            Where they start.
+        paths : int | None
+            How many; all rays of a ``RaySource``.
+        seed : int
+            Of the random numbers; the same seed gives the same paths, whatever the chunk.
+        keep : bool
+            Keep the single detections (memory grows with the number of paths).
+        chunk : int
+            Paths of one launch; bounds the memory.
+        progress : Progress | None
+            Told after each launch.
+        toward : str | None
+            Detector whose nominal family the source's light mostly belongs to, which saves time; by default the first
+            one.
         """
         total = self._total(source, paths)
         features = self.features(keep)
@@ -313,10 +350,14 @@ class PathTracer:
     def nominal_steps(self, source: Source, toward: str | None, paths: int) -> tuple[Step, ...]:
         """Surfaces that nominal light of a source meets and that the paths of a run take in this order.
 
-        Args:
-            source: where they start.
-            toward: as of ``run``.
-            paths: of the run.
+        Parameters
+        ----------
+        source : Source
+            Where they start.
+        toward : str | None
+            As of ``run``.
+        paths : int
+            Of the run.
         """
         line = self._clear.line(toward) if paths >= LEAST_ALONG else []
         if not line or not isinstance(source, DiskSource):

@@ -32,12 +32,17 @@ _AIM = 1e-6
 class Beam:
     """One beam: its middle ray and ``RIM`` rays along its edge.
 
-    Attributes:
-        camera: whose.
-        name: ``imaging/left edge`` ... or ``monitor/`` and the channel's name.
-        vertices: (1 + RIM, K, 3) world points, middle ray first, metres; imaging beams run from the scene to the line
-            CCD, monitor beams from the pinhole to the area CCD.
-        footprints: (mirror, pass) -> (1 + RIM, 2) points in the mirror's x, y, metres; pass 0 first, then 1.
+    Attributes
+    ----------
+    camera : str
+        whose.
+    name : str
+        ``imaging/left edge`` ... or ``monitor/`` and the channel's name.
+    vertices : np.ndarray
+        (1 + RIM, K, 3) world points, middle ray first, metres; imaging beams run from the scene to the line CCD,
+        monitor beams from the pinhole to the area CCD.
+    footprints : Mapping[tuple[str, int], np.ndarray]
+        (mirror, pass) -> (1 + RIM, 2) points in the mirror's x, y, metres; pass 0 first, then 1.
     """
 
     camera: str
@@ -66,12 +71,17 @@ class LightPaths:
 def trace_light_paths(instrument: Instrument, backend: Backend, state: State, reach: float = 0.0) -> LightPaths:
     """Trace the beams.
 
-    Args:
-        instrument: the instrument.
-        backend: where to trace.
-        state: what is perturbed.
-        reach: how far the imaging beams are drawn beyond the first mirror toward the scene, metres; 0 takes the
-            distance of the farthest 180-deg prism, without a monitor the longest camera's length.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    backend : Backend
+        Where to trace.
+    state : State
+        What is perturbed.
+    reach : float
+        How far the imaging beams are drawn beyond the first mirror toward the scene, metres; 0 takes the distance of
+        the farthest 180-deg prism, without a monitor the longest camera's length.
     """
     placed = instrument.assembly.place([state])
     spec = instrument.spec

@@ -48,8 +48,10 @@ class PictureError(RuntimeError):
 def colour_variant(backend: Backend) -> Iterator[Any]:
     """Mitsuba with its colour variant; the one that was set before is set again afterwards.
 
-    Raises:
-        PictureError: the variant cannot be set (another one is never taken), or Mitsuba fails.
+    Raises
+    ------
+    PictureError
+        The variant cannot be set (another one is never taken), or Mitsuba fails.
     """
     import mitsuba as mi  # after optics, which has named the LLVM library
 
@@ -78,10 +80,14 @@ def _set_variant(mi: Any, variant: str) -> None:
 class Studio:
     """A scene and a camera in Mitsuba.
 
-    Args:
-        mi: mitsuba with its colour variant set.
-        parts: what stands in the studio.
-        view: the camera.
+    Parameters
+    ----------
+    mi
+        Mitsuba with its colour variant set.
+    parts
+        What stands in the studio.
+    view
+        The camera.
     """
 
     def __init__(self, mi: Any, parts: list[Part], view: View) -> None:
@@ -103,10 +109,14 @@ class Studio:
     def light(self, pixels: np.ndarray, samples: int, seed: int) -> np.ndarray:
         """Mean light in pixels, (N, 3).
 
-        Args:
-            pixels: row times width plus column, (N,).
-            samples: per pixel.
-            seed: of the samples.
+        Parameters
+        ----------
+        pixels : np.ndarray
+            Row times width plus column, (N,).
+        samples : int
+            Per pixel.
+        seed : int
+            Of the samples.
         """
         mi = self._mi
         every = np.repeat(pixels, samples)
@@ -122,9 +132,12 @@ class Studio:
     def first_hits(self, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
         """Number of the part that every pixel shows first, -1 for none (H, W), and the normal there, (H, W, 3).
 
-        Args:
-            x: where in the pixel, pixels from its middle.
-            y: likewise.
+        Parameters
+        ----------
+        x : float
+            Where in the pixel, pixels from its middle.
+        y : float
+            likewise.
         """
         import drjit as dr
 
@@ -173,9 +186,12 @@ SHOULDER = 0.75
 def still_patches(seen: Sequence[tuple[np.ndarray, np.ndarray]], matt: Sequence[bool]) -> np.ndarray:
     """Numbers of the flat patches of matt surfaces, (H, W); -1 on their borders and everywhere else.
 
-    Args:
-        seen: some looks at the scene: number of the part (H, W), -1 for none, and normal (H, W, 3).
-        matt: of every part, whether the light on it changes slowly.
+    Parameters
+    ----------
+    seen : Sequence[tuple[np.ndarray, np.ndarray]]
+        Some looks at the scene: number of the part (H, W), -1 for none, and normal (H, W, 3).
+    matt : Sequence[bool]
+        Of every part, whether the light on it changes slowly.
     """
     first, square = _patches(*seen[0]), np.ones((3, 3), np.uint8)
     still = np.array([*matt, False])[seen[0][0]]
@@ -188,9 +204,12 @@ def still_patches(seen: Sequence[tuple[np.ndarray, np.ndarray]], matt: Sequence[
 def without_grain(image: np.ndarray, patches: np.ndarray) -> np.ndarray:
     """Average the light over each patch; what belongs to none stays as it is.
 
-    Args:
-        image: (H, W, 3) rendered light.
-        patches: (H, W) numbers, -1 for none.
+    Parameters
+    ----------
+    image : np.ndarray
+        (H, W, 3) rendered light.
+    patches : np.ndarray
+        (H, W) numbers, -1 for none.
     """
     out = image.astype(np.float32)
     for value in np.unique(patches[patches >= 0]):
@@ -234,11 +253,16 @@ Advance = Callable[[str, int, int], None]
 class Shot:
     """One picture.
 
-    Attributes:
-        name: of the file.
-        width, height: pixels.
-        coarse, fine: samples per pixel, of matt surfaces (which are smoothed) and of all else.
-        shows: ``instrument``, ``prisms`` or ``focal_plane``.
+    Attributes
+    ----------
+    name : str
+        Of the file.
+    width, height : int
+        pixels.
+    coarse, fine : int
+        Samples per pixel, of matt surfaces (which are smoothed) and of all else.
+    shows : str
+        ``instrument``, ``prisms`` or ``focal_plane``.
     """
 
     name: str
@@ -267,17 +291,27 @@ def write_pictures(
 ) -> None:
     """Render the pictures of an instrument in a perturbed state and hand them over as PNG files.
 
-    Args:
-        instrument: the instrument.
-        backend: where to trace.
-        state: what is perturbed; motions are far too small to be seen.
-        write: takes the name of a file and what writes it, e.g. ``RunFolder.write_with``.
-        seed: of the samples.
-        advance: told how many percent of all pictures are done.
-        shots: which pictures.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    backend : Backend
+        Where to trace.
+    state : State
+        What is perturbed; motions are far too small to be seen.
+    write : Callable[[str, Callable[[Path], None]], None]
+        Takes the name of a file and what writes it, e.g. ``RunFolder.write_with``.
+    seed : int
+        Of the samples.
+    advance : Advance
+        Told how many percent of all pictures are done.
+    shots : tuple[Shot, ...]
+        Which pictures.
 
-    Raises:
-        PictureError: Mitsuba cannot run the variant that the pictures need, or fails.
+    Raises
+    ------
+    PictureError
+        Mitsuba cannot run the variant that the pictures need, or fails.
     """
     paths = trace_light_paths(instrument, backend, state)
     pixels = [shot.width * shot.height for shot in shots]
@@ -305,8 +339,10 @@ def render_shot(
 ) -> np.ndarray:
     """One picture, (height, width, 3) uint8, red first.
 
-    Raises:
-        PictureError: Mitsuba cannot run the variant that the pictures need, or fails.
+    Raises
+    ------
+    PictureError
+        Mitsuba cannot run the variant that the pictures need, or fails.
     """
     view, parts = staged(instrument, paths, shot)
     with colour_variant(backend) as mi:

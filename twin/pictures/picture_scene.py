@@ -23,11 +23,16 @@ from twin.pictures.scene_file import BLOCK, BRASS, DARK, GLASS, MIRROR, SILICON,
 class View:
     """A pinhole camera; +Z of the base frame is up in the picture.
 
-    Attributes:
-        eye: where it stands, metres.
-        forward, right, up: unit vectors in the base frame.
-        half_width: tangent of half the horizontal field.
-        width, height: of the picture, pixels.
+    Attributes
+    ----------
+    eye : np.ndarray
+        Where it stands, metres.
+    forward, right, up : np.ndarray
+        Unit vectors in the base frame.
+    half_width : float
+        Tangent of half the horizontal field.
+    width, height : int
+        Of the picture, pixels.
     """
 
     eye: np.ndarray
@@ -71,13 +76,20 @@ def framed(
 ) -> View:
     """The nearest camera of a direction that has all points in its picture.
 
-    Args:
-        points: (N, 3), metres.
-        azimuth: of the camera as seen from the points, from +X toward +Y, degrees.
-        elevation: likewise, toward +Z, degrees.
-        field: horizontal field of view, degrees.
-        size: width and height, pixels.
-        margin: share of the width that stays free on every side.
+    Parameters
+    ----------
+    points : np.ndarray
+        (N, 3), metres.
+    azimuth : float
+        Of the camera as seen from the points, from +X toward +Y, degrees.
+    elevation : float
+        Likewise, toward +Z, degrees.
+    field : float
+        Horizontal field of view, degrees.
+    size : tuple[int, int]
+        Width and height, pixels.
+    margin : float
+        Share of the width that stays free on every side.
     """
     width, height = size
     forward, right, up = looking(azimuth, elevation)
@@ -152,12 +164,18 @@ _MATERIALS = (
 class Part:
     """A mesh of one material.
 
-    Attributes:
-        body: path of the body that it belongs to; ``light/...`` for beams, ``floor``.
-        mesh: in the base frame, metres.
-        bsdf: Mitsuba's description of the material.
-        radiance: red, green, blue that it emits.
-        matt: whether light on it changes slowly: neither mirror nor glass, and no thin line.
+    Attributes
+    ----------
+    body : str
+        Path of the body that it belongs to; ``light/...`` for beams, ``floor``.
+    mesh : trimesh.Trimesh
+        In the base frame, metres.
+    bsdf : Mapping[str, Any]
+        Mitsuba's description of the material.
+    radiance : tuple[float, float, float] | None
+        Red, green, blue that it emits.
+    matt : bool
+        Whether light on it changes slowly: neither mirror nor glass, and no thin line.
     """
 
     body: str
@@ -170,10 +188,14 @@ class Part:
 def studio_parts(instrument: Instrument, paths: LightPaths, pixel: float) -> list[Part]:
     """All that stands in the studio.
 
-    Args:
-        instrument: the instrument.
-        paths: its beams and where its bodies stand.
-        pixel: size of a picture's pixel at the instrument, metres; it decides how thick lines are drawn.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    paths : LightPaths
+        Its beams and where its bodies stand.
+    pixel : float
+        Size of a picture's pixel at the instrument, metres; it decides how thick lines are drawn.
     """
     scene = build_scene(instrument, paths, tube=BEAM_PIXELS * pixel)
     backs = {

@@ -76,10 +76,14 @@ MONITOR = (_metal(213, 94, 0, 0.0, 0.8), _metal(230, 159, 0, 0.0, 0.8))
 def scene_bytes(instrument: Instrument, state: State, paths: LightPaths) -> bytes:
     """The content of ``scene.glb``: the instrument in a perturbed state as binary glTF.
 
-    Args:
-        instrument: the instrument.
-        state: what is perturbed.
-        paths: its light in that state.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    state : State
+        What is perturbed.
+    paths : LightPaths
+        Its light in that state.
     """
     scene = build_scene(instrument, paths)
     scene.metadata["motions"] = motions(instrument, state, paths.placed)
@@ -89,10 +93,14 @@ def scene_bytes(instrument: Instrument, state: State, paths: LightPaths) -> byte
 def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[str, dict[str, Any]]:
     """Body -> its motion against its parent, as the scene's ``extras`` hold it; bodies at rest are left out.
 
-    Args:
-        instrument: the instrument.
-        state: what is perturbed, for the pivots.
-        placed: its bodies in that state.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    state : State
+        What is perturbed, for the pivots.
+    placed : PlacedBodies
+        Its bodies in that state.
     """
     nominal = instrument.assembly.place()
     bodies = instrument.assembly.tree.bodies
@@ -262,8 +270,10 @@ _HERE = files(__package__) / "viewer"
 def viewer_markup(moved: str) -> Markup:
     """The element in which the view appears, hidden until it does.
 
-    Args:
-        moved: what was moved, for readers; empty for nothing.
+    Parameters
+    ----------
+    moved : str
+        What was moved, for readers; empty for nothing.
     """
     text = (_HERE / "viewer.html").read_text("utf-8")
     return Markup(text).format(moved=moved or "nothing")
@@ -277,8 +287,10 @@ def viewer_programs() -> tuple[str, str]:
 def viewer_scripts(scene: bytes) -> Markup:
     """What makes the view: the library and the scene, both packed, and the program. They stand at the end of a page.
 
-    Args:
-        scene: binary glTF, as `scene_bytes` gives it.
+    Parameters
+    ----------
+    scene : bytes
+        Binary glTF, as `scene_bytes` gives it.
     """
     program, library = viewer_programs()
     # names of tags cannot stand in base64, and the program is ours

@@ -58,16 +58,26 @@ _REMEDIES = (
 class SpotResult:
     """One channel in one state.
 
-    Attributes:
-        frames: as recorded.
-        mean: (H, W) DN that was measured.
-        used: (H, W) pixels that were used.
-        residual: (H, W) mean over the fitted shape, in standard deviations; None where no shape was fitted.
-        findings: what was found in the frames and what became of it.
-        cost: sigma of the place over what it would be without what was found, minus 1.
-        core: reduced chi-square of the spot's core, and its number of pixels; None where no shape was fitted.
-        fits: whether the core has the calibrated shape.
-        noise_ratio: noise of the frames over the stated one; None where they agree.
+    Attributes
+    ----------
+    frames : StateFrames
+        As recorded.
+    mean : np.ndarray
+        (H, W) DN that was measured.
+    used : np.ndarray
+        (H, W) pixels that were used.
+    residual : np.ndarray | None
+        (H, W) mean over the fitted shape, in standard deviations; None where no shape was fitted.
+    findings : tuple[Finding, ...]
+        What was found in the frames and what became of it.
+    cost : float
+        Sigma of the place over what it would be without what was found, minus 1.
+    core : tuple[float, int] | None
+        Reduced chi-square of the spot's core, and its number of pixels; None where no shape was fitted.
+    fits : bool
+        Whether the core has the calibrated shape.
+    noise_ratio : float | None
+        Noise of the frames over the stated one; None where they agree.
     """
 
     frames: StateFrames
@@ -90,10 +100,14 @@ class SpotResult:
 class ChannelResult:
     """One channel.
 
-    Attributes:
-        channel: its frames and what is known of its CCD.
-        before: in the nominal state.
-        after: in each of the others.
+    Attributes
+    ----------
+    channel : ChannelFrames
+        Its frames and what is known of its CCD.
+    before : SpotResult
+        In the nominal state.
+    after : tuple[SpotResult, ...]
+        In each of the others.
     """
 
     channel: ChannelFrames
@@ -117,10 +131,14 @@ def remedy(reason: str) -> str:
 class ChannelMeasurement:
     """The work on one channel: search its frames, then measure its spots.
 
-    Args:
-        test: the measurement.
-        channel: its frames.
-        shape: of its spot on the whole CCD; None to learn it from the frames before.
+    Parameters
+    ----------
+    test
+        The measurement.
+    channel
+        Its frames.
+    shape
+        Of its spot on the whole CCD; None to learn it from the frames before.
     """
 
     def __init__(self, test: MeasurementSpec, channel: ChannelFrames, shape: SpotTemplate | None) -> None:
@@ -341,8 +359,10 @@ class ChannelMeasurement:
     def shift_covariance(self, number: int) -> np.ndarray:
         """(1, 2, 2) px^2 of after - before, by noise.
 
-        Args:
-            number: of the state after, from 1 on.
+        Parameters
+        ----------
+        number : int
+            Of the state after, from 1 on.
         """
         if self._shifts:
             # its noise is worked out with that of the learnt shape, and not from the positions
@@ -366,8 +386,10 @@ class ChannelMeasurement:
     def noise_parts(self, number: int) -> tuple[NoiseParts, NoiseParts]:
         """Noise of the spot before and after, for the covariance of a series of shifts.
 
-        Args:
-            number: of the state after, from 1 on.
+        Parameters
+        ----------
+        number : int
+            Of the state after, from 1 on.
         """
         if self._shifts:
             return self._shifts[number - 1].parts

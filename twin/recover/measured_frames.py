@@ -38,9 +38,12 @@ def repeated_frames(test: Spec, channels: Sequence[ChannelFrames]) -> list[Issue
     Noise is another one in every frame, so that two are never alike: one of them is a copy, and shift and sigma would
     be those of frames against themselves. Frames of one grey value alone hold no noise, and are not looked at.
 
-    Args:
-        test: the measurement.
-        channels: as they were read.
+    Parameters
+    ----------
+    test : Spec
+        The measurement.
+    channels : Sequence[ChannelFrames]
+        As they were read.
     """
     seen: dict[bytes, tuple[StateFrames, int]] = {}
     told: set[tuple[int, int]] = set()
@@ -80,9 +83,12 @@ def order_warnings(channels: Sequence[ChannelFrames], times: Sequence[float] | N
 
     Told only of channels of which every file says when it was recorded, or what it is of.
 
-    Args:
-        channels: as they were read.
-        times: of a series, seconds; None for a single state after.
+    Parameters
+    ----------
+    channels : Sequence[ChannelFrames]
+        As they were read.
+    times : Sequence[float] | None
+        Of a series, seconds; None for a single state after.
     """
     out = []
     swapped = [channel.name for channel in channels if _swapped(channel)]
@@ -134,12 +140,18 @@ _MOST_GREY = 2.0**32
 class StateFrames:
     """Frames of one channel in one state.
 
-    Attributes:
-        files: they are from, by their paths.
-        frames: (N, H, W) grey values as recorded.
-        offset: row and column of the CCD at which they begin.
-        key: where they stand in the measurement's file.
-        origin: of each file when it was recorded, and the note in it, as far as it says so.
+    Attributes
+    ----------
+    files : tuple[str, ...]
+        They are from, by their paths.
+    frames : np.ndarray
+        (N, H, W) grey values as recorded.
+    offset : Shape
+        Row and column of the CCD at which they begin.
+    key : KeyPath
+        Where they stand in the measurement's file.
+    origin : tuple[tuple[datetime | None, str], ...]
+        Of each file when it was recorded, and the note in it, as far as it says so.
     """
 
     files: tuple[str, ...]
@@ -167,16 +179,26 @@ class StateFrames:
 class ChannelFrames:
     """All frames of one channel.
 
-    Attributes:
-        name: ``CAMERA/CHANNEL``.
-        ccd: rows and columns of its CCD.
-        before: of the nominal state.
-        after: of each state to be measured.
-        bad: (rows, columns) of the CCD: pixels of the bad-pixel map; None for none.
-        correction: of its pixels by dark and flat frames; None without.
-        transfer: measured photon transfer; None where the data sheet's is used.
-        noise: of the detector, as the corrected frames have it.
-        raw_noise: as the frames as recorded have it.
+    Attributes
+    ----------
+    name : str
+        ``CAMERA/CHANNEL``.
+    ccd : Shape
+        Rows and columns of its CCD.
+    before : StateFrames
+        Of the nominal state.
+    after : tuple[StateFrames, ...]
+        Of each state to be measured.
+    bad : np.ndarray | None
+        (rows, columns) of the CCD: pixels of the bad-pixel map; None for none.
+    correction : PixelCorrection | None
+        Of its pixels by dark and flat frames; None without.
+    transfer : PhotonTransfer | None
+        Measured photon transfer; None where the data sheet's is used.
+    noise : NoiseModel
+        Of the detector, as the corrected frames have it.
+    raw_noise : NoiseModel
+        As the frames as recorded have it.
     """
 
     name: str
@@ -200,14 +222,21 @@ def read_measurement(
 ) -> tuple[ChannelFrames, ...]:
     """Read all files of a measurement.
 
-    Args:
-        setup: the measurement.
-        noise: of the CCDs by their data sheet.
-        ccd: rows and columns of the instrument's CCDs; None to take those of the frames before.
-        advance: told how many channels are read.
+    Parameters
+    ----------
+    setup : MeasurementSetup
+        The measurement.
+    noise : NoiseModel
+        Of the CCDs by their data sheet.
+    ccd : Shape | None
+        Rows and columns of the instrument's CCDs; None to take those of the frames before.
+    advance : Callable[[int], None]
+        Told how many channels are read.
 
-    Raises:
-        InputError: files that cannot be read or do not fit; one issue for each channel.
+    Raises
+    ------
+    InputError
+        Files that cannot be read or do not fit; one issue for each channel.
     """
     _require_memory(setup.test)
     out: list[ChannelFrames] = []
@@ -442,12 +471,18 @@ def _bad(test: MeasurementSpec, name: str, ccd: Shape, before: StateFrames) -> n
 def cannot_measure(test: Spec, state: StateFrames, channel: str, reason: str, remedy: str) -> Issue:
     """What is said of frames in which no spot can be measured.
 
-    Args:
-        test: the measurement.
-        state: the frames.
-        channel: whose.
-        reason: why not.
-        remedy: what to do about it.
+    Parameters
+    ----------
+    test : Spec
+        The measurement.
+    state : StateFrames
+        The frames.
+    channel : str
+        whose.
+    reason : str
+        Why not.
+    remedy : str
+        What to do about it.
     """
     files = state.files[0] + (f" and {len(state.files) - 1} more" if len(state.files) > 1 else "")
     return test.issue(f"the spot of {channel} cannot be measured in {files}: {reason}", state.key, allowed=remedy)

@@ -107,11 +107,16 @@ def _bar(figure: Figure, shown: Any, grid: Any, label: str) -> None:
 class Line:
     """One change over time.
 
-    Attributes:
-        camera: whose; empty for what is of both.
-        name: with its unit.
-        marks: (3, T) times in seconds, values and their standard deviations, each time by itself.
-        band: (3, F) the same of all times together, also between them; None where nothing is known of that.
+    Attributes
+    ----------
+    camera : str
+        Whose; empty for what is of both.
+    name : str
+        With its unit.
+    marks : np.ndarray
+        (3, T) times in seconds, values and their standard deviations, each time by itself.
+    band : np.ndarray | None
+        (3, F) the same of all times together, also between them; None where nothing is known of that.
     """
 
     camera: str
@@ -123,8 +128,10 @@ class Line:
 def changes_svg(lines: Sequence[Line]) -> str:
     """Changes over time, camera by camera beside each other, and below them what is of both.
 
-    Args:
-        lines: of every change.
+    Parameters
+    ----------
+    lines : Sequence[Line]
+        Of every change.
     """
     with svg.look("measured-series"):
         size, unit = time_unit(lines[0].marks[0])

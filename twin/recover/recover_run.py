@@ -50,13 +50,20 @@ CALIBRATE, READ, MEASURE = "calibrate", "read the frames", "search and measure t
 class RecoverRun:
     """What a measurement gave.
 
-    Attributes:
-        setup: the measurement.
-        readings: of each state after.
-        channels: in the order of the spots.
-        pitch: of the CCDs' pixels, metres.
-        smoothed: all times of a series read together; None for a single state, and where nothing is stated to move.
-        warnings: what the user should know.
+    Attributes
+    ----------
+    setup : MeasurementSetup
+        The measurement.
+    readings : tuple[MonitorReading, ...]
+        Of each state after.
+    channels : tuple[ChannelResult, ...]
+        In the order of the spots.
+    pitch : float
+        Of the CCDs' pixels, metres.
+    smoothed : SmoothedCourse | None
+        All times of a series read together; None for a single state, and where nothing is stated to move.
+    warnings : tuple[str, ...]
+        What the user should know.
     """
 
     setup: MeasurementSetup
@@ -134,15 +141,23 @@ def run_recover(
 ) -> RecoverRun:
     """Measure the spots and read what they say.
 
-    Args:
-        setup: the measurement.
-        backend: where the instrument is traced.
-        seed: of nothing; nothing is drawn.
-        advance: told what is being done.
-        experiment: the instrument where it has been built already; results are the same.
+    Parameters
+    ----------
+    setup : MeasurementSetup
+        The measurement.
+    backend : Backend
+        Where the instrument is traced.
+    seed : int
+        Of nothing; nothing is drawn.
+    advance : Advance
+        Told what is being done.
+    experiment : MonitorExperiment | None
+        The instrument where it has been built already; results are the same.
 
-    Raises:
-        InputError: files that cannot be read, or spots that cannot be measured, by name.
+    Raises
+    ------
+    InputError
+        Files that cannot be read, or spots that cannot be measured, by name.
     """
     advance(CALIBRATE, 0, 1)
     bench = _modelled(setup, backend, experiment) if setup.model is not None else _formulas(setup)
@@ -339,9 +354,12 @@ def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], err
 def state_name(times: Sequence[float] | None, number: int) -> str:
     """How a reader knows a state: of a series by its time.
 
-    Args:
-        times: of a series, seconds; None for a single state after.
-        number: 0 for the nominal state, from 1 on those after it.
+    Parameters
+    ----------
+    times : Sequence[float] | None
+        Of a series, seconds; None for a single state after.
+    number : int
+        0 for the nominal state, from 1 on those after it.
     """
     if number == 0:
         return "before"

@@ -64,10 +64,14 @@ class Twin(Protocol):
 class CameraTwin(CameraView):
     """A camera of an instrument in one state. Made by `load_camera` and `InstrumentTwin.camera`.
 
-    Attributes:
-        twin: the instrument, of which this may be all.
-        name: of the camera in it.
-        obstruction: whether what other bodies take of its beam is missing.
+    Attributes
+    ----------
+    twin : Twin
+        The instrument, of which this may be all.
+    name : str
+        Of the camera in it.
+    obstruction : bool
+        Whether what other bodies take of its beam is missing.
     """
 
     twin: Twin = field(repr=False)
@@ -78,10 +82,14 @@ class CameraTwin(CameraView):
     def of(cls, twin: Twin, name: str, obstruction: bool = True) -> CameraTwin:
         """A camera of an instrument, in the instrument's state.
 
-        Args:
-            twin: the instrument.
-            name: of the camera in it.
-            obstruction: whether what other bodies take of its beam is missing.
+        Parameters
+        ----------
+        twin : Twin
+            The instrument.
+        name : str
+            Of the camera in it.
+        obstruction : bool
+            Whether what other bodies take of its beam is missing.
         """
         experiment = twin.experiment
         seen = CameraView.within(experiment.instrument, name, experiment.backend, twin.state, obstruction)
@@ -90,8 +98,10 @@ class CameraTwin(CameraView):
     def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> CameraTwin:
         """The same camera with bodies of its instrument perturbed; arguments and errors as `InstrumentTwin.perturbed`.
 
-        Args:
-            perturb: motions in words, such as ``"M2 shift z 20 um"``, or node -> keys of `perturb:` in a job's YAML.
+        Parameters
+        ----------
+        perturb : Mapping[str, Mapping[str, Any]] | str
+            Motions in words, such as ``"M2 shift z 20 um"``, or node -> keys of `perturb:` in a job's YAML.
         """
         return CameraTwin.of(self.twin.perturbed(*perturb), self.name, self.obstruction)
 
@@ -124,8 +134,10 @@ class InstrumentTwin:
     Made by `load` and by `perturbed`. Copies share what was built and calibrated, so that a loop over perturbations
     pays for the instrument once.
 
-    Attributes:
-        resolved: the job that it stands for, with everything that it names.
+    Attributes
+    ----------
+    resolved : ResolvedJob
+        The job that it stands for, with everything that it names.
     """
 
     resolved: ResolvedJob
@@ -135,13 +147,19 @@ class InstrumentTwin:
     def of(cls, resolved: ResolvedJob, backend: str = "llvm", like: InstrumentTwin | None = None) -> InstrumentTwin:
         """The twin of a job that has been read.
 
-        Args:
-            resolved: the job.
-            backend: where to trace, ``llvm`` or ``cuda``.
-            like: one of the same instrument, cameras and detector, which is then not built again.
+        Parameters
+        ----------
+        resolved : ResolvedJob
+            The job.
+        backend : str
+            Where to trace, ``llvm`` or ``cuda``.
+        like : InstrumentTwin | None
+            One of the same instrument, cameras and detector, which is then not built again.
 
-        Raises:
-            BackendUnavailable: this machine does not have it.
+        Raises
+        ------
+        BackendUnavailable
+            This machine does not have it.
         """
         return cls(resolved, _Bench(resolved, backend) if like is None else like._bench.stating(resolved))
 
@@ -186,22 +204,28 @@ class InstrumentTwin:
     def state(self) -> State:
         """Body -> motion, SI: what the perturbations come to, deformations by heat included.
 
-        Raises:
-            InputError: a temperature for which the materials have no data.
+        Raises
+        ------
+        InputError
+            a temperature for which the materials have no data.
         """
         return self._bench.experiment.state(self.resolved.job)
 
     def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> InstrumentTwin:
         """Return this instrument with the given bodies perturbed.
 
-        Args:
-            perturb: motions in words, such as ``"M2 shift z 3 um"``, or node -> keys and unit strings of `perturb:` in
-                a job's YAML, such as ``{"base/forward/M2": {"shift": "0 0 3 um"}}``. The last parts of a node's path
-                are enough where only one node ends so. A node that is perturbed already gets this in place of what it
-                had; others keep theirs.
+        Parameters
+        ----------
+        perturb : Mapping[str, Mapping[str, Any]] | str
+            Motions in words, such as ``"M2 shift z 3 um"``, or node -> keys and unit strings of `perturb:` in a job's
+            YAML, such as ``{"base/forward/M2": {"shift": "0 0 3 um"}}``. The last parts of a node's path are enough
+            where only one node ends so. A node that is perturbed already gets this in place of what it had; others keep
+            theirs.
 
-        Raises:
-            InputError: no such node, or nothing that can be done to it.
+        Raises
+        ------
+        InputError
+            No such node, or nothing that can be done to it.
         """
         plain = {**self._plain, "perturb": {**self._plain.get("perturb", {}), **self._given(perturb)}}
         twin = self._with_job(plain)
@@ -223,13 +247,16 @@ class InstrumentTwin:
     def with_disturbances(self, disturbances: str | Mapping[str, Any]) -> InstrumentTwin:
         """Return this instrument with another prior, on which `posterior` and all total sigmas rest.
 
-        Args:
-            disturbances: as `disturbances:` in a job's YAML: name of a file of the library (``launch``), path of one's
-                own, ``none`` for nothing, or ``{"file": ..., "causes": {...}, "without": [...]}``. It replaces what
-                was stated before.
+        Parameters
+        ----------
+        disturbances : str | Mapping[str, Any]
+            As `disturbances:` in a job's YAML: name of a file of the library (``launch``), path of one's own, ``none``
+            for nothing, or ``{"file": ..., "causes": {...}, "without": [...]}``. It replaces what was stated before.
 
-        Raises:
-            InputError: no such file, or one that is not valid for this instrument.
+        Raises
+        ------
+        InputError
+            No such file, or one that is not valid for this instrument.
         """
         named = disturbances if isinstance(disturbances, str) else dict(disturbances)
         plain = {**self._plain, "disturbances": named}
@@ -243,14 +270,20 @@ class InstrumentTwin:
     def render(self, frames: int | None = None, seed: int | None = None, **render: Any) -> Shot:
         """Render the nominal and the perturbed instrument, and expose its detectors.
 
-        Args:
-            frames: of each exposure; the job's or the instrument's own number if not given.
-            seed: of all noise; the job's (1 unless it says otherwise) if not given.
-            render: further keys of `render:` in a job's YAML, such as ``stray=True``, ``quality=True`` or
-                ``images=["spots", "knife_edge"]``.
+        Parameters
+        ----------
+        frames : int | None
+            Of each exposure; the job's or the instrument's own number if not given.
+        seed : int | None
+            Of all noise; the job's (1 unless it says otherwise) if not given.
+        render : Any
+            Further keys of `render:` in a job's YAML, such as ``stray=True``, ``quality=True`` or ``images=["spots",
+            "knife_edge"]``.
 
-        Raises:
-            InputError: a wrong key, or a perturbation so large that light misses the mirrors or a spot its CCD.
+        Raises
+        ------
+        InputError
+            a wrong key, or a perturbation so large that light misses the mirrors or a spot its CCD.
         """
         given = {"frames": frames, "seed": seed}
         own = {key: value for key, value in given.items() if value is not None}
@@ -262,15 +295,22 @@ class InstrumentTwin:
         """What every estimator reads from images, given the calibration of the unperturbed instrument and what is
         stated to move.
 
-        Args:
-            before: frames of the unperturbed instrument, grey values, (channel, frame, row, column) in the order of
-                ``shot.before.channel``; a DataArray or an array.
-            after: of the perturbed one.
-            centroid: name of a method of `analysis.spots.CENTROIDS`; the job's if not given.
+        Parameters
+        ----------
+        before : Any
+            Frames of the unperturbed instrument, grey values, (channel, frame, row, column) in the order of
+            ``shot.before.channel``; a DataArray or an array.
+        after : Any
+            Of the perturbed one.
+        centroid : str | None
+            Name of a method of `analysis.spots.CENTROIDS`; the job's if not given.
 
-        Raises:
-            ValueError: frames of another shape, or no such centroid.
-            SpotError: a spot cannot be measured.
+        Raises
+        ------
+        ValueError
+            Frames of another shape, or no such centroid.
+        SpotError
+            a spot cannot be measured.
         """
         method = self.resolved.job.analysis.centroid if centroid is None else centroid
         experiment = self._bench.experiment
@@ -297,17 +337,23 @@ class InstrumentTwin:
     def jacobian(self, motions: Sequence[str]) -> xr.Dataset:
         """Exact derivatives by elementary motions, about the unperturbed instrument.
 
-        Args:
-            motions: such as ``base/forward/M2 shift z``, ``base/backward/focal_plane rotate x about rear_node``,
-                ``base/forward scale`` or ``base/forward/M1 figure Z5``.
+        Parameters
+        ----------
+        motions : Sequence[str]
+            Such as ``base/forward/M2 shift z``, ``base/backward/focal_plane rotate x about rear_node``, ``base/forward
+            scale`` or ``base/forward/M1 figure Z5``.
 
-        Returns:
+        Returns
+        -------
+        xr.Dataset
             Per um, arcsec, ppm or nm of each motion (coordinate ``per``): ``spots`` (channel, axis, motion), px;
             ``true`` (camera, parameter, motion), the traced change; ``readings`` (camera, estimator, parameter,
             motion), what each estimator makes of the spots. Parameters are in arcsec and um, as their names end.
 
-        Raises:
-            InputError: no such node, pivot or motion.
+        Raises
+        ------
+        InputError
+            No such node, pivot or motion.
         """
         experiment = self._bench.experiment
         names = list(self.cameras)
@@ -345,12 +391,17 @@ class InstrumentTwin:
     def camera(self, name: str = "", obstruction: bool = True) -> CameraTwin:
         """One of its cameras as optical designers look at it, in this state.
 
-        Args:
-            name: of the camera; may be left out where there is one.
-            obstruction: whether what prisms and other bodies take of its beam is missing.
+        Parameters
+        ----------
+        name : str
+            Of the camera; may be left out where there is one.
+        obstruction : bool
+            Whether what prisms and other bodies take of its beam is missing.
 
-        Raises:
-            InputError: no camera of that name.
+        Raises
+        ------
+        InputError
+            No camera of that name.
         """
         # it draws
 
@@ -394,16 +445,23 @@ def load(
 ) -> InstrumentTwin:
     """An instrument to work with.
 
-    Args:
-        what: name of an instrument in the library (``gf7_pair``), or path of an instrument's file, of a job, or of the
-            config.yaml of a run; a job's perturbations come with it.
-        backend: where to trace, ``llvm`` or ``cuda``.
-        disturbances: what is stated to move, as `InstrumentTwin.with_disturbances` takes it; the job's or the
-            instrument's own if not given.
+    Parameters
+    ----------
+    what : str | Path
+        Name of an instrument in the library (``gf7_pair``), or path of an instrument's file, of a job, or of the
+        config.yaml of a run; a job's perturbations come with it.
+    backend : str
+        Where to trace, ``llvm`` or ``cuda``.
+    disturbances : str | Mapping[str, Any] | None
+        What is stated to move, as `InstrumentTwin.with_disturbances` takes it; the job's or the instrument's own if not
+        given.
 
-    Raises:
-        InputError: no such name, or a file that cannot be read or is not valid, with line and key.
-        BackendUnavailable: this machine does not have it.
+    Raises
+    ------
+    InputError
+        No such name, or a file that cannot be read or is not valid, with line and key.
+    BackendUnavailable
+        This machine does not have it.
     """
     loaded = _load(what, backend)
     return loaded if disturbances is None else loaded.with_disturbances(disturbances)
@@ -424,13 +482,18 @@ def _load(what: str | Path, backend: str) -> InstrumentTwin:
 def load_camera(what: str | Path, backend: str = "llvm") -> CameraTwin:
     """A camera by itself, as optical designers look at it; its ``perturbed`` moves and warms its parts.
 
-    Args:
-        what: name of a camera in the library (``gf7``), or path of a camera's file.
-        backend: where to trace, ``llvm`` or ``cuda``.
+    Parameters
+    ----------
+    what : str | Path
+        Name of a camera in the library (``gf7``), or path of a camera's file.
+    backend : str
+        Where to trace, ``llvm`` or ``cuda``.
 
-    Raises:
-        InputError: no such name, a file that cannot be read or is not valid, or a prescription that brings no light
-            through the stop to the image.
+    Raises
+    ------
+    InputError
+        No such name, a file that cannot be read or is not valid, or a prescription that brings no light through the
+        stop to the image.
     """
     camera = read_camera(what)  # what is no camera is told as that
     return _load(Path(what) if is_path(what) else str(what), backend).camera(camera.name)
@@ -444,15 +507,22 @@ _FORMS = "NODE shift x|y|z, NODE rotate x|y|z, NODE scale, NODE figure Z5; 'abou
 def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
     """The elementary motion that a text names.
 
-    Args:
-        text: ``NODE shift x``, ``NODE rotate x``, ``NODE scale`` or ``NODE figure Z5``, then perhaps ``about PIVOT``.
-        nodes: path -> what may be done to it, for all bodies of the instrument.
+    Parameters
+    ----------
+    text : str
+        ``NODE shift x``, ``NODE rotate x``, ``NODE scale`` or ``NODE figure Z5``, then perhaps ``about PIVOT``.
+    nodes : Mapping[str, NodeInfo]
+        Path -> what may be done to it, for all bodies of the instrument.
 
-    Returns:
+    Returns
+    -------
+    ElementaryMotion
         The motion, labelled with the text.
 
-    Raises:
-        InputError: not of this form, no such node or pivot, or a motion that the node does not have.
+    Raises
+    ------
+    InputError
+        Not of this form, no such node or pivot, or a motion that the node does not have.
     """
     try:
         name, kind, axis, amount, pivot = motion_of(text)

@@ -29,12 +29,18 @@ from twin.framework.run_folder import RunFolder
 class TestResult:
     """A finished test.
 
-    Attributes:
-        name: as it was called, ``lab focus``.
-        numbers: what KIND.json of a run folder holds, keys ending in their unit.
-        report: verdict, tables and figures, for a reader.
-        setup: the test with all it refers to.
-        run: everything that was computed; its class depends on the test.
+    Attributes
+    ----------
+    name : str
+        As it was called, ``lab focus``.
+    numbers : Mapping[str, Any]
+        What KIND.json of a run folder holds, keys ending in their unit.
+    report : Report
+        Verdict, tables and figures, for a reader.
+    setup : Spec
+        The test with all it refers to.
+    run : Any
+        Everything that was computed; its class depends on the test.
     """
 
     name: str
@@ -56,12 +62,17 @@ class TestResult:
     def save(self, folder: str | Path, force: bool = False) -> Path:
         """Write the run folder that the command would write.
 
-        Args:
-            folder: to be made.
-            force: replace it if it is a run folder.
+        Parameters
+        ----------
+        folder : str | Path
+            To be made.
+        force : bool
+            Replace it if it is a run folder.
 
-        Raises:
-            RunFolderError: it is there already, or cannot be written.
+        Raises
+        ------
+        RunFolderError
+            It is there already, or cannot be written.
         """
         with RunFolder(Path(folder), force) as target:
             write_test(self._kind, self.numbers, self.report, self._facts, target)
@@ -78,17 +89,25 @@ def perform(
 ) -> TestResult:
     """Run what a command runs on its file.
 
-    Args:
-        name: ``camera``, ``recover``, ``tolerance``, ``uncertainty``; or any of ``lab``, ``orbit`` (but export),
-            ``design`` and ``asbuilt`` with its subcommand, such as ``lab focus``.
-        file: of the test, or its name in the library.
-        seed: of all that is drawn; the file's own if not given.
-        backend: where to trace, ``llvm`` or ``cuda``.
-        changes: keys of the test's file with other values, of ``camera`` and ``uncertainty`` those of the run's
-            config.yaml; a mapping replaces single keys of a mapping.
+    Parameters
+    ----------
+    name : str
+        ``camera``, ``recover``, ``tolerance``, ``uncertainty``; or any of ``lab``, ``orbit`` (but export), ``design``
+        and ``asbuilt`` with its subcommand, such as ``lab focus``.
+    file : str | Path
+        Of the test, or its name in the library.
+    seed : int | None
+        Of all that is drawn; the file's own if not given.
+    backend : str
+        Where to trace, ``llvm`` or ``cuda``.
+    changes : Any
+        Keys of the test's file with other values, of ``camera`` and ``uncertainty`` those of the run's config.yaml; a
+        mapping replaces single keys of a mapping.
 
-    Raises:
-        InputError: no such test, file or key; or the test failed on its bench, with the key to be changed.
+    Raises
+    ------
+    InputError
+        No such test, file or key; or the test failed on its bench, with the key to be changed.
     """
     if name not in PROCEDURES:
         raise InputError(unknown("no such test", name, PROCEDURES).at())

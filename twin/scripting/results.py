@@ -35,16 +35,23 @@ from twin.targets.target_measurement import PlaceTargets
 class Shot:
     """An exposure of the nominal and of the perturbed instrument.
 
-    Attributes:
-        before, after: frames, uint16 grey values, (channel, frame, row, column); without a monitor there is no channel.
-        expected: expected photons per pixel and frame, (state, channel, row, column), as in irradiance.nc; empty
-            without a monitor.
-        truth: true changes of every camera, by exact tracing: parameters of each ``camera``; of two cameras
-            ``angle_change_arcsec``, and ``ground_along_m``, ``ground_across_m``, ``ground_height_m``, errors of points
-            on the ground that are located as if nothing had changed.
-        verdict: what was recovered, how well, and what limits it.
-        warnings: what one should know before using the numbers.
-        run: everything that the command ``twin.render`` would write: image quality, targets, stray light, course.
+    Attributes
+    ----------
+    before, after : xr.DataArray
+        Frames, uint16 grey values, (channel, frame, row, column); without a monitor there is no channel.
+    expected : xr.Dataset
+        Expected photons per pixel and frame, (state, channel, row, column), as in irradiance.nc; empty without a
+        monitor.
+    truth : xr.Dataset
+        True changes of every camera, by exact tracing: parameters of each ``camera``; of two cameras
+        ``angle_change_arcsec``, and ``ground_along_m``, ``ground_across_m``, ``ground_height_m``, errors of points on
+        the ground that are located as if nothing had changed.
+    verdict : str
+        What was recovered, how well, and what limits it.
+    warnings : tuple[str, ...]
+        What one should know before using the numbers.
+    run : JobRun
+        Everything that the command ``twin.render`` would write: image quality, targets, stray light, course.
     """
 
     before: xr.DataArray
@@ -61,12 +68,17 @@ class Shot:
     def save(self, folder: str | Path, force: bool = False) -> Path:
         """Write the run folder that the command would write, with its report.
 
-        Args:
-            folder: to be made.
-            force: replace it if it is a run folder.
+        Parameters
+        ----------
+        folder : str | Path
+            To be made.
+        force : bool
+            Replace it if it is a run folder.
 
-        Raises:
-            RunFolderError: it is there already, or cannot be written.
+        Raises
+        ------
+        RunFolderError
+            It is there already, or cannot be written.
         """
         # what draws waits until it is asked for
         from twin.main_job.render_folder import write_run
@@ -121,21 +133,31 @@ class Shot:
 class Found:
     """What every estimator reads from images.
 
-    Attributes:
-        values: readings, (camera, estimator, parameter), in arcsec and um as the parameters' names end.
-        covariance: of the whole error, (camera, estimator, parameter, parameter_2), products of these units: by noise
-            and by what is stated to move; where nothing is stated, by noise alone.
-        covariance_noise: of that what the noise of the images does, likewise.
-        angle: of two cameras, ``change_arcsec`` with ``change_arcsec_sigma`` (total) and ``change_arcsec_sigma_noise``
-            by estimator; empty otherwise.
-        ground: of two cameras of known altitude, ``along_m``, ``across_m``, ``height_m`` with their sigmas, likewise.
-        disturbances: name of what is stated to move, on which the total sigmas rest; empty for nothing.
-        spots: ``before`` and ``after`` (channel, axis), px, with ``before_sigma`` and ``after_sigma``.
-        sigma_holds: whether nothing that was measured contradicts the sigmas.
-        warnings: why they do not, and what else one should know before using the numbers.
-        from_statement: share of the ``posterior``'s variance of each reading that no spot constrains: that part of
-            sigma is from the statement, not from the spots; (row) with levels camera and parameter, empty where
-            nothing is stated.
+    Attributes
+    ----------
+    values : xr.DataArray
+        Readings, (camera, estimator, parameter), in arcsec and um as the parameters' names end.
+    covariance : xr.DataArray
+        Of the whole error, (camera, estimator, parameter, parameter_2), products of these units: by noise and by what
+        is stated to move; where nothing is stated, by noise alone.
+    covariance_noise : xr.DataArray
+        Of that what the noise of the images does, likewise.
+    angle : xr.Dataset
+        Of two cameras, ``change_arcsec`` with ``change_arcsec_sigma`` (total) and ``change_arcsec_sigma_noise`` by
+        estimator; empty otherwise.
+    ground : xr.Dataset
+        Of two cameras of known altitude, ``along_m``, ``across_m``, ``height_m`` with their sigmas, likewise.
+    disturbances : str
+        Name of what is stated to move, on which the total sigmas rest; empty for nothing.
+    spots : xr.Dataset
+        ``before`` and ``after`` (channel, axis), px, with ``before_sigma`` and ``after_sigma``.
+    sigma_holds : bool
+        Whether nothing that was measured contradicts the sigmas.
+    warnings : tuple[str, ...]
+        Why they do not, and what else one should know before using the numbers.
+    from_statement : pd.Series
+        Share of the ``posterior``'s variance of each reading that no spot constrains: that part of sigma is from the
+        statement, not from the spots; (row) with levels camera and parameter, empty where nothing is stated.
     """
 
     values: xr.DataArray
@@ -172,10 +194,14 @@ class Found:
     def compare(self, truth: xr.Dataset) -> pd.DataFrame:
         """Readings beside the truth.
 
-        Args:
-            truth: of the exposure, ``shot.truth``.
+        Parameters
+        ----------
+        truth : xr.Dataset
+            Of the exposure, ``shot.truth``.
 
-        Returns:
+        Returns
+        -------
+        pd.DataFrame
             A row for every camera and parameter, for the angle between two cameras and for errors on the ground: what
             is ``true``, each estimator's reading, and of the ``judged`` one ``sigma`` (total), ``sigma_noise``,
             ``error`` = reading - true and ``in_sigma`` = error / sigma.
@@ -280,9 +306,12 @@ def _truth(run: JobRun) -> xr.Dataset:
 def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     """What a script sees of the reading of one state.
 
-    Args:
-        reading: of it.
-        warnings: of the instrument; those of the reading are added.
+    Parameters
+    ----------
+    reading : MonitorReading
+        Of it.
+    warnings : Sequence[str]
+        Of the instrument; those of the reading are added.
     """
     recovery, cameras = reading.recovery, list(reading.cameras)
     channels = ["/".join(channel) for channel in reading.channels]
@@ -342,8 +371,10 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
 def as_frames(given: Any, name: str, channels: Sequence[str], shape: tuple[int, int]) -> np.ndarray:
     """Frames as the analysis takes them, (C, frames, rows, columns), with the channels in the instrument's order.
 
-    Raises:
-        ValueError: other dimensions, channels or pixels.
+    Raises
+    ------
+    ValueError
+        Other dimensions, channels or pixels.
     """
     if isinstance(given, xr.DataArray) and "channel" in given.coords:
         missing = [key for key in channels if key not in given.channel.values]

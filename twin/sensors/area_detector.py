@@ -62,8 +62,10 @@ class NoiseTerm(FurtherNoise, Protocol):
 class ReadNoise:
     """Normal noise of the electronics, new in every frame.
 
-    Attributes:
-        sigma_e: electrons rms.
+    Attributes
+    ----------
+    sigma_e : float
+        Electrons rms.
     """
 
     sigma_e: float
@@ -94,8 +96,10 @@ class ReadNoise:
 class FixedOffsets:
     """Normal differences of the pixels' offsets.
 
-    Attributes:
-        sigma_e: electrons rms.
+    Attributes
+    ----------
+    sigma_e : float
+        Electrons rms.
     """
 
     sigma_e: float
@@ -216,8 +220,10 @@ class EmvaDetector:
     def from_sheet(cls, sheet: DetectorSpec, exposure: float) -> EmvaDetector:
         """The detector of a data sheet's file, for frames of that exposure, seconds.
 
-        Raises:
-            InputError: the dark current alone saturates the pixels, or the sheet names a noise that is not known.
+        Raises
+        ------
+        InputError
+            The dark current alone saturates the pixels, or the sheet names a noise that is not known.
         """
         sheet.check_exposure(exposure)
         for name in sheet.noise or {}:
@@ -372,19 +378,26 @@ class EmvaDetector:
         """Frames of an image whose numbers are drawn at once: so many that memory stays bounded; the frames do not
         depend on it.
 
-        Args:
-            frames: of the image.
-            pixels: of a frame.
+        Parameters
+        ----------
+        frames : int
+            Of the image.
+        pixels : int
+            Of a frame.
         """
         return min(frames, max(1, (_FURTHER_PIXELS if self.noise else _FRAMES_PIXELS) // pixels))
 
     def exposing_bytes(self, frames: int, pixels: int, threads: int) -> int:
         """Memory that the exposure of images takes for a while, beside the frames that it gives, bytes.
 
-        Args:
-            frames: of an image.
-            pixels: of a frame.
-            threads: that expose.
+        Parameters
+        ----------
+        frames : int
+            Of an image.
+        pixels : int
+            Of a frame.
+        threads : int
+            That expose.
         """
         together = self.frames_at_once(frames, pixels)
         # electrons, read noise, and electrons as they were collected for noise that depends on them
@@ -464,9 +477,12 @@ def told_of_steps(noise: NoiseModel, whose: str) -> tuple[str, ...]:
     """A warning for a detector whose noise does not spread over the steps of its grey values where there are few DN of
     light; none for others. It depends on the detector's numbers alone, and nothing is drawn.
 
-    Args:
-        noise: of the detector.
-        whose: how a reader knows it.
+    Parameters
+    ----------
+    noise : NoiseModel
+        Of the detector.
+    whose : str
+        How a reader knows it.
     """
     few = float(noise.frame_variance_dn2(noise.dark_level_dn + FEW)) - WHOLE
     if few >= COARSE**2:
@@ -482,11 +498,15 @@ def told_of_steps(noise: NoiseModel, whose: str) -> tuple[str, ...]:
 def coarse_warnings(setup: Spec) -> tuple[str, ...]:
     """Warnings as of `told_of_steps` for the area CCDs of an instrument that a job or test refers to; none without one.
 
-    Args:
-        setup: a job or test with all it refers to.
+    Parameters
+    ----------
+    setup : Spec
+        a job or test with all it refers to.
 
-    Raises:
-        InputError: as `EmvaDetector.from_sheet`.
+    Raises
+    ------
+    InputError
+        As `EmvaDetector.from_sheet`.
     """
     instrument, sheet = getattr(setup, "instrument", None), getattr(setup, "detector", None)
     if not isinstance(instrument, InstrumentSpec) or not isinstance(sheet, DetectorSpec):

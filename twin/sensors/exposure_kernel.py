@@ -65,11 +65,16 @@ _SINGLE = 4e-7
 class Reading:
     """How electrons become grey values.
 
-    Attributes:
-        sigma_e: read noise, electrons rms; 0 for none, for which no number is drawn.
-        gain_dn_per_e: grey values per electron.
-        full_well_e: electrons at which a pixel saturates.
-        most_dn: largest grey value.
+    Attributes
+    ----------
+    sigma_e : float
+        Read noise, electrons rms; 0 for none, for which no number is drawn.
+    gain_dn_per_e : float
+        Grey values per electron.
+    full_well_e : float
+        Electrons at which a pixel saturates.
+    most_dn : int
+        Largest grey value.
     """
 
     sigma_e: float
@@ -80,10 +85,14 @@ class Reading:
     def read_out(self, level: np.ndarray, noise: Sequence[np.ndarray], shift: np.ndarray) -> np.ndarray:
         """Grey values of electrons, whose array they take over.
 
-        Args:
-            level: electrons, of any shape.
-            noise: terms that are added to them one after the other, electrons.
-            shift: black level with the pixels' own offsets, grey values.
+        Parameters
+        ----------
+        level : np.ndarray
+            Electrons, of any shape.
+        noise : Sequence[np.ndarray]
+            Terms that are added to them one after the other, electrons.
+        shift : np.ndarray
+            Black level with the pixels' own offsets, grey values.
         """
         np.minimum(level, self.full_well_e, out=level)
         for term in noise:
@@ -103,13 +112,19 @@ class Reading:
     ) -> None:
         """Expose images.
 
-        Args:
-            expected: number of an image -> its expected electrons, and ``shift`` as of ``read_out``, P numbers each.
-            streams: of the I images, each a stream of words, of Poisson numbers of huge means and of normal numbers;
-                some may be the same.
-            out: the frames, (I, F, P) uint16.
-            together: frames of an image that are done at once.
-            threads: that draw.
+        Parameters
+        ----------
+        expected : Callable[[int], tuple[np.ndarray, np.ndarray]]
+            Number of an image -> its expected electrons, and ``shift`` as of ``read_out``, P numbers each.
+        streams : Sequence[np.random.SeedSequence]
+            Of the I images, each a stream of words, of Poisson numbers of huge means and of normal numbers; some may be
+            the same.
+        out : np.ndarray
+            The frames, (I, F, P) uint16.
+        together : int
+            Frames of an image that are done at once.
+        threads : int
+            That draw.
         """
         images, frames, pixels = out.shape
         together = min(together, frames)
@@ -140,9 +155,12 @@ class Reading:
 def exposing_bytes(frames: int, pixels: int) -> int:
     """Memory that an exposure by kernels takes for a while, bytes.
 
-    Args:
-        frames: of an image that are done at once.
-        pixels: of a frame.
+    Parameters
+    ----------
+    frames : int
+        Of an image that are done at once.
+    pixels : int
+        Of a frame.
     """
     return max(_TOGETHER, frames * pixels) * 40 + pixels * 64
 
@@ -151,10 +169,14 @@ def exposing_bytes(frames: int, pixels: int) -> int:
 class _Numbers:
     """What a group of images is made of; its memory serves one group after the other.
 
-    Attributes:
-        mean: expected electrons of all pixels, (lanes,), likewise ``shift`` as of ``Reading.read_out``.
-        words: of 64 bits, frame by frame, (frames, lanes).
-        normals: of the read noise, likewise; None without.
+    Attributes
+    ----------
+    mean : np.ndarray
+        Expected electrons of all pixels, (lanes,), likewise ``shift`` as of ``Reading.read_out``.
+    words : np.ndarray
+        Of 64 bits, frame by frame, (frames, lanes).
+    normals : np.ndarray | None
+        Of the read noise, likewise; None without.
     """
 
     mean: np.ndarray
@@ -181,8 +203,10 @@ class _Numbers:
 class _SameNumbers:
     """Random numbers of a stream of several images, none of whose means is huge: whoever comes first draws them.
 
-    Attributes:
-        words, normals: of all frames, (frames, pixels); None before they are drawn, normals also without read noise.
+    Attributes
+    ----------
+    words, normals : np.ndarray | None
+        Of all frames, (frames, pixels); None before they are drawn, normals also without read noise.
     """
 
     words: np.ndarray | None = None
@@ -192,11 +216,16 @@ class _SameNumbers:
     def put(self, numbers: _Numbers, own: slice, count: int, draw: Callable[[], None]) -> None:
         """Put the numbers where an image has its own.
 
-        Args:
-            numbers: of a group of images.
-            own: the image's lanes.
-            count: of frames.
-            draw: draws them to this place.
+        Parameters
+        ----------
+        numbers : _Numbers
+            Of a group of images.
+        own : slice
+            The image's lanes.
+        count : int
+            Of frames.
+        draw : Callable[[], None]
+            Draws them to this place.
         """
         with self.drawing:
             if self.words is None:
@@ -290,11 +319,16 @@ class _Group:
 class _Drawn:
     """Frames whose random numbers are being drawn.
 
-    Attributes:
-        group: their images.
-        numbers: where they are drawn to.
-        out: the frames, (images, frames, pixels).
-        work: draws each image.
+    Attributes
+    ----------
+    group : _Group
+        Their images.
+    numbers : _Numbers
+        Where they are drawn to.
+    out : np.ndarray
+        The frames, (images, frames, pixels).
+    work : Sequence[Future[np.ndarray | None]]
+        Draws each image.
     """
 
     group: _Group
@@ -342,10 +376,14 @@ def kernels_there() -> bool:
 class _Table:
     """The table of quantiles in the kernels' memory.
 
-    Attributes:
-        known: four cells a word: the least quantile of each, and in its highest bit whether it has others.
-        law: distribution functions at the rows' means, single precision.
-        bound: of each row, of the error of an interpolation of them.
+    Attributes
+    ----------
+    known : Any
+        Four cells a word: the least quantile of each, and in its highest bit whether it has others.
+    law : Any
+        Distribution functions at the rows' means, single precision.
+    bound : Any
+        Of each row, of the error of an interpolation of them.
     """
 
     known: Any
@@ -442,13 +480,20 @@ def _compared(
 ) -> tuple[Any, Any]:
     """Grey values of what ``_looked_up`` left open, and where the number still is not certain.
 
-    Args:
-        mean: of all lanes.
-        word: of all frames, one after the other.
-        normal: likewise.
-        shift: of all lanes.
-        numbers: of the read-out.
-        at: places in all frames, and lanes, of the open ones.
+    Parameters
+    ----------
+    mean : Any
+        Of all lanes.
+    word : Any
+        Of all frames, one after the other.
+    normal : Any
+        likewise.
+    shift : Any
+        Of all lanes.
+    numbers : Sequence[Any]
+        Of the read-out.
+    at : tuple[Any, Any]
+        Places in all frames, and lanes, of the open ones.
     """
     import drjit as dr
     from drjit.llvm import Bool, Float32, Float64, UInt32, UInt64

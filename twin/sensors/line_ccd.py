@@ -59,7 +59,9 @@ def band_wavelengths(band: BandSpec) -> tuple[np.ndarray, np.ndarray]:
 def band_factors(band: BandSpec, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
     """What a line CCD does to an image, at frequencies along the line (fx) and along the track (fy), cycles/m.
 
-    Returns:
+    Returns
+    -------
+    dict[str, np.ndarray]
         ``pixel``: its square area; ``diffusion``: charge that spreads to neighbours; ``tdi_step``: the image moves on
         while the charge waits for its next step; ``tdi_rate``: image and charge drift apart over the stages.
     """
@@ -79,9 +81,12 @@ class LineCcd:
     Every row of an image is collected over all stages of a column's pixels, so that pixel differences are those of
     columns.
 
-    Attributes:
-        band: geometry and clocking.
-        detector: of the sum over all stages.
+    Attributes
+    ----------
+    band : BandSpec
+        Geometry and clocking.
+    detector : EmvaDetector
+        Of the sum over all stages.
     """
 
     band: BandSpec
@@ -91,8 +96,10 @@ class LineCcd:
     def from_specs(cls, band: BandSpec, sheet: DetectorSpec) -> LineCcd:
         """From what the files say.
 
-        Raises:
-            InputError: the dark current alone saturates the pixels.
+        Raises
+        ------
+        InputError
+            The dark current alone saturates the pixels.
         """
         return cls(band, EmvaDetector.from_sheet(sheet, band.exposure))
 
@@ -146,8 +153,10 @@ class LineCcd:
     ) -> np.ndarray:
         """Frames of images (..., H, W) whose first column is the line's pixel ``column``, uint16 (..., frames, H, W).
 
-        Raises:
-            ValueError: the image reaches beyond the ends of the line.
+        Raises
+        ------
+        ValueError
+            The image reaches beyond the ends of the line.
         """
         last = column + photons.shape[-1]
         if column < 0 or last > self.band.pixels:
@@ -168,10 +177,14 @@ _PER_CYCLE = 6
 class Collection:
     """When the charge of a pixel is collected, about the middle of it.
 
-    Attributes:
-        steps: how often the charge stands still, stages x phases.
-        step: from one to the next, seconds.
-        open_share: share of each step in which light falls in, in its middle.
+    Attributes
+    ----------
+    steps : int
+        How often the charge stands still, stages x phases.
+    step : float
+        From one to the next, seconds.
+    open_share : float
+        Share of each step in which light falls in, in its middle.
     """
 
     steps: int
@@ -221,11 +234,16 @@ class Collection:
     def transfer(self, nu: np.ndarray | float, frequency: float, amplitude: float, phase: float) -> np.ndarray:
         """T of one oscillation, complex, (...).
 
-        Args:
-            nu: cycles per pixel, (...).
-            frequency: hertz.
-            amplitude: pixels.
-            phase: in the middle of the collection, radians.
+        Parameters
+        ----------
+        nu : np.ndarray | float
+            Cycles per pixel, (...).
+        frequency : float
+            hertz.
+        amplitude : float
+            pixels.
+        phase : float
+            In the middle of the collection, radians.
         """
         z = 2.0 * np.pi * amplitude * np.asarray(nu, np.float64)
         most = int(np.ceil(np.max(np.abs(z), initial=0.0))) + _BEYOND
@@ -272,9 +290,12 @@ class Collection:
 class Motion:
     """A random motion of the image in one direction: oscillations of random phase and bands of noise, independent.
 
-    Attributes:
-        frequency, amplitude: (K,) hertz and pixels, of the oscillations.
-        first, last, level: (B,) hertz and pixels^2/Hz, of the bands, one-sided.
+    Attributes
+    ----------
+    frequency, amplitude : np.ndarray
+        (K,) hertz and pixels, of the oscillations.
+    first, last, level : np.ndarray
+        (B,) hertz and pixels^2/Hz, of the bands, one-sided.
     """
 
     frequency: np.ndarray
@@ -287,8 +308,10 @@ class Motion:
     def of(cls, lines: Sequence[tuple[float, float]] = (), bands: Sequence[tuple[float, float, float]] = ()) -> Motion:
         """From (frequency, amplitude) of lines and (first, last, level) of bands.
 
-        Raises:
-            ValueError: a frequency that is not above zero, an amplitude or level below zero, an empty band.
+        Raises
+        ------
+        ValueError
+            a frequency that is not above zero, an amplitude or level below zero, an empty band.
         """
         line, band = np.array(lines, np.float64).reshape(-1, 2), np.array(bands, np.float64).reshape(-1, 3)
         if not (np.all(line[:, 0] > 0.0) and np.all(line[:, 1] >= 0.0)):

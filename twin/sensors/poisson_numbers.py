@@ -56,10 +56,14 @@ _ROOM = 1 << 17
 class _Guide:
     """Quantiles in the cells of mean and u, row-major: of the mean 32 to the electron, of u 2^10.
 
-    Attributes:
-        known: the quantile where the cell has one, else ``_UNDECIDED``, uint8.
-        least: the smallest in the cell, uint8.
-        law: F of the numbers below ``MOST_IN_TABLE`` at the cells' means and at the table's end.
+    Attributes
+    ----------
+    known : np.ndarray
+        The quantile where the cell has one, else ``_UNDECIDED``, uint8.
+    least : np.ndarray
+        The smallest in the cell, uint8.
+    law : np.ndarray
+        F of the numbers below ``MOST_IN_TABLE`` at the cells' means and at the table's end.
     """
 
     known: np.ndarray
@@ -89,7 +93,9 @@ def _guide() -> _Guide:
 def quantile_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The guide table as kernels read it.
 
-    Returns:
+    Returns
+    -------
+    tuple[np.ndarray, np.ndarray, np.ndarray]
         The least quantile in each cell of mean and u, row-major, with the highest bit set where the cell has others,
         uint8; F of the numbers below ``MOST_IN_TABLE`` at the cells' means, one after the other; and for each row a
         bound of what a linear interpolation of F between its mean and the next is off. The second derivative of F by
@@ -109,13 +115,19 @@ def quantile_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def poisson_numbers(mean: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """Draw independent Poisson numbers.
 
-    Args:
-        mean: of any shape (...), finite and >= 0; not checked.
-        count: numbers of each mean.
-        rng: is asked for one word of 64 bits for every number, in the order of the result, and then for the numbers of
-            means beyond ``SERIES_END``.
+    Parameters
+    ----------
+    mean : np.ndarray
+        Of any shape (...), finite and >= 0; not checked.
+    count : int
+        Numbers of each mean.
+    rng : np.random.Generator
+        Is asked for one word of 64 bits for every number, in the order of the result, and then for the numbers of means
+        beyond ``SERIES_END``.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         Whole numbers as float64, (count, ...).
     """
     (out,) = poisson_pieces(mean, count, rng, count)
@@ -125,13 +137,20 @@ def poisson_numbers(mean: np.ndarray, count: int, rng: np.random.Generator) -> n
 def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, together: int) -> Iterator[np.ndarray]:
     """The numbers of ``poisson_numbers`` some at a time, so that they need not all be held.
 
-    Args:
-        mean: as there.
-        count: as there.
-        rng: as there. When the first numbers have come, it stands where it would after all of them.
-        together: numbers of each mean in a piece.
+    Parameters
+    ----------
+    mean : np.ndarray
+        As there.
+    count : int
+        As there.
+    rng : np.random.Generator
+        As there. When the first numbers have come, it stands where it would after all of them.
+    together : int
+        Numbers of each mean in a piece.
 
-    Yields:
+    Yields
+    ------
+    np.ndarray
         Whole numbers as float64, (together or fewer, ...).
     """
     flat = np.ascontiguousarray(mean, dtype=np.float64).reshape(-1)
@@ -157,12 +176,18 @@ def split_stream(
 ) -> tuple[np.random.Generator, np.random.Generator]:
     """Generators of the words and of the numbers of huge means, whose streams follow each other in that of ``rng``.
 
-    Args:
-        rng: stands after both when this returns, where not all numbers are drawn together; else it is both.
-        huge: means from ``SERIES_END`` on, (H,).
-        count: numbers of each mean.
-        size: number of all means.
-        together: numbers of each mean that are drawn at once.
+    Parameters
+    ----------
+    rng : np.random.Generator
+        Stands after both when this returns, where not all numbers are drawn together; else it is both.
+    huge : np.ndarray
+        Means from ``SERIES_END`` on, (H,).
+    count : int
+        Numbers of each mean.
+    size : int
+        Number of all means.
+    together : int
+        Numbers of each mean that are drawn at once.
     """
     if together >= count:
         return rng, rng
@@ -178,10 +203,14 @@ def split_stream(
 def words_of(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
     """Words of 64 bits, (count, size); not the raw ones, which some bit generators have of 32.
 
-    Args:
-        rng: is asked for them.
-        count: of each mean.
-        size: number of means.
+    Parameters
+    ----------
+    rng : np.random.Generator
+        Is asked for them.
+    count : int
+        Of each mean.
+    size : int
+        Number of means.
     """
     return rng.integers(0, _LAST, (count, size), dtype=np.uint64, endpoint=True)
 
@@ -189,11 +218,16 @@ def words_of(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
 def poisson_quantile(mean: np.ndarray, word: np.ndarray) -> np.ndarray:
     """Quantiles of Poisson distributions.
 
-    Args:
-        mean: (N,), at least 0 and below ``SERIES_END``.
-        word: u = (word + 1/2) / 2^64, uint64, (..., N).
+    Parameters
+    ----------
+    mean : np.ndarray
+        (N,), at least 0 and below ``SERIES_END``.
+    word : np.ndarray
+        u = (word + 1/2) / 2^64, uint64, (..., N).
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         The smallest whole numbers whose distribution function is at least u, float64, (..., N).
     """
     flat = np.ascontiguousarray(mean, dtype=np.float64)
@@ -206,10 +240,14 @@ def poisson_quantile(mean: np.ndarray, word: np.ndarray) -> np.ndarray:
 class _Plan:
     """Means (N,) and how the number of each is found.
 
-    Attributes:
-        mean: all means.
-        row: where a mean's row of the table begins; of larger means the first row's.
-        large: indices of the means beyond the table and below ``SERIES_END``.
+    Attributes
+    ----------
+    mean : np.ndarray
+        All means.
+    row : np.ndarray
+        Where a mean's row of the table begins; of larger means the first row's.
+    large : np.ndarray
+        Indices of the means beyond the table and below ``SERIES_END``.
     """
 
     mean: np.ndarray

@@ -51,9 +51,12 @@ class Perturbed(Protocol):
 class Spread:
     """A number that varies.
 
-    Attributes:
-        key: where it stands below ``perturb``.
-        factor: how it varies, as a study's file says it.
+    Attributes
+    ----------
+    key : KeyPath
+        Where it stands below ``perturb``.
+    factor : Mapping[str, Any]
+        How it varies, as a study's file says it.
     """
 
     key: KeyPath
@@ -84,29 +87,45 @@ def study(
 ) -> xr.Dataset:
     """Perturb, render and recover an instrument many times, on all cores.
 
-    Args:
-        instrument: as it is at the beginning; its other perturbations stay.
-        vary: motion in words -> a range in place of its number, ``{"M2 shift z": "(-5 .. 5) um"}``: an even spread from
-            -5 to 5; ``(0 +- 2)`` is a normal one with sigma 2. Or node -> keys of a perturbation with ranges,
-            ``{"M2": {"shift": "0 0 (-5 .. 5) um"}}``.
-        n: number of runs.
-        seed: of the design; the noise of each run has a stream of its own.
-        design: ``latin_hypercube``, ``sobol`` or ``monte_carlo``.
-        responses: name -> ``{"key": [...], "sigma": [...], "noise": [...]}`` as in a study's file; by default readings
-            of the model and true values of every camera's parameters and of the angle between two cameras.
-        workers: number of processes; one for each core if not given.
-        out: folder of the study, with its report, which stays; none is kept if not given.
-        quiet: show neither progress nor warnings.
-        progress: whether a bar is shown on a terminal and in a notebook; or what is told the number of runs that are
-            there and of all, ``progress(done, runs)``, each time that some are.
+    Parameters
+    ----------
+    instrument : Perturbed
+        As it is at the beginning; its other perturbations stay.
+    vary : Mapping[str, Mapping[str, Any] | str]
+        Motion in words -> a range in place of its number, ``{"M2 shift z": "(-5 .. 5) um"}``: an even spread from -5 to
+        5; ``(0 +- 2)`` is a normal one with sigma 2. Or node -> keys of a perturbation with ranges, ``{"M2": {"shift":
+        "0 0 (-5 .. 5) um"}}``.
+    n : int
+        Number of runs.
+    seed : int
+        Of the design; the noise of each run has a stream of its own.
+    design : str
+        ``latin_hypercube``, ``sobol`` or ``monte_carlo``.
+    responses : Mapping[str, Mapping[str, Any]] | None
+        Name -> ``{"key": [...], "sigma": [...], "noise": [...]}`` as in a study's file; by default readings of the
+        model and true values of every camera's parameters and of the angle between two cameras.
+    workers : int | None
+        Number of processes; one for each core if not given.
+    out : str | Path | None
+        Folder of the study, with its report, which stays; none is kept if not given.
+    quiet : bool
+        Show neither progress nor warnings.
+    progress : bool | Told
+        Whether a bar is shown on a terminal and in a notebook; or what is told the number of runs that are there and of
+        all, ``progress(done, runs)``, each time that some are.
 
-    Returns:
+    Returns
+    -------
+    xr.Dataset
         A value of every factor and response for each ``run``; runs whose light is lost are ``failed``, with a
         ``message``.
 
-    Raises:
-        InputError: nothing varies, a range of another form, or what a job's file would not be allowed to say.
-        RuntimeError: the study could not be completed; the message says why.
+    Raises
+    ------
+    InputError
+        Nothing varies, a range of another form, or what a job's file would not be allowed to say.
+    RuntimeError
+        The study could not be completed; the message says why.
     """
     config = config_text(instrument, vary, n, seed, design, responses)
     with scratch("twin-study") as place:
@@ -180,8 +199,10 @@ _WIDTH = 30  # of the bar, characters
 def tell_through(descriptor: int) -> Told:
     """Return what writes the numbers into a pipe, a line each time; a reader that is gone ends nothing.
 
-    Args:
-        descriptor: of the pipe, inherited; processes that this one starts do not get it.
+    Parameters
+    ----------
+    descriptor : int
+        Of the pipe, inherited; processes that this one starts do not get it.
     """
     os.set_inheritable(descriptor, False)
 

@@ -23,12 +23,17 @@ START = "start the workers and do the first runs"
 def check_size(setup: StudySetup, confirmed: bool) -> None:
     """See whether a study may have as many runs as it has.
 
-    Args:
-        setup: the study.
-        confirmed: whether it may have more than its limit.
+    Parameters
+    ----------
+    setup : StudySetup
+        The study.
+    confirmed : bool
+        Whether it may have more than its limit.
 
-    Raises:
-        InputError: it may not, or their results do not fit into the memory.
+    Raises
+    ------
+    InputError
+        It may not, or their results do not fit into the memory.
     """
     limit, runs = setup.study.limits.runs, run_count(setup.study)
     if runs > limit and not confirmed:
@@ -50,17 +55,27 @@ def run_study(
 ) -> Result:
     """Run what is missing of a study, and write its run folder.
 
-    Args:
-        setup: the study.
-        session: the command at work.
-        place: folder in which finished blocks are kept.
-        chosen: number of local processes, None for one per core; address of a running cluster, None for none.
-        say: told how long it will take.
-        progress: told the number of runs that are there, and of all, beside the session.
+    Parameters
+    ----------
+    setup : StudySetup
+        The study.
+    session : Session
+        The command at work.
+    place : Path
+        Folder in which finished blocks are kept.
+    chosen : tuple[int | None, str | None]
+        Number of local processes, None for one per core; address of a running cluster, None for none.
+    say : Callable[[str], None]
+        Told how long it will take.
+    progress : Callable[[int, int], None]
+        Told the number of runs that are there, and of all, beside the session.
 
-    Raises:
-        InputError, InputErrorText, RunFolderError: bad input.
-        Incomplete: not all runs could be done.
+    Raises
+    ------
+    InputError, InputErrorText, RunFolderError
+        Bad input.
+    Incomplete
+        Not all runs could be done.
     """
     plan, base, folder = Plan.of(setup), base_of(setup), session.folder
     errors, warnings = Console(stderr=True), list[str]()

@@ -33,9 +33,12 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
     (empty for pure numbers and texts), ``role`` and, for factors and responses, ``key``, where it stands in the base
     or in the results.
 
-    Args:
-        plan: the study.
-        result: of all its runs.
+    Parameters
+    ----------
+    plan : Plan
+        The study.
+    result : BlockResult
+        Of all its runs.
     """
     study = plan.setup.study
     data: dict[str, Any] = {}
@@ -111,9 +114,12 @@ def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
     """Contents of study.json, but for the times: of each response mean, standard deviation and quantiles of the runs
     that did not fail; null where there are none.
 
-    Args:
-        data: as `make_dataset` makes it.
-        plan: the study.
+    Parameters
+    ----------
+    data : xr.Dataset
+        As `make_dataset` makes it.
+    plan : Plan
+        The study.
     """
     study = plan.setup.study
     failed = data[FAILED].values.astype(bool)
@@ -161,11 +167,16 @@ def _value(estimate: Estimate | None) -> float | None:
 class Numbers:
     """What a study gave.
 
-    Attributes:
-        data: of every run, as `make_dataset` makes it.
-        summary: contents of study.json.
-        files: names of the files that hold the data.
-        unwritten: files that could not be made, a sentence each; the others hold the same.
+    Attributes
+    ----------
+    data : xr.Dataset
+        Of every run, as `make_dataset` makes it.
+    summary : dict[str, Any]
+        Contents of study.json.
+    files : tuple[str, ...]
+        Names of the files that hold the data.
+    unwritten : tuple[str, ...]
+        Files that could not be made, a sentence each; the others hold the same.
     """
 
     data: xr.Dataset
@@ -177,12 +188,18 @@ class Numbers:
 def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, folder: RunFolder) -> Numbers:
     """Write the data set in all FORMATS, and study.json.
 
-    Args:
-        plan: the study.
-        result: of all its runs.
-        seconds: that this command took for the runs it computed.
-        computed: number of these.
-        folder: of the study.
+    Parameters
+    ----------
+    plan : Plan
+        The study.
+    result : BlockResult
+        Of all its runs.
+    seconds : float
+        That this command took for the runs it computed.
+    computed : int
+        Number of these.
+    folder : RunFolder
+        Of the study.
     """
     data = make_dataset(plan, result)
     numbers = reference_frames.described(

@@ -49,10 +49,14 @@ LARGEST_RULE = 65
 class BandPupils:
     """Pupils of one image, all about one point of it, so that colours that stand apart blur it.
 
-    Attributes:
-        pupils: of every wavelength, (K,), or one alone, the same at all of them.
-        wavelengths: (K,), metres.
-        weights: share of the signal at each, (K,), which sum to 1.
+    Attributes
+    ----------
+    pupils : tuple[PupilFunction, ...]
+        Of every wavelength, (K,), or one alone, the same at all of them.
+    wavelengths : np.ndarray
+        (K,), metres.
+    weights : np.ndarray
+        Share of the signal at each, (K,), which sum to 1.
     """
 
     pupils: tuple[PupilFunction, ...]
@@ -101,14 +105,21 @@ def wavelengths_enough(
 ) -> int:
     """How many wavelengths an MTF over a spectrum takes.
 
-    Args:
-        spectrum: the light.
-        first: count of the first rule.
-        values: of the MTF by the rule of so many wavelengths, or of other numbers of this kind.
-        largest: wavelengths of the last rule.
+    Parameters
+    ----------
+    spectrum : SpectrumSpec
+        The light.
+    first : int
+        Count of the first rule.
+    values : Callable[[int], np.ndarray]
+        Of the MTF by the rule of so many wavelengths, or of other numbers of this kind.
+    largest : int
+        Wavelengths of the last rule.
 
-    Raises:
-        UnphysicalError: it still changes by more than ``WORST_CHANGE`` at ``largest`` wavelengths.
+    Raises
+    ------
+    UnphysicalError
+        It still changes by more than ``WORST_CHANGE`` at ``largest`` wavelengths.
     """
     if spectrum.lines or spectrum.ends[0] == spectrum.ends[1]:
         return first
@@ -158,12 +169,18 @@ def knife_edge(direction: str, angle: float) -> HalfPlane:
 class EdgeOptics:
     """Optical transfer function along one direction at one site, over defocus.
 
-    Attributes:
-        light: pupils of the site in the band's light.
-        band: whose light it is.
-        normal: direction of the frequencies in the image, unit, (2,).
-        cutoff: cycles/m, of the shortest wavelength.
-        table: spline over defocus of the samples at ``frequencies``, complex as (real, imaginary).
+    Attributes
+    ----------
+    light : BandPupils
+        Pupils of the site in the band's light.
+    band : BandSpec
+        Whose light it is.
+    normal : np.ndarray
+        Direction of the frequencies in the image, unit, (2,).
+    cutoff : float
+        cycles/m, of the shortest wavelength.
+    table : BSpline
+        Spline over defocus of the samples at ``frequencies``, complex as (real, imaginary).
     """
 
     light: BandPupils
@@ -221,10 +238,14 @@ _ROUND_REACH = 4.0
 class EdgeImager:
     """Images of one edge at one site as a line CCD takes them.
 
-    Attributes:
-        optics: transfer function along the edge's normal.
-        ccd: the line CCD.
-        region: side of the square image, pixels.
+    Attributes
+    ----------
+    optics : EdgeOptics
+        Transfer function along the edge's normal.
+    ccd : LineCcd
+        The line CCD.
+    region : int
+        Side of the square image, pixels.
     """
 
     optics: EdgeOptics
@@ -243,9 +264,12 @@ class EdgeImager:
     def image(self, defocus: float, offset: float) -> np.ndarray:
         """Share of the white signal in every pixel, (region, region).
 
-        Args:
-            defocus: of the detector, metres, positive downstream.
-            offset: of the edge from the middle of the image along its normal, metres.
+        Parameters
+        ----------
+        defocus : float
+            Of the detector, metres, positive downstream.
+        offset : float
+            Of the edge from the middle of the image along its normal, metres.
         """
         pitch, normal = self.ccd.band.pitch, self.optics.normal
         grid = Grid(-0.5 * (self.region - 1) * pitch, pitch, self.region)
@@ -288,14 +312,22 @@ class TargetLostError(PhysicalError):
 class View:
     """One place of a camera's line in one state.
 
-    Attributes:
-        ccd: the line CCD.
-        light: pupils of the image in the band's light.
-        local: mapping from target coordinates (metres on the nominal image scale) to the image, about the chief ray.
-        shift: of the chief ray's place on the focal plane against the nominal state, (along, across), metres.
-        column: first column of the window on the line.
-        offset: of the chief ray from the middle of the window, (along, across), metres.
-        region: side of the window, pixels.
+    Attributes
+    ----------
+    ccd : LineCcd
+        The line CCD.
+    light : BandPupils
+        Pupils of the image in the band's light.
+    local : LocalMap
+        Mapping from target coordinates (metres on the nominal image scale) to the image, about the chief ray.
+    shift : np.ndarray
+        Of the chief ray's place on the focal plane against the nominal state, (along, across), metres.
+    column : int
+        First column of the window on the line.
+    offset : np.ndarray
+        Of the chief ray from the middle of the window, (along, across), metres.
+    region : int
+        Side of the window, pixels.
     """
 
     ccd: LineCcd
@@ -357,11 +389,16 @@ class View:
 class BarDesign:
     """Bars in a window's middle that have the Nyquist frequency on the nominal image, and what is measured of them.
 
-    Attributes:
-        target: the bars.
-        frequency: on the target, (2,), cycles/m.
-        nominal: on the nominal image, (2,), cycles/m.
-        group: (rows, columns) of the window that lie well inside the group.
+    Attributes
+    ----------
+    target : Target
+        The bars.
+    frequency : np.ndarray
+        On the target, (2,), cycles/m.
+    nominal : np.ndarray
+        On the nominal image, (2,), cycles/m.
+    group : tuple[slice, slice]
+        (rows, columns) of the window that lie well inside the group.
     """
 
     target: Target
@@ -407,13 +444,19 @@ def usable_pixels(pixels: int, region: int) -> float:
 class TargetCamera:
     """A camera before targets at infinity.
 
-    Args:
-        path: of its light.
-        ccd: the line CCD.
-        region: side of the windows, pixels.
+    Parameters
+    ----------
+    path
+        Of its light.
+    ccd
+        The line CCD.
+    region
+        Side of the windows, pixels.
 
-    Raises:
-        ValueError: the line is too short for the windows.
+    Raises
+    ------
+    ValueError
+        The line is too short for the windows.
     """
 
     def __init__(self, path: TargetPath, ccd: LineCcd, region: int) -> None:
@@ -432,8 +475,10 @@ class TargetCamera:
     def views(self, state: State) -> dict[str, View]:
         """Every place in a state.
 
-        Raises:
-            TargetLostError: light is lost, or an image moves off the line.
+        Raises
+        ------
+        TargetLostError
+            Light is lost, or an image moves off the line.
         """
         try:
             hits = self.path.places(state, self.directions)

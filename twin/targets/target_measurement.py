@@ -36,12 +36,17 @@ NYQUIST = 0.5
 class TargetReading:
     """MTF from one target.
 
-    Attributes:
-        reason: why the frames cannot be measured; empty if they can.
-        true_nyquist: MTF of the traced pupil and the detector at ``at_nyquist``.
-        at_nyquist: frequency of what is called the MTF at Nyquist, (along, track), cycles/pixel.
-        true_axis: what ``true_nyquist`` would be without the target's tilt, at the Nyquist frequency along the line or
-            along the track: that of image quality at this place.
+    Attributes
+    ----------
+    reason : str
+        Why the frames cannot be measured; empty if they can.
+    true_nyquist : float
+        MTF of the traced pupil and the detector at ``at_nyquist``.
+    at_nyquist : tuple[float, float]
+        Frequency of what is called the MTF at Nyquist, (along, track), cycles/pixel.
+    true_axis : float
+        What ``true_nyquist`` would be without the target's tilt, at the Nyquist frequency along the line or along the
+        track: that of image quality at this place.
     """
 
     reason: str
@@ -54,10 +59,14 @@ class TargetReading:
 class EdgeReading(TargetReading):
     """MTF from one knife edge.
 
-    Attributes:
-        measured: from the frames, None if they cannot be measured.
-        frequency: (F,) along the edge's normal, cycles/m.
-        true: (F,) MTF of the traced pupil and the detector there.
+    Attributes
+    ----------
+    measured : EdgeMtf | None
+        From the frames, None if they cannot be measured.
+    frequency : np.ndarray
+        (F,) along the edge's normal, cycles/m.
+    true : np.ndarray
+        (F,) MTF of the traced pupil and the detector there.
     """
 
     measured: EdgeMtf | None
@@ -80,8 +89,10 @@ class EdgeReading(TargetReading):
 class BarReading(TargetReading):
     """MTF from one bar target near the Nyquist frequency.
 
-    Attributes:
-        measured: from the frames, None if they cannot be measured.
+    Attributes
+    ----------
+    measured : BarMtf | None
+        From the frames, None if they cannot be measured.
     """
 
     measured: BarMtf | None
@@ -96,11 +107,16 @@ class BarReading(TargetReading):
 class TargetShots:
     """All targets at one place in one state.
 
-    Attributes:
-        frames: name of the image -> grey values, uint16 (N, H, W).
-        column: of the windows' first pixels on the line.
-        edges, bars: direction -> reading; empty if not rendered.
-        light_lost: share of the light that bodies in the beam take.
+    Attributes
+    ----------
+    frames : Mapping[str, np.ndarray]
+        Name of the image -> grey values, uint16 (N, H, W).
+    column : int
+        Of the windows' first pixels on the line.
+    edges, bars : Mapping[str, EdgeReading]
+        Direction -> reading; empty if not rendered.
+    light_lost : float
+        Share of the light that bodies in the beam take.
     """
 
     frames: Mapping[str, np.ndarray]
@@ -114,10 +130,14 @@ class TargetShots:
 class PlaceTargets:
     """Before and after at one place of a line.
 
-    Attributes:
-        place: nominal (along, across) on the focal plane, metres.
-        shift: true move of the image of a fixed direction on the focal plane, (along, across), metres.
-        before, after: the images.
+    Attributes
+    ----------
+    place : np.ndarray
+        Nominal (along, across) on the focal plane, metres.
+    shift : np.ndarray
+        True move of the image of a fixed direction on the focal plane, (along, across), metres.
+    before, after : TargetShots
+        The images.
     """
 
     place: np.ndarray
@@ -135,10 +155,14 @@ class PlaceTargets:
 class CameraTargets:
     """One camera.
 
-    Attributes:
-        band: name of the line CCD's band.
-        pitch: of its pixels, metres.
-        places: left, centre, right.
+    Attributes
+    ----------
+    band : str
+        Name of the line CCD's band.
+    pitch : float
+        Of its pixels, metres.
+    places : Mapping[str, PlaceTargets]
+        Left, centre, right.
     """
 
     band: str
@@ -150,10 +174,14 @@ class CameraTargets:
 class TargetRun:
     """All cameras.
 
-    Attributes:
-        cameras: by name.
-        frames: of each image.
-        obstruction: whether what stands in the beams is missing in the pupils.
+    Attributes
+    ----------
+    cameras : Mapping[str, CameraTargets]
+        By name.
+    frames : int
+        Of each image.
+    obstruction : bool
+        Whether what stands in the beams is missing in the pupils.
     """
 
     cameras: Mapping[str, CameraTargets]
@@ -272,8 +300,10 @@ _PATTERN, _EXPOSURE = 3, 4
 def target_pixels(resolved: ResolvedJob) -> int:
     """Pixels of all frames of a job's test targets, before and after.
 
-    Args:
-        resolved: the job.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job.
     """
     settings, names = resolved.targets, resolved.job.render.target_images
     kinds = sum({"knife_edge": len(DIRECTIONS), "bars": len(DIRECTIONS) + len(EVEN_FIELDS)}.get(n, 1) for n in names)
@@ -284,8 +314,10 @@ def target_pixels(resolved: ResolvedJob) -> int:
 def check_targets(resolved: ResolvedJob) -> None:
     """See before any work whether the targets can be recorded as the job says.
 
-    Raises:
-        InputError: the windows do not fit the line, or there are too many frames.
+    Raises
+    ------
+    InputError
+        The windows do not fit the line, or there are too many frames.
     """
     job, settings = resolved.job, resolved.targets
     if not job.render.target_images:
@@ -320,11 +352,16 @@ def _band(resolved: ResolvedJob, name: str) -> str:
 def target_camera(resolved: ResolvedJob, instrument: Instrument, name: str, backend: Backend) -> TargetCamera:
     """A camera of an instrument before targets, with the line CCD, the windows and the obstruction that a job asks for.
 
-    Args:
-        resolved: the job, with the data sheets of its line CCDs.
-        instrument: as built from it.
-        name: of the camera.
-        backend: where to trace.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job, with the data sheets of its line CCDs.
+    instrument : Instrument
+        As built from it.
+    name : str
+        Of the camera.
+    backend : Backend
+        Where to trace.
     """
     assert resolved.line_detectors is not None
     model, sheet = instrument.cameras[name], resolved.line_detectors[resolved.instrument.cameras[name].camera]
@@ -344,16 +381,25 @@ def render_targets(
 ) -> TargetRun:
     """Render, expose and measure the job's test targets.
 
-    Args:
-        resolved: the job, with targets among its images, as ``check_targets`` lets it pass.
-        instrument: as built from it.
-        backend: where to trace.
-        state: after the perturbation.
-        seed: of the noise.
-        advance: told how many of how many windows are done.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job, with targets among its images, as ``check_targets`` lets it pass.
+    instrument : Instrument
+        As built from it.
+    backend : Backend
+        Where to trace.
+    state : State
+        After the perturbation.
+    seed : int
+        Of the noise.
+    advance : Callable[[int, int], None]
+        Told how many of how many windows are done.
 
-    Raises:
-        TargetLostError: the perturbation moves the light off.
+    Raises
+    ------
+    TargetLostError
+        The perturbation moves the light off.
     """
     settings, images = resolved.targets, resolved.job.render.target_images
     frames = settings.frames or 1
@@ -448,14 +494,22 @@ def read_bars(
 ) -> BarReading:
     """Measure the mean (H, W) of some frames of a bar target, and trace the truth.
 
-    Args:
-        view: the place.
-        direction: that they measure.
-        design: the bars.
-        mean: (H, W) of their frames, grey values.
-        dark: (H, W) of as many frames with the shutter closed.
-        bright: (H, W) of as many frames of an even field, as bright as the bars.
-        frames: how many.
+    Parameters
+    ----------
+    view : View
+        The place.
+    direction : str
+        That they measure.
+    design : BarDesign
+        The bars.
+    mean : np.ndarray
+        (H, W) of their frames, grey values.
+    dark : np.ndarray
+        (H, W) of as many frames with the shutter closed.
+    bright : np.ndarray
+        (H, W) of as many frames of an even field, as bright as the bars.
+    frames : int
+        How many.
     """
     frequency = design.seen(view)
     true = float(np.abs(view.transfer(frequency[None]))[0])

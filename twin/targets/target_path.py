@@ -58,10 +58,14 @@ MAP_ORDER = 4
 class LocalMap:
     """Exact chief-ray mapping near one field direction: target coordinates to image coordinates.
 
-    Attributes:
-        scale: largest target coordinate, metres; coordinates are divided by it.
-        coefficients: (terms, 2), of the monomials of ``_monomials``.
-        residual: largest distance of the traced chief rays from the polynomial, metres.
+    Attributes
+    ----------
+    scale : float
+        Largest target coordinate, metres; coordinates are divided by it.
+    coefficients : np.ndarray
+        (terms, 2), of the monomials of ``_monomials``.
+    residual : float
+        Largest distance of the traced chief rays from the polynomial, metres.
     """
 
     scale: float
@@ -83,11 +87,16 @@ class LocalMap:
 class LineRays:
     """Rays of F beams, N each, where they meet the line CCD, in its own frame: X' along the track, Y' along the line.
 
-    Attributes:
-        position, direction: (F, N, 3), metres and unit.
-        path: optical path from the incoming plane wavefront, (F, N), metres.
-        valid: False where an aperture stops the ray, (F, N).
-        size: of the line CCD relative to nominal.
+    Attributes
+    ----------
+    position, direction : np.ndarray
+        (F, N, 3), metres and unit.
+    path : np.ndarray
+        Optical path from the incoming plane wavefront, (F, N), metres.
+    valid : np.ndarray
+        False where an aperture stops the ray, (F, N).
+    size : float
+        Of the line CCD relative to nominal.
     """
 
     position: np.ndarray
@@ -105,14 +114,22 @@ def _monomials(q: np.ndarray) -> np.ndarray:
 class TargetPath:
     """A camera that looks at targets.
 
-    Args:
-        assembly: that holds the camera.
-        name: prefix of its sequences ``NAME/imaging``, ``NAME/to_stop``, ``NAME/image_to_stop`` ...
-        root: path of its body.
-        model: its derived numbers.
-        backend: where to trace.
-        collimator: what it looks into; None for a far scene.
-        shadows: what stands in its beams; None for a camera alone, or to ignore it.
+    Parameters
+    ----------
+    assembly
+        That holds the camera.
+    name
+        Prefix of its sequences ``NAME/imaging``, ``NAME/to_stop``, ``NAME/image_to_stop`` ...
+    root
+        Path of its body.
+    model
+        Its derived numbers.
+    backend
+        Where to trace.
+    collimator
+        What it looks into; None for a far scene.
+    shadows
+        What stands in its beams; None for a camera alone, or to ignore it.
     """
 
     def __init__(
@@ -168,8 +185,10 @@ class TargetPath:
         """The state as light of another wavelength (metres) than the design's meets it, see
         ``scenes.models.camera_model.coloured``.
 
-        Raises:
-            ValueError: a lens whose glass is not named, or not known there.
+        Raises
+        ------
+        ValueError
+            a lens whose glass is not named, or not known there.
         """
         return coloured(self.model.spec, self.root, state, wavelength)
 
@@ -178,8 +197,10 @@ class TargetPath:
 
         In metres of the nominal CCD: its pixels keep their pitch in these coordinates when it grows.
 
-        Raises:
-            BeamMissedError: a chief ray does not reach the line CCD.
+        Raises
+        ------
+        BeamMissedError
+            a chief ray does not reach the line CCD.
         """
         # a chief ray that a mirror in the middle of the beam stops is still the beam's middle
         rays = self.rays(state, directions, np.zeros((1, 2)), edges=False)
@@ -188,15 +209,23 @@ class TargetPath:
     def rays(self, state: State, directions: np.ndarray, points: np.ndarray, edges: bool = True) -> LineRays:
         """Rays of beams of directions (F, 3), world, through points of the stop in units of its radius.
 
-        Args:
-            state: of the assembly.
-            directions: of the light.
-            points: of the stop, (N, 2); without ``edges`` also of each beam, (F, N, 2).
-            edges: whether edges of the camera's surfaces and bodies in the beams stop rays.
+        Parameters
+        ----------
+        state : State
+            Of the assembly.
+        directions : np.ndarray
+            Of the light.
+        points : np.ndarray
+            Of the stop, (N, 2); without ``edges`` also of each beam, (F, N, 2).
+        edges : bool
+            Whether edges of the camera's surfaces and bodies in the beams stop rays.
 
-        Raises:
-            AimError: a beam does not reach the stop.
-            BeamMissedError: nothing of one reaches the line CCD.
+        Raises
+        ------
+        AimError
+            a beam does not reach the stop.
+        BeamMissedError
+            Nothing of one reaches the line CCD.
         """
         placed = self.assembly.place([state])
         systems, to_stop = self._systems(state, len(directions), placed)
@@ -221,8 +250,10 @@ class TargetPath:
     def shadow_pieces(self, state: State, directions: np.ndarray) -> np.ndarray:
         """What bodies take of beams of directions (F, 3): convex polygons on the stop's unit disk, (F, K, V, 2).
 
-        Raises:
-            AimError, BeamMissedError: as ``rays``.
+        Raises
+        ------
+        AimError, BeamMissedError
+            As ``rays``.
         """
         if self.shadows is None:
             return np.zeros((len(directions), 0, 3, 2))
@@ -255,17 +286,26 @@ class TargetPath:
 
         Its lengths are those of ``places``.
 
-        Args:
-            state: of the assembly.
-            directions: of the light, world.
-            places: as ``places`` gives them for the same state; what they are at the design wavelength is what all
-                colours of an image count from.
-            target_shift: of the collimator's target, see ``Collimator.path``.
-            wavelength: of the light, metres; the design wavelength by default.
+        Parameters
+        ----------
+        state : State
+            Of the assembly.
+        directions : np.ndarray
+            Of the light, world.
+        places : np.ndarray
+            As ``places`` gives them for the same state; what they are at the design wavelength is what all colours of
+            an image count from.
+        target_shift : float
+            Of the collimator's target, see ``Collimator.path``.
+        wavelength : float | None
+            Of the light, metres; the design wavelength by default.
 
-        Raises:
-            BeamMissedError, AimError: the beam does not get through.
-            ValueError: it is vignetted, or a glass is not known at that wavelength.
+        Raises
+        ------
+        BeamMissedError, AimError
+            The beam does not get through.
+        ValueError
+            It is vignetted, or a glass is not known at that wavelength.
         """
         colour = self.model.spec.wavelength if wavelength is None else wavelength
         state = self.coloured(state, colour)
@@ -332,13 +372,18 @@ class TargetPath:
     def shadows_on_stop(self, state: State, directions: np.ndarray) -> tuple[np.ndarray, float]:
         """What edges of the camera's surfaces and bodies take of beams of directions (F, 3).
 
-        Returns:
+        Returns
+        -------
+        tuple[np.ndarray, float]
             Convex polygons on the stop's unit disk that do not overlap, (F, K, V, 2), and how much of its area their
             shares are right to.
 
-        Raises:
-            AimError, BeamMissedError: as ``rays``.
-            UnphysicalError: edges that no polygons follow.
+        Raises
+        ------
+        AimError, BeamMissedError
+            As ``rays``.
+        UnphysicalError
+            Edges that no polygons follow.
         """
         taken, error = self._taken(*self._imaging(state, directions), directions)
         return (np.zeros((len(directions), 0, 3, 2)) if taken is None else taken), error

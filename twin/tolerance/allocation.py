@@ -47,13 +47,20 @@ _SAFE = 1.0
 class Allocation:
     """Limits that were chosen.
 
-    Attributes:
-        scales: of every entry, new limit over the old one, before and after rounding, (E,) each.
-        limits: entry -> new limit as files have it.
-        costs: of every entry, before and after, (2, E).
-        predicted: yield of the old and of the new limits, by the model as it was corrected.
-        reached: whether the yield of the new limits, as they are rounded, reaches what was asked.
-        unrounded: whether that of the limits before rounding does.
+    Attributes
+    ----------
+    scales : np.ndarray
+        Of every entry, new limit over the old one, before and after rounding, (E,) each.
+    limits : Mapping[str, str | float]
+        Entry -> new limit as files have it.
+    costs : np.ndarray
+        Of every entry, before and after, (2, E).
+    predicted : tuple[float, float]
+        Yield of the old and of the new limits, by the model as it was corrected.
+    reached : bool
+        Whether the yield of the new limits, as they are rounded, reaches what was asked.
+    unrounded : bool
+        Whether that of the limits before rounding does.
     """
 
     scales: np.ndarray
@@ -81,13 +88,20 @@ def allocate(
 ) -> Allocation:
     """Choose limits.
 
-    Args:
-        setup: the budget.
-        bench: of it.
-        model: of its merits.
-        samples: cameras of it.
-        spec: what is asked.
-        advance: shows how far it is.
+    Parameters
+    ----------
+    setup : ToleranceSetup
+        The budget.
+    bench : ToleranceBench
+        Of it.
+    model : MeritModel
+        Of its merits.
+    samples : Samples
+        Cameras of it.
+    spec : AllocationSpec
+        What is asked.
+    advance : Advance
+        Shows how far it is.
     """
     costs = _Costs.of(setup)
     checked = min(CHECKED, len(samples.x))
@@ -139,8 +153,10 @@ def allocate(
 class CostCurve:
     """What a limit costs: through stated points a smooth line that never rises, straight beyond them, in logarithms.
 
-    Args:
-        points: limits over the stated one and their costs, ascending, two at least.
+    Parameters
+    ----------
+    points
+        Limits over the stated one and their costs, ascending, two at least.
     """
 
     def __init__(self, points: Sequence[tuple[float, float]]) -> None:
@@ -162,9 +178,12 @@ class CostCurve:
 class _Costs:
     """What limits cost.
 
-    Attributes:
-        curves: logarithm of the cost of every entry by that of its limit over the stated one, E.
-        kept: whether its limit stays: as stated, and where its distribution is not about zero.
+    Attributes
+    ----------
+    curves : tuple[CostCurve, ...]
+        Logarithm of the cost of every entry by that of its limit over the stated one, E.
+    kept : np.ndarray
+        Whether its limit stays: as stated, and where its distribution is not about zero.
     """
 
     curves: tuple[CostCurve, ...]
@@ -193,13 +212,20 @@ class _Costs:
 class _Trade:
     """Worst margins of cameras as functions of the limits, about those of a bench.
 
-    Args:
-        bench: at whose limits the model was made.
-        model: of its merits.
-        samples: draws and the errors of their adjustments.
-        costs: of the limits.
-        share: of the cameras that is to pass.
-        values: of the merits of the first of the cameras by exact traces; they are traced if they are not given.
+    Parameters
+    ----------
+    bench
+        At whose limits the model was made.
+    model
+        Of its merits.
+    samples
+        Draws and the errors of their adjustments.
+    costs
+        Of the limits.
+    share
+        Of the cameras that is to pass.
+    values
+        Of the merits of the first of the cameras by exact traces; they are traced if they are not given.
     """
 
     def __init__(
@@ -257,10 +283,14 @@ class _Trade:
     def cheapest(self, low: np.ndarray, high: np.ndarray, total: np.ndarray) -> np.ndarray:
         """The step (E,) within bounds to the cheapest limits that pass; without any, to the tightest.
 
-        Args:
-            low: bounds of the step, (E,).
-            high: likewise.
-            total: where the bench's own limits are, (E,).
+        Parameters
+        ----------
+        low : np.ndarray
+            Bounds of the step, (E,).
+        high : np.ndarray
+            likewise.
+        total : np.ndarray
+            Where the bench's own limits are, (E,).
         """
         start = self.tightened(low)
         if self.costs.kept.all() or self.quantile(start)[0] > 0.0:
@@ -306,7 +336,9 @@ def _graded(
 ) -> tuple[dict[str, str | float], np.ndarray]:
     """Limits rounded down to grades; then, if some may be looser, one after the other goes up where the yield allows.
 
-    Returns:
+    Returns
+    -------
+    tuple[dict[str, str | float], np.ndarray]
         Entry -> limit, and limits over the stated ones, (E,).
     """
     entries = list(setup.test.tolerances.items())

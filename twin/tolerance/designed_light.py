@@ -26,8 +26,10 @@ TRANSFER = 1e-3
 def light_of(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | None:
     """The spectrum in which a budget judges a camera; None for its design wavelength.
 
-    Raises:
-        InputError: a spectrum is asked for that the camera does not have.
+    Raises
+    ------
+    InputError
+        a spectrum is asked for that the camera does not have.
     """
     if test.light == "spectrum" and camera.light is None:
         raise test.error(
@@ -42,10 +44,13 @@ def light_of(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | No
 class LitRoots:
     """From coefficients of a wavefront (T,) to what it is worth over the light that comes through.
 
-    Attributes:
-        rest: matrices (F, T, T) of which the squares of products with the coefficients are the mean square, piston and
-            tilt taken out.
-        tilt: likewise (F, 2, T) that of the tilt.
+    Attributes
+    ----------
+    rest : np.ndarray
+        Matrices (F, T, T) of which the squares of products with the coefficients are the mean square, piston and tilt
+        taken out.
+    tilt : np.ndarray
+        Likewise (F, 2, T) that of the tilt.
     """
 
     rest: np.ndarray
@@ -55,9 +60,12 @@ class LitRoots:
     def of(cls, lit: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], degree: int) -> LitRoots:
         """Make them.
 
-        Args:
-            lit: of F fields nodes x, y and shares of a quadrature over the light, as of ``VariedBeams.lit``.
-            degree: of the polynomials over the stop.
+        Parameters
+        ----------
+        lit : Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
+            Of F fields nodes x, y and shares of a quadrature over the light, as of ``VariedBeams.lit``.
+        degree : int
+            Of the polynomials over the stop.
         """
         rest, tilt = [], []
         for x, y, share in lit:
@@ -77,9 +85,12 @@ class LitRoots:
 
         Tilt is taken out of all wavelengths together: where they stand apart in the image, that blurs it.
 
-        Args:
-            terms: coefficients of K wavelengths about one point of the image, (S, F, K, T).
-            shares: of the wavelengths, which sum to 1, (K,).
+        Parameters
+        ----------
+        terms : np.ndarray
+            Coefficients of K wavelengths about one point of the image, (S, F, K, T).
+        shares : np.ndarray
+            Of the wavelengths, which sum to 1, (K,).
         """
         out = terms @ np.swapaxes(self.rest, 1, 2)
         if len(shares) > 1:
@@ -100,17 +111,27 @@ def fixed_transfers(
 ) -> dict[int, list[list[VariedTransfer]]]:
     """For every merit of kind mtf its transfer functions, field by field and direction by direction.
 
-    Args:
-        optics: the designed camera.
-        test: the budget, for messages.
-        merits: of it.
-        fields: (F, 2).
-        light: wavelengths, metres, and their shares, (C,) each.
-        cosines: direction cosines of the traced rays, (C or 1, F, N, 2).
-        degree: of the polynomials over the stop.
+    Parameters
+    ----------
+    optics : CameraOptics
+        The designed camera.
+    test : ToleranceBudgetSpec
+        The budget, for messages.
+    merits : Sequence[Merit]
+        Of it.
+    fields : np.ndarray
+        (F, 2).
+    light : tuple[np.ndarray, np.ndarray]
+        Wavelengths, metres, and their shares, (C,) each.
+    cosines : np.ndarray
+        Direction cosines of the traced rays, (C or 1, F, N, 2).
+    degree : int
+        Of the polynomials over the stop.
 
-    Raises:
-        InputError: no MTF, or none at that frequency.
+    Raises
+    ------
+    InputError
+        No MTF, or none at that frequency.
     """
     asked = [(k, merit) for k, merit in enumerate(merits) if merit.spec.kind == "mtf"]
     if not asked:

@@ -22,9 +22,12 @@ FAR = 1e-3
 def given_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, ...]:
     """Of the instrument as designed.
 
-    Args:
-        setup: the budget.
-        bench: of it.
+    Parameters
+    ----------
+    setup : ToleranceSetup
+        The budget.
+    bench : ToleranceBench
+        Of it.
     """
     model = bench.optics.model
     shadow = unstated_shadows(model, obscuration(model, bench.backend))
@@ -38,9 +41,12 @@ def given_warnings(setup: ToleranceSetup, bench: ToleranceBench) -> tuple[str, .
 def beam_warnings(bench: ToleranceBench, states: Sequence[State]) -> tuple[str, ...]:
     """Of bodies that stand in beams of the monitor in some states, each body and beam once.
 
-    Args:
-        bench: of the budget.
-        states: the worst cameras.
+    Parameters
+    ----------
+    bench : ToleranceBench
+        Of the budget.
+    states : Sequence[State]
+        The worst cameras.
     """
     found: dict[str, list[str]] = {}
     for state in states:
@@ -54,9 +60,12 @@ def beam_warnings(bench: ToleranceBench, states: Sequence[State]) -> tuple[str, 
 def missed_warnings(missed: Mapping[str, float], cameras: int) -> tuple[str, ...]:
     """Of monitor merits whose interpolated derivatives are too coarse.
 
-    Args:
-        missed: name of a merit -> relative difference of its sigmas from those with traced derivatives.
-        cameras: in which they were traced.
+    Parameters
+    ----------
+    missed : Mapping[str, float]
+        Name of a merit -> relative difference of its sigmas from those with traced derivatives.
+    cameras : int
+        In which they were traced.
     """
     return tuple(
         f"{name}: with derivatives traced in {cameras} cameras the sigma differs by up to {100.0 * off:.2g} % from "

@@ -36,11 +36,16 @@ class MeritModel:
 
     x are the numbers that vary, in units of their sizes; compensators follow ideally.
 
-    Attributes:
-        nominal: of the designed camera, adjusted, (P,).
-        slope: (P, K).
-        curvature: symmetric, (P, K, K).
-        paired: whether products of two numbers are in it.
+    Attributes
+    ----------
+    nominal : np.ndarray
+        Of the designed camera, adjusted, (P,).
+    slope : np.ndarray
+        (P, K).
+    curvature : np.ndarray
+        Symmetric, (P, K, K).
+    paired : bool
+        Whether products of two numbers are in it.
     """
 
     nominal: np.ndarray
@@ -66,10 +71,14 @@ class MeritModel:
 class ScaledModel:
     """A model at fixed draws of which every tolerance may be scaled.
 
-    Attributes:
-        nominal: parts of the designed camera, (P,).
-        first: what each tolerance adds by itself to the first order, (S, P, E).
-        second: what pairs add to the second, symmetric, halves counted, (S, P, E, E).
+    Attributes
+    ----------
+    nominal : np.ndarray
+        Parts of the designed camera, (P,).
+    first : np.ndarray
+        What each tolerance adds by itself to the first order, (S, P, E).
+    second : np.ndarray
+        What pairs add to the second, symmetric, halves counted, (S, P, E, E).
     """
 
     nominal: np.ndarray
@@ -80,10 +89,14 @@ class ScaledModel:
     def of(cls, model: MeritModel, x: np.ndarray, entries: Sequence[Sequence[int]]) -> ScaledModel:
         """Make it of a model.
 
-        Args:
-            model: of the numbers that vary.
-            x: draws, (S, K); of many numbers only as many are kept as the memory holds.
-            entries: numbers of each tolerance, E.
+        Parameters
+        ----------
+        model : MeritModel
+            Of the numbers that vary.
+        x : np.ndarray
+            Draws, (S, K); of many numbers only as many are kept as the memory holds.
+        entries : Sequence[Sequence[int]]
+            Numbers of each tolerance, E.
         """
         count, parts = len(entries), len(model.nominal)
         draws = x[: max(_FEWEST, _MOST_HELD // (parts * count**2))]
@@ -109,13 +122,19 @@ class ScaledModel:
 class Sensitivities:
     """What every tolerance does by itself.
 
-    Attributes:
-        nominal: values of the merits of the designed camera, adjusted, (M,).
-        values: with each tolerance at its limit, below and above, (E, 2, M); of a figure error what its terms come to
-            on the average.
-        moves: of the compensators for that, SI, (E, 2, C); NaN for a figure error.
-        problems: why a camera has no light there, empty where it has, (E,).
-        model: of all numbers together.
+    Attributes
+    ----------
+    nominal : np.ndarray
+        Values of the merits of the designed camera, adjusted, (M,).
+    values : np.ndarray
+        With each tolerance at its limit, below and above, (E, 2, M); of a figure error what its terms come to on the
+        average.
+    moves : np.ndarray
+        Of the compensators for that, SI, (E, 2, C); NaN for a figure error.
+    problems : tuple[str, ...]
+        Why a camera has no light there, empty where it has, (E,).
+    model : MeritModel
+        Of all numbers together.
     """
 
     nominal: np.ndarray
@@ -172,10 +191,13 @@ def _spread(bench: ToleranceBench, model: MeritModel, rows: np.ndarray, share: n
 class InverseLimits:
     """At which share of its limit each tolerance by itself spoils each merit by its loss.
 
-    Attributes:
-        losses: of the merits, SI, (M,).
-        shares: (E, M); infinite where the loss is not reached at ``FARTHEST`` times the limit, NaN for a figure error
-            whose mean cannot tell.
+    Attributes
+    ----------
+    losses : np.ndarray
+        Of the merits, SI, (M,).
+    shares : np.ndarray
+        (E, M); infinite where the loss is not reached at ``FARTHEST`` times the limit, NaN for a figure error whose
+        mean cannot tell.
     """
 
     losses: np.ndarray
@@ -251,10 +273,14 @@ def _roots(excess: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.nda
     First a step that doubles until the zero lies between two levels, then the straight line through both ends, of which
     the one that stays twice counts half (Illinois).
 
-    Args:
-        excess: numbers of the functions and a level for each -> values.
-        start: levels, (R,).
-        advance: shows how far it is.
+    Parameters
+    ----------
+    excess : Callable[[np.ndarray, np.ndarray], np.ndarray]
+        Numbers of the functions and a level for each -> values.
+    start : np.ndarray
+        Levels, (R,).
+    advance : Advance
+        Shows how far it is.
     """
     count = len(start)
     low, high = np.full(count, -np.inf), np.full(count, np.inf)

@@ -53,16 +53,24 @@ STEP = 0.1
 class MonitorMerit:
     """The monitor of a budget's instrument.
 
-    Attributes:
-        experiment: the designed instrument with what is stated to move.
-        path: its light, on area CCDs that are set to their spots.
-        images: likewise, of the cameras alone whose spots something moves.
-        stated: disturbances of the designed instrument, as motions that are independent of each other.
-        noise: of its spots' shifts, (D, D) px^2.
-        changes: of the derivatives of spots (K, D, M) and parameters (K, 4 J, M) per SI unit of each number that
-            varies and of each compensator.
-        asked: name of a merit -> its readings' rows on the parameters, (Q, 4 J), and the gain that reads them; None for
-            the posterior's.
+    Attributes
+    ----------
+    experiment : MonitorExperiment
+        The designed instrument with what is stated to move.
+    path : SpotPath
+        Its light, on area CCDs that are set to their spots.
+    images : SpotPath
+        Likewise, of the cameras alone whose spots something moves.
+    stated : Disturbances
+        Disturbances of the designed instrument, as motions that are independent of each other.
+    noise : np.ndarray
+        Of its spots' shifts, (D, D) px^2.
+    changes : tuple[np.ndarray, np.ndarray]
+        Of the derivatives of spots (K, D, M) and parameters (K, 4 J, M) per SI unit of each number that varies and of
+        each compensator.
+    asked : Mapping[str, tuple[np.ndarray, np.ndarray | None]]
+        Name of a merit -> its readings' rows on the parameters, (Q, 4 J), and the gain that reads them; None for the
+        posterior's.
     """
 
     experiment: MonitorExperiment
@@ -84,15 +92,23 @@ class MonitorMerit:
     ) -> MonitorMerit | None:
         """That of a budget; None where no merit is about a monitor.
 
-        Args:
-            setup: the budget.
-            experiment: its designed instrument.
-            camera: that is judged.
-            numbers: K that vary, the compensators last.
-            ranges: of the compensators, SI, (C,).
+        Parameters
+        ----------
+        setup : ToleranceSetup
+            The budget.
+        experiment : MonitorExperiment
+            Its designed instrument.
+        camera : str
+            That is judged.
+        numbers : Sequence[VariedNumber]
+            K that vary, the compensators last.
+        ranges : np.ndarray
+            Of the compensators, SI, (C,).
 
-        Raises:
-            InputError: the instrument has no monitor, nothing is stated to move, or there is no such reading.
+        Raises
+        ------
+        InputError
+            The instrument has no monitor, nothing is stated to move, or there is no such reading.
         """
         wanted = {name: merit for name, merit in setup.test.merits.items() if merit.kind in OF_MONITOR}
         if not wanted:
@@ -138,12 +154,17 @@ class MonitorMerit:
     def variances(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, np.ndarray]:
         """Variances of all readings of every merit, (S, Q), SI.
 
-        Args:
-            amounts: of the numbers and the compensators, SI, (S, K).
-            states: what they add up to, S.
+        Parameters
+        ----------
+        amounts : np.ndarray
+            Of the numbers and the compensators, SI, (S, K).
+        states : Sequence[State]
+            What they add up to, S.
 
-        Raises:
-            BeamMissedError, AimError: the light of a state does not come to its area CCDs.
+        Raises
+        ------
+        BeamMissedError, AimError
+            The light of a state does not come to its area CCDs.
         """
         noise = self._noise(states)
         used = np.flatnonzero(np.any(self.changes[0], axis=(1, 2)) | np.any(self.changes[1], axis=(1, 2)))
@@ -232,11 +253,16 @@ class Merit:
     square wavefront errors by field, MTF by field and direction, components of a turn, residual places along the line,
     shares of a beam by field, variances of readings.
 
-    Attributes:
-        name: in the file.
-        spec: what is asked.
-        fields: numbers of its fields among those of the bench, (F,).
-        parts: columns of the bench's parts that are its own.
+    Attributes
+    ----------
+    name : str
+        In the file.
+    spec : MeritSpec
+        What is asked.
+    fields : np.ndarray
+        Numbers of its fields among those of the bench, (F,).
+    parts : slice
+        Columns of the bench's parts that are its own.
     """
 
     name: str
@@ -305,10 +331,14 @@ def merits_of(
 ) -> tuple[tuple[Merit, ...], np.ndarray]:
     """The merits of a budget, and the fields (F, 2) that any of them has.
 
-    Args:
-        specs: by name.
-        line_points: at which distortion is told.
-        cameras: of the instrument.
+    Parameters
+    ----------
+    specs : dict[str, MeritSpec]
+        By name.
+    line_points : int
+        At which distortion is told.
+    cameras : Sequence[str]
+        Of the instrument.
     """
     fields: dict[tuple[float, float], int] = {}
     out, start = [], 0
@@ -361,15 +391,23 @@ def obstructed_shares(
 ) -> np.ndarray:
     """Share of the stop's area that bodies together take of every beam, (S, F).
 
-    Args:
-        path: the camera's, with its shadows.
-        states: S states.
-        directions: of the light, world, (F, 3).
-        start: a point of each beam before the first mirror, world, (F, 3).
+    Parameters
+    ----------
+    path : TargetPath
+        The camera's, with its shadows.
+    states : Sequence[State]
+        S states.
+    directions : np.ndarray
+        Of the light, world, (F, 3).
+    start : np.ndarray
+        a point of each beam before the first mirror, world, (F, 3).
 
-    Raises:
-        AimError, BeamMissedError: the light of a state is lost.
-        UnphysicalError: shadows that cannot be.
+    Raises
+    ------
+    AimError, BeamMissedError
+        The light of a state is lost.
+    UnphysicalError
+        Shadows that cannot be.
     """
     assert path.shadows is not None
     nodes, fields = quadrature.disk(RINGS), len(directions)

@@ -85,10 +85,14 @@ class ToleranceBase:
 def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list[Outcome]:
     """What cameras come to.
 
-    Args:
-        bench: of the budget.
-        x: numbers that vary, in units of their sizes, (S, K).
-        seeds: of the errors of each camera's adjustments, S.
+    Parameters
+    ----------
+    bench : ToleranceBench
+        Of the budget.
+    x : np.ndarray
+        Numbers that vary, in units of their sizes, (S, K).
+    seeds : Sequence[int]
+        Of the errors of each camera's adjustments, S.
     """
     errors = adjustment_errors(bench, seeds)
     tried = bench.try_out(x * bench.sizes, errors)
@@ -132,11 +136,16 @@ def law_of(one: ToleranceSpec) -> dict[str, Any]:
 def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: int) -> StudySetup:
     """The study that draws cameras of a budget.
 
-    Args:
-        setup: the budget.
-        bench: of it.
-        samples: number of cameras.
-        seed: of the draws.
+    Parameters
+    ----------
+    setup : ToleranceSetup
+        The budget.
+    bench : ToleranceBench
+        Of it.
+    samples : int
+        Number of cameras.
+    seed : int
+        Of the draws.
     """
     test = setup.test
     factors: dict[str, Any] = {}
@@ -167,14 +176,22 @@ def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: i
 class Samples:
     """Cameras that were drawn.
 
-    Attributes:
-        x: numbers that vary, in units of their sizes, (S, K).
-        values: of the merits, SI, (S, M); NaN for a camera without light.
-        moves: of the compensators, SI, (S, C).
-        settled: by how much a further step of the adjustments would change the wavefront, waves, (S,).
-        seeds: of the errors of each camera's adjustments, (S,).
-        problems: why a camera has no light, empty where it has, (S,).
-        seconds: that it took.
+    Attributes
+    ----------
+    x : np.ndarray
+        Numbers that vary, in units of their sizes, (S, K).
+    values : np.ndarray
+        Of the merits, SI, (S, M); NaN for a camera without light.
+    moves : np.ndarray
+        Of the compensators, SI, (S, C).
+    settled : np.ndarray
+        By how much a further step of the adjustments would change the wavefront, waves, (S,).
+    seeds : np.ndarray
+        Of the errors of each camera's adjustments, (S,).
+    problems : tuple[str, ...]
+        Why a camera has no light, empty where it has, (S,).
+    seconds : float
+        That it took.
     """
 
     x: np.ndarray
@@ -190,11 +207,16 @@ class Samples:
 class Workforce:
     """Who draws cameras.
 
-    Attributes:
-        workers: number of processes; None for one per core.
-        scheduler: address of a running cluster, None for none.
-        journal: folder that keeps what is done, to go on with; None for none, then this process does it alone.
-        warn: told what the user should know of how it is done.
+    Attributes
+    ----------
+    workers : int | None
+        Number of processes; None for one per core.
+    scheduler : str | None
+        Address of a running cluster, None for none.
+    journal : Path | None
+        Folder that keeps what is done, to go on with; None for none, then this process does it alone.
+    warn : Callable[[str], None]
+        Told what the user should know of how it is done.
     """
 
     workers: int | None = None
@@ -215,19 +237,31 @@ def draw_samples(
 ) -> Samples:
     """Draw cameras and try them; the numbers do not depend on who does it.
 
-    Args:
-        setup: the budget.
-        bench: of it, in this process.
-        backend: where to trace.
-        samples: number of cameras.
-        seed: of the draws.
-        force: who does it.
-        part: of the work, for the journal and the progress.
-        advance: shows how far it is.
+    Parameters
+    ----------
+    setup : ToleranceSetup
+        The budget.
+    bench : ToleranceBench
+        Of it, in this process.
+    backend : Backend
+        Where to trace.
+    samples : int
+        Number of cameras.
+    seed : int
+        Of the draws.
+    force : Workforce
+        Who does it.
+    part : str
+        Of the work, for the journal and the progress.
+    advance : Advance
+        Shows how far it is.
 
-    Raises:
-        RunFolderError: the journal is another run's, or cannot be written.
-        Incomplete: as the engine of studies.
+    Raises
+    ------
+    RunFolderError
+        The journal is another run's, or cannot be written.
+    Incomplete
+        As the engine of studies.
     """
     study = study_of(setup, bench, samples, seed)
     plan = Plan.of(study)

@@ -43,11 +43,16 @@ def told(slopes: np.ndarray, change: np.ndarray) -> np.ndarray:
 class Adjustments:
     """Compensators and what they do to the residuals of the wavefront.
 
-    Attributes:
-        ranges: SI, (C,); zero leaves a compensator where it is.
-        steps: of which they are moved by whole numbers, SI, 0 for any amount, (C,).
-        accuracies: standard deviations of their moves, SI, (C,).
-        slope: derivatives of the designed camera's residuals, (R, C), waves per SI unit; 0 where the range is zero.
+    Attributes
+    ----------
+    ranges : np.ndarray
+        SI, (C,); zero leaves a compensator where it is.
+    steps : np.ndarray
+        Of which they are moved by whole numbers, SI, 0 for any amount, (C,).
+    accuracies : np.ndarray
+        Standard deviations of their moves, SI, (C,).
+    slope : np.ndarray
+        Derivatives of the designed camera's residuals, (R, C), waves per SI unit; 0 where the range is zero.
     """
 
     ranges: np.ndarray
@@ -58,13 +63,20 @@ class Adjustments:
     def best(self, slopes: np.ndarray, residuals: np.ndarray, moves: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Amounts that make linearised residuals least, within ranges.
 
-        Args:
-            slopes: of the residuals of each camera, (S, R, C).
-            residuals: where the moves are, (S, R).
-            moves: SI, (S, C).
-            free: compensators that move, (C,); the others stay.
+        Parameters
+        ----------
+        slopes : np.ndarray
+            Of the residuals of each camera, (S, R, C).
+        residuals : np.ndarray
+            Where the moves are, (S, R).
+        moves : np.ndarray
+            SI, (S, C).
+        free : np.ndarray
+            Compensators that move, (C,); the others stay.
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             SI, (S, C).
         """
         size = np.where(self.ranges > 0.0, self.ranges, 1.0)
@@ -93,10 +105,14 @@ class Adjustments:
     def corrected(self, slopes: np.ndarray, change: np.ndarray, miss: np.ndarray) -> np.ndarray:
         """Slopes (S, R, C) that have what a step came to (Broyden's rank-one update); of a camera that stays, as it is.
 
-        Args:
-            slopes: before, (S, R, C).
-            change: of the moves, SI, (S, C).
-            miss: residuals after the step less what the slopes told of them, (S, R).
+        Parameters
+        ----------
+        slopes : np.ndarray
+            Before, (S, R, C).
+        change : np.ndarray
+            Of the moves, SI, (S, C).
+        miss : np.ndarray
+            Residuals after the step less what the slopes told of them, (S, R).
         """
         size = np.where(self.ranges > 0.0, self.ranges, 1.0)
         step = change / size
@@ -112,11 +128,16 @@ class Adjustments:
     def made(self, slopes: np.ndarray, residuals: np.ndarray, moves: np.ndarray, errors: np.ndarray) -> np.ndarray:
         """Moves as they are made: by whole steps and with errors, one after the other.
 
-        Args:
-            slopes: of the residuals, (S, R, C).
-            residuals: where ``moves`` are, (S, R).
-            moves: that are wanted, SI, (S, C).
-            errors: in standard deviations, (S, C).
+        Parameters
+        ----------
+        slopes : np.ndarray
+            Of the residuals, (S, R, C).
+        residuals : np.ndarray
+            Where ``moves`` are, (S, R).
+        moves : np.ndarray
+            That are wanted, SI, (S, C).
+        errors : np.ndarray
+            In standard deviations, (S, C).
         """
         free = np.ones(len(self.ranges), dtype=bool)
         wanted, made = moves.copy(), moves.copy()
@@ -151,13 +172,19 @@ _MOVE = 1e-3
 class Tried:
     """Cameras that were tried.
 
-    Attributes:
-        moves: amounts of the compensators, SI, (S, C).
-        parts: of all merits, (S, P); NaN where the light is lost.
-        problems: why it is lost, empty where it is not, (S,).
-        settled: rms by which one further step would change the wavefront, waves, (S,).
-        paths: optical paths of the beams' rays less those of the chief rays, of all traced wavelengths, (S, F, K N),
-            metres; None if not asked for.
+    Attributes
+    ----------
+    moves : np.ndarray
+        Amounts of the compensators, SI, (S, C).
+    parts : np.ndarray
+        Of all merits, (S, P); NaN where the light is lost.
+    problems : tuple[str, ...]
+        Why it is lost, empty where it is not, (S,).
+    settled : np.ndarray
+        Rms by which one further step would change the wavefront, waves, (S,).
+    paths : np.ndarray | None
+        Optical paths of the beams' rays less those of the chief rays, of all traced wavelengths, (S, F, K N), metres;
+        None if not asked for.
     """
 
     moves: np.ndarray
@@ -182,21 +209,34 @@ class Tried:
 class ToleranceBench:
     """A camera with what varies, what is adjusted and what is asked.
 
-    Args:
-        setup: the budget.
-        backend: where to trace.
-        experiment: of the budget's instrument, where it is built already.
+    Parameters
+    ----------
+    setup
+        The budget.
+    backend
+        Where to trace.
+    experiment
+        Of the budget's instrument, where it is built already.
 
-    Attributes:
-        numbers: that vary.
-        compensators: that are adjusted.
-        merits: that are asked.
-        fields: of the wavefronts, (F, 2).
-        monitor: of the instrument; None where no merit is about it.
-        colours, shares: wavelengths of the light of the wavefronts and MTFs, metres, and their shares, (C,) each.
+    Attributes
+    ----------
+    numbers
+        That vary.
+    compensators
+        That are adjusted.
+    merits
+        That are asked.
+    fields
+        Of the wavefronts, (F, 2).
+    monitor
+        Of the instrument; None where no merit is about it.
+    colours, shares
+        Wavelengths of the light of the wavefronts and MTFs, metres, and their shares, (C,) each.
 
-    Raises:
-        InputError: names that do not exist, a merit that the camera cannot have, or a camera without light.
+    Raises
+    ------
+    InputError
+        Names that do not exist, a merit that the camera cannot have, or a camera without light.
     """
 
     def __init__(self, setup: ToleranceSetup, backend: Backend, experiment: MonitorExperiment | None = None) -> None:
@@ -280,9 +320,12 @@ class ToleranceBench:
     def _prepare_in(self, colours: np.ndarray, shares: np.ndarray) -> None:
         """Work out what does not change from camera to camera.
 
-        Args:
-            colours: wavelengths of the light, metres, (C,).
-            shares: of them, which sum to 1, (C,).
+        Parameters
+        ----------
+        colours : np.ndarray
+            Wavelengths of the light, metres, (C,).
+        shares : np.ndarray
+            Of them, which sum to 1, (C,).
         """
         model = self.optics.model
         self.colours, self.shares = colours, shares
@@ -332,13 +375,19 @@ class ToleranceBench:
     def try_out(self, amounts: np.ndarray, errors: np.ndarray | None = None, paths: bool = False) -> Tried:
         """Trace cameras, adjust them, and work out their merits.
 
-        Args:
-            amounts: of the numbers that vary, SI, (S, K).
-            errors: of the compensators' moves in standard deviations, (S, C); then each is moved by whole steps with
-                its error, in their order, the later ones following the earlier; None for the ideal adjustment.
-            paths: whether their optical paths are wanted.
+        Parameters
+        ----------
+        amounts : np.ndarray
+            Of the numbers that vary, SI, (S, K).
+        errors : np.ndarray | None
+            Of the compensators' moves in standard deviations, (S, C); then each is moved by whole steps with its error,
+            in their order, the later ones following the earlier; None for the ideal adjustment.
+        paths : bool
+            Whether their optical paths are wanted.
 
-        Returns:
+        Returns
+        -------
+        Tried
             The cameras; one whose light is lost does not change the others.
         """
         starts = range(0, len(amounts), AT_ONCE)
@@ -446,8 +495,10 @@ class ToleranceBench:
 
         Mean squares and MTFs bend because they are functions of a wavefront that hardly does.
 
-        Args:
-            slopes: of the optical paths by the numbers, metres, (L, F, K N).
+        Parameters
+        ----------
+        slopes : np.ndarray
+            Of the optical paths by the numbers, metres, (L, F, K N).
         """
         out = np.zeros((self.parts, len(slopes), len(slopes)))
         residuals = self._residuals(slopes).reshape(len(slopes), len(self.fields), -1) if len(self.fields) else None

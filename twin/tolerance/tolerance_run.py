@@ -53,9 +53,12 @@ number that varies, of a merit or compensator in the tables, and of a merit of t
 class Yield:
     """Share of cameras that pass.
 
-    Attributes:
-        passed: number of cameras that do; of: all.
-        low, high: limits of the share, at ``CONFIDENCE`` (Clopper and Pearson).
+    Attributes
+    ----------
+    passed : int
+        Number of cameras that do; of: all.
+    low, high : float
+        Limits of the share, at ``CONFIDENCE`` (Clopper and Pearson).
     """
 
     passed: int
@@ -83,15 +86,24 @@ class Yield:
 class MeritResult:
     """One merit over all cameras.
 
-    Attributes:
-        merit: the merit.
-        nominal: of the designed camera, adjusted, SI.
-        mean, deviation: over the cameras, SI.
-        levels: value that shares ``LEVELS`` of the cameras do not exceed (of MTF: exceed), SI.
-        linear, quadratic: the same by the models.
-        passing: share that passes.
-        model_passing: the same by the linear and the quadratic model.
-        shares: entry -> share of the variance that is gone without it, by the quadratic model.
+    Attributes
+    ----------
+    merit : Merit
+        The merit.
+    nominal : float
+        Of the designed camera, adjusted, SI.
+    mean, deviation : float
+        Over the cameras, SI.
+    levels : tuple[float, ...]
+        Value that shares ``LEVELS`` of the cameras do not exceed (of MTF: exceed), SI.
+    linear, quadratic : tuple[float, ...]
+        The same by the models.
+    passing : Yield
+        Share that passes.
+    model_passing : tuple[float, float]
+        The same by the linear and the quadratic model.
+    shares : Mapping[str, float]
+        Entry -> share of the variance that is gone without it, by the quadratic model.
     """
 
     merit: Merit
@@ -110,20 +122,33 @@ class MeritResult:
 class ToleranceRun:
     """A tolerance budget and what it comes to.
 
-    Attributes:
-        setup: the budget.
-        bench: on which it was tried.
-        found: sensitivities and model.
-        inverse: limits for a loss.
-        samples: cameras that were drawn.
-        merits: of them.
-        passing: share of cameras that meet all requirements.
-        allocation: limits chosen anew; None where none are asked.
-        judged: share of cameras with these limits that meet all requirements, of cameras of their own.
-        jobs: the worst cameras as files of jobs, by name.
-        warnings: what the user should know.
-        missed: merit of the monitor -> largest relative difference of its sigma from that with derivatives which are
-            traced in the camera itself, in the first ``EXACT`` cameras.
+    Attributes
+    ----------
+    setup : ToleranceSetup
+        The budget.
+    bench : ToleranceBench
+        On which it was tried.
+    found : Sensitivities
+        Sensitivities and model.
+    inverse : InverseLimits
+        Limits for a loss.
+    samples : Samples
+        Cameras that were drawn.
+    merits : tuple[MeritResult, ...]
+        Of them.
+    passing : Yield
+        Share of cameras that meet all requirements.
+    allocation : Allocation | None
+        Limits chosen anew; None where none are asked.
+    judged : Yield | None
+        Share of cameras with these limits that meet all requirements, of cameras of their own.
+    jobs : Mapping[str, str]
+        The worst cameras as files of jobs, by name.
+    warnings : tuple[str, ...]
+        What the user should know.
+    missed : Mapping[str, float]
+        Merit of the monitor -> largest relative difference of its sigma from that with derivatives which are traced in
+        the camera itself, in the first ``EXACT`` cameras.
     """
 
     setup: ToleranceSetup
@@ -149,17 +174,25 @@ def run_tolerance(
 ) -> ToleranceRun:
     """Compute a tolerance budget.
 
-    Args:
-        setup: the budget.
-        backend: where to trace.
-        seed: of the draws; the budget's own by default.
-        advance: shows how far it is.
-        force: who draws the cameras; this process alone by default.
+    Parameters
+    ----------
+    setup : ToleranceSetup
+        The budget.
+    backend : Backend
+        Where to trace.
+    seed : int | None
+        Of the draws; the budget's own by default.
+    advance : Advance
+        Shows how far it is.
+    force : Workforce | None
+        Who draws the cameras; this process alone by default.
 
-    Raises:
-        InputError: names that do not exist, a designed camera without the light that is asked, or more memory than
-            there is.
-        RunFolderError, Incomplete: as ``draw_samples``.
+    Raises
+    ------
+    InputError
+        Names that do not exist, a designed camera without the light that is asked, or more memory than there is.
+    RunFolderError, Incomplete
+        As ``draw_samples``.
     """
     test, force = setup.test, force or Workforce()
     told: dict[str, None] = {}  # what is told twice, of the cameras and of those by which an allocation is judged
@@ -267,9 +300,12 @@ def _judged(
 class Modelled:
     """What the models say of the cameras that were drawn.
 
-    Attributes:
-        linear, quadratic: values of the merits, SI, (S, M).
-        without: the same to the second order without each tolerance, of the first of the cameras, (E, S', M).
+    Attributes
+    ----------
+    linear, quadratic : np.ndarray
+        Values of the merits, SI, (S, M).
+    without : np.ndarray
+        The same to the second order without each tolerance, of the first of the cameras, (E, S', M).
     """
 
     linear: np.ndarray

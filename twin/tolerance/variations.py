@@ -37,12 +37,18 @@ SHAPE = ("scale", "stretch", "radius", "conic", "index", "abbe")
 class BodyMove:
     """What one number does to one body, per SI unit, in the body's own frame.
 
-    Attributes:
-        rotate: rotation vector, (3,).
-        shift: (3,), metres.
-        pivot: point that the turn leaves in place, (3,), metres.
-        figure: Noll index -> metres of sag.
-        shape: name of ``SHAPE`` -> change.
+    Attributes
+    ----------
+    rotate : np.ndarray
+        Rotation vector, (3,).
+    shift : np.ndarray
+        (3,), metres.
+    pivot : np.ndarray
+        Point that the turn leaves in place, (3,), metres.
+    figure : FrozenMap[int, float]
+        Noll index -> metres of sag.
+    shape : FrozenMap[str, float]
+        Name of ``SHAPE`` -> change.
     """
 
     rotate: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -56,13 +62,19 @@ class BodyMove:
 class VariedNumber:
     """One number that varies.
 
-    Attributes:
-        name: of the entry of the file, with the term where it is one of a whole figure error.
-        entry: name of the entry.
-        kind: of the motion.
-        size: SI amount of one unit of it: the limit of a tolerance, 1 of a compensator; of a term of a figure error its
-            standard deviation.
-        moves: body -> what it does.
+    Attributes
+    ----------
+    name : str
+        Of the entry of the file, with the term where it is one of a whole figure error.
+    entry : str
+        Name of the entry.
+    kind : str
+        Of the motion.
+    size : float
+        SI amount of one unit of it: the limit of a tolerance, 1 of a compensator; of a term of a figure error its
+        standard deviation.
+    moves : FrozenMap[str, BodyMove]
+        Body -> what it does.
     """
 
     name: str
@@ -75,8 +87,10 @@ class VariedNumber:
 def tolerance_numbers(setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel) -> tuple[VariedNumber, ...]:
     """The numbers of all tolerances, in the order of the file; a figure error has one for each of its terms.
 
-    Raises:
-        InputError: a body that is not there, or that does not allow what a tolerance says.
+    Raises
+    ------
+    InputError
+        a body that is not there, or that does not allow what a tolerance says.
     """
     maker = _Maker(setup.test, instrument, thermal)
     out: list[VariedNumber] = []
@@ -195,17 +209,27 @@ def heat_moves(
 ) -> FrozenMap[str, BodyMove]:
     """What a change of temperature does to every body, per SI unit, taken between none and an amount.
 
-    Args:
-        thermal: of the instrument.
-        instrument: whose bodies they are.
-        body: that is warmed, with all it carries.
-        kind: ``temperature`` or ``gradient``.
-        axis: of a gradient.
-        amount: kelvin, or K/m.
-        others: temperatures that other bodies have meanwhile.
+    Parameters
+    ----------
+    thermal : ThermalModel
+        Of the instrument.
+    instrument : Instrument
+        Whose bodies they are.
+    body : str
+        That is warmed, with all it carries.
+    kind : str
+        ``temperature`` or ``gradient``.
+    axis : int
+        Of a gradient.
+    amount : float
+        Kelvin, or K/m.
+    others : Mapping[str, Temperature]
+        Temperatures that other bodies have meanwhile.
 
-    Raises:
-        TemperatureError: expansion or index is not known there.
+    Raises
+    ------
+    TemperatureError
+        Expansion or index is not known there.
     """
     heat = Temperature(amount) if kind == "temperature" else Temperature(0.0, triple(amount * np.eye(3)[axis]))
     fields = {**others, body: heat}
@@ -244,9 +268,12 @@ def spectrum_shares(terms: Sequence[int], power: float) -> np.ndarray:
 
     The variance of a term falls with the power of its radial order n, as (n + 1)^-power.
 
-    Args:
-        terms: Noll's numbers.
-        power: of the radial order.
+    Parameters
+    ----------
+    terms : Sequence[int]
+        Noll's numbers.
+    power : float
+        Of the radial order.
     """
     order = np.array([noll_to_nm(j)[0] for j in terms])
     variance = (order + 1.0) ** -power
@@ -259,10 +286,14 @@ def spectrum_over(element: Element, terms: Sequence[int], power: float) -> np.nd
     The mean square is that of many surfaces, about each surface's mean over its clear aperture. Terms have unit rms
     over the smallest circle round that aperture, and another one over a rectangle or a ring in it.
 
-    Args:
-        element: the surface.
-        terms: Noll's numbers.
-        power: as of ``spectrum_shares``.
+    Parameters
+    ----------
+    element : Element
+        The surface.
+    terms : Sequence[int]
+        Noll's numbers.
+    power : float
+        As of ``spectrum_shares``.
     """
     shares, disk, outer = spectrum_shares(terms, power), element.figure_disk, element.outer_edge
     assert outer is not None
@@ -283,11 +314,16 @@ _CELLS = 200
 def states_of(numbers: Sequence[VariedNumber], amounts: np.ndarray) -> list[State]:
     """The states that numbers add up to.
 
-    Args:
-        numbers: K of them.
-        amounts: SI, (S, K).
+    Parameters
+    ----------
+    numbers : Sequence[VariedNumber]
+        K of them.
+    amounts : np.ndarray
+        SI, (S, K).
 
-    Returns:
+    Returns
+    -------
+    list[State]
         S states; bodies that nothing moves in any of them are left out.
     """
     count = len(amounts)

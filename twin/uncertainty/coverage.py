@@ -46,19 +46,28 @@ _DRAWN, _DETECTOR, _BEFORE, _AFTER = 9, 10, 11, 12
 class Coverage:
     """N measured states.
 
-    Attributes:
-        quantities: Q of them.
-        drawn: how many states were drawn; those in which a spot leaves its CCD, or comes too near its edge, are not
-            measured.
-        truth: (N, Q).
-        errors: estimator -> (N, Q) reading minus truth.
-        sigmas: estimator -> (N, Q) total standard deviations.
-        expected: estimator -> (levels, Q) share of intervals that should hold the truth: the levels themselves where
-            all states are measured. The measured ones of others move the spots less than is stated, which makes
-            errors that go with the spots smaller; of the posterior none do.
-        chi_square: (N,) predictive chi-square of the shifts.
-        alarms: in how many states it was beyond its limit.
-        doubted: in how many the spots were not as calibrated, or the readings not linear and not worked out anew.
+    Attributes
+    ----------
+    quantities : tuple[Quantity, ...]
+        Q of them.
+    drawn : int
+        How many states were drawn; those in which a spot leaves its CCD, or comes too near its edge, are not measured.
+    truth : np.ndarray
+        (N, Q).
+    errors : Mapping[str, np.ndarray]
+        Estimator -> (N, Q) reading minus truth.
+    sigmas : Mapping[str, np.ndarray]
+        Estimator -> (N, Q) total standard deviations.
+    expected : Mapping[str, np.ndarray]
+        Estimator -> (levels, Q) share of intervals that should hold the truth: the levels themselves where all states
+        are measured. The measured ones of others move the spots less than is stated, which makes errors that go with
+        the spots smaller; of the posterior none do.
+    chi_square : np.ndarray
+        (N,) predictive chi-square of the shifts.
+    alarms : int
+        In how many states it was beyond its limit.
+    doubted : int
+        In how many the spots were not as calibrated, or the readings not linear and not worked out anew.
     """
 
     quantities: tuple[Quantity, ...]
@@ -87,9 +96,12 @@ class Coverage:
     def held(self, estimator: str, level: int) -> np.ndarray:
         """(Q,) number of states whose interval holds the truth.
 
-        Args:
-            estimator: its name.
-            level: number in ``LEVELS``.
+        Parameters
+        ----------
+        estimator : str
+            Its name.
+        level : int
+            Number in ``LEVELS``.
         """
         inside = np.abs(self.errors[estimator]) <= HALF_WIDTHS[level] * self.sigmas[estimator]
         return np.asarray(np.sum(inside, axis=0))
@@ -102,9 +114,12 @@ class Coverage:
     def limits(self, estimator: str, level: int) -> np.ndarray:
         """(2, Q) smallest and largest count that agree with what is expected, ``FALSE`` for all counts together.
 
-        Args:
-            estimator: its name.
-            level: number in ``LEVELS``.
+        Parameters
+        ----------
+        estimator : str
+            Its name.
+        level : int
+            Number in ``LEVELS``.
         """
         from scipy.stats import binom  # takes long, and only a report of random states needs it
 
@@ -146,13 +161,20 @@ def run_states(
 ) -> Coverage:
     """Draw, render, expose and recover states; every state has detectors and a nominal measurement of its own.
 
-    Args:
-        experiment: the instrument, with stated disturbances.
-        quantities: whose errors are wanted.
-        count: how many states are drawn.
-        frames: of each measurement.
-        seed: of all that is drawn.
-        advance: told how many states are done.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument, with stated disturbances.
+    quantities : tuple[Quantity, ...]
+        Whose errors are wanted.
+    count : int
+        How many states are drawn.
+    frames : int
+        Of each measurement.
+    seed : int
+        Of all that is drawn.
+    advance : Advance
+        Told how many states are done.
     """
     stated, disturbances = experiment.stated, experiment.disturbances
     assert stated is not None
@@ -267,13 +289,20 @@ _SPREAD = "what is stated to move"
 class UncertaintyRun:
     """What was found.
 
-    Attributes:
-        resolved: the job with everything it names.
-        limits: of its instrument under its disturbances.
-        seed: of the random states.
-        coverage: of the random states, None if none were asked for.
-        warnings: blurred cameras, coarse grey values, and stated motions that no spot sees.
-        images: what the checks of its images found.
+    Attributes
+    ----------
+    resolved : ResolvedJob
+        The job with everything it names.
+    limits : MonitorLimits
+        Of its instrument under its disturbances.
+    seed : int
+        Of the random states.
+    coverage : Coverage | None
+        Of the random states, None if none were asked for.
+    warnings : tuple[str, ...]
+        Blurred cameras, coarse grey values, and stated motions that no spot sees.
+    images : ImageChecks
+        What the checks of its images found.
     """
 
     resolved: ResolvedJob
@@ -289,15 +318,23 @@ def run_uncertainty(
 ) -> UncertaintyRun:
     """Work out what limits the readings of a job's instrument; what the job does to it is not looked at.
 
-    Args:
-        resolved: the job.
-        backend: where to trace.
-        seed: of the random states.
-        advance: told what is being done.
-        states: how many random states are drawn, rendered and recovered.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job.
+    backend : Backend
+        Where to trace.
+    seed : int
+        Of the random states.
+    advance : Advance
+        Told what is being done.
+    states : int
+        How many random states are drawn, rendered and recovered.
 
-    Raises:
-        InputError: nothing is stated to move, or what is stated cannot be.
+    Raises
+    ------
+    InputError
+        Nothing is stated to move, or what is stated cannot be.
     """
     if resolved.disturbances is None:
         raise InputError(

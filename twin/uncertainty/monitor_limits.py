@@ -51,10 +51,14 @@ covariance varies by some per cent between states.
 class Remedy:
     """Something that could be done.
 
-    Attributes:
-        name: short, small letters and _.
-        what: in words.
-        sigma: (Q,) standard deviations of the posterior that it would leave.
+    Attributes
+    ----------
+    name : str
+        Short, small letters and _.
+    what : str
+        In words.
+    sigma : np.ndarray
+        (Q,) standard deviations of the posterior that it would leave.
     """
 
     name: str
@@ -66,17 +70,28 @@ class Remedy:
 class MonitorLimits:
     """What limits an instrument's readings.
 
-    Attributes:
-        instrument: its name.
-        stated: what moves.
-        quantities: Q of them.
-        noise: (D, D) of the shifts of the spots, px^2.
-        frames: of each state.
-        splits: estimator -> the variances of all quantities.
-        least_seen: of every quantity.
-        remedies: what would help.
-        outside: chance that a spot leaves its CCD, or comes too near its edge, so that nothing is measured.
-        without: why there is no remedy by a second monitor; empty where there is one, or nobody asked.
+    Attributes
+    ----------
+    instrument : str
+        Its name.
+    stated : Disturbances
+        What moves.
+    quantities : tuple[Quantity, ...]
+        Q of them.
+    noise : np.ndarray
+        (D, D) of the shifts of the spots, px^2.
+    frames : int
+        Of each state.
+    splits : Mapping[str, Split]
+        Estimator -> the variances of all quantities.
+    least_seen : tuple[LeastSeen, ...]
+        Of every quantity.
+    remedies : tuple[Remedy, ...]
+        What would help.
+    outside : float
+        Chance that a spot leaves its CCD, or comes too near its edge, so that nothing is measured.
+    without : str
+        Why there is no remedy by a second monitor; empty where there is one, or nobody asked.
     """
 
     instrument: str
@@ -98,9 +113,12 @@ class MonitorLimits:
     def lines(self, estimator: str, quantity: int) -> list[tuple[str, float]]:
         """Label and share of the variance of an estimate's error, largest first, noise apart.
 
-        Args:
-            estimator: its name, or empty for the variance before a measurement.
-            quantity: its number.
+        Parameters
+        ----------
+        estimator : str
+            Its name, or empty for the variance before a measurement.
+        quantity : int
+            Its number.
         """
         split = self.splits[estimator or BEST]
         total = (split.sigma if estimator else split.sigma_before)[quantity] ** 2
@@ -152,9 +170,12 @@ def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarra
     The pattern of the pixels' response cancels where a spot stays on its pixels. It is therefore worked out for some
     states of the stated disturbances, and the mean is taken; for none where their spots leave the CCDs.
 
-    Args:
-        experiment: the instrument.
-        frames: of each.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    frames : int
+        Of each.
     """
     centroid, calibration = experiment.resolved.job.analysis.centroid, experiment.calibration
     nominal = experiment.expected_frames(experiment.nominal_photons)
@@ -182,14 +203,21 @@ def find_limits(
     """What limits the readings of all quantities that what is stated changes; None where nothing is stated to move, or
     nothing that changes a camera.
 
-    Args:
-        experiment: the instrument.
-        noise: (D, D) of the shifts, px^2.
-        frames: of each state.
-        second_monitor: whether a second one is built to say what it would give; it takes a second or two.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    noise : np.ndarray
+        (D, D) of the shifts, px^2.
+    frames : int
+        Of each state.
+    second_monitor : bool
+        Whether a second one is built to say what it would give; it takes a second or two.
 
-    Raises:
-        InputError: what is stated cannot be.
+    Raises
+    ------
+    InputError
+        What is stated cannot be.
     """
     stated = experiment.disturbances
     if stated is None:
@@ -287,11 +315,16 @@ def unseen_texts(
 ) -> tuple[str, ...]:
     """A warning for each stated body whose motions have next to no derivative in the spots and yet make sigma.
 
-    Args:
-        stated: what moves.
-        noise: (D, D) of the shifts, px^2.
-        quantities: Q of them.
-        gain: (4 K, D) of the estimator that is judged by.
+    Parameters
+    ----------
+    stated : Disturbances
+        What moves.
+    noise : np.ndarray
+        (D, D) of the shifts, px^2.
+    quantities : Sequence[Quantity]
+        Q of them.
+    gain : np.ndarray
+        (4 K, D) of the estimator that is judged by.
     """
     rows = np.stack([quantity.row for quantity in quantities])
     out = []
@@ -323,10 +356,14 @@ def part_of(body: str) -> str:
 def combination_text(limits: MonitorLimits, number: int, most: int = 4) -> str:
     """The motions that hide best, in words.
 
-    Args:
-        limits: of an instrument.
-        number: of the quantity.
-        most: motions that are named.
+    Parameters
+    ----------
+    limits : MonitorLimits
+        Of an instrument.
+    number : int
+        Of the quantity.
+    most : int
+        Motions that are named.
     """
     seen, quantity, stated = limits.least_seen[number], limits.quantities[number], limits.stated
     order = sorted(range(len(seen.amounts)), key=lambda k: -abs(seen.amounts[k]))[:most]

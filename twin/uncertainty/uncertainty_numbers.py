@@ -230,9 +230,12 @@ def _by_quantity(
 ) -> dict[str, dict[str, Any]]:
     """Group -> key -> value.
 
-    Args:
-        quantities: Q of them.
-        values: Q of them.
+    Parameters
+    ----------
+    quantities : Sequence[limits.Quantity]
+        Q of them.
+    values : Sequence[Any] | np.ndarray
+        Q of them.
     """
     out: dict[str, dict[str, Any]] = {}
     for quantity, value in zip(quantities, values, strict=True):
@@ -243,8 +246,10 @@ def _by_quantity(
 def uncertainty_numbers(run: UncertaintyRun) -> dict[str, Any]:
     """Contents of uncertainty.json of the command: those of the main job's, and ``states``, what random states gave.
 
-    Args:
-        run: of the command.
+    Parameters
+    ----------
+    run : UncertaintyRun
+        Of the command.
     """
     out = LIMITS(run.limits)
     if run.coverage is not None:

@@ -45,11 +45,16 @@ def limits_section(
 ) -> Section:
     """What limits the readings: the figure and the tables.
 
-    Args:
-        limits: of the instrument, None where nothing is stated to move.
-        lines: motions that are named of each quantity.
-        folded: how many of its three tables a reader has to ask for.
-        figure: as of ``limits_svg`` where it has been drawn already.
+    Parameters
+    ----------
+    limits : MonitorLimits | None
+        Of the instrument, None where nothing is stated to move.
+    lines : int
+        Motions that are named of each quantity.
+    folded : int
+        How many of its three tables a reader has to ask for.
+    figure : str | None
+        As of ``limits_svg`` where it has been drawn already.
     """
     title = "What limits the readings"
     if limits is None:

@@ -29,13 +29,20 @@ _HALVINGS = 20
 class InputRange:
     """A chosen input and where the row stays as it is, all other inputs being what they are.
 
-    Attributes:
-        name: what it is.
-        value: as chosen; None where it is no number.
-        unit: of the numbers; "1" for a factor.
-        low, high: limits; None where there is none within a factor of `FARTHEST`, or the row does not agree.
-        agrees: whether the row does.
-        said: where else the row holds, where the input is no number.
+    Attributes
+    ----------
+    name : str
+        What it is.
+    value : float | None
+        As chosen; None where it is no number.
+    unit : str
+        Of the numbers; "1" for a factor.
+    low, high : float | None
+        Limits; None where there is none within a factor of `FARTHEST`, or the row does not agree.
+    agrees : bool
+        Whether the row does.
+    said : str
+        Where else the row holds, where the input is no number.
     """
 
     name: str
@@ -72,11 +79,16 @@ def _two(value: float) -> str:
 class Chosen:
     """An input that was chosen, and how the measured value goes with it.
 
-    Attributes:
-        name: what it is, a phrase.
-        value: as chosen, not zero.
-        unit: of it.
-        response: what is measured, in the row's unit, when the input is so many times what it is.
+    Attributes
+    ----------
+    name : str
+        What it is, a phrase.
+    value : float
+        As chosen, not zero.
+    unit : str
+        Of it.
+    response : Callable[[float], float]
+        What is measured, in the row's unit, when the input is so many times what it is.
     """
 
     name: str
@@ -92,9 +104,12 @@ class Chosen:
     def range(self, holds: Callable[[float], bool], agrees: bool) -> InputRange:
         """Where a row stays as it is.
 
-        Args:
-            holds: whether a measured value agrees.
-            agrees: whether that of the row does; if not, no limits are looked for.
+        Parameters
+        ----------
+        holds : Callable[[float], bool]
+            Whether a measured value agrees.
+        agrees : bool
+            Whether that of the row does; if not, no limits are looked for.
         """
         low = high = None
         if agrees:
@@ -119,9 +134,12 @@ class Chosen:
 class Supposed:
     """A choice that is no number.
 
-    Attributes:
-        name: what it is, a phrase with the choice.
-        said: where else the row holds, found by trying.
+    Attributes
+    ----------
+    name : str
+        What it is, a phrase with the choice.
+    said : str
+        Where else the row holds, found by trying.
     """
 
     name: str
@@ -179,11 +197,14 @@ class _Sentences(Formatter):
 def sentence(text: str, facts: Mapping[str, Any]) -> str:
     """Return a text of ``printed.yaml`` with its facts.
 
-    Args:
-        text: facts stand in braces as for `str.format`. Before the digits may stand statistics and a unit, separated by
-            spaces: ``{error:abs max arcsec .3f}`` is the largest size of an SI array's values in arcseconds. Several
-            values are listed, those of a mapping with their names.
-        facts: by name.
+    Parameters
+    ----------
+    text : str
+        Facts stand in braces as for `str.format`. Before the digits may stand statistics and a unit, separated by
+        spaces: ``{error:abs max arcsec .3f}`` is the largest size of an SI array's values in arcseconds. Several values
+        are listed, those of a mapping with their names.
+    facts : Mapping[str, Any]
+        By name.
     """
     return _Sentences().vformat(text, (), facts)
 
@@ -241,29 +262,51 @@ inputs chosen here, or a theory beside which nothing is printed.
 class CheckResult:
     """What a check found; exactly these are the keys in JSON.
 
-    Attributes:
-        id: dotted, beginning with the paper's number.
-        also: further ids of the same row.
-        paper: the paper's number.
-        equation: where it is printed: equation, table or section.
-        statement: what the paper says, in one sentence.
-        printed: the paper's number; None where it prints none.
-        implied: what the statement implies, where no number is printed.
-        measured: the simulation's number; None when it failed or nothing can be compared.
-        sigma: standard deviation of ``measured``; None where there is no noise.
-        unit: of all these numbers; "1" for a ratio.
-        tolerance: how far apart claim and measurement may be, without the noise.
-        comparison: two-sided, at most or at least; a row with one side takes whatever lies on the other.
-        because: why that tolerance, a phrase.
-        power: tolerance + 3 sigma: the smallest error of the statement that the row would have found. An error just so
-            large is found half the time, one of 3 sigma more practically always. None where nothing is compared.
-        tells: how far away the other statement is that the row is to tell from the printed one.
-        against: that other statement, a phrase.
-        theory: with what it agrees, where nothing is printed; else empty.
-        inputs: chosen here, and how far each may move.
-        verdict: one of VERDICTS.
-        how: lines: how it was measured; the reason, unless it is confirmed; the comparison that makes the verdict.
-        seconds: computing time since the group's result before; the first one holds the work that all share.
+    Attributes
+    ----------
+    id : str
+        Dotted, beginning with the paper's number.
+    also : tuple[str, ...]
+        Further ids of the same row.
+    paper : str
+        The paper's number.
+    equation : str
+        Where it is printed: equation, table or section.
+    statement : str
+        What the paper says, in one sentence.
+    printed : float | None
+        The paper's number; None where it prints none.
+    implied : float | None
+        What the statement implies, where no number is printed.
+    measured : float | None
+        The simulation's number; None when it failed or nothing can be compared.
+    sigma : float | None
+        Standard deviation of ``measured``; None where there is no noise.
+    unit : str
+        Of all these numbers; "1" for a ratio.
+    tolerance : float
+        How far apart claim and measurement may be, without the noise.
+    comparison : Comparison
+        Two-sided, at most or at least; a row with one side takes whatever lies on the other.
+    because : str
+        Why that tolerance, a phrase.
+    power : float | None
+        Tolerance + 3 sigma: the smallest error of the statement that the row would have found. An error just so large
+        is found half the time, one of 3 sigma more practically always. None where nothing is compared.
+    tells : float | None
+        How far away the other statement is that the row is to tell from the printed one.
+    against : str
+        That other statement, a phrase.
+    theory : str
+        With what it agrees, where nothing is printed; else empty.
+    inputs : tuple[InputRange, ...]
+        Chosen here, and how far each may move.
+    verdict : Verdict
+        One of VERDICTS.
+    how : str
+        Lines: how it was measured; the reason, unless it is confirmed; the comparison that makes the verdict.
+    seconds : float
+        Computing time since the group's result before; the first one holds the work that all share.
     """
 
     id: str
@@ -320,9 +363,12 @@ class CheckResult:
 class Explanation(Spec):
     """A known reason for a value other than the claimed one.
 
-    Attributes:
-        verdict: CORRECTED if the reason is a fault, a gap or an ambiguity of the print, else REFUTED.
-        text: the reason, with the facts that `Check.evaluate` is given, see `sentence`.
+    Attributes
+    ----------
+    verdict : Literal['confirmed with correction', 'refuted']
+        CORRECTED if the reason is a fault, a gap or an ambiguity of the print, else REFUTED.
+    text : Text
+        The reason, with the facts that `Check.evaluate` is given, see `sentence`.
     """
 
     verdict: Literal["confirmed with correction", "refuted"]
@@ -335,28 +381,47 @@ class Check(Spec):
     that no tolerance can follow a result; `evaluate` compares what was measured, with the inputs that were chosen for
     it, and gives the result.
 
-    Attributes:
-        id: dotted, beginning with the paper's number, for instance ``001.table3.centroid``.
-        equation: where it is printed, for instance ``eq. (5)``.
-        statement: what the paper says, in one sentence.
-        unit: of printed, measured and tolerance; "1" for a ratio.
-        printed: the paper's number; None where it prints none.
-        tolerance: how far apart printed and measured may be and still agree, without the noise.
-        because: why that tolerance.
-        comparison: ``two-sided``: off to either side counts; or what the paper claims of the measured value: ``at
-            most`` or ``at least`` the printed, so that whatever lies on the other side agrees, however far away.
-        expected: the verdict that is known from earlier work; any other one is reported and fails the command. By
-            default that of agreement.
-        tells: how far away the nearest other statement is that the row is to tell from this one, in its unit; with a
-            tolerance plus noise above that it confirms nothing. None only where nothing can be compared.
-        against: that other statement, a phrase that goes on "told from".
-        basis: what agreement rests on, see AGREED; the inputs of ``chosen`` are given to `evaluate`.
-        theory: which theory agreement rests on, a phrase; the basis is then ``theory``.
-        also: further ids of the same row, where one comparison is of two equations.
-        not_checkable: why nothing can be compared; empty where something can.
-        explanations: known reasons for other values, the likeliest first; `evaluate` is given the values.
-        otherwise: what can be said where neither claim nor explanation agrees.
-        how: how the number is measured and what else is found, with facts like the explanations.
+    Attributes
+    ----------
+    id : Text
+        Dotted, beginning with the paper's number, for instance ``001.table3.centroid``.
+    equation : Text
+        Where it is printed, for instance ``eq. (5)``.
+    statement : Text
+        What the paper says, in one sentence.
+    unit : Text
+        Of printed, measured and tolerance; "1" for a ratio.
+    printed : Number | None
+        The paper's number; None where it prints none.
+    tolerance : Number
+        How far apart printed and measured may be and still agree, without the noise.
+    because : Text
+        Why that tolerance.
+    comparison : Comparison
+        ``two-sided``: off to either side counts; or what the paper claims of the measured value: ``at most`` or ``at
+        least`` the printed, so that whatever lies on the other side agrees, however far away.
+    expected : Verdict
+        The verdict that is known from earlier work; any other one is reported and fails the command. By default that of
+        agreement.
+    tells : Number | None
+        How far away the nearest other statement is that the row is to tell from this one, in its unit; with a tolerance
+        plus noise above that it confirms nothing. None only where nothing can be compared.
+    against : Text
+        That other statement, a phrase that goes on "told from".
+    basis : Basis
+        What agreement rests on, see AGREED; the inputs of ``chosen`` are given to `evaluate`.
+    theory : Text
+        Which theory agreement rests on, a phrase; the basis is then ``theory``.
+    also : tuple[Text, ...]
+        Further ids of the same row, where one comparison is of two equations.
+    not_checkable : Text
+        Why nothing can be compared; empty where something can.
+    explanations : tuple[Explanation, ...]
+        Known reasons for other values, the likeliest first; `evaluate` is given the values.
+    otherwise : Text
+        What can be said where neither claim nor explanation agrees.
+    how : Text
+        How the number is measured and what else is found, with facts like the explanations.
     """
 
     id: Text
@@ -445,17 +510,27 @@ class Check(Spec):
         whose value it is within the same limit gives verdict and reason; else it is refuted. A limit above
         ``tells`` makes of either agreement ``undecided``.
 
-        Args:
-            measured: the simulation's number.
-            sigma: its standard deviation, None without noise.
-            how: what stands after the row's own ``how``.
-            implied: what the paper's statement implies, where it prints no number.
-            explained: values that the row's explanations would give, in their order; None where one is no reason here.
-            inputs: chosen here; needed where the row's basis is ``chosen``.
-            facts: what the row's texts name in braces, beside ``measured``.
+        Parameters
+        ----------
+        measured : float
+            The simulation's number.
+        sigma : float | None
+            Its standard deviation, None without noise.
+        how : str
+            What stands after the row's own ``how``.
+        implied : float | None
+            What the paper's statement implies, where it prints no number.
+        explained : Sequence[float | None]
+            Values that the row's explanations would give, in their order; None where one is no reason here.
+        inputs : Sequence[Chosen | Supposed]
+            Chosen here; needed where the row's basis is ``chosen``.
+        facts : Mapping[str, Any]
+            What the row's texts name in braces, beside ``measured``.
 
-        Raises:
-            ValueError: a number is not finite, there is nothing to compare with, or inputs are missing.
+        Raises
+        ------
+        ValueError
+            a number is not finite, there is nothing to compare with, or inputs are missing.
         """
         measured, noise = float(measured), SIGMAS * float(sigma or 0.0)
         goal = self.printed if self.printed is not None else implied

@@ -43,17 +43,28 @@ class ArtefactText(Spec):
 class Context:
     """What the function of a group may use.
 
-    Attributes:
-        backend: where to trace.
-        seed: of all noise; the same seed must give the same results.
-        fast: whether fewer trials have to do; the verdicts must not depend on it.
-        selected: ids that are wanted; others need no work, and their results are not kept.
-        checks: id -> check, of the whole group.
-        report_progress: takes the fraction of the group's work that is done, and what is being done.
-        folder: where the group may put files of its own, which the report lists; None when nothing is written.
-        experiments: instrument -> experiment, shared by all groups.
-        texts: name of a figure or table of the group -> what is said of it.
-        artefacts: added so far.
+    Attributes
+    ----------
+    backend : Backend
+        Where to trace.
+    seed : int
+        Of all noise; the same seed must give the same results.
+    fast : bool
+        Whether fewer trials have to do; the verdicts must not depend on it.
+    selected : frozenset[str]
+        Ids that are wanted; others need no work, and their results are not kept.
+    checks : Mapping[str, Check]
+        Id -> check, of the whole group.
+    report_progress : Callable[[float, str], None]
+        Takes the fraction of the group's work that is done, and what is being done.
+    folder : Path | None
+        Where the group may put files of its own, which the report lists; None when nothing is written.
+    experiments : dict[str, MonitorExperiment]
+        Instrument -> experiment, shared by all groups.
+    texts : Mapping[str, ArtefactText]
+        Name of a figure or table of the group -> what is said of it.
+    artefacts : list[Artefact]
+        Added so far.
     """
 
     backend: Backend
@@ -78,8 +89,10 @@ class Context:
     def check(self, identifier: str) -> Check:
         """One of the group's checks, to be evaluated.
 
-        Raises:
-            KeyError: the group has none of that id.
+        Raises
+        ------
+        KeyError
+            The group has none of that id.
         """
         return self.checks[identifier]
 
@@ -96,8 +109,10 @@ class Context:
     def add(self, artefact: Artefact) -> None:
         """Show a figure, table or data in the report and keep it in the run folder.
 
-        Raises:
-            ValueError: the group has another of that name.
+        Raises
+        ------
+        ValueError
+            The group has another of that name.
         """
         if any((artefact.name, artefact.kind) == (other.name, other.kind) for other in self.artefacts):
             raise ValueError(f"two artefacts {artefact.name}.{artefact.kind} in one group")
@@ -142,14 +157,22 @@ Run = Callable[[Context], Iterable[CheckResult]]
 class CheckGroup:
     """Checks that share work.
 
-    Attributes:
-        prefix: name of the group, beginning with the paper's number; where all its ids share a prefix, that.
-        title: what it is about, for the report.
-        seconds: rough computing time on two cores.
-        checks: everything it checks.
-        run: does it; yields one result for every selected check, as soon as it has it.
-        fast_seconds: rough time of the fast run, None where that is the same.
-        artefacts: name of a figure or table -> what is said of it.
+    Attributes
+    ----------
+    prefix : str
+        Name of the group, beginning with the paper's number; where all its ids share a prefix, that.
+    title : str
+        What it is about, for the report.
+    seconds : float
+        Rough computing time on two cores.
+    checks : tuple[Check, ...]
+        Everything it checks.
+    run : Run
+        Does it; yields one result for every selected check, as soon as it has it.
+    fast_seconds : float | None
+        Rough time of the fast run, None where that is the same.
+    artefacts : Mapping[str, ArtefactText]
+        Name of a figure or table -> what is said of it.
     """
 
     prefix: str
@@ -243,8 +266,10 @@ class Printed:
     def group(self, prefix: str, run: Run) -> CheckGroup:
         """The group of that prefix, whose rows a function computes.
 
-        Raises:
-            InputError: there is no such group.
+        Raises
+        ------
+        InputError
+            There is no such group.
         """
         if prefix not in self.groups:
             known = nearest(prefix, self.groups)
@@ -322,11 +347,15 @@ class Printed:
 def load_printed(paper: str) -> Printed:
     """What a paper prints.
 
-    Args:
-        paper: its number, for instance "001".
+    Parameters
+    ----------
+    paper : str
+        Its number, for instance "001".
 
-    Raises:
-        InputError: there is no file of that paper, or it cannot be read.
+    Raises
+    ------
+    InputError
+        There is no file of that paper, or it cannot be read.
     """
     return Printed(read_yaml(FOLDER / f"paper_{paper}" / FILE))
 
@@ -346,9 +375,12 @@ def drawing(
 ) -> Callable[[Draw], Callable[..., str]]:
     """Decorator that makes of a function, which draws what it is given into a figure, one that returns the SVG.
 
-    Args:
-        name: makes the SVG's identifiers its own.
-        height: of the figure, inches; both may be functions of what is drawn.
+    Parameters
+    ----------
+    name : str | Callable[..., str]
+        Makes the SVG's identifiers its own.
+    height : float | Callable[..., float]
+        Of the figure, inches; both may be functions of what is drawn.
     """
 
     def decorate(draw: Draw) -> Callable[..., str]:

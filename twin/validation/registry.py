@@ -66,8 +66,10 @@ class Selection:
 def require_unique(groups: Iterable[CheckGroup]) -> None:
     """Refuse groups or ids that come twice.
 
-    Raises:
-        ValueError: one does.
+    Raises
+    ------
+    ValueError
+        One does.
     """
     groups = tuple(groups)
     names = Counter(group.prefix for group in groups)
@@ -80,12 +82,17 @@ def require_unique(groups: Iterable[CheckGroup]) -> None:
 def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, ...]:
     """The groups, with the ids that lie under one of the prefixes; all where ``only`` is None.
 
-    Args:
-        groups: all there are.
-        only: prefixes, separated by commas, that end where a part of an id ends; a row's further ids count as well.
+    Parameters
+    ----------
+    groups : Sequence[CheckGroup]
+        All there are.
+    only : str | None
+        Prefixes, separated by commas, that end where a part of an id ends; a row's further ids count as well.
 
-    Raises:
-        UnknownCheck: there is nothing under one of them.
+    Raises
+    ------
+    UnknownCheck
+        There is nothing under one of them.
     """
     require_unique(groups)
     if only is None:
@@ -102,8 +109,10 @@ def select(groups: Sequence[CheckGroup], only: str | None) -> tuple[Selection, .
 def require_known(only: str | None) -> None:
     """Refuse what `select` would refuse, without any group where none has been imported yet.
 
-    Raises:
-        UnknownCheck: there is nothing under one of the prefixes.
+    Raises
+    ------
+    UnknownCheck
+        There is nothing under one of the prefixes.
     """
     # other distributions' groups are in no file of ours
     if only is not None and not entries() and "GROUPS" not in globals():
@@ -113,8 +122,10 @@ def require_known(only: str | None) -> None:
 def _known(only: str, ids: Sequence[str]) -> list[str]:
     """The prefixes, all of which have ids under them.
 
-    Raises:
-        UnknownCheck: one has not.
+    Raises
+    ------
+    UnknownCheck
+        One has not.
     """
     prefixes = [part.strip() for part in only.split(",")]
     for prefix in prefixes:

@@ -48,14 +48,22 @@ class GroupRun:
 class Validation:
     """What a validation found.
 
-    Attributes:
-        runs: group by group.
-        backend, seed: what it ran with.
-        only: the selection as it was given, None for everything.
-        fast: whether with fewer trials.
-        started: time of the start, seconds since the epoch.
-        seconds: computing time.
-        written: whether it goes into a run folder.
+    Attributes
+    ----------
+    runs : tuple[GroupRun, ...]
+        Group by group.
+    backend, seed : str
+        What it ran with.
+    only : str | None
+        The selection as it was given, None for everything.
+    fast : bool
+        Whether with fewer trials.
+    started : float
+        Time of the start, seconds since the epoch.
+    seconds : float
+        Computing time.
+    written : bool
+        Whether it goes into a run folder.
     """
 
     runs: tuple[GroupRun, ...]
@@ -134,14 +142,22 @@ def run_checks(
 ) -> Validation:
     """Run the groups one after the other.
 
-    Args:
-        selections: the groups with their wanted ids.
-        backend: where to trace.
-        seed: of all noise.
-        only: the selection as the user gave it, kept in the results.
-        fast: make fewer trials, as continuous integration wants it.
-        progress: called whenever a group gets on.
-        folder: the open run folder, None when nothing is written.
+    Parameters
+    ----------
+    selections : Sequence[Selection]
+        The groups with their wanted ids.
+    backend : Backend
+        Where to trace.
+    seed : int
+        Of all noise.
+    only : str | None
+        The selection as the user gave it, kept in the results.
+    fast : bool
+        Make fewer trials, as continuous integration wants it.
+    progress : Progress
+        Called whenever a group gets on.
+    folder : Path | None
+        The open run folder, None when nothing is written.
     """
     started, clock = time.time(), time.monotonic()
     experiments: dict[str, MonitorExperiment] = {}
@@ -205,8 +221,10 @@ def _run_group(
 def _keep(result: CheckResult, found: dict[str, CheckResult], group: CheckGroup, wanted: frozenset[str]) -> None:
     """File a result.
 
-    Raises:
-        ValueError: the group has no such check, or has answered it before.
+    Raises
+    ------
+    ValueError
+        The group has no such check, or has answered it before.
     """
     if result.id not in group.ids:
         raise ValueError(f"the group {group.prefix} answered {result.id}, which it does not hold")

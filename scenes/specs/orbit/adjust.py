@@ -43,16 +43,22 @@ PointCount = Annotated[Whole, Field(ge=0, le=1_000_000)]
 class LawSpec(Spec):
     """How an error of readings behaves in time.
 
-    Attributes:
-        law: constant; rate, of even growth from the middle of what shares it; white, readings independent of one
-            another that a cubic spline joins; walk, a random walk that is zero in the middle; slow, a stationary
-            process that forgets itself over `time`; orbital, cosine and sine of the period `time`; jitter, an
-            oscillation of `frequency` whose amplitude and phase forget themselves over `time`.
-        shared_by: what has one draw of it: each pass, all passes of a star tracker, or the block.
-        interval: between independent readings of `white`; between the values of `walk`, of `slow` and of the amplitudes
-            of `jitter` that are solved for, seconds.
-        time: correlation time of `slow` and of the amplitudes of `jitter`, period of `orbital`, seconds.
-        frequency: of `jitter`, hertz.
+    Attributes
+    ----------
+    law : LawKind
+        Constant; rate, of even growth from the middle of what shares it; white, readings independent of one another
+        that a cubic spline joins; walk, a random walk that is zero in the middle; slow, a stationary process that
+        forgets itself over `time`; orbital, cosine and sine of the period `time`; jitter, an oscillation of `frequency`
+        whose amplitude and phase forget themselves over `time`.
+    shared_by : Literal['pass', 'tracker', 'block']
+        What has one draw of it: each pass, all passes of a star tracker, or the block.
+    interval : Interval
+        Between independent readings of `white`; between the values of `walk`, of `slow` and of the amplitudes of
+        `jitter` that are solved for, seconds.
+    time : Period | None
+        Correlation time of `slow` and of the amplitudes of `jitter`, period of `orbital`, seconds.
+    frequency : Frequency | None
+        Of `jitter`, hertz.
     """
 
     law: LawKind
@@ -76,14 +82,21 @@ class LawSpec(Spec):
 class AttitudeLawSpec(LawSpec):
     """A law of errors of the attitude.
 
-    Attributes:
-        law: how it behaves in time.
-        shared_by: what has one draw of it.
-        interval: between independent readings, or between values that are solved for, seconds.
-        time: correlation time or period, seconds.
-        frequency: of `jitter`, hertz.
-        sigma: standard deviation about body X, Y and Z, radians: of a constant, a reading, an amplitude, of jitter as a
-            root mean square; of a rate in each second; of what a walk gains in a second.
+    Attributes
+    ----------
+    law
+        How it behaves in time.
+    shared_by
+        What has one draw of it.
+    interval
+        Between independent readings, or between values that are solved for, seconds.
+    time
+        Correlation time or period, seconds.
+    frequency
+        Of `jitter`, hertz.
+    sigma : AngleSigmas
+        Standard deviation about body X, Y and Z, radians: of a constant, a reading, an amplitude, of jitter as a root
+        mean square; of a rate in each second; of what a walk gains in a second.
     """
 
     sigma: AngleSigmas
@@ -92,13 +105,20 @@ class AttitudeLawSpec(LawSpec):
 class OrbitLawSpec(LawSpec):
     """A law of errors of the orbit.
 
-    Attributes:
-        law: how it behaves in time.
-        shared_by: what has one draw of it.
-        interval: between independent readings, or between values that are solved for, seconds.
-        time: correlation time or period, seconds.
-        frequency: of `jitter`, hertz.
-        sigma: standard deviation along body X, Y and Z of the middle of the pass, metres, as for the attitude.
+    Attributes
+    ----------
+    law
+        How it behaves in time.
+    shared_by
+        What has one draw of it.
+    interval
+        Between independent readings, or between values that are solved for, seconds.
+    time
+        Correlation time or period, seconds.
+    frequency
+        Of `jitter`, hertz.
+    sigma : Sigmas
+        Standard deviation along body X, Y and Z of the middle of the pass, metres, as for the attitude.
     """
 
     sigma: Sigmas
@@ -107,9 +127,12 @@ class OrbitLawSpec(LawSpec):
 class ReadingLawsSpec(Spec):
     """Laws of the errors of the readings, by names that reports show.
 
-    Attributes:
-        attitude: of the star trackers with their mounting.
-        orbit: of the positions.
+    Attributes
+    ----------
+    attitude : Named[AttitudeLawSpec]
+        Of the star trackers with their mounting.
+    orbit : Named[OrbitLawSpec]
+        Of the positions.
     """
 
     attitude: Annotated[Named[AttitudeLawSpec], not_empty("no laws of the attitude", "at least one")]
@@ -125,9 +148,12 @@ class ReadingLawsSpec(Spec):
 class TrackerAngleSpec(Spec):
     """A measured angle between two star trackers: the difference of what is constant in their errors.
 
-    Attributes:
-        between: the two.
-        sigma: about body X, Y and Z, radians.
+    Attributes
+    ----------
+    between : tuple[Name, Name]
+        The two.
+    sigma : tuple[float, float, float]
+        About body X, Y and Z, radians.
     """
 
     between: tuple[Name, Name]
@@ -137,12 +163,18 @@ class TrackerAngleSpec(Spec):
 class BlockPassSpec(Spec):
     """A pass over the block.
 
-    Attributes:
-        epoch: UTC at which it passes vertically above a place.
-        longitude, latitude: of this place, radians; of the area's middle where not given.
-        direction: to the south or to the north.
-        roll: of the satellite about body X, radians; positive looks to the left of the track, toward -Y.
-        tracker: star tracker that gives its attitude.
+    Attributes
+    ----------
+    epoch : UtcTime
+        UTC at which it passes vertically above a place.
+    longitude, latitude : Longitude | None
+        Of this place, radians; of the area's middle where not given.
+    direction : Literal['descending', 'ascending']
+        To the south or to the north.
+    roll : float
+        Of the satellite about body X, radians; positive looks to the left of the track, toward -Y.
+    tracker : Name
+        Star tracker that gives its attitude.
     """
 
     epoch: UtcTime
@@ -156,11 +188,16 @@ class BlockPassSpec(Spec):
 class AreaSpec(Spec):
     """Where the points lie.
 
-    Attributes:
-        longitude, latitude: of its middle, radians.
-        height: mean of the ground above the ellipsoid, metres.
-        relief: heights lie evenly within this on either side of the mean, metres.
-        east, north: its lengths, metres.
+    Attributes
+    ----------
+    longitude, latitude : Longitude
+        Of its middle, radians.
+    height : TerrainHeight
+        Mean of the ground above the ellipsoid, metres.
+    relief : Relief
+        Heights lie evenly within this on either side of the mean, metres.
+    east, north : FieldLength
+        Its lengths, metres.
     """
 
     longitude: Longitude
@@ -174,14 +211,22 @@ class AreaSpec(Spec):
 class BlockPointsSpec(Spec):
     """Points of the block at random places of the area; every scene that sees one observes it.
 
-    Attributes:
-        control: points with known coordinates.
-        tie: points without.
-        check: tie points whose coordinates are compared with the truth afterwards.
-        image: standard deviation of an image point in x and in y, pixels.
-        control_sigma: of each axis in plan, and of the height, of control points, metres.
-        gross: share of the tie points' image points that are wrong.
-        gross_size: how far these are off, pixels.
+    Attributes
+    ----------
+    control : PointCount
+        Points with known coordinates.
+    tie : PointCount
+        Points without.
+    check : Whole
+        Tie points whose coordinates are compared with the truth afterwards.
+    image : Number
+        Standard deviation of an image point in x and in y, pixels.
+    control_sigma : tuple[float, float]
+        Of each axis in plan, and of the height, of control points, metres.
+    gross : Number
+        Share of the tie points' image points that are wrong.
+    gross_size : Number
+        How far these are off, pixels.
     """
 
     control: PointCount = 10
@@ -199,11 +244,16 @@ class BlockPointsSpec(Spec):
 class LaserSpec(Spec):
     """A laser altimeter that looks along body Z.
 
-    Attributes:
-        footprints: of each pass, evenly spaced over the area; the images see them, too.
-        range: standard deviation of a range, metres.
-        pointing: of the beam about body X and Y, radians.
-        beam: full angle of the beam, radians; where in it the range is taken is not known.
+    Attributes
+    ----------
+    footprints : Whole
+        Of each pass, evenly spaced over the area; the images see them, too.
+    range : Positive
+        Standard deviation of a range, metres.
+    pointing : float
+        Of the beam about body X and Y, radians.
+    beam : float
+        Full angle of the beam, radians; where in it the range is taken is not known.
     """
 
     footprints: Annotated[Whole, Field(ge=1, le=1000)] = 5
@@ -215,9 +265,12 @@ class LaserSpec(Spec):
 class TerrainModelSpec(Spec):
     """A terrain model as weak control of the heights of tie points.
 
-    Attributes:
-        sigma: of a height, independent from point to point, metres.
-        common: of an error that all heights share, metres.
+    Attributes
+    ----------
+    sigma : Positive
+        Of a height, independent from point to point, metres.
+    common : float
+        Of an error that all heights share, metres.
     """
 
     sigma: Positive = 4.0
@@ -227,10 +280,14 @@ class TerrainModelSpec(Spec):
 class CameraChangeSpec(Spec):
     """How a line camera may have changed since its calibration, one standard deviation.
 
-    Attributes:
-        lasting: the same in all passes.
-        each_pass: of each pass by itself.
-        walk: what it gains in a day, as a random walk from the first pass on.
+    Attributes
+    ----------
+    lasting : CameraDriftSpec
+        The same in all passes.
+    each_pass : CameraDriftSpec
+        Of each pass by itself.
+    walk : CameraDriftSpec
+        What it gains in a day, as a random walk from the first pass on.
     """
 
     lasting: CameraDriftSpec = CameraDriftSpec.model_construct()
@@ -253,9 +310,12 @@ class CameraChangeSpec(Spec):
 class MonitorRecordSpec(Spec):
     """A record of `twin.operate`, whose estimate says how the cameras stand in every pass.
 
-    Attributes:
-        record: its folder, or the URL of its database.
-        plan: file of the plan of operation under which it is followed; None for the plan that the record keeps.
+    Attributes
+    ----------
+    record : Reference
+        Its folder, or the URL of its database.
+    plan : Reference | None
+        File of the plan of operation under which it is followed; None for the plan that the record keeps.
     """
 
     record: Reference
@@ -271,33 +331,58 @@ def one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None:
 class OrbitAdjustSpec(PayloadTestSpec):
     """A block of scenes, adjusted at once.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file.
-        lines: of the camera that take part; each is a scene of each pass.
-        earth: its rotation.
-        altitude: of the sun-synchronous orbit, metres.
-        span: how long the orbit is followed before and after each pass' epoch, seconds.
-        line_time: from one image line to the next, seconds.
-        attitude: true attitude, without the roll of the passes.
-        area: where the points lie.
-        passes: by name.
-        points: and how well they are measured.
-        errors: what is stated of the readings.
-        truth: what the readings' errors follow in truth; None where they follow what is stated.
-        angles: between star trackers.
-        changes: line -> how its camera may have changed.
-        monitor: how well an on-board monitor reads these changes in each pass; None for no monitor.
-        monitor_record: what a record of `twin.operate` says of them, in place of `monitor`; the true cameras are drawn
-            from that.
-        laser: an altimeter; None for none.
-        terrain: a terrain model; None for none.
-        without: sensors that are there and are not used.
-        robust: whether gross errors are looked for.
-        components: laws and groups of measurements whose variances are estimated.
-        datum: by which control points are given too far east, north and up, unknown to the analysis, metres.
-        seed: of every random number.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or path of a file.
+    lines : tuple[Name, ...]
+        Of the camera that take part; each is a scene of each pass.
+    earth : EarthSpec
+        Its rotation.
+    altitude : Altitude
+        Of the sun-synchronous orbit, metres.
+    span : float
+        How long the orbit is followed before and after each pass' epoch, seconds.
+    line_time : LineTime
+        From one image line to the next, seconds.
+    attitude : AttitudeSpec
+        True attitude, without the roll of the passes.
+    area : AreaSpec
+        Where the points lie.
+    passes : Named[BlockPassSpec]
+        By name.
+    points : BlockPointsSpec
+        And how well they are measured.
+    errors : ReadingLawsSpec
+        What is stated of the readings.
+    truth : ReadingLawsSpec | None
+        What the readings' errors follow in truth; None where they follow what is stated.
+    angles : tuple[TrackerAngleSpec, ...]
+        Between star trackers.
+    changes : Named[CameraChangeSpec]
+        Line -> how its camera may have changed.
+    monitor : MonitorReadingSpec | None
+        How well an on-board monitor reads these changes in each pass; None for no monitor.
+    monitor_record : MonitorRecordSpec | None
+        What a record of `twin.operate` says of them, in place of `monitor`; the true cameras are drawn from that.
+    laser : LaserSpec | None
+        An altimeter; None for none.
+    terrain : TerrainModelSpec | None
+        a terrain model; None for none.
+    without : tuple[Sensor, ...]
+        Sensors that are there and are not used.
+    robust : Flag
+        Whether gross errors are looked for.
+    components : tuple[Name, ...]
+        Laws and groups of measurements whose variances are estimated.
+    datum : tuple[float, float, float]
+        By which control points are given too far east, north and up, unknown to the analysis, metres.
+    seed : Seed
+        Of every random number.
     """
 
     lines: tuple[Name, ...] = ("forward", "nadir", "backward")
@@ -374,9 +459,12 @@ class OrbitAdjustSpec(PayloadTestSpec):
 class CameraReadingSpec(Spec):
     """What a monitor reads of a line camera in a pass, against the state of its calibration.
 
-    Attributes:
-        angles: d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), radians.
-        principal_distance: d_f, metres.
+    Attributes
+    ----------
+    angles : AngleErrors
+        d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), radians.
+    principal_distance : float
+        d_f, metres.
     """
 
     angles: AngleErrors
@@ -386,10 +474,14 @@ class CameraReadingSpec(Spec):
 class MonitoredSpec(MonitorReadingSpec):
     """Readings of an on-board monitor, one of every line camera in every pass that it watched.
 
-    Attributes:
-        angles: standard deviation of d_alpha, d_beta and d_gamma, radians.
-        principal_distance: of d_f, metres.
-        readings: pass -> line -> what it read.
+    Attributes
+    ----------
+    angles
+        Standard deviation of d_alpha, d_beta and d_gamma, radians.
+    principal_distance
+        Of d_f, metres.
+    readings : Named[Named[CameraReadingSpec]]
+        Pass -> line -> what it read.
     """
 
     readings: Annotated[Named[Named[CameraReadingSpec]], not_empty("no readings", "at least one pass")]
@@ -398,24 +490,41 @@ class MonitoredSpec(MonitorReadingSpec):
 class MeasuredAdjustSpec(MeasuredTestSpec):
     """A block of measured passes, adjusted at once.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file: the camera as it was calibrated.
-        data: folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
-        conventions: of all tables.
-        passes: by name.
-        effects: on the light, that are in the image points; `corrected` takes them out.
-        names: whether one name of a point in the tables of two passes is one point on the ground (shared), or names
-            count within their pass (own).
-        errors: laws of the errors of orbit and attitude.
-        trackers: pass -> star tracker that gave its attitude; "tracker" where not said.
-        changes: line -> how its camera may have changed since the calibration.
-        monitor: readings of these changes; None for no monitor.
-        monitor_record: what a record of `twin.operate` says of them, in place of `monitor`.
-        without: sensors that are there and are not used.
-        robust: whether gross errors are looked for.
-        components: laws and groups of measurements whose variances are estimated.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or path of a file: the camera as it was calibrated.
+    data
+        Folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
+    conventions
+        Of all tables.
+    passes
+        By name.
+    effects
+        On the light, that are in the image points; `corrected` takes them out.
+    names : Literal['shared', 'own']
+        Whether one name of a point in the tables of two passes is one point on the ground (shared), or names count
+        within their pass (own).
+    errors : ReadingLawsSpec
+        Laws of the errors of orbit and attitude.
+    trackers : Named[Name]
+        Pass -> star tracker that gave its attitude; "tracker" where not said.
+    changes : Named[CameraChangeSpec]
+        Line -> how its camera may have changed since the calibration.
+    monitor : MonitoredSpec | None
+        Readings of these changes; None for no monitor.
+    monitor_record : MonitorRecordSpec | None
+        What a record of `twin.operate` says of them, in place of `monitor`.
+    without : tuple[Literal['ties', 'control', 'monitor'], ...]
+        Sensors that are there and are not used.
+    robust : Flag
+        Whether gross errors are looked for.
+    components : tuple[Name, ...]
+        Laws and groups of measurements whose variances are estimated.
     """
 
     names: Literal["shared", "own"]

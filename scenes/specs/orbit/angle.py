@@ -61,10 +61,14 @@ class StripsSpec(Spec):
     Places are pixels, counted from 0, of the camera's usual line: one with the payload's own number of pixels, or an
     instrument's first line. On a line with more or fewer pixels they stand at the same share of its length.
 
-    Attributes:
-        points: on each strip, three or more.
-        first: place of the first point on the line.
-        last: place of the last point.
+    Attributes
+    ----------
+    points : Points
+        On each strip, three or more.
+    first : Number
+        Place of the first point on the line.
+    last : Number
+        Place of the last point.
     """
 
     points: Points
@@ -85,10 +89,14 @@ class StripsSpec(Spec):
 class TerrainSpec(Spec):
     """Heights of the ground points above the ellipsoid.
 
-    Attributes:
-        height: mean, metres.
-        relief: standard deviation about it, metres.
-        length: along the strip over which heights are alike (correlation exp(-(distance/length)^2/2)), metres.
+    Attributes
+    ----------
+    height : TerrainHeight
+        Mean, metres.
+    relief : Relief
+        Standard deviation about it, metres.
+    length : float
+        Along the strip over which heights are alike (correlation exp(-(distance/length)^2/2)), metres.
     """
 
     height: TerrainHeight = 0.0
@@ -99,11 +107,16 @@ class TerrainSpec(Spec):
 class LightEffectsSpec(Spec):
     """What happens to the light between ground and camera.
 
-    Attributes:
-        light_time: the Earth turns while the light is under way.
-        aberration: the satellite's velocity tilts what it sees.
-        refraction: the standard atmosphere bends the light.
-        wavelength: in vacuum, for the refraction, metres.
+    Attributes
+    ----------
+    light_time : Flag
+        The Earth turns while the light is under way.
+    aberration : Flag
+        The satellite's velocity tilts what it sees.
+    refraction : Flag
+        The standard atmosphere bends the light.
+    wavelength : Wavelength
+        In vacuum, for the refraction, metres.
     """
 
     light_time: Flag = True
@@ -115,12 +128,18 @@ class LightEffectsSpec(Spec):
 class EffectsSpec(LightEffectsSpec):
     """What happens to the light between ground and camera.
 
-    Attributes:
-        light_time: the Earth turns while the light is under way.
-        aberration: the satellite's velocity tilts what it sees.
-        refraction: the standard atmosphere bends the light.
-        wavelength: in vacuum, for the refraction, metres.
-        corrected: the analysis takes the effects that are on out of the ground points, by its models of them.
+    Attributes
+    ----------
+    light_time
+        The Earth turns while the light is under way.
+    aberration
+        The satellite's velocity tilts what it sees.
+    refraction
+        The standard atmosphere bends the light.
+    wavelength
+        In vacuum, for the refraction, metres.
+    corrected : Flag
+        The analysis takes the effects that are on out of the ground points, by its models of them.
     """
 
     corrected: Flag = True
@@ -129,11 +148,14 @@ class EffectsSpec(LightEffectsSpec):
 class AngleErrorsSpec(Spec):
     """Errors of what is measured.
 
-    Attributes:
-        station: standard deviation of each coordinate of the measured orbit, metres.
-        points: standard deviation of each coordinate of a ground point, matching and aerial triangulation together,
-            metres.
-        datum: shift that all ground points share, east, north and up, unknown to the analysis, metres.
+    Attributes
+    ----------
+    station : GroundSigma
+        Standard deviation of each coordinate of the measured orbit, metres.
+    points : GroundSigma
+        Standard deviation of each coordinate of a ground point, matching and aerial triangulation together, metres.
+    datum : DatumShift
+        Shift that all ground points share, east, north and up, unknown to the analysis, metres.
     """
 
     station: GroundSigma = 0.5
@@ -144,25 +166,41 @@ class AngleErrorsSpec(Spec):
 class OrbitAngleSpec(PayloadTestSpec):
     """The intersection angles of a camera of two or more lines from one moment's ground points.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or scenes/library/instruments, or path of a file of either sort. The
-            lines of a payload are ideal projections, those of an instrument are traced, one for each of its cameras.
-        angles: name -> the two lines that the angle lies between; None for alpha [forward, nadir] and beta [nadir,
-            backward] where the camera has these lines, or alpha between the lines of a camera that has two.
-        perturb: what has changed since the laboratory; the analysis does not know it. For a payload line -> rotation
-            vector in body axes, for an instrument node path -> perturbation as in a job.
-        earth: its rotation.
-        orbit: true orbit.
-        attitude: true attitude.
-        time: moment of exposure, seconds from the orbit's epoch.
-        strips: where the points lie.
-        terrain: their heights.
-        effects: on the light.
-        errors: of the measured station and points.
-        passes: how often the measurement is repeated with errors drawn anew, for the scatter.
-        seed: of every random number.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or scenes/library/instruments, or path of a file of either sort. The lines of a
+        payload are ideal projections, those of an instrument are traced, one for each of its cameras.
+    angles : Angles
+        Name -> the two lines that the angle lies between; None for alpha [forward, nadir] and beta [nadir, backward]
+        where the camera has these lines, or alpha between the lines of a camera that has two.
+    perturb : Paths[Change]
+        What has changed since the laboratory; the analysis does not know it. For a payload line -> rotation vector in
+        body axes, for an instrument node path -> perturbation as in a job.
+    earth : EarthSpec
+        Its rotation.
+    orbit : OrbitSpec
+        True orbit.
+    attitude : AttitudeSpec
+        True attitude.
+    time : Moment
+        Moment of exposure, seconds from the orbit's epoch.
+    strips : StripsSpec
+        Where the points lie.
+    terrain : TerrainSpec
+        Their heights.
+    effects : EffectsSpec
+        On the light.
+    errors : AngleErrorsSpec
+        Of the measured station and points.
+    passes : Passes
+        How often the measurement is repeated with errors drawn anew, for the scatter.
+    seed : Seed
+        Of every random number.
     """
 
     angles: Angles = None

@@ -20,9 +20,12 @@ LEAST_TIES = 20
 class CameraDriftSpec(Spec):
     """How much a line camera changes from field to field, one standard deviation.
 
-    Attributes:
-        angles: d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), radians.
-        principal_distance: d_f, metres.
+    Attributes
+    ----------
+    angles : AngleSigmas
+        d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), radians.
+    principal_distance : LengthSigma
+        d_f, metres.
     """
 
     angles: AngleSigmas = (0.0, 0.0, 0.0)
@@ -32,9 +35,12 @@ class CameraDriftSpec(Spec):
 class MonitorReadingSpec(Spec):
     """Standard deviation of what the on-board monitor reads of each line camera in each pass.
 
-    Attributes:
-        angles: of d_alpha, d_beta and d_gamma, radians.
-        principal_distance: of d_f, metres.
+    Attributes
+    ----------
+    angles : tuple[float, float, float]
+        Of d_alpha, d_beta and d_gamma, radians.
+    principal_distance : float
+        Of d_f, metres.
     """
 
     angles: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, above_zero=True, largest="1 deg"))]
@@ -44,9 +50,12 @@ class MonitorReadingSpec(Spec):
 class StripSpec(Spec):
     """Every pass is adjusted on its tie points before check points are intersected.
 
-    Attributes:
-        ties: how many tie points are drawn; measured points of images are used as they come.
-        length: of the strip along the track on which they lie, around the field, metres.
+    Attributes
+    ----------
+    ties : Whole
+        How many tie points are drawn; measured points of images are used as they come.
+    length : float
+        Of the strip along the track on which they lie, around the field, metres.
     """
 
     ties: Annotated[Whole, Field(le=5000)] = 500
@@ -84,11 +93,16 @@ Repeats = Annotated[Whole, Field(ge=0, le=1000)]
 class FieldSpec(Spec):
     """A test field and the pass over it.
 
-    Attributes:
-        latitude, longitude: of its middle, which the satellite passes at the epoch, radians.
-        epoch: UTC of the pass.
-        height: mean of the ground above the ellipsoid, metres.
-        relief: heights lie evenly within this on either side of the mean, metres.
+    Attributes
+    ----------
+    latitude, longitude : Latitude
+        Of its middle, which the satellite passes at the epoch, radians.
+    epoch : UtcTime
+        UTC of the pass.
+    height : TerrainHeight
+        Mean of the ground above the ellipsoid, metres.
+    relief : Relief
+        Heights lie evenly within this on either side of the mean, metres.
     """
 
     latitude: Latitude
@@ -101,11 +115,16 @@ class FieldSpec(Spec):
 class PointsSpec(Spec):
     """Ground points of every field, at random places of the nadir line's image; all three lines see each of them.
 
-    Attributes:
-        control: points that are used for the calibration.
-        check: points that only test it.
-        first, last: ends of the part of the nadir line that they lie on, pixels from 0.
-        length: of the field along the track, metres.
+    Attributes
+    ----------
+    control : Count
+        Points that are used for the calibration.
+    check : Count
+        Points that only test it.
+    first, last : Number
+        Ends of the part of the nadir line that they lie on, pixels from 0.
+    length : FieldLength
+        Of the field along the track, metres.
     """
 
     control: Count = 60
@@ -126,9 +145,12 @@ class PointsSpec(Spec):
 class PatchPlaceSpec(Spec):
     """Where a patch of ground lies.
 
-    Attributes:
-        pixel: of the nadir line that sees its middle.
-        track: of its middle from the field's middle, metres along the flight.
+    Attributes
+    ----------
+    pixel : Number
+        Of the nadir line that sees its middle.
+    track : float
+        Of its middle from the field's middle, metres along the flight.
     """
 
     pixel: Number
@@ -138,14 +160,20 @@ class PatchPlaceSpec(Spec):
 class CalibrationImagesSpec(Spec):
     """Patches of every field whose images are rendered and measured, instead of drawn image points.
 
-    Attributes:
-        patches: of every field.
-        lines, pixels: size of every image.
-        ground: what is there. The terrain's height is the field's; a real terrain is another part of the model in each
-            patch.
-        control: orthophoto and elevation model. Their errors are drawn for each patch; a shift is common to all.
-        points: of every patch. What its `control` and `height_sigma` say is taken for the accuracy of the reference.
-        oversampling: samples of the ground along each side of a pixel.
+    Attributes
+    ----------
+    patches : tuple[PatchPlaceSpec, ...]
+        Of every field.
+    lines, pixels : Side
+        Size of every image.
+    ground : GroundSpec
+        What is there. The terrain's height is the field's; a real terrain is another part of the model in each patch.
+    control : ControlSpec
+        Orthophoto and elevation model. Their errors are drawn for each patch; a shift is common to all.
+    points : ImagePointsSpec
+        Of every patch. What its `control` and `height_sigma` say is taken for the accuracy of the reference.
+    oversampling : Whole
+        Samples of the ground along each side of a pixel.
     """
 
     patches: tuple[PatchPlaceSpec, ...]
@@ -174,15 +202,23 @@ class CalibrationErrorsSpec(ErrorsSpec):
     """Errors of what is measured. The star trackers' bias is the change of the angle between them and the cameras since
     the laboratory.
 
-    Attributes:
-        gps: of the orbit.
-        star_tracker: of the attitude.
-        season: standard deviation of a further constant bias of each field about body X, Y, Z, radians.
-        image: standard deviation of an image point in x and in y, pixels.
-        control: standard deviation of each coordinate of a control point, metres.
-        datum: shift that the coordinates of all control points share, east, north and up, unknown to the analysis,
-            metres. Check points are given in the right datum.
-        switched_on: false for exact image points, control points and orbit, and an attitude with its biases only.
+    Attributes
+    ----------
+    gps
+        Of the orbit.
+    star_tracker
+        Of the attitude.
+    season : AngleSigmas
+        Standard deviation of a further constant bias of each field about body X, Y, Z, radians.
+    image : Number
+        Standard deviation of an image point in x and in y, pixels.
+    control : GroundSigma
+        Standard deviation of each coordinate of a control point, metres.
+    datum : DatumShift
+        Shift that the coordinates of all control points share, east, north and up, unknown to the analysis, metres.
+        Check points are given in the right datum.
+    switched_on : Flag
+        False for exact image points, control points and orbit, and an attitude with its biases only.
     """
 
     season: AngleSigmas = (0.0, 0.0, 0.0)
@@ -197,9 +233,12 @@ class LaunchSpec(Spec):
     and for nothing else; an estimate far beyond it is a sign of wrong ground coordinates or of a wrong camera file,
     which the fit alone does not show.
 
-    Attributes:
-        bias: angle between star trackers and cameras about body X, Y, Z, radians; 0 where nothing is known of it.
-        interior: principal distances and principal points, metres.
+    Attributes
+    ----------
+    bias : AngleSigmas
+        Angle between star trackers and cameras about body X, Y, Z, radians; 0 where nothing is known of it.
+    interior : float
+        Principal distances and principal points, metres.
     """
 
     bias: AngleSigmas = (2e-4, 2e-4, 2e-4)
@@ -209,9 +248,12 @@ class LaunchSpec(Spec):
 class MapLimitsSpec(Spec):
     """Largest RMS errors without ground control that a map at a scale of 1:50 000 allows.
 
-    Attributes:
-        plan: both axes together, metres; 25 m is 0.5 mm on the map.
-        height: metres.
+    Attributes
+    ----------
+    plan : float
+        Both axes together, metres; 25 m is 0.5 mm on the map.
+    height : float
+        metres.
     """
 
     plan: Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 km")] = 25.0
@@ -234,31 +276,54 @@ def checked_schemes(schemes: Sequence[Sequence[str]], fields: Mapping[str, objec
 class OrbitCalibrationSpec(TitledSpec):
     """A calibration over several fields, tested on all of them without ground control.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file, with lines forward, nadir and backward.
-        perturb: line -> how its interior has changed since the laboratory. The nadir line's principal point is the
-            gauge and does not change: it cannot be told from a turn of the whole camera, `errors.star_tracker.bias`.
-        earth: its rotation.
-        altitude: of the descending sun-synchronous orbit over each field, metres.
-        span: how long the orbit is followed before and after the field's middle, seconds.
-        line_time: from one image line to the next, seconds.
-        attitude: true attitude.
-        fields: by name.
-        schemes: scheme -> fields whose parameters are averaged for it. One more, by the next number, lets each field
-            use its own.
-        points: of every field, drawn; None where images are measured.
-        images: rendered and measured instead of drawn points.
-        effects: on the light.
-        errors: of what is measured.
-        drift: line -> how its camera changes from field to field.
-        monitor: how well an on-board monitor reads these changes in each pass; None for no monitor.
-        strip: tie points for an adjustment of every pass; None for none.
-        launch: how much of a change is no surprise.
-        limits: for the verdict.
-        repeats: campaigns over the same fields with everything drawn anew, for what differs from one to the next.
-        seed: of every random number.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera : Ref
+        Name in scenes/library/payloads or path of a file, with lines forward, nadir and backward.
+    perturb : Named[InteriorChangeSpec]
+        Line -> how its interior has changed since the laboratory. The nadir line's principal point is the gauge and
+        does not change: it cannot be told from a turn of the whole camera, `errors.star_tracker.bias`.
+    earth : EarthSpec
+        Its rotation.
+    altitude : Altitude
+        Of the descending sun-synchronous orbit over each field, metres.
+    span : float
+        How long the orbit is followed before and after the field's middle, seconds.
+    line_time : LineTime
+        From one image line to the next, seconds.
+    attitude : AttitudeSpec
+        True attitude.
+    fields : Named[FieldSpec]
+        By name.
+    schemes : tuple[tuple[Name, ...], ...]
+        Scheme -> fields whose parameters are averaged for it. One more, by the next number, lets each field use its
+        own.
+    points : PointsSpec | None
+        Of every field, drawn; None where images are measured.
+    images : CalibrationImagesSpec | None
+        Rendered and measured instead of drawn points.
+    effects : EffectsSpec
+        On the light.
+    errors : CalibrationErrorsSpec
+        Of what is measured.
+    drift : CameraDrifts
+        Line -> how its camera changes from field to field.
+    monitor : MonitorReadingSpec | None
+        How well an on-board monitor reads these changes in each pass; None for no monitor.
+    strip : StripSpec | None
+        Tie points for an adjustment of every pass; None for none.
+    launch : LaunchSpec
+        How much of a change is no surprise.
+    limits : MapLimitsSpec
+        For the verdict.
+    repeats : Repeats
+        Campaigns over the same fields with everything drawn anew, for what differs from one to the next.
+    seed : Seed
+        Of every random number.
     """
 
     camera: Ref

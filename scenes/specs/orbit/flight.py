@@ -28,10 +28,14 @@ Levels = Annotated[
 class JitterLineSpec(Spec):
     """An oscillation: amplitude x sin(2 pi frequency x time + phase) about each axis of the body.
 
-    Attributes:
-        frequency: in hertz.
-        amplitude: about body X, Y and Z (roll, pitch, yaw), half of what it swings from end to end, radians.
-        phase: about each axis, or one for all, radians, time counting from the orbit's epoch; None for random ones.
+    Attributes
+    ----------
+    frequency : Frequency
+        In hertz.
+    amplitude : Amplitudes
+        About body X, Y and Z (roll, pitch, yaw), half of what it swings from end to end, radians.
+    phase : Phases | None
+        About each axis, or one for all, radians, time counting from the orbit's epoch; None for random ones.
     """
 
     frequency: Frequency
@@ -42,9 +46,12 @@ class JitterLineSpec(Spec):
 class JitterBandSpec(Spec):
     """A random motion with an even spectrum between two frequencies, Gaussian at every time.
 
-    Attributes:
-        first, last: ends of the band, hertz.
-        level: one-sided spectral density about body X, Y and Z, rad^2/Hz; level x (last - first) is the variance.
+    Attributes
+    ----------
+    first, last : Frequency
+        Ends of the band, hertz.
+    level : Levels
+        One-sided spectral density about body X, Y and Z, rad^2/Hz; level x (last - first) is the variance.
     """
 
     first: Frequency
@@ -62,9 +69,12 @@ class JitterBandSpec(Spec):
 class JitterSpec(Spec):
     """Small fast turns of the body about its own axes, after all else that the attitude says; nothing by default.
 
-    Attributes:
-        lines: oscillations.
-        bands: of noise.
+    Attributes
+    ----------
+    lines : tuple[JitterLineSpec, ...]
+        oscillations.
+    bands : tuple[JitterBandSpec, ...]
+        Of noise.
     """
 
     lines: tuple[JitterLineSpec, ...] = Field(default=(), max_length=100)
@@ -86,8 +96,10 @@ def parse_utc(text: Any) -> str:
     """Check the text of an instant; a value that is written another way than the pattern is refused, also a leap
     second.
 
-    Raises:
-        Problem: no text, another form, without its zone, or no such instant.
+    Raises
+    ------
+    Problem
+        No text, another form, without its zone, or no such instant.
     """
     if not isinstance(text, str):
         raise Problem("not a date and time", shown(text), ALLOWED)
@@ -133,9 +145,12 @@ _ZERO = (0.0, 0.0, 0.0)
 class EarthSpec(Spec):
     """What is not predicted of the Earth's rotation (IERS bulletins).
 
-    Attributes:
-        ut1_utc: UT1 - UTC at the epoch, seconds.
-        polar_motion: x and y of the pole, radians (x toward Greenwich, y toward 90 degrees west).
+    Attributes
+    ----------
+    ut1_utc : float
+        UT1 - UTC at the epoch, seconds.
+    polar_motion : tuple[float, float]
+        x and y of the pole, radians (x toward Greenwich, y toward 90 degrees west).
     """
 
     ut1_utc: Annotated[float, Quantity(TIME, largest="0.9 s")] = 0.0
@@ -145,11 +160,16 @@ class EarthSpec(Spec):
 class PassingSpec(Spec):
     """An orbit that passes a place at the epoch; the osculating orbit is a circle there.
 
-    Attributes:
-        longitude, latitude: geodetic, of the place vertically below the satellite, radians.
-        altitude: of the satellite above the ellipsoid there, metres.
-        direction: of the pass, to the south or to the north.
-        inclination: osculating, radians; without it the orbit is sun-synchronous.
+    Attributes
+    ----------
+    longitude, latitude : Longitude
+        Geodetic, of the place vertically below the satellite, radians.
+    altitude : Altitude
+        Of the satellite above the ellipsoid there, metres.
+    direction : Literal['descending', 'ascending']
+        Of the pass, to the south or to the north.
+    inclination : Inclination | None
+        Osculating, radians; without it the orbit is sun-synchronous.
     """
 
     longitude: Longitude
@@ -162,14 +182,22 @@ class PassingSpec(Spec):
 class ElementsSpec(Spec):
     """Osculating elements at the epoch, against the true equator of the epoch.
 
-    Attributes:
-        altitude: semi-major axis less the equatorial radius, metres.
-        eccentricity: at most 0.1.
-        inclination: radians; without it the orbit is sun-synchronous.
-        node: right ascension of the ascending node from the celestial intermediate origin, radians.
-        node_local_time: local mean solar time of the descending node instead of `node`, seconds of the day.
-        perigee: argument of the perigee, radians.
-        argument: argument of latitude (perigee + true anomaly) at the epoch, radians.
+    Attributes
+    ----------
+    altitude : Altitude
+        Semi-major axis less the equatorial radius, metres.
+    eccentricity : Number
+        At most 0.1.
+    inclination : Inclination | None
+        Radians; without it the orbit is sun-synchronous.
+    node : Longitude | None
+        Right ascension of the ascending node from the celestial intermediate origin, radians.
+    node_local_time : float | None
+        Local mean solar time of the descending node instead of `node`, seconds of the day.
+    perigee : Longitude
+        Argument of the perigee, radians.
+    argument : Longitude
+        Argument of latitude (perigee + true anomaly) at the epoch, radians.
     """
 
     altitude: Altitude
@@ -193,9 +221,12 @@ class ElementsSpec(Spec):
 class StateSpec(Spec):
     """State vector at the epoch.
 
-    Attributes:
-        position: in the GCRS, metres.
-        velocity: in the GCRS, m/s.
+    Attributes
+    ----------
+    position : Position
+        In the GCRS, metres.
+    velocity : Velocity
+        In the GCRS, m/s.
     """
 
     position: Position
@@ -205,12 +236,18 @@ class StateSpec(Spec):
 class OrbitSpec(Spec):
     """An orbit: exactly one of `passing`, `elements` and `state`.
 
-    Attributes:
-        epoch: UTC; all times of the orbit are seconds from it.
-        before, after: how long the orbit is followed to either side of the epoch, seconds.
-        passing: a place that it passes.
-        elements: its osculating elements.
-        state: a state vector.
+    Attributes
+    ----------
+    epoch : UtcTime
+        UTC; all times of the orbit are seconds from it.
+    before, after : Span
+        How long the orbit is followed to either side of the epoch, seconds.
+    passing : PassingSpec | None
+        a place that it passes.
+    elements : ElementsSpec | None
+        Its osculating elements.
+    state : StateSpec | None
+        a state vector.
     """
 
     epoch: UtcTime
@@ -241,12 +278,17 @@ class OrbitSpec(Spec):
 class AttitudeSpec(Spec):
     """How the satellite holds itself.
 
-    Attributes:
-        nadir: Z points along the ellipsoid's normal (geodetic) or to the Earth's centre (geocentric).
-        steering: X lies along the inertial velocity (none), or along the track on the turning Earth (yaw), so that the
-            image at nadir does not drift along the line.
-        offset: rotation vector of the body against the orbital frame, radians (roll, pitch, yaw).
-        jitter: small fast turns about the body's own axes; None for none.
+    Attributes
+    ----------
+    nadir : Literal['geodetic', 'geocentric']
+        Z points along the ellipsoid's normal (geodetic) or to the Earth's centre (geocentric).
+    steering : Literal['none', 'yaw']
+        X lies along the inertial velocity (none), or along the track on the turning Earth (yaw), so that the image at
+        nadir does not drift along the line.
+    offset : tuple[float, float, float]
+        Rotation vector of the body against the orbital frame, radians (roll, pitch, yaw).
+    jitter : JitterSpec | None
+        Small fast turns about the body's own axes; None for none.
     """
 
     nadir: Literal["geodetic", "geocentric"] = "geodetic"
@@ -258,12 +300,18 @@ class AttitudeSpec(Spec):
 class GpsErrorsSpec(Spec):
     """Errors of the measured orbit, along X, Y and Z of the orbital frame.
 
-    Attributes:
-        interval: between fixes, seconds.
-        noise: standard deviation of a fix, independent from fix to fix, metres.
-        drift: standard deviation of what changes slowly, metres.
-        correlation_time: over which `drift` falls to 1/e in its correlation, seconds.
-        velocity: standard deviation of a fix's velocity, independent from fix to fix, m/s.
+    Attributes
+    ----------
+    interval : Interval
+        Between fixes, seconds.
+    noise : LengthSigmas
+        Standard deviation of a fix, independent from fix to fix, metres.
+    drift : LengthSigmas
+        Standard deviation of what changes slowly, metres.
+    correlation_time : float
+        Over which `drift` falls to 1/e in its correlation, seconds.
+    velocity : SpeedSigmas
+        Standard deviation of a fix's velocity, independent from fix to fix, m/s.
     """
 
     interval: Interval = 1.0
@@ -277,9 +325,12 @@ class ThermalDriftSpec(Spec):
     """Angle between star trackers and cameras that changes with the satellite's temperature along the orbit:
     amplitude x sin(latitude - reference).
 
-    Attributes:
-        amplitude: rotation vector about body X, Y and Z, radians.
-        reference: geodetic latitude at which it vanishes, radians.
+    Attributes
+    ----------
+    amplitude : AngleErrors
+        Rotation vector about body X, Y and Z, radians.
+    reference : Latitude
+        Geodetic latitude at which it vanishes, radians.
     """
 
     amplitude: AngleErrors = _ZERO
@@ -290,9 +341,12 @@ class SlowErrorsSpec(Spec):
     """Errors of the attitude that last for many readings and change within a pass: a cubic spline through independent
     values.
 
-    Attributes:
-        noise: standard deviation of a value about body X, Y and Z, radians.
-        interval: between values, seconds.
+    Attributes
+    ----------
+    noise : AngleSigmas
+        Standard deviation of a value about body X, Y and Z, radians.
+    interval : Interval
+        Between values, seconds.
     """
 
     noise: AngleSigmas = _ZERO
@@ -302,14 +356,22 @@ class SlowErrorsSpec(Spec):
 class StarTrackerErrorsSpec(Spec):
     """Errors of the measured attitude, rotations about body X, Y and Z: measured after true.
 
-    Attributes:
-        interval: between readings, seconds.
-        noise: standard deviation of a reading, independent from reading to reading, radians.
-        bias: constant, radians.
-        thermal: changes with latitude.
-        slow: changes within a pass.
-        drift: standard deviation of a rate that each pass has, by what it changes in a second, radians.
-        walk: standard deviation of what a random walk gains in a second, radians.
+    Attributes
+    ----------
+    interval : Interval
+        Between readings, seconds.
+    noise : AngleSigmas
+        Standard deviation of a reading, independent from reading to reading, radians.
+    bias : AngleErrors
+        Constant, radians.
+    thermal : ThermalDriftSpec
+        Changes with latitude.
+    slow : SlowErrorsSpec
+        Changes within a pass.
+    drift : AngleSigmas
+        Standard deviation of a rate that each pass has, by what it changes in a second, radians.
+    walk : AngleSigmas
+        Standard deviation of what a random walk gains in a second, radians.
     """
 
     interval: Interval = 0.125
@@ -324,9 +386,12 @@ class StarTrackerErrorsSpec(Spec):
 class ErrorsSpec(Spec):
     """Errors of what the satellite measures of itself; all zero unless given.
 
-    Attributes:
-        gps: of the orbit.
-        star_tracker: of the attitude.
+    Attributes
+    ----------
+    gps : GpsErrorsSpec
+        Of the orbit.
+    star_tracker : StarTrackerErrorsSpec
+        Of the attitude.
     """
 
     gps: GpsErrorsSpec = GpsErrorsSpec.model_construct()
@@ -336,10 +401,14 @@ class ErrorsSpec(Spec):
 class PayloadTestSpec(TitledSpec):
     """A test of a payload.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera : Ref
+        Name in scenes/library/payloads or path of a file.
     """
 
     camera: Ref

@@ -39,9 +39,12 @@ SomeLines = Annotated[tuple[Name, ...] | None, AfterValidator(_some_lines)]
 class SplineSpec(Spec):
     """The attitude over time as a cubic spline, for jitter that is no lines.
 
-    Attributes:
-        interval: of its knots, seconds.
-        sigma: standard deviation of a coefficient before the observations, radians.
+    Attributes
+    ----------
+    interval : float
+        Of its knots, seconds.
+    sigma : AngleSigma
+        Standard deviation of a coefficient before the observations, radians.
     """
 
     interval: Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
@@ -51,15 +54,24 @@ class SplineSpec(Spec):
 class JitterSearchSpec(Spec):
     """How jitter is sought.
 
-    Attributes:
-        lowest, highest: frequencies, hertz.
-        axes: of the body about which it is sought.
-        false_alarm: probability of finding any where there is none, over all frequencies together.
-        trend: degree in time of what changes slowly, of each line by itself.
-        interior: degree along each line of what is wrong with its interior orientation.
-        height: of tie points, above the ellipsoid, metres.
-        height_sigma: how wrong that may be, metres.
-        spline: None for none.
+    Attributes
+    ----------
+    lowest, highest : Frequency
+        Frequencies, hertz.
+    axes : Axes
+        Of the body about which it is sought.
+    false_alarm : Number
+        Probability of finding any where there is none, over all frequencies together.
+    trend : Whole
+        Degree in time of what changes slowly, of each line by itself.
+    interior : Whole
+        Degree along each line of what is wrong with its interior orientation.
+    height : TerrainHeight
+        Of tie points, above the ellipsoid, metres.
+    height_sigma : HeightSigma
+        How wrong that may be, metres.
+    spline : SplineSpec | None
+        None for none.
     """
 
     lowest: Frequency = 0.1
@@ -86,16 +98,26 @@ PointNoise = Annotated[Number, Field(gt=0.0, le=10.0)]
 class BandPointsSpec(Spec):
     """Places that all lines see.
 
-    Attributes:
-        count: how many.
-        duration: of the strip that they are spread over, seconds of flight.
-        noise: standard deviation of an image coordinate, pixels, independent from line to line.
-        line_noise: line -> its standard deviation where it differs from `noise`, which the measurements state of all.
-        rows: interval of the rows that the places lie on, seconds of flight; None for places anywhere.
-        row_spread: standard deviation of a place's moment about its row, seconds.
-        height: mean height of the ground, metres.
-        relief: heights are even between height - relief and height + relief, metres.
-        wrong: share of image points that lie somewhere else within 20 pixels.
+    Attributes
+    ----------
+    count : Whole
+        How many.
+    duration : float
+        Of the strip that they are spread over, seconds of flight.
+    noise : PointNoise
+        Standard deviation of an image coordinate, pixels, independent from line to line.
+    line_noise : dict[Name, PointNoise]
+        Line -> its standard deviation where it differs from `noise`, which the measurements state of all.
+    rows : float | None
+        Interval of the rows that the places lie on, seconds of flight; None for places anywhere.
+    row_spread : float
+        Standard deviation of a place's moment about its row, seconds.
+    height : TerrainHeight
+        Mean height of the ground, metres.
+    relief : float
+        Heights are even between height - relief and height + relief, metres.
+    wrong : Number
+        Share of image points that lie somewhere else within 20 pixels.
     """
 
     count: Annotated[Whole, Field(ge=30, le=20_000)] = 1000
@@ -112,21 +134,36 @@ class BandPointsSpec(Spec):
 class OrbitJitterSpec(PayloadTestSpec):
     """A pass whose jitter is sought in places that several lines saw.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file.
-        lines: that are used, by name; None for all.
-        earth: its rotation.
-        orbit: true orbit.
-        attitude: true attitude, with its jitter.
-        effects: what happens to the light between ground and camera.
-        line_time: from one image line to the next, seconds.
-        time: middle of the strip, seconds from the orbit's epoch.
-        points: that are measured.
-        errors: of what the satellite measures of itself.
-        search: how jitter is sought.
-        seed: of every random number.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or path of a file.
+    lines : SomeLines
+        That are used, by name; None for all.
+    earth : EarthSpec
+        Its rotation.
+    orbit : OrbitSpec
+        True orbit.
+    attitude : AttitudeSpec
+        True attitude, with its jitter.
+    effects : LightEffectsSpec
+        What happens to the light between ground and camera.
+    line_time : LineTime
+        From one image line to the next, seconds.
+    time : Moment
+        Middle of the strip, seconds from the orbit's epoch.
+    points : BandPointsSpec
+        That are measured.
+    errors : ErrorsSpec
+        Of what the satellite measures of itself.
+    search : JitterSearchSpec
+        How jitter is sought.
+    seed : Seed
+        Of every random number.
     """
 
     lines: SomeLines = None

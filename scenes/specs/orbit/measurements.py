@@ -64,14 +64,22 @@ class OrbitFileSpec(Spec):
     """An orbit in a file: SP3-c or d, CCSDS OEM, DIMAP, or CSV. What a file says itself may be left out here; else both
     agree.
 
-    Attributes:
-        file: path.
-        satellite: which of the file's, where there are several.
-        frame: axes of positions and velocities; inertial ones need Earth orientation.
-        time_scale: what the clock shows.
-        epoch: reading of that clock at 0 s, for tables with `time [s]`.
-        leap_seconds: whether `time [s]` of a UTC clock counts those since its epoch; asked for where there are some.
-        offset: seconds to be added to the times.
+    Attributes
+    ----------
+    file : Reference
+        path.
+    satellite : Satellite | None
+        Which of the file's, where there are several.
+    frame : OrbitFrame | None
+        Axes of positions and velocities; inertial ones need Earth orientation.
+    time_scale : TimeScale | None
+        What the clock shows.
+    epoch : ClockReading | None
+        Reading of that clock at 0 s, for tables with `time [s]`.
+    leap_seconds : Literal['counted', 'skipped'] | None
+        Whether `time [s]` of a UTC clock counts those since its epoch; asked for where there are some.
+    offset : ClockOffset
+        Seconds to be added to the times.
     """
 
     file: Reference
@@ -86,19 +94,32 @@ class OrbitFileSpec(Spec):
 class AttitudeFileSpec(Spec):
     """An attitude in a file: CCSDS AEM, DIMAP, or CSV of quaternions or of roll, pitch and yaw.
 
-    Attributes:
-        file: path.
-        satellite: which of the file's, where there are several.
-        frame: that the body is turned against; `orbital` has X forward, Z down, Y = Z x X.
-        time_scale: what the clock shows.
-        epoch: reading of that clock at 0 s, for tables with `time [s]`.
-        leap_seconds: whether `time [s]` of a UTC clock counts those since its epoch; asked for where there are some.
-        offset: seconds to be added to the times.
-        scalar: where a quaternion's scalar part stands, the cosine of half the turn.
-        turns: what the quaternion does to the components of a vector, v' = q v q*.
-        body_axes: what x, y and z of the file's body point to in flight, as [forward, right, down].
-        sequence: of roll about x, pitch about y, yaw about z: `xyz` means v_frame = Rx(roll) Ry(pitch) Rz(yaw) v_body.
-        nadir, steering: of the orbital frame, as in `attitude` of a simulated pass.
+    Attributes
+    ----------
+    file : Reference
+        path.
+    satellite : Satellite | None
+        Which of the file's, where there are several.
+    frame : TurnFrame | None
+        That the body is turned against; `orbital` has X forward, Z down, Y = Z x X.
+    time_scale : TimeScale | None
+        What the clock shows.
+    epoch : ClockReading | None
+        Reading of that clock at 0 s, for tables with `time [s]`.
+    leap_seconds : Literal['counted', 'skipped'] | None
+        Whether `time [s]` of a UTC clock counts those since its epoch; asked for where there are some.
+    offset : ClockOffset
+        Seconds to be added to the times.
+    scalar : Literal['last', 'first'] | None
+        Where a quaternion's scalar part stands, the cosine of half the turn.
+    turns : Literal['body_to_frame', 'frame_to_body'] | None
+        What the quaternion does to the components of a vector, v' = q v q*.
+    body_axes : BodyAxes
+        What x, y and z of the file's body point to in flight, as [forward, right, down].
+    sequence : Sequence | None
+        Of roll about x, pitch about y, yaw about z: `xyz` means v_frame = Rx(roll) Ry(pitch) Rz(yaw) v_body.
+    nadir, steering : Literal['geodetic', 'geocentric'] | None
+        Of the orbital frame, as in `attitude` of a simulated pass.
     """
 
     file: Reference
@@ -119,11 +140,16 @@ class AttitudeFileSpec(Spec):
 class PlatformFilesSpec(Spec):
     """Orbit and attitude of a pass from files.
 
-    Attributes:
-        orbit: its file.
-        attitude: its file.
-        earth_orientation: table of the IERS (finals2000A, C04) or CSV; for inertial frames.
-        earth: what takes its place, of one moment.
+    Attributes
+    ----------
+    orbit : OrbitFileSpec
+        Its file.
+    attitude : AttitudeFileSpec
+        Its file.
+    earth_orientation : Reference | None
+        Table of the IERS (finals2000A, C04) or CSV; for inertial frames.
+    earth : EarthSpec | None
+        What takes its place, of one moment.
     """
 
     orbit: OrbitFileSpec
@@ -158,14 +184,20 @@ class _HeightsFileSpec(Spec):
 class GroundFileSpec(_HeightsFileSpec):
     """Ground points in a file: CSV, GeoJSON or .gcp of the Ames Stereo Pipeline.
 
-    Attributes:
-        file: path.
-        crs: of the coordinates, as PROJ knows it: EPSG:4979 and EPSG:4978 say all, EPSG:4326 and EPSG:32650 need
-            `heights`.
-        heights: above the ellipsoid, or above the geoid of `geoid`.
-        geoid: grid of heights of the geoid above the ellipsoid, GeoTIFF or GTX.
-        sigma: of points that the file gives none for: east and north, and up, metres.
-        sigma_axes: of the three sigmas of a .gcp: Earth-fixed x, y, z as that program takes them, or east, north, up.
+    Attributes
+    ----------
+    file
+        path.
+    crs
+        Of the coordinates, as PROJ knows it: EPSG:4979 and EPSG:4978 say all, EPSG:4326 and EPSG:32650 need `heights`.
+    heights
+        Above the ellipsoid, or above the geoid of `geoid`.
+    geoid
+        Grid of heights of the geoid above the ellipsoid, GeoTIFF or GTX.
+    sigma : tuple[PointSigma, PointSigma] | None
+        Of points that the file gives none for: east and north, and up, metres.
+    sigma_axes : Literal['xyz', 'enu']
+        Of the three sigmas of a .gcp: Earth-fixed x, y, z as that program takes them, or east, north, up.
     """
 
     sigma: tuple[PointSigma, PointSigma] | None = None
@@ -175,12 +207,18 @@ class GroundFileSpec(_HeightsFileSpec):
 class RasterFileSpec(_HeightsFileSpec):
     """An orthophoto or an elevation model as GeoTIFF.
 
-    Attributes:
-        file: path.
-        crs: of a file that does not say it.
-        heights: of an elevation model, above the ellipsoid, or above the geoid of `geoid`.
-        geoid: as for ground points.
-        band: of the file that is read, counted from 1.
+    Attributes
+    ----------
+    file
+        path.
+    crs
+        Of a file that does not say it.
+    heights
+        Of an elevation model, above the ellipsoid, or above the geoid of `geoid`.
+    geoid
+        As for ground points.
+    band : Whole
+        Of the file that is read, counted from 1.
     """
 
     band: Annotated[Whole, Field(ge=1, le=1000)] = 1
@@ -197,14 +235,21 @@ def with_absolute_files(
 ) -> SpecType:
     """Make the paths of all files of measurements that a specification names absolute.
 
-    Args:
-        spec: as it was read.
-        folder: that relative paths start from; None for that of the file it was read from.
-        owner: in which it stands, if the files have to be there.
-        key: where it stands there.
+    Parameters
+    ----------
+    spec : SpecType
+        As it was read.
+    folder : Path | None
+        That relative paths start from; None for that of the file it was read from.
+    owner : Spec | None
+        In which it stands, if the files have to be there.
+    key : KeyPath
+        Where it stands there.
 
-    Raises:
-        InputError: a file that has to be there is not, told at the owner's key.
+    Raises
+    ------
+    InputError
+        a file that has to be there is not, told at the owner's key.
     """
     place = Path(spec.source.file).parent if folder is None else folder
     changes: dict[str, Any] = {}
@@ -225,10 +270,13 @@ def with_absolute_files(
 class QuaternionSpec(Spec):
     """What the four numbers q1, q2, q3, q4 of an attitude mean.
 
-    Attributes:
-        scalar: whether the scalar part (the cosine of half the turn) is the first or the last of the four.
-        turns: what the quaternion does to the components of a vector, v' = q v q*: from body axes into those of the
-            frame, or the other way.
+    Attributes
+    ----------
+    scalar : Literal['first', 'last']
+        Whether the scalar part (the cosine of half the turn) is the first or the last of the four.
+    turns : Literal['body_to_frame', 'frame_to_body']
+        What the quaternion does to the components of a vector, v' = q v q*: from body axes into those of the frame, or
+        the other way.
     """
 
     scalar: Literal["first", "last"]
@@ -239,16 +287,25 @@ class ConventionsSpec(Spec):
     """How the numbers of the tables are to be read. All must be said; quaternion and body axes where a table
     holds quaternions.
 
-    Attributes:
-        frame: axes of positions, velocities and quaternions; velocities are those against these axes. itrs is
-            Earth-fixed (WGS 84, CGCS2000 and ITRF agree with it to some centimetres).
-        quaternion: order and sense; of tables.
-        body_axes: what x, y and z of the quaternions' body point to in flight, as [forward, right, down].
-        time_scale: in which the epochs of the passes are written. Times in tables are SI seconds from them.
-        line_moment: which moment of its exposure the time of a line is.
-        centre: image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
-        first_pixel: number of the first pixel of a line.
-        first_pixel_sees: to which side of the track the first pixel looks.
+    Attributes
+    ----------
+    frame : Literal['itrs']
+        Axes of positions, velocities and quaternions; velocities are those against these axes. itrs is Earth-fixed (WGS
+        84, CGCS2000 and ITRF agree with it to some centimetres).
+    quaternion : QuaternionSpec | None
+        Order and sense; of tables.
+    body_axes : BodyAxes | None
+        What x, y and z of the quaternions' body point to in flight, as [forward, right, down].
+    time_scale : Literal['utc']
+        In which the epochs of the passes are written. Times in tables are SI seconds from them.
+    line_moment : Literal['start', 'middle', 'end']
+        Which moment of its exposure the time of a line is.
+    centre : Literal['integer', 'half']
+        Image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
+    first_pixel : int
+        Number of the first pixel of a line.
+    first_pixel_sees : Literal['right', 'left']
+        To which side of the track the first pixel looks.
     """
 
     frame: Literal["itrs"]
@@ -264,16 +321,25 @@ class ConventionsSpec(Spec):
 class PassFilesSpec(Spec):
     """The tables of a pass, CSV; paths are relative to the file that names them.
 
-    Attributes:
-        epoch: of the times in all tables.
-        platform: orbit and attitude in one table, or files of other formats (SP3, OEM, AEM ...) with what they do not
-            say themselves; or each in its own table:
-        orbit: time, x, y, z and perhaps vx, vy, vz.
-        attitude: time, q1, q2, q3, q4.
-        lines: when the lines of each line camera were exposed.
-        ground: points on the ground, with coordinates, sigmas and roles.
-        image_points: where the line cameras see them.
-        tie_points: likewise, of points without known coordinates; None for none.
+    Attributes
+    ----------
+    epoch : UtcTime
+        Of the times in all tables.
+    platform : Reference | PlatformFilesSpec | None
+        Orbit and attitude in one table, or files of other formats (SP3, OEM, AEM ...) with what they do not say
+        themselves; or each in its own table:
+    orbit : Reference | None
+        Time, x, y, z and perhaps vx, vy, vz.
+    attitude : Reference | None
+        Time, q1, q2, q3, q4.
+    lines : Reference
+        When the lines of each line camera were exposed.
+    ground : Reference
+        Points on the ground, with coordinates, sigmas and roles.
+    image_points : Reference
+        Where the line cameras see them.
+    tie_points : Reference | None
+        Likewise, of points without known coordinates; None for none.
     """
 
     epoch: UtcTime
@@ -307,9 +373,12 @@ Passes = Annotated[Named[PassFilesSpec], not_empty("no passes", "at least one pa
 class OrbitDataSpec(Spec):
     """Measurements of passes: ``data.yaml`` of a folder.
 
-    Attributes:
-        conventions: of all tables.
-        passes: by name, of the pass or of the field that it passes.
+    Attributes
+    ----------
+    conventions : ConventionsSpec
+        Of all tables.
+    passes : Passes
+        By name, of the pass or of the field that it passes.
     """
 
     conventions: ConventionsSpec
@@ -319,10 +388,14 @@ class OrbitDataSpec(Spec):
 class OrbitReadingsSpec(Spec):
     """What is known of the errors of the orbit's readings, along X, Y and Z of the orbital frame.
 
-    Attributes:
-        noise: standard deviation of a reading, independent from reading to reading, metres.
-        drift: standard deviation of what the whole pass has in common, metres.
-        interval: between readings that are independent, seconds; None for the median of the table.
+    Attributes
+    ----------
+    noise : LengthSigmas
+        Standard deviation of a reading, independent from reading to reading, metres.
+    drift : LengthSigmas
+        Standard deviation of what the whole pass has in common, metres.
+    interval : Interval | None
+        Between readings that are independent, seconds; None for the median of the table.
     """
 
     noise: LengthSigmas
@@ -333,13 +406,19 @@ class OrbitReadingsSpec(Spec):
 class AttitudeReadingsSpec(Spec):
     """What is known of the errors of the attitude's readings, about X, Y and Z of the body. Biases are solved for.
 
-    Attributes:
-        noise: standard deviation of a reading, independent from reading to reading, radians.
-        slow: what changes within a pass.
-        drift: standard deviation of the rate of each pass, by what it changes in a second, radians; zeros where there
-            is none, None where nobody knows.
-        walk: standard deviation of what a random walk gains in a second, radians.
-        interval: between readings that are independent, seconds; None for the median of the table.
+    Attributes
+    ----------
+    noise : AngleSigmas
+        Standard deviation of a reading, independent from reading to reading, radians.
+    slow : SlowErrorsSpec
+        What changes within a pass.
+    drift : AngleSigmas | None
+        Standard deviation of the rate of each pass, by what it changes in a second, radians; zeros where there is none,
+        None where nobody knows.
+    walk : AngleSigmas
+        Standard deviation of what a random walk gains in a second, radians.
+    interval : Interval | None
+        Between readings that are independent, seconds; None for the median of the table.
     """
 
     noise: AngleSigmas
@@ -352,10 +431,14 @@ class AttitudeReadingsSpec(Spec):
 class ReadingErrorsSpec(Spec):
     """Standard deviations of the readings; those of points stand in their tables.
 
-    Attributes:
-        gps: of the orbit.
-        star_tracker: of the attitude.
-        season: by how much biases may differ from pass to pass about body X, Y, Z, radians; used for warnings only.
+    Attributes
+    ----------
+    gps : OrbitReadingsSpec
+        Of the orbit.
+    star_tracker : AttitudeReadingsSpec
+        Of the attitude.
+    season : AngleSigmas
+        By how much biases may differ from pass to pass about body X, Y, Z, radians; used for warnings only.
     """
 
     gps: OrbitReadingsSpec
@@ -385,14 +468,22 @@ class FixedTestSpec(PayloadTestSpec):
 class MeasuredTestSpec(FixedTestSpec):
     """What all tests on measurements say.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
-        data: folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
-        conventions: of all tables.
-        passes: by name.
-        effects: on the light, that are in the image points; `corrected` takes them out.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+    data : Reference | None
+        Folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
+    conventions : ConventionsSpec | None
+        Of all tables.
+    passes : Passes | None
+        By name.
+    effects : EffectsSpec
+        On the light, that are in the image points; `corrected` takes them out.
     """
 
     data: Reference | None = None
@@ -415,21 +506,36 @@ class MeasuredTestSpec(FixedTestSpec):
 class MeasuredCalibrationSpec(MeasuredTestSpec):
     """A calibration on measured passes.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
-        data: folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
-        conventions: of all tables.
-        passes: by name.
-        effects: on the light, that are in the image points; `corrected` takes them out.
-        schemes: passes whose parameters are averaged; each by itself is added.
-        errors: of the readings of orbit and attitude.
-        screening: whether image points are given robust weights and those with gross errors left out.
-        ties: whether tie points calibrate together with the control points, or are kept apart for the strips.
-        strip: whether every pass is adjusted on its tie points before check points are intersected.
-        launch: how much of a change is no surprise.
-        limits: for the verdict.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+    data
+        Folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
+    conventions
+        Of all tables.
+    passes
+        By name.
+    effects
+        On the light, that are in the image points; `corrected` takes them out.
+    schemes : tuple[tuple[Name, ...], ...]
+        Passes whose parameters are averaged; each by itself is added.
+    errors : ReadingErrorsSpec
+        Of the readings of orbit and attitude.
+    screening : Literal['robust', 'none']
+        Whether image points are given robust weights and those with gross errors left out.
+    ties : Literal['with_control', 'apart']
+        Whether tie points calibrate together with the control points, or are kept apart for the strips.
+    strip : Flag
+        Whether every pass is adjusted on its tie points before check points are intersected.
+    launch : LaunchSpec
+        How much of a change is no surprise.
+    limits : MapLimitsSpec
+        For the verdict.
     """
 
     schemes: tuple[tuple[Name, ...], ...]
@@ -444,17 +550,28 @@ class MeasuredCalibrationSpec(MeasuredTestSpec):
 class MeasuredAngleSpec(MeasuredTestSpec):
     """Intersection angles from the ground points that the lines of one moment see.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
-        data: folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
-        conventions: of all tables.
-        passes: by name.
-        effects: on the light, that are in the image points; `corrected` takes them out.
-        angles: name -> the two lines that the angle lies between; None for the usual ones.
-        time: the moment, seconds from the pass's epoch; None for the middle of the image points of each line.
-        errors: of the readings of orbit and attitude.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+    data
+        Folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
+    conventions
+        Of all tables.
+    passes
+        By name.
+    effects
+        On the light, that are in the image points; `corrected` takes them out.
+    angles : Angles
+        Name -> the two lines that the angle lies between; None for the usual ones.
+    time : Moment | None
+        The moment, seconds from the pass's epoch; None for the middle of the image points of each line.
+    errors : ReadingErrorsSpec
+        Of the readings of orbit and attitude.
     """
 
     angles: Angles = None
@@ -473,16 +590,26 @@ class MeasuredAngleSpec(MeasuredTestSpec):
 class MeasuredJitterSpec(MeasuredTestSpec):
     """A search for jitter in points that several lines of a pass saw.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
-        data: folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
-        conventions: of all tables.
-        passes: by name.
-        effects: on the light, that are in the image points; `corrected` takes them out.
-        lines: that are used, by name; None for all that have points.
-        search: how jitter is sought.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+    data
+        Folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
+    conventions
+        Of all tables.
+    passes
+        By name.
+    effects
+        On the light, that are in the image points; `corrected` takes them out.
+    lines : SomeLines
+        That are used, by name; None for all that have points.
+    search : JitterSearchSpec
+        How jitter is sought.
     """
 
     lines: SomeLines = None
@@ -492,12 +619,17 @@ class MeasuredJitterSpec(MeasuredTestSpec):
 class LineTimesFileSpec(Spec):
     """When lines were exposed: a table of camera, line and time.
 
-    Attributes:
-        file: path, CSV with columns `camera`, `line` and `time [s]` or `date_time`; or the DIMAP file of a scene, for a
-            camera of one line.
-        time_scale: of the clock.
-        epoch: reading of that clock at 0 s, for tables with `time [s]`.
-        moment: which moment of its exposure a line's time is.
+    Attributes
+    ----------
+    file : Reference
+        Path, CSV with columns `camera`, `line` and `time [s]` or `date_time`; or the DIMAP file of a scene, for a
+        camera of one line.
+    time_scale : TimeScale
+        Of the clock.
+    epoch : ClockReading | None
+        Reading of that clock at 0 s, for tables with `time [s]`.
+    moment : Literal['start', 'middle', 'end']
+        Which moment of its exposure a line's time is.
     """
 
     file: Reference
@@ -509,13 +641,18 @@ class LineTimesFileSpec(Spec):
 class ImagePointsFileSpec(Spec):
     """Where lines see ground points: a table of point, camera, line, pixel and their sigmas.
 
-    Attributes:
-        file: path, CSV with columns `point`, `camera`, `line`, `pixel`, `line_sigma`, `pixel_sigma` and perhaps
-            `correlation`; or the .gcp of the Ames Stereo Pipeline that is the file of the ground points, with images
-            that are called as the lines, `nadir.tif`.
-        centre: image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
-        first_pixel: number of the first pixel of a line.
-        first_pixel_sees: to which side of the track the first pixel looks.
+    Attributes
+    ----------
+    file : Reference
+        Path, CSV with columns `point`, `camera`, `line`, `pixel`, `line_sigma`, `pixel_sigma` and perhaps
+        `correlation`; or the .gcp of the Ames Stereo Pipeline that is the file of the ground points, with images that
+        are called as the lines, `nadir.tif`.
+    centre : Literal['integer', 'half']
+        Image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
+    first_pixel : Whole
+        Number of the first pixel of a line.
+    first_pixel_sees : Literal['right', 'left']
+        To which side of the track the first pixel looks.
     """
 
     file: Reference
@@ -527,12 +664,18 @@ class ImagePointsFileSpec(Spec):
 class UncertaintySpec(Spec):
     """How wrong camera and platform may be, standard deviations: what hides a convention, if it is large enough.
 
-    Attributes:
-        attitude: of the measured attitude with the camera's mounting, about each axis.
-        position: of the orbit, along each axis.
-        interior: of each line's place in the focal plane, pixels along and across it.
-        scale: of each line's principal distance, relative.
-        time: of the line times against those of orbit and attitude.
+    Attributes
+    ----------
+    attitude : AngleSigma
+        Of the measured attitude with the camera's mounting, about each axis.
+    position : PointSigma
+        Of the orbit, along each axis.
+    interior : Number
+        Of each line's place in the focal plane, pixels along and across it.
+    scale : Number
+        Of each line's principal distance, relative.
+    time : float
+        Of the line times against those of orbit and attitude.
     """
 
     attitude: AngleSigma = 3e-4
@@ -545,18 +688,30 @@ class UncertaintySpec(Spec):
 class OrbitCheckSpec(FixedTestSpec):
     """A check of the conventions of a pass in files.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
-        platform: orbit and attitude.
-        lines: times of the lines.
-        ground: points on the ground.
-        image_points: where the lines see them.
-        effects: what happens to the light between ground and camera.
-        uncertainty: how wrong camera and platform may be.
-        points: most of each line that are used.
-        shown: places of points that are printed for each reading.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+    platform : PlatformFilesSpec
+        Orbit and attitude.
+    lines : LineTimesFileSpec
+        Times of the lines.
+    ground : GroundFileSpec
+        Points on the ground.
+    image_points : ImagePointsFileSpec
+        Where the lines see them.
+    effects : LightEffectsSpec
+        What happens to the light between ground and camera.
+    uncertainty : UncertaintySpec
+        How wrong camera and platform may be.
+    points : Whole
+        Most of each line that are used.
+    shown : Whole
+        Places of points that are printed for each reading.
     """
 
     platform: PlatformFilesSpec
@@ -572,9 +727,12 @@ class OrbitCheckSpec(FixedTestSpec):
 class ImageWindowSpec(Spec):
     """A part of an image.
 
-    Attributes:
-        row, column: of the file, of its first pixel, counted from 0.
-        rows, columns: its size.
+    Attributes
+    ----------
+    row, column : Whole
+        Of the file, of its first pixel, counted from 0.
+    rows, columns : Whole
+        Its size.
     """
 
     row: Annotated[Whole, Field(ge=0)]
@@ -586,13 +744,20 @@ class ImageWindowSpec(Spec):
 class LineImageFileSpec(Spec):
     """A line's image in a file.
 
-    Attributes:
-        file: path, TIFF; a georeference in it is not used.
-        band: that is read, counted from 1.
-        first_line: number, in the table of times, of the image's first row.
-        first_pixel: pixel of the line, counted from 0, of the image's first column.
-        first_pixel_sees: to which side of the track the first column looks.
-        window: part that is matched; None for all.
+    Attributes
+    ----------
+    file : Reference
+        Path, TIFF; a georeference in it is not used.
+    band : Whole
+        That is read, counted from 1.
+    first_line : Whole
+        Number, in the table of times, of the image's first row.
+    first_pixel : Whole
+        Pixel of the line, counted from 0, of the image's first column.
+    first_pixel_sees : str
+        To which side of the track the first column looks.
+    window : ImageWindowSpec | None
+        Part that is matched; None for all.
     """
 
     file: Reference
@@ -606,18 +771,30 @@ class LineImageFileSpec(Spec):
 class OrbitMatchSpec(FixedTestSpec):
     """Points of an orthophoto, and tie points, sought in line images.
 
-    Attributes:
-        name: as the file is called; also of the pass in what is exported.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
-        platform: orbit and attitude.
-        lines: times of the lines.
-        images: line -> its image.
-        orthophoto: of the ground.
-        dem: of the ground.
-        control_sigma: of places of the orthophoto with their heights: in plan, each axis, and in height, metres.
-        effects: what happens to the light between ground and camera.
-        points: how many, and how they are matched.
+    Attributes
+    ----------
+    name
+        As the file is called; also of the pass in what is exported.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+    platform : PlatformFilesSpec
+        Orbit and attitude.
+    lines : LineTimesFileSpec
+        Times of the lines.
+    images : Named[LineImageFileSpec]
+        Line -> its image.
+    orthophoto : RasterFileSpec
+        Of the ground.
+    dem : RasterFileSpec
+        Of the ground.
+    control_sigma : tuple[PointSigma, PointSigma]
+        Of places of the orthophoto with their heights: in plan, each axis, and in height, metres.
+    effects : LightEffectsSpec
+        What happens to the light between ground and camera.
+    points : ImagePointsSpec
+        How many, and how they are matched.
     """
 
     platform: PlatformFilesSpec

@@ -52,13 +52,20 @@ def _once(names: tuple[Parameter, ...]) -> tuple[Parameter, ...]:
 class MotionSpec(Spec):
     """How a body moves along the orbit: what mounts do and temperatures of this model do not say.
 
-    Attributes:
-        rotate: rotation vector in the body's own frame about the pivot, radians; comes before the shift.
-        shift: in the body's own frame, metres.
-        pivot: name of the body's point that the rotation leaves in place.
-        begin: when it begins, seconds.
-        duration: over which it grows evenly to `rotate` and `shift`, where it stays, seconds; 0 for a step.
-        period: instead of `duration`, of a swing `rotate` x sin(2 pi (t - begin)/period), seconds, which lasts always.
+    Attributes
+    ----------
+    rotate : Rotation
+        Rotation vector in the body's own frame about the pivot, radians; comes before the shift.
+    shift : Shift
+        In the body's own frame, metres.
+    pivot : Name
+        Name of the body's point that the rotation leaves in place.
+    begin : Moment
+        When it begins, seconds.
+    duration : Span
+        Over which it grows evenly to `rotate` and `shift`, where it stays, seconds; 0 for a step.
+    period : Interval | None
+        Instead of `duration`, of a swing `rotate` x sin(2 pi (t - begin)/period), seconds, which lasts always.
     """
 
     rotate: Rotation = (0.0, 0.0, 0.0)
@@ -95,12 +102,18 @@ class GroundSpec(Spec):
     """Check points at every time of the course, at random places that both lines see; their means lie where the two
     views are at equal times before and after.
 
-    Attributes:
-        points: at every time.
-        first, last: ends of the part of the second camera's line that they lie on, pixels from 0.
-        length: of the piece of the strip along the track, metres.
-        height: mean above the ellipsoid, metres.
-        relief: heights lie evenly within this on either side of the mean, metres.
+    Attributes
+    ----------
+    points : Count
+        At every time.
+    first, last : Number
+        Ends of the part of the second camera's line that they lie on, pixels from 0.
+    length : FieldLength
+        Of the piece of the strip along the track, metres.
+    height : TerrainHeight
+        Mean above the ellipsoid, metres.
+    relief : Relief
+        Heights lie evenly within this on either side of the mean, metres.
     """
 
     points: Annotated[Count, Field(ge=2)] = 60
@@ -119,12 +132,18 @@ class GroundSpec(Spec):
 class MonitorErrorsSpec(ErrorsSpec):
     """Errors of what is measured; orbit and attitude are exact unless given.
 
-    Attributes:
-        gps: of the orbit.
-        star_tracker: of the attitude. What both cameras share of it the monitor does not see.
-        image: standard deviation of an image point along and across the line, pixels.
-        monitor: noise of the monitor's frames; false for expected images without noise or rounding.
-        switched_on: false for exact image points, orbit and attitude, and monitor frames without noise.
+    Attributes
+    ----------
+    gps
+        Of the orbit.
+    star_tracker
+        Of the attitude. What both cameras share of it the monitor does not see.
+    image : Number
+        Standard deviation of an image point along and across the line, pixels.
+    monitor : Flag
+        Noise of the monitor's frames; false for expected images without noise or rounding.
+    switched_on : Flag
+        False for exact image points, orbit and attitude, and monitor frames without noise.
     """
 
     image: Annotated[Number, Field(ge=0, le=10)] = 0.3
@@ -138,17 +157,27 @@ class CorrectionSpec(Spec):
     With every reading the command changes by `gain` times what the posterior says is left of the quantity, over what
     the mechanism does to it.
 
-    Attributes:
-        camera: whose quantity it is.
-        quantity: `d_alpha`, `d_beta`, `d_gamma`, `d_f`, or `defocus`, best focus less line CCD.
-        mechanism: the motion of a body that corrects it, in words without amount: `forward/focal_plane shift z`; by
-            default the line of sight is corrected in the processing of the images on the ground, and no body moves.
-        gain: share of what is left that one reading corrects.
-        delay: readings after which a command has its effect; 0 for at once, before the images of that moment.
-        step: the mechanism moves by whole steps, with unit; by default it moves by any amount.
-        range: to either side of where it stands at the beginning, with unit; none by default.
-        dead_band: what is left and is smaller is left alone, in the quantity's unit.
-        response: what the mechanism does over what it is known to do; the estimate does not know it.
+    Attributes
+    ----------
+    camera : Name
+        Whose quantity it is.
+    quantity : Literal['d_alpha', 'd_beta', 'd_gamma', 'd_f', 'defocus']
+        `d_alpha`, `d_beta`, `d_gamma`, `d_f`, or `defocus`, best focus less line CCD.
+    mechanism : Text | None
+        The motion of a body that corrects it, in words without amount: `forward/focal_plane shift z`; by default the
+        line of sight is corrected in the processing of the images on the ground, and no body moves.
+    gain : Number
+        Share of what is left that one reading corrects.
+    delay : Whole
+        Readings after which a command has its effect; 0 for at once, before the images of that moment.
+    step : Text | None
+        The mechanism moves by whole steps, with unit; by default it moves by any amount.
+    range : Text | None
+        To either side of where it stands at the beginning, with unit; none by default.
+    dead_band : Text | None
+        What is left and is smaller is left alone, in the quantity's unit.
+    response : Number
+        What the mechanism does over what it is known to do; the estimate does not know it.
     """
 
     camera: Name
@@ -226,10 +255,14 @@ class CorrectionSpec(Spec):
 class ReadingsSpec(Spec):
     """When the spots are read, and images are taken just after.
 
-    Attributes:
-        begin: of the first, seconds from the orbit's epoch.
-        every: from one to the next.
-        count: how many.
+    Attributes
+    ----------
+    begin : Moment
+        Of the first, seconds from the orbit's epoch.
+    every : Interval
+        From one to the next.
+    count : Whole
+        How many.
     """
 
     begin: Moment = 0.0
@@ -245,11 +278,16 @@ class ReadingsSpec(Spec):
 class LoopImagesSpec(Spec):
     """Pairs of line images, rendered after some of the readings with the loop open and closed.
 
-    Attributes:
-        times: of these readings, seconds from the orbit's epoch.
-        side: lines and pixels of every image.
-        ground: what is there.
-        points: how points of the second camera's image are sought in the first one's; `tie` says how many.
+    Attributes
+    ----------
+    times : tuple[Moment, ...]
+        Of these readings, seconds from the orbit's epoch.
+    side : Side
+        Lines and pixels of every image.
+    ground : SceneGroundSpec
+        What is there.
+    points : ImagePointsSpec
+        How points of the second camera's image are sought in the first one's; `tie` says how many.
     """
 
     times: Annotated[tuple[Moment, ...], Field(min_length=1, max_length=20)]
@@ -267,11 +305,15 @@ class LoopImagesSpec(Spec):
 class MechanismsSpec(Spec):
     """Mechanisms that point and refocus by what the monitor's readings say, beside the same pair left alone.
 
-    Attributes:
-        readings: when the spots are read where the file has no course: amounts of what is stated to move are then drawn
-            by its laws in time. With a course they are read at each of its times.
-        corrections: name -> what acts on what the readings say.
-        images: pairs of line images; none without this section.
+    Attributes
+    ----------
+    readings : ReadingsSpec | None
+        When the spots are read where the file has no course: amounts of what is stated to move are then drawn by its
+        laws in time. With a course they are read at each of its times.
+    corrections : Named[CorrectionSpec]
+        Name -> what acts on what the readings say.
+    images : LoopImagesSpec | None
+        Pairs of line images; none without this section.
     """
 
     readings: ReadingsSpec | None = None
@@ -282,35 +324,59 @@ class MechanismsSpec(Spec):
 class OrbitMonitorSpec(TitledSpec):
     """Height errors along an orbit with and without on-board monitoring, or with mechanisms that act on its readings.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        instrument: name in scenes/library/instruments or path of a file; two cameras with monitors.
-        cameras: the two that make the stereo pair; the first is turned against the second. All of the instrument's when
-            it has two.
-        perturb: node -> a constant perturbation against the nominal instrument, as in a job.
-        course: evenly spaced times from the orbit's epoch, with temperatures. Mechanisms have `readings` in its place
-            where amounts are drawn.
-        motion: node -> how it moves, which no estimate knows.
-        reference: one of the times, at which the cameras were calibrated and the monitor's reference images were taken.
-        disturbances: what is expected to move, and how it goes on in time, as in a job: the monitor's values and their
-            sigmas rest on it. The instrument's by default.
-        interval: from one measurement of the monitor to the next, a multiple of the course's step; between them what it
-            says is interpolated linearly, before the first and after the last it is held. Where disturbances are
-            stated, all measurements are smoothed together, too.
-        intervals: that are compared; by default all that divide the course.
-        apply: which of the monitor's values correct the cameras.
-        mechanisms: in place of `reference` and `interval`: the loop is closed, and every reading is acted upon.
-        frames: of one measurement; as many as the instrument's monitor takes by default.
-        analysis: how the monitor's images are analysed.
-        repeats: how often a measurement is repeated with noise drawn anew, for the scatter.
-        earth: its rotation.
-        orbit: true orbit, over all times and a minute more at either end.
-        attitude: true attitude.
-        line_time: from one image line to the next, seconds.
-        ground: check points.
-        errors: of what is measured.
-        seed: of every random number.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    instrument : Ref
+        Name in scenes/library/instruments or path of a file; two cameras with monitors.
+    cameras : tuple[Name, ...] | None
+        The two that make the stereo pair; the first is turned against the second. All of the instrument's when it has
+        two.
+    perturb : Paths[PlainPerturbationSpec]
+        Node -> a constant perturbation against the nominal instrument, as in a job.
+    course : CourseSpec | None
+        Evenly spaced times from the orbit's epoch, with temperatures. Mechanisms have `readings` in its place where
+        amounts are drawn.
+    motion : Paths[MotionSpec]
+        Node -> how it moves, which no estimate knows.
+    reference : Moment | None
+        One of the times, at which the cameras were calibrated and the monitor's reference images were taken.
+    disturbances : JobDisturbances | None
+        What is expected to move, and how it goes on in time, as in a job: the monitor's values and their sigmas rest on
+        it. The instrument's by default.
+    interval : Interval | None
+        From one measurement of the monitor to the next, a multiple of the course's step; between them what it says is
+        interpolated linearly, before the first and after the last it is held. Where disturbances are stated, all
+        measurements are smoothed together, too.
+    intervals : tuple[Interval, ...] | None
+        That are compared; by default all that divide the course.
+    apply : tuple[Parameter, ...]
+        Which of the monitor's values correct the cameras.
+    mechanisms : MechanismsSpec | None
+        In place of `reference` and `interval`: the loop is closed, and every reading is acted upon.
+    frames : Frames | None
+        Of one measurement; as many as the instrument's monitor takes by default.
+    analysis : AnalysisSpec
+        How the monitor's images are analysed.
+    repeats : Repeats
+        How often a measurement is repeated with noise drawn anew, for the scatter.
+    earth : EarthSpec
+        Its rotation.
+    orbit : OrbitSpec
+        True orbit, over all times and a minute more at either end.
+    attitude : AttitudeSpec
+        True attitude.
+    line_time : LineTime
+        From one image line to the next, seconds.
+    ground : GroundSpec
+        Check points.
+    errors : MonitorErrorsSpec
+        Of what is measured.
+    seed : Seed
+        Of every random number.
     """
 
     instrument: Ref

@@ -75,16 +75,25 @@ def _apart(outlines: tuple[tuple[Corner, ...], ...]) -> tuple[tuple[Corner, ...]
 class LineImageSpec(Spec):
     """How a line forms and records its image.
 
-    Attributes:
-        f_number: of the lens, whose pupil is round and evenly lit.
-        transmission: of the lens, mean over the spectrum.
-        wavefront: error by even Zernike terms (Noll, unit rms), metres.
-        obstruction: outlines of what stands before the lens, convex polygons that do not overlap, corners (along the
-            line, along the track) in units of the pupil's radius.
-        spectrum: first and last wavelength, metres; the light is the Sun's between them.
-        detector: data sheet, by name or path.
-        diffusion: rms spread of charge between pixels, metres.
-        tdi: how the line collects light; its line time is that of the image.
+    Attributes
+    ----------
+    f_number : Number
+        Of the lens, whose pupil is round and evenly lit.
+    transmission : Number
+        Of the lens, mean over the spectrum.
+    wavefront : dict[EvenTerm, TermSize]
+        Error by even Zernike terms (Noll, unit rms), metres.
+    obstruction : tuple[Outline, ...]
+        Outlines of what stands before the lens, convex polygons that do not overlap, corners (along the line, along the
+        track) in units of the pupil's radius.
+    spectrum : WavelengthRange
+        First and last wavelength, metres; the light is the Sun's between them.
+    detector : Ref
+        Data sheet, by name or path.
+    diffusion : Diffusion
+        Rms spread of charge between pixels, metres.
+    tdi : TdiSpec
+        How the line collects light; its line time is that of the image.
     """
 
     f_number: Annotated[Number, Field(ge=1.0, le=100.0)]
@@ -108,15 +117,23 @@ class LineImageSpec(Spec):
 class TerrainSpec(Spec):
     """Heights of the ground above the ellipsoid.
 
-    Attributes:
-        kind: `real`: the elevation model that comes with matplotlib (Jacksboro fault, Tennessee, 3 arc seconds),
-            mirrored beyond its edges of 30 km x 32 km; `fractal`: drawn.
-        height: mean height, metres.
-        relief: rms of the heights about their mean, metres; for `real` none keeps the heights' own, 121 m.
-        exponent: of a fractal's amplitude spectrum over frequency; larger is smoother.
-        post: of a fractal's posts, metres; between posts the terrain is a cubic spline.
-        longest: wavelength above which a fractal has no more relief, metres.
-        offset: east and north of the patch's centre from the real model's middle, metres.
+    Attributes
+    ----------
+    kind : Literal['real', 'fractal']
+        `real`: the elevation model that comes with matplotlib (Jacksboro fault, Tennessee, 3 arc seconds), mirrored
+        beyond its edges of 30 km x 32 km; `fractal`: drawn.
+    height : TerrainHeight
+        Mean height, metres.
+    relief : float | None
+        Rms of the heights about their mean, metres; for `real` none keeps the heights' own, 121 m.
+    exponent : Number
+        Of a fractal's amplitude spectrum over frequency; larger is smoother.
+    post : Spacing
+        Of a fractal's posts, metres; between posts the terrain is a cubic spline.
+    longest : GroundLength
+        Wavelength above which a fractal has no more relief, metres.
+    offset : tuple[float, float]
+        East and north of the patch's centre from the real model's middle, metres.
     """
 
     kind: Literal["real", "fractal"] = "real"
@@ -139,13 +156,20 @@ class TerrainSpec(Spec):
 class TextureSpec(Spec):
     """Reflectance of the ground.
 
-    Attributes:
-        spacing: of the reflectance's cells, metres; the field is a cubic B-spline of them and holds nothing finer.
-        mean: reflectance.
-        contrast: rms of the reflectance over its mean.
-        parcels: share of the ground that is fields of crops; the rest varies as a fractal.
-        parcel_size: side of such a field of mean area, metres.
-        roads: metres from one road to the next.
+    Attributes
+    ----------
+    spacing : Spacing
+        Of the reflectance's cells, metres; the field is a cubic B-spline of them and holds nothing finer.
+    mean : Number
+        reflectance.
+    contrast : Number
+        Rms of the reflectance over its mean.
+    parcels : Share
+        Share of the ground that is fields of crops; the rest varies as a fractal.
+    parcel_size : GroundLength
+        Side of such a field of mean area, metres.
+    roads : GroundLength
+        Metres from one road to the next.
     """
 
     spacing: Spacing = 2.0
@@ -159,12 +183,18 @@ class TextureSpec(Spec):
 class LightSpec(Spec):
     """The Sun and the air.
 
-    Attributes:
-        elevation: of the Sun, radians.
-        azimuth: of the Sun, from north over east, radians.
-        transmission: of the air, down and up together.
-        sky: share of the light on level ground that comes evenly from the sky.
-        path: light scattered by the air into the camera, as the reflectance that would give it.
+    Attributes
+    ----------
+    elevation : Elevation
+        Of the Sun, radians.
+    azimuth : float
+        Of the Sun, from north over east, radians.
+    transmission : Number
+        Of the air, down and up together.
+    sky : Share
+        Share of the light on level ground that comes evenly from the sky.
+    path : Number
+        Light scattered by the air into the camera, as the reflectance that would give it.
     """
 
     elevation: Elevation = math.radians(50.0)
@@ -177,10 +207,14 @@ class LightSpec(Spec):
 class GroundSpec(Spec):
     """The true ground, on the day of the pass.
 
-    Attributes:
-        terrain: heights.
-        texture: reflectance.
-        light: Sun and air.
+    Attributes
+    ----------
+    terrain : TerrainSpec
+        heights.
+    texture : TextureSpec
+        reflectance.
+    light : LightSpec
+        Sun and air.
     """
 
     terrain: TerrainSpec = TerrainSpec.model_construct()
@@ -191,10 +225,14 @@ class GroundSpec(Spec):
 class DemSpec(Spec):
     """A reference elevation model.
 
-    Attributes:
-        post: distance of its posts, metres.
-        sigma: standard deviation of a height, metres.
-        correlation: distance over which the heights' errors are alike, metres.
+    Attributes
+    ----------
+    post : Spacing
+        Distance of its posts, metres.
+    sigma : GroundSigma
+        Standard deviation of a height, metres.
+    correlation : GroundLength
+        Distance over which the heights' errors are alike, metres.
     """
 
     post: Spacing = 25.0
@@ -205,16 +243,26 @@ class DemSpec(Spec):
 class ControlSpec(Spec):
     """The control source: an orthophoto of another date with a reference elevation model; both share one error in plan.
 
-    Attributes:
-        spacing: ground sample distance of the orthophoto, metres.
-        mtf: of the orthophoto at its Nyquist frequency.
-        noise: of the orthophoto, rms, in reflectance.
-        changed: share of the fields that look different on its date.
-        light: of its date.
-        shift: constant error in plan, east and north, metres.
-        sigma: standard deviation of a smooth error in plan, each axis, metres.
-        correlation: distance over which that error changes, metres.
-        dem: elevation model.
+    Attributes
+    ----------
+    spacing : Spacing
+        Ground sample distance of the orthophoto, metres.
+    mtf : Number
+        Of the orthophoto at its Nyquist frequency.
+    noise : Number
+        Of the orthophoto, rms, in reflectance.
+    changed : Share
+        Share of the fields that look different on its date.
+    light : LightSpec
+        Of its date.
+    shift : tuple[float, float]
+        Constant error in plan, east and north, metres.
+    sigma : GroundSigma
+        Standard deviation of a smooth error in plan, each axis, metres.
+    correlation : GroundLength
+        Distance over which that error changes, metres.
+    dem : DemSpec
+        Elevation model.
     """
 
     spacing: Spacing = 2.0
@@ -241,18 +289,29 @@ def _is_odd(side: int) -> int:
 class ImagePointsSpec(Spec):
     """Points measured in images.
 
-    Attributes:
-        control: points of the orthophoto that are sought in every line.
-        check: more of them, kept apart to test with.
-        tie: points of the nadir line's image that are sought in the others.
-        reach: how far the predicted place may be off, pixels and lines.
-        template: its side, pixels.
-        least_correlation: of image and template after the fit.
-        largest_sigma: of a place along its worst direction, pixels.
-        height_sigma: of the reference heights, as their producer states it, metres.
-        roughness: rms by which noise of the attitude bends the displacement over a patch, pixels: neighbours within it
-            do not contradict each other.
-        false_alarm: share of right matches that consensus may take for wrong.
+    Attributes
+    ----------
+    control : Whole
+        Points of the orthophoto that are sought in every line.
+    check : Whole
+        More of them, kept apart to test with.
+    tie : Whole
+        Points of the nadir line's image that are sought in the others.
+    reach : Whole
+        How far the predicted place may be off, pixels and lines.
+    template : Whole
+        Its side, pixels.
+    least_correlation : Number
+        Of image and template after the fit.
+    largest_sigma : Number
+        Of a place along its worst direction, pixels.
+    height_sigma : GroundSigma
+        Of the reference heights, as their producer states it, metres.
+    roughness : Number
+        Rms by which noise of the attitude bends the displacement over a patch, pixels: neighbours within it do not
+        contradict each other.
+    false_alarm : Number
+        Share of right matches that consensus may take for wrong.
     """
 
     control: Annotated[Whole, Field(ge=0, le=2000)] = 60
@@ -286,9 +345,12 @@ LineTime = Annotated[float, Quantity(TIME, above_zero=True, largest="1 s")]
 class InteriorChangeSpec(Spec):
     """How the interior orientation of a line has changed since the laboratory.
 
-    Attributes:
-        principal_distance: change of the principal distance, metres.
-        principal_point: change of x (flight) and y (along the line), metres.
+    Attributes
+    ----------
+    principal_distance : float
+        Change of the principal distance, metres.
+    principal_point : tuple[float, float]
+        Change of x (flight) and y (along the line), metres.
     """
 
     principal_distance: Annotated[float, Quantity(LENGTH, largest="5 mm")] = 0.0
@@ -298,11 +360,16 @@ class InteriorChangeSpec(Spec):
 class PatchSpec(Spec):
     """The patch of ground that is imaged; its middle lies on what one line sees at a moment.
 
-    Attributes:
-        line: of the camera, by name.
-        pixel: of that line that sees the middle.
-        time: at which it does, seconds from the orbit's epoch.
-        lines, pixels: size of every image.
+    Attributes
+    ----------
+    line : Name
+        Of the camera, by name.
+    pixel : Number
+        Of that line that sees the middle.
+    time : Moment
+        At which it does, seconds from the orbit's epoch.
+    lines, pixels : Side
+        Size of every image.
     """
 
     line: Name = "nadir"
@@ -315,24 +382,42 @@ class PatchSpec(Spec):
 class OrbitSimulateSpec(PayloadTestSpec):
     """A pass over a patch of ground.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        camera: name in scenes/library/payloads or path of a file; it needs a section `image`.
-        lines: those that are rendered, by name.
-        perturb: line -> how its interior has changed since the laboratory.
-        earth: its rotation.
-        orbit: true orbit.
-        attitude: true attitude.
-        effects: what happens to the light between ground and camera.
-        line_time: from one image line to the next, seconds.
-        patch: where and how large.
-        ground: what is there.
-        control: what is known of the ground.
-        points: that are measured in the images; none without this section.
-        errors: of what the satellite measures of itself.
-        oversampling: samples of the ground along each side of a pixel.
-        seed: of every random number.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    camera
+        Name in scenes/library/payloads or path of a file; it needs a section `image`.
+    lines : tuple[Name, ...]
+        Those that are rendered, by name.
+    perturb : Named[InteriorChangeSpec]
+        Line -> how its interior has changed since the laboratory.
+    earth : EarthSpec
+        Its rotation.
+    orbit : OrbitSpec
+        True orbit.
+    attitude : AttitudeSpec
+        True attitude.
+    effects : LightEffectsSpec
+        What happens to the light between ground and camera.
+    line_time : LineTime
+        From one image line to the next, seconds.
+    patch : PatchSpec
+        Where and how large.
+    ground : GroundSpec
+        What is there.
+    control : ControlSpec
+        What is known of the ground.
+    points : ImagePointsSpec | None
+        That are measured in the images; none without this section.
+    errors : ErrorsSpec
+        Of what the satellite measures of itself.
+    oversampling : Whole
+        Samples of the ground along each side of a pixel.
+    seed : Seed
+        Of every random number.
     """
 
     lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "backward")

@@ -54,10 +54,14 @@ def _line_detectors(camera: ThreeLineCameraSpec) -> FrozenMap[str, DetectorSpec]
 class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
     """An intersection-angle test with its camera: a payload, or an instrument with the cameras that it names.
 
-    Attributes:
-        camera: the payload, None for an instrument.
-        instrument: the instrument, None for a payload.
-        cameras: what `instrument.cameras.<name>.camera` says -> prescription; empty for a payload.
+    Attributes
+    ----------
+    camera : ThreeLineCameraSpec | None
+        The payload, None for an instrument.
+    instrument : InstrumentSpec | None
+        The instrument, None for a payload.
+    cameras : Paths[CameraSpec]
+        What `instrument.cameras.<name>.camera` says -> prescription; empty for a payload.
     """
 
     FOLDER = load.ORBIT
@@ -139,8 +143,10 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 class PayloadSetup(ExperimentSetup[TestType], Generic[TestType]):
     """A test of a payload.
 
-    Attributes:
-        camera: the payload.
+    Attributes
+    ----------
+    camera : ThreeLineCameraSpec
+        The payload.
     """
 
     FOLDER = load.ORBIT
@@ -157,8 +163,10 @@ class PayloadSetup(ExperimentSetup[TestType], Generic[TestType]):
 class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
     """An in-orbit calibration with its camera.
 
-    Attributes:
-        detectors: data sheets of its line CCDs where images are rendered.
+    Attributes
+    ----------
+    detectors : Paths[DetectorSpec]
+        Data sheets of its line CCDs where images are rendered.
     """
 
     detectors: Paths[DetectorSpec] = Field(default_factory=FrozenMap)
@@ -201,12 +209,18 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
 class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
     """A stereo pair along its orbit, monitored, with its instrument.
 
-    Attributes:
-        instrument: cameras and monitors on their base.
-        cameras: what the instrument's cameras are called -> prescription.
-        detector: data sheet of the monitor's area CCDs.
-        disturbances: what is stated to move, None for nothing.
-        line_detectors: as cameras -> data sheet of the line CCD that images; None where no line images are rendered.
+    Attributes
+    ----------
+    instrument : InstrumentSpec
+        Cameras and monitors on their base.
+    cameras : Paths[CameraSpec]
+        What the instrument's cameras are called -> prescription.
+    detector : DetectorSpec
+        Data sheet of the monitor's area CCDs.
+    disturbances : DisturbancesSpec | None
+        What is stated to move, None for nothing.
+    line_detectors : Paths[DetectorSpec] | None
+        As cameras -> data sheet of the line CCD that images; None where no line images are rendered.
     """
 
     FOLDER = load.ORBIT
@@ -256,8 +270,10 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
 class SimulateSetup(PayloadSetup[OrbitSimulateSpec]):
     """A pass over a patch of ground with its camera.
 
-    Attributes:
-        detectors: data sheets of its line CCDs, by the name that the image sections give.
+    Attributes
+    ----------
+    detectors : Paths[DetectorSpec]
+        Data sheets of its line CCDs, by the name that the image sections give.
     """
 
     detectors: Paths[DetectorSpec]
@@ -325,8 +341,10 @@ class MatchSetup(PayloadSetup[measurements.OrbitMatchSpec]):
 class MeasuredPassesSetup(PayloadSetup[TestType], Generic[TestType]):
     """A test on measurements with its camera.
 
-    Attributes:
-        data: the passes, with paths that hold from anywhere.
+    Attributes
+    ----------
+    data : measurements.OrbitDataSpec
+        The passes, with paths that hold from anywhere.
     """
 
     data: measurements.OrbitDataSpec
@@ -415,9 +433,11 @@ DATA_FILE = "data.yaml"
 def data_of(test: measurements.MeasuredTestSpec) -> measurements.OrbitDataSpec:
     """The passes of a test, with paths that hold from anywhere.
 
-    Raises:
-        InputError: there is no such folder, its file is not valid, a file is not there, or nothing says how a table of
-            an attitude is to be read.
+    Raises
+    ------
+    InputError
+        There is no such folder, its file is not valid, a file is not there, or nothing says how a table of an attitude
+        is to be read.
     """
     file = Path(test.source.file)
     if test.data is None:
@@ -442,12 +462,17 @@ def data_of(test: measurements.MeasuredTestSpec) -> measurements.OrbitDataSpec:
 def without_sensors(setup: AnyAdjust, names: Sequence[str]) -> AnyAdjust:
     """The block adjusted without further sensors.
 
-    Args:
-        setup: the block.
-        names: of sensors.
+    Parameters
+    ----------
+    setup : AnyAdjust
+        The block.
+    names : Sequence[str]
+        Of sensors.
 
-    Raises:
-        InputError: the block has no such sensor.
+    Raises
+    ------
+    InputError
+        The block has no such sensor.
     """
     if not names:
         return setup

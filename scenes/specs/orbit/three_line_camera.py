@@ -33,12 +33,18 @@ class CcdSpec(Spec):
     s, counted from 0 on the whole line; the look is along (tan psi_x, tan psi_y, 1) in the camera's axes. They hold for
     the line's principal_distance and principal_point, whose changes are counted from there, and contain the distortion.
 
-    Attributes:
-        first, last: its pixels, both included.
-        shift: x (flight) and y (along the line) in the focal plane, metres.
-        rotate: about the line of sight, from +x toward +y, about the CCD's middle, radians.
-        psi_x: forward, radians; per pixel, pixel^2, ... after the first.
-        psi_y: to the right, likewise.
+    Attributes
+    ----------
+    first, last : Whole
+        Its pixels, both included.
+    shift : tuple[float, float]
+        x (flight) and y (along the line) in the focal plane, metres.
+    rotate : float
+        About the line of sight, from +x toward +y, about the CCD's middle, radians.
+    psi_x : LookAngles | None
+        Forward, radians; per pixel, pixel^2, ... after the first.
+    psi_y : LookAngles | None
+        To the right, likewise.
     """
 
     first: Annotated[Whole, Field(ge=0)]
@@ -67,19 +73,30 @@ class LineCameraSpec(Spec):
     d means that the point looks further out than an ideal projection (Brown, Photogramm. Eng. 37(8), 1971: the term is
     added to the measured coordinates).
 
-    Attributes:
-        look: angle of the camera's Z from the base's +Z, about the base's Y, positive forward (toward +X), radians.
-        rotate: misalignment, a rotation vector in the camera's own axes after the look, radians.
-        position: of the projection centre in the base frame, metres.
-        principal_distance: f, metres.
-        principal_point: where the camera's Z meets the focal plane, x (flight) and y (along the line) from the line's
-            centre, metres.
-        k1: radial distortion of third order, 1/m^2.
-        k2: radial distortion of fifth order, 1/m^4.
-        pixels: how many; None for as many as the payload says.
-        pitch: of its pixels, metres; None for the payload's.
-        image: how it forms and records its image; None for the payload's.
-        ccds: of which it is made, from pixel 0 on; empty for one straight line.
+    Attributes
+    ----------
+    look : LookAngle
+        Angle of the camera's Z from the base's +Z, about the base's Y, positive forward (toward +X), radians.
+    rotate : Rotation
+        Misalignment, a rotation vector in the camera's own axes after the look, radians.
+    position : Vector3
+        Of the projection centre in the base frame, metres.
+    principal_distance : PositiveLength
+        f, metres.
+    principal_point : Vector2
+        Where the camera's Z meets the focal plane, x (flight) and y (along the line) from the line's centre, metres.
+    k1 : float
+        Radial distortion of third order, 1/m^2.
+    k2 : float
+        Radial distortion of fifth order, 1/m^4.
+    pixels : LongestLine | None
+        How many; None for as many as the payload says.
+    pitch : PixelPitch | None
+        Of its pixels, metres; None for the payload's.
+    image : LineImageSpec | None
+        How it forms and records its image; None for the payload's.
+    ccds : tuple[CcdSpec, ...]
+        Of which it is made, from pixel 0 on; empty for one straight line.
     """
 
     look: LookAngle
@@ -110,14 +127,21 @@ class LineCameraSpec(Spec):
 class ThreeLineCameraSpec(TitledSpec):
     """The payload of a three-line mapping satellite.
 
-    Attributes:
-        name: as the file is called.
-        description: for people.
-        pixels: of each line that does not say its own; pixel 0 is at its -y end.
-        pitch: of their pixels, metres.
-        lines: by name; normally forward, nadir and backward, in the order in which they see a point on the ground, then
-            others such as a high-resolution and a multispectral one.
-        image: how lines that do not say it themselves form and record their images; only rendering needs it.
+    Attributes
+    ----------
+    name
+        As the file is called.
+    description
+        For people.
+    pixels : LongestLine
+        Of each line that does not say its own; pixel 0 is at its -y end.
+    pitch : PixelPitch
+        Of their pixels, metres.
+    lines : Named[LineCameraSpec]
+        By name; normally forward, nadir and backward, in the order in which they see a point on the ground, then others
+        such as a high-resolution and a multispectral one.
+    image : LineImageSpec | None
+        How lines that do not say it themselves form and record their images; only rendering needs it.
     """
 
     pixels: LongestLine

@@ -60,9 +60,12 @@ def packed(value: Any) -> bytes:
 def unpacked(content: bytes, *classes: type) -> Any:
     """Return the value that `packed` was given, sequences as tuples.
 
-    Args:
-        content: the bytes.
-        classes: data classes that are in it, beside those of the filter.
+    Parameters
+    ----------
+    content : bytes
+        The bytes.
+    classes : type
+        Data classes that are in it, beside those of the filter.
     """
     known: dict[str, Any] = {one.__name__: one for one in (*_CLASSES, *classes)}
 
@@ -104,14 +107,22 @@ CHANCE = 1e-4
 class Sensor:
     """One sensor of temperature.
 
-    Attributes:
-        body: where it is.
-        readings: that came. first_us, last_us: the times of the first and of the newest, microseconds.
-        value: of the newest, kelvin; repeats: how often it came in a row before it; since_us: first of these.
-        step: smallest difference of two readings that followed each other, kelvin; infinite before there is one.
-        sigma: of its readings, kelvin.
-        recent: the last readings against what was expected of each, in standard deviations.
-        stuck: whether it repeats itself.
+    Attributes
+    ----------
+    body : str
+        Where it is.
+    readings : int
+        That came. first_us, last_us: the times of the first and of the newest, microseconds.
+    value : float
+        Of the newest, kelvin; repeats: how often it came in a row before it; since_us: first of these.
+    step : float
+        Smallest difference of two readings that followed each other, kelvin; infinite before there is one.
+    sigma : float
+        Of its readings, kelvin.
+    recent : tuple[float, ...]
+        The last readings against what was expected of each, in standard deviations.
+    stuck : bool
+        Whether it repeats itself.
     """
 
     body: str
@@ -164,9 +175,12 @@ class Sensor:
     def state(self, now: int, alone: bool) -> tuple[str, int, str]:
         """``ok``, ``dead``, ``stuck`` or ``doubtful``; since when, microseconds; and why.
 
-        Args:
-            now: time of the newest reading of all.
-            alone: whether no other sensor disagrees with what is stated as it does.
+        Parameters
+        ----------
+        now : int
+            Time of the newest reading of all.
+        alone : bool
+            Whether no other sensor disagrees with what is stated as it does.
         """
         if self.stuck:
             return "stuck", self.since_us, f"{self.repeats + 1} readings in a row of {self.value:.6g} K"
@@ -188,12 +202,18 @@ class Sensor:
 class Scores:
     """How good predictions of readings were that were made before these came.
 
-    Attributes:
-        readings: of the monitor.
-        components: independent numbers in them.
-        within_one, within_two: how many of these were within one and two standard deviations.
-        log_score: mean over the readings of the logarithm of the density stated for what came, px^-D.
-        chi_square: of all.
+    Attributes
+    ----------
+    readings : int
+        Of the monitor.
+    components : int
+        Independent numbers in them.
+    within_one, within_two : int
+        How many of these were within one and two standard deviations.
+    log_score : float
+        Mean over the readings of the logarithm of the density stated for what came, px^-D.
+    chi_square : float
+        Of all.
     """
 
     readings: int = 0
@@ -228,28 +248,45 @@ class Told:
 class Standing:
     """Where an estimate stands.
 
-    Attributes:
-        belief: what is believed; seconds count from the epoch.
-        time: of the newest entry, microseconds.
-        scores: of predictions.
-        innovations: (time_us, chi-square, degrees of freedom) of the last readings.
-        jumps: that were told.
-        sensors: by body.
-        left_out: (time_us, kind, subject, reason) of the last entries that were not used.
-        spread: (4, Q) sums over the readings of all that is read, of its square, of what temperatures leave of it and
-            of that one's square; see `explained`.
-        basis: (D + P, n) what the states do, by which it is seen that they are the states of this computer's linear
-            algebra.
-        used: (U,) ids of the entries that were used since it was last kept for good, in their order.
-        left: (U, m) what share of the mean square of jumps could not be told before each of them.
-        told: innovations since then.
-        silent: (body, time_us) of sensors that repeat themselves, and of the first of their equal readings: none counts
-            from there on.
-        pending: (id, time_us) of a reading of the monitor that was set aside, of which the next one decides; it is
-            among those that were used. None for none.
-        bad: (time_us, reason) of the last readings of the monitor that were taken for bad ones, and of a pending one.
-        first: as ``innovations``, of the first readings of all.
-        accused: bodies whose sensors have disagreed with what is stated at the same time as others.
+    Attributes
+    ----------
+    belief : Belief
+        What is believed; seconds count from the epoch.
+    time : int
+        Of the newest entry, microseconds.
+    scores : Scores
+        Of predictions.
+    innovations : tuple[tuple[int, float, int], ...]
+        (time_us, chi-square, degrees of freedom) of the last readings.
+    jumps : tuple[Told, ...]
+        That were told.
+    sensors : Mapping[str, Sensor]
+        By body.
+    left_out : tuple[tuple[int, str, str, str], ...]
+        (time_us, kind, subject, reason) of the last entries that were not used.
+    spread : Array
+        (4, Q) sums over the readings of all that is read, of its square, of what temperatures leave of it and of that
+        one's square; see `explained`.
+    basis : Array
+        (D + P, n) what the states do, by which it is seen that they are the states of this computer's linear algebra.
+    used : NDArray[np.int64]
+        (U,) ids of the entries that were used since it was last kept for good, in their order.
+    left : Array
+        (U, m) what share of the mean square of jumps could not be told before each of them.
+    told : tuple[tuple[int, float, int], ...]
+        Innovations since then.
+    silent : tuple[tuple[str, int], ...]
+        (body, time_us) of sensors that repeat themselves, and of the first of their equal readings: none counts from
+        there on.
+    pending : tuple[int, int] | None
+        (id, time_us) of a reading of the monitor that was set aside, of which the next one decides; it is among those
+        that were used. None for none.
+    bad : tuple[tuple[int, str], ...]
+        (time_us, reason) of the last readings of the monitor that were taken for bad ones, and of a pending one.
+    first : tuple[tuple[int, float, int], ...]
+        As ``innovations``, of the first readings of all.
+    accused : tuple[str, ...]
+        Bodies whose sensors have disagreed with what is stated at the same time as others.
     """
 
     belief: Belief
@@ -292,8 +329,10 @@ class Standing:
     def decided(self, left_out: str) -> Standing:
         """With the decision on the reading that was set aside.
 
-        Args:
-            left_out: why it is left out; empty where it is taken after all.
+        Parameters
+        ----------
+        left_out : str
+            Why it is left out; empty where it is taken after all.
         """
         assert self.pending is not None
         number, time = self.pending
@@ -341,12 +380,18 @@ class Standing:
 class Taking:
     """Takes a record's entries one after the other.
 
-    Attributes:
-        model: what the estimate rests on.
-        how: its filter, with the events of the record as steps.
-        epoch: from which seconds count, microseconds.
-        reference: (C, 2) px that all shifts are counted from.
-        temperature: of the instrument in its calibration, kelvin.
+    Attributes
+    ----------
+    model : OperationModel
+        What the estimate rests on.
+    how : SeriesFilter
+        Its filter, with the events of the record as steps.
+    epoch : int
+        From which seconds count, microseconds.
+    reference : Array
+        (C, 2) px that all shifts are counted from.
+    temperature : float
+        Of the instrument in its calibration, kelvin.
     """
 
     model: OperationModel
@@ -362,9 +407,12 @@ class Taking:
     def start(self, time: int, silent: tuple[tuple[str, int], ...] = ()) -> Standing:
         """Before any entry.
 
-        Args:
-            time: of the first, microseconds.
-            silent: sensors that are known to repeat themselves.
+        Parameters
+        ----------
+        time : int
+            Of the first, microseconds.
+        silent : tuple[tuple[str, int], ...]
+            Sensors that are known to repeat themselves.
         """
         spread = np.zeros((4, len(self.model.quantities)))
         belief, basis = self.how.start(self.seconds(time)), self.how.space.basis
@@ -373,10 +421,13 @@ class Taking:
     def take(self, standing: Standing, entries: Sequence[Mapping[str, Any]]) -> Standing:
         """All entries of one moment.
 
-        Args:
-            standing: before.
-            entries: of one time, each with its content as plain data and, as ``decided``, whether somebody includes it
-                and why; None where nobody has decided.
+        Parameters
+        ----------
+        standing : Standing
+            before.
+        entries : Sequence[Mapping[str, Any]]
+            Of one time, each with its content as plain data and, as ``decided``, whether somebody includes it and why;
+            None where nobody has decided.
         """
         standing = replace(standing, time=max(standing.time, int(entries[0]["time_us"])))
         for one in entries:
@@ -395,8 +446,10 @@ class Taking:
     def observed(self, entry: Mapping[str, Any]) -> Observed:
         """What an entry that is used says.
 
-        Args:
-            entry: of the monitor, or of a sensor that the filter knows.
+        Parameters
+        ----------
+        entry : Mapping[str, Any]
+            Of the monitor, or of a sensor that the filter knows.
         """
         time, content = self.seconds(int(entry["time_us"])), entry["content"]
         if entry["kind"] == "temperature":

@@ -55,15 +55,23 @@ _MODEL, _HEAD = -1, 0
 class Operation:
     """The estimate of a record under a plan.
 
-    Args:
-        history: the record.
-        plan: with its instrument, that of the record.
-        advance: called with the number of readings that were taken, of how many.
-        before_it: the same before some readings came; None for none. See `again`.
+    Parameters
+    ----------
+    history
+        The record.
+    plan
+        With its instrument, that of the record.
+    advance
+        Called with the number of readings that were taken, of how many.
+    before_it
+        The same before some readings came; None for none. See `again`.
 
-    Raises:
-        Problem: the record has no reading of the monitor.
-        InputError: the plan states what its instrument cannot do.
+    Raises
+    ------
+    Problem
+        The record has no reading of the monitor.
+    InputError
+        The plan states what its instrument cannot do.
     """
 
     def __init__(
@@ -305,11 +313,15 @@ class Operation:
     def forecast(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
         """What is expected at times ahead, by all readings.
 
-        Args:
-            times_us: (T,) microseconds of TAI since 2000, not before the newest reading.
+        Parameters
+        ----------
+        times_us : Sequence[int] | NDArray[np.int64]
+            (T,) microseconds of TAI since 2000, not before the newest reading.
 
-        Raises:
-            Problem: a time before it.
+        Raises
+        ------
+        Problem
+            a time before it.
         """
         times = np.asarray(times_us, np.int64)
         if len(times) and times.min() < self.standing.time:
@@ -374,11 +386,15 @@ class Operation:
     def smoothed(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
         """What all readings say of times; of those after the newest it is the forecast.
 
-        Args:
-            times_us: (T,) microseconds of TAI since 2000, from the first reading on.
+        Parameters
+        ----------
+        times_us : Sequence[int] | NDArray[np.int64]
+            (T,) microseconds of TAI since 2000, from the first reading on.
 
-        Raises:
-            Problem: a time before it.
+        Raises
+        ------
+        Problem
+            a time before it.
         """
         times = np.asarray(times_us, np.int64)
         found = self._past(times, self._taking.how.parameters_of)
@@ -396,13 +412,18 @@ class Operation:
     def motions(self, time_us: int, acting: bool = False) -> Motions:
         """Every stated motion at one time, by all readings.
 
-        Args:
-            time_us: microseconds of TAI since 2000, from the first reading on.
-            acting: temperatures of bodies with sensors times the factor by which heat does more to light than was
-                computed, so that what is computed of the motions is what `smoothed` says.
+        Parameters
+        ----------
+        time_us : int
+            Microseconds of TAI since 2000, from the first reading on.
+        acting : bool
+            Temperatures of bodies with sensors times the factor by which heat does more to light than was computed, so
+            that what is computed of the motions is what `smoothed` says.
 
-        Raises:
-            Problem: a time before it.
+        Raises
+        ------
+        Problem
+            a time before it.
         """
         stated = self.model.how.stated
         how = replace(self._taking.how, steps=(*self._taking.how.steps, *self._steps()))
@@ -443,16 +464,22 @@ class Operation:
     def jointly(self, times_us: Sequence[int] | NDArray[np.int64]) -> tuple[Array, Array]:
         """What all readings say of several times together; of one time it is what `smoothed` says.
 
-        Args:
-            times_us: (T,) microseconds of TAI since 2000 in order, from the first reading on; if one is before the
-                newest reading, jumps that the last readings hint at do not count for those after it.
+        Parameters
+        ----------
+        times_us : Sequence[int] | NDArray[np.int64]
+            (T,) microseconds of TAI since 2000 in order, from the first reading on; if one is before the newest
+            reading, jumps that the last readings hint at do not count for those after it.
 
-        Returns:
+        Returns
+        -------
+        tuple[Array, Array]
             (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other, and (T, 4 K, T, 4 K) the
             covariance of their errors, those of one time with those of another.
 
-        Raises:
-            Problem: a time before it.
+        Raises
+        ------
+        Problem
+            a time before it.
         """
         times, taking = np.asarray(times_us, np.int64), self._taking
         seconds = [taking.seconds(int(time)) for time in times]

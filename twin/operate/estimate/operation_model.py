@@ -41,11 +41,16 @@ then and its part of the chance of a false alarm.
 class OperationModel:
     """What an estimate rests on beside readings.
 
-    Attributes:
-        how: the filter, which knows of no events yet.
-        spots: (camera, channel) of each spot, in the order of shifts.
-        quantities: Q of them that are read.
-        reading: (4 K, D) parameters per px by the estimator `model`, by which every camera moves as a whole.
+    Attributes
+    ----------
+    how : SeriesFilter
+        The filter, which knows of no events yet.
+    spots : tuple[tuple[str, str], ...]
+        (camera, channel) of each spot, in the order of shifts.
+    quantities : tuple[Quantity, ...]
+        Q of them that are read.
+    reading : Array
+        (4 K, D) parameters per px by the estimator `model`, by which every camera moves as a whole.
     """
 
     how: SeriesFilter
@@ -64,14 +69,21 @@ def traced_model(
 ) -> OperationModel:
     """Trace what is stated to move.
 
-    Args:
-        setup: the plan with its instrument.
-        reference_sigma: (C, 2) px of the spots that all shifts are counted from, row and column.
-        sensors: bodies of which there are temperatures.
-        experiment: on the instrument.
+    Parameters
+    ----------
+    setup : OperationSetup
+        The plan with its instrument.
+    reference_sigma : Array
+        (C, 2) px of the spots that all shifts are counted from, row and column.
+    sensors : Sequence[str]
+        Bodies of which there are temperatures.
+    experiment : MonitorExperiment
+        On the instrument.
 
-    Raises:
-        InputError: a body that the instrument does not have, or that cannot move or be warmed so.
+    Raises
+    ------
+    InputError
+        a body that the instrument does not have, or that cannot move or be warmed so.
     """
     plan = setup.operation
     stated, motions = experiment.disturbances, experiment.stated
@@ -101,11 +113,16 @@ def heat_inputs(
 
     A sensor stands at its body's origin. A body of which no temperature is stated has that of the body that carries it.
 
-    Args:
-        stated: all that moves or gets warm, M components.
-        thermal: of the instrument.
-        sensors: bodies.
-        sigma: standard deviation of the factor of what heat of each body does.
+    Parameters
+    ----------
+    stated : StatedMotions
+        All that moves or gets warm, M components.
+    thermal : ThermalModel
+        Of the instrument.
+    sensors : Sequence[str]
+        bodies.
+    sigma : float
+        Standard deviation of the factor of what heat of each body does.
     """
     heat = [k for k, one in enumerate(stated.components) if one.kind in HEAT]
     still = {stated.components[k].body: Temperature() for k in heat}
@@ -131,9 +148,11 @@ def heat_inputs(
 def read_plan(path: Path, history: History) -> OperationSetup:
     """The plan in a file.
 
-    Raises:
-        InputError: it cannot be read, is not valid, or is of another instrument than the record; a requirement is of a
-            quantity that the instrument does not have.
+    Raises
+    ------
+    InputError
+        It cannot be read, is not valid, or is of another instrument than the record; a requirement is of a quantity
+        that the instrument does not have.
     """
     setup = read_operation(path)
     operation, digest = setup.operation, digest_of_job(setup.model)
@@ -167,8 +186,10 @@ def keep_plan(setup: OperationSetup, file: Path, history: History) -> bool:
 def kept_plan(history: History) -> OperationSetup | None:
     """The plan that the record keeps and that counts; None for none.
 
-    Raises:
-        InputError: it is of a program that wrote it otherwise.
+    Raises
+    ------
+    InputError
+        It is of a program that wrote it otherwise.
     """
     row = history.plan()
     return None if row is None else validate(OperationSetup, YamlFile("the record's plan", row["content"], {}))

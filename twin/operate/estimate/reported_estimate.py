@@ -36,13 +36,20 @@ MOST_BAD = 2
 class Course:
     """Estimate at T times.
 
-    Attributes:
-        times: (T,) microseconds of TAI since 2000.
-        quantities: Q that are read.
-        values: (T, Q) in each one's unit, changes since the calibration.
-        sigmas: (T, Q) their total standard deviations.
-        changes: (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
-        covariance: (T, 4 K, 4 K) of their errors.
+    Attributes
+    ----------
+    times : NDArray[np.int64]
+        (T,) microseconds of TAI since 2000.
+    quantities : tuple[Quantity, ...]
+        Q that are read.
+    values : Array
+        (T, Q) in each one's unit, changes since the calibration.
+    sigmas : Array
+        (T, Q) their total standard deviations.
+    changes : Array
+        (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
+    covariance : Array
+        (T, 4 K, 4 K) of their errors.
     """
 
     times: NDArray[np.int64]
@@ -82,15 +89,22 @@ class _Dated:
 class FoundJump(_Dated):
     """A jump that was told.
 
-    Attributes:
-        body: that explains it best; rivals: others -> their log likelihood ratio.
-        after_us, until_us: between which readings it came; told_us: at which it was told.
-        sizes: (motion, unit, size, sigma).
-        log_ratio: of the likelihoods with it and without it, when it was told.
-        false_alarm: chance of as large a ratio anywhere in the whole life without a jump, at most.
-        carried: quantity -> (read, changed, sigma): what the spots alone say of it if the camera moved as a whole, what
-            it did to the line by the bodies that can have made it, and the sigma of that. A part that moves spots need
-            not move the line as much.
+    Attributes
+    ----------
+    body : str
+        That explains it best; rivals: others -> their log likelihood ratio.
+    after_us, until_us : int
+        Between which readings it came; told_us: at which it was told.
+    sizes : tuple[tuple[str, str, float, float], ...]
+        (motion, unit, size, sigma).
+    log_ratio : float
+        Of the likelihoods with it and without it, when it was told.
+    false_alarm : float
+        Chance of as large a ratio anywhere in the whole life without a jump, at most.
+    carried : Mapping[str, tuple[float, float, float]]
+        Quantity -> (read, changed, sigma): what the spots alone say of it if the camera moved as a whole, what it did
+        to the line by the bodies that can have made it, and the sigma of that. A part that moves spots need not move
+        the line as much.
     """
 
     body: str
@@ -134,11 +148,16 @@ class FoundJump(_Dated):
 class SensorState(_Dated):
     """What a sensor of temperature is worth.
 
-    Attributes:
-        body: where it is.
-        state: ``ok``, ``dead``, ``stuck`` or ``doubtful``.
-        since_us: since when; last_us: its newest reading.
-        reason: why, empty where it is ok.
+    Attributes
+    ----------
+    body : str
+        Where it is.
+    state : str
+        ``ok``, ``dead``, ``stuck`` or ``doubtful``.
+    since_us : int
+        Since when; last_us: its newest reading.
+    reason : str
+        Why, empty where it is ok.
     """
 
     body: str
@@ -152,12 +171,18 @@ class SensorState(_Dated):
 class Break(_Dated):
     """A requirement.
 
-    Attributes:
-        quantity: group and key; unit: of its limit.
-        limit: that the size of its change must not exceed; probability: with which.
-        chance_now: that it does now.
-        holds_now: whether that is rare enough.
-        breaks_us: time from which on it is not, within the horizon; None if it does not come.
+    Attributes
+    ----------
+    quantity : str
+        Group and key; unit: of its limit.
+    limit : float
+        That the size of its change must not exceed; probability: with which.
+    chance_now : float
+        That it does now.
+    holds_now : bool
+        Whether that is rare enough.
+    breaks_us : int | None
+        Time from which on it is not, within the horizon; None if it does not come.
     """
 
     quantity: str
@@ -173,10 +198,14 @@ class Break(_Dated):
 class Motions:
     """Every stated motion at one time.
 
-    Attributes:
-        time: microseconds.
-        labels: M names; units: theirs.
-        mean: (M,) in these units. covariance: (M, M) of their errors.
+    Attributes
+    ----------
+    time : int
+        microseconds.
+    labels : tuple[str, ...]
+        M names; units: theirs.
+    mean : Array
+        (M,) in these units. covariance: (M, M) of their errors.
     """
 
     time: int
@@ -190,23 +219,40 @@ class Motions:
 class Following:
     """What is known after all readings of a record.
 
-    Attributes:
-        time: of the newest, microseconds.
-        readings: of the monitor that were used.
-        now: the state.
-        scores: of predictions made before each reading came.
-        innovations: (time_us, chi-square, degrees of freedom) of the last readings.
-        jumps: that were told.
-        events: (time_us, name, causes that stepped).
-        sensors: what those of temperature are worth.
-        left_out: (time_us, kind, subject, reason) of the last entries that were not used.
-        explained: quantity -> share of its scatter that temperatures explain.
-        widened: by how much sigmas now are wider since the last readings contradict what is stated; 1 if they do not.
-        too_many_jumps: whether more jumps were told than is stated.
-        breaks: the requirements.
-        bad_readings: (time_us, reason) of the last readings of the monitor that were taken for bad ones.
-        undecided: whether the newest of these may be the first after a jump; sigmas then count with both.
-        too_small: causes of the prior with which sensors of several bodies disagree at the same time.
+    Attributes
+    ----------
+    time : int
+        Of the newest, microseconds.
+    readings : int
+        Of the monitor that were used.
+    now : Course
+        The state.
+    scores : Scores
+        Of predictions made before each reading came.
+    innovations : tuple[tuple[int, float, int], ...]
+        (time_us, chi-square, degrees of freedom) of the last readings.
+    jumps : tuple[FoundJump, ...]
+        That were told.
+    events : tuple[tuple[int, str, tuple[str, ...]], ...]
+        (time_us, name, causes that stepped).
+    sensors : tuple[SensorState, ...]
+        What those of temperature are worth.
+    left_out : tuple[tuple[int, str, str, str], ...]
+        (time_us, kind, subject, reason) of the last entries that were not used.
+    explained : Mapping[str, float]
+        Quantity -> share of its scatter that temperatures explain.
+    widened : float
+        By how much sigmas now are wider since the last readings contradict what is stated; 1 if they do not.
+    too_many_jumps : bool
+        Whether more jumps were told than is stated.
+    breaks : tuple[Break, ...]
+        The requirements.
+    bad_readings : tuple[tuple[int, str], ...]
+        (time_us, reason) of the last readings of the monitor that were taken for bad ones.
+    undecided : bool
+        Whether the newest of these may be the first after a jump; sigmas then count with both.
+    too_small : tuple[str, ...]
+        Causes of the prior with which sensors of several bodies disagree at the same time.
     """
 
     time: int
@@ -277,10 +323,14 @@ def _rows(keys: str, rows: Sequence[tuple[Any, ...]]) -> list[dict[str, Any]]:
 def beyond(value: Array, sigma: Array, limit: float) -> Array:
     """Chance that the size of something is larger than a limit.
 
-    Args:
-        value: what is expected of it.
-        sigma: its standard deviation, likewise.
-        limit: in the same unit.
+    Parameters
+    ----------
+    value : Array
+        What is expected of it.
+    sigma : Array
+        Its standard deviation, likewise.
+    limit : float
+        In the same unit.
     """
     scale = np.where(sigma > 0.0, sigma, 1e-300)
     return np.asarray(ndtr((value - limit) / scale) + ndtr((-value - limit) / scale))
@@ -294,11 +344,16 @@ def widening(
     explains them. What contradicts the first readings, or a jump, is not forgotten: of what the spots do not
     show, the state rests on it for as long as nothing explains it.
 
-    Args:
-        squares: (N, 2) chi-square and degrees of freedom of each reading before it came, in the order of time.
-        now: (T,) number of readings up to each time.
-        centred: whether readings after the time count as well.
-        lasting: number of readings from which on it counts, and (n, 2) as ``squares``, of what is not forgotten.
+    Parameters
+    ----------
+    squares : Array
+        (N, 2) chi-square and degrees of freedom of each reading before it came, in the order of time.
+    now : Sequence[int] | NDArray[np.intp]
+        (T,) number of readings up to each time.
+    centred : bool
+        Whether readings after the time count as well.
+    lasting : Sequence[tuple[int, Array]]
+        Number of readings from which on it counts, and (n, 2) as ``squares``, of what is not forgotten.
     """
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(squares, axis=0)])
     out, number = np.ones(len(now)), np.asarray(now, int)
@@ -329,12 +384,18 @@ Row = Mapping[str, Any]
 def raise_alarms(history: History, plan: OperationSpec, following: Following) -> list[Alarm]:
     """Add to a record what of its estimate is to be known and has not been told.
 
-    Args:
-        history: the record.
-        plan: under which it was followed.
-        following: what is known after all readings.
+    Parameters
+    ----------
+    history : History
+        The record.
+    plan : OperationSpec
+        Under which it was followed.
+    following : Following
+        What is known after all readings.
 
-    Returns:
+    Returns
+    -------
+    list[Alarm]
         The alarms that are new.
     """
     before = history.alarms()
@@ -372,9 +433,12 @@ def _is_told(alarm: Alarm, before: Sequence[Row]) -> bool:
 def name_of(quantity: str, quantities: Sequence[Quantity]) -> str:
     """A quantity in words: ``Δf of forward``.
 
-    Args:
-        quantity: group and key.
-        quantities: all that are read.
+    Parameters
+    ----------
+    quantity : str
+        Group and key.
+    quantities : Sequence[Quantity]
+        All that are read.
     """
     group = quantity.partition(" ")[0]
     symbol = next(one.parameter.symbol for one in quantities if one.name == quantity)

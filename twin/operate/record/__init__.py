@@ -22,8 +22,10 @@ class RecordFailed(Exception):
 def require_file(file: Path) -> None:
     """Refuse the file of a record that is not there.
 
-    Raises:
-        NotARecord: it is not.
+    Raises
+    ------
+    NotARecord
+        It is not.
     """
     if not file.is_file():
         raise NotARecord(f"no record at {file}; python -m twin.operate init DIR INSTRUMENT makes one")

@@ -40,14 +40,21 @@ def digest_of_data(data: Any) -> str:
 class Entry:
     """One reading, or one event.
 
-    Attributes:
-        kind: of reading, as `scenes.specs.operation` names them.
-        subject: body, star tracker or camera; name of an event; for a run the kind again.
-        time: microseconds of TAI since 2000-01-01T00:00:00 TAI.
-        content: what was read, plain data in SI units, or in those that the keys of a run's numbers end in.
-        line: of the file, counted from 1; None for a file that is one reading.
-        origin: SHA-256 of all that it was found from, such as a monitor's frames, which cannot be of two moments; ""
-            for numbers that are what was read.
+    Attributes
+    ----------
+    kind : str
+        Of reading, as `scenes.specs.operation` names them.
+    subject : str
+        Body, star tracker or camera; name of an event; for a run the kind again.
+    time : int
+        Microseconds of TAI since 2000-01-01T00:00:00 TAI.
+    content : Mapping[str, Any]
+        What was read, plain data in SI units, or in those that the keys of a run's numbers end in.
+    line : int | None
+        Of the file, counted from 1; None for a file that is one reading.
+    origin : str
+        SHA-256 of all that it was found from, such as a monitor's frames, which cannot be of two moments; "" for
+        numbers that are what was read.
     """
 
     kind: str
@@ -67,10 +74,14 @@ class Entry:
 class Refused:
     """What is not taken.
 
-    Attributes:
-        reason: what is wrong with it, and what to do.
-        line: of the file; None for all of it.
-        entry: the reading, where it could be read at all.
+    Attributes
+    ----------
+    reason : str
+        What is wrong with it, and what to do.
+    line : int | None
+        Of the file; None for all of it.
+    entry : Entry | None
+        The reading, where it could be read at all.
     """
 
     reason: str
@@ -82,12 +93,18 @@ class Refused:
 class Alarm:
     """Something of which a person has to know.
 
-    Attributes:
-        kind: what is wrong: ``broken``, ``breaks``, ``jump``, ``sensor`` or ``contradiction``.
-        subject: quantity, body or sensor.
-        time: to which it belongs, microseconds of TAI since 2000.
-        text: a sentence.
-        content: the numbers behind it, plain data.
+    Attributes
+    ----------
+    kind : str
+        What is wrong: ``broken``, ``breaks``, ``jump``, ``sensor`` or ``contradiction``.
+    subject : str
+        Quantity, body or sensor.
+    time : int
+        To which it belongs, microseconds of TAI since 2000.
+    text : str
+        a sentence.
+    content : Mapping[str, Any]
+        The numbers behind it, plain data.
     """
 
     kind: str
@@ -106,12 +123,18 @@ class Alarm:
 class Given:
     """What one file holds.
 
-    Attributes:
-        file: absolute path.
-        sha256: of it.
-        meaning: SHA-256 of what was said of it: columns, or the time of a run.
-        items: readings and refusals in the order of the file.
-        frames: other files that it was found from, by path, with their SHA-256.
+    Attributes
+    ----------
+    file : str
+        Absolute path.
+    sha256 : str
+        Of it.
+    meaning : str
+        SHA-256 of what was said of it: columns, or the time of a run.
+    items : Sequence[Entry | Refused]
+        Readings and refusals in the order of the file.
+    frames : Mapping[str, str]
+        Other files that it was found from, by path, with their SHA-256.
     """
 
     file: str
@@ -129,13 +152,19 @@ def _leap(day: int) -> float:
 def micros(text: str, scale: str = "UTC", seconds: float = 0.0) -> int:
     """Microseconds of TAI since 2000 of what a clock showed.
 
-    Args:
-        text: date and time, ISO 8601.
-        scale: of the clock.
-        seconds: SI seconds that have passed since.
+    Parameters
+    ----------
+    text : str
+        Date and time, ISO 8601.
+    scale : str
+        Of the clock.
+    seconds : float
+        SI seconds that have passed since.
 
-    Raises:
-        Problem: not such a text.
+    Raises
+    ------
+    Problem
+        Not such a text.
     """
     one = single_reading(text)
     if scale == "UTC" and one.second[0] < DAY:
@@ -148,13 +177,19 @@ def micros(text: str, scale: str = "UTC", seconds: float = 0.0) -> int:
 def micros_after(epoch: str, scale: str, seconds: float) -> int:
     """The same of a clock whose days have 86400 s and that counts seconds from an epoch.
 
-    Args:
-        epoch: what it read at 0 s.
-        scale: of the clock.
-        seconds: that it counted.
+    Parameters
+    ----------
+    epoch : str
+        What it read at 0 s.
+    scale : str
+        Of the clock.
+    seconds : float
+        That it counted.
 
-    Raises:
-        Problem: not a date and time.
+    Raises
+    ------
+    Problem
+        Not a date and time.
     """
     instant = Readings.after(epoch, np.array([seconds])).instants(scale)
     return _count(int(instant.day[0]), float(instant.second[0]))
@@ -190,9 +225,12 @@ def instrument_digest(instrument: Mapping[str, Any], cameras: Mapping[str, Any])
 
     The data sheet of its CCDs and their exposure are not part of it: a measurement may state others.
 
-    Args:
-        instrument: plain data, as a config.yaml has them.
-        cameras: reference -> plain data of the prescription.
+    Parameters
+    ----------
+    instrument : Mapping[str, Any]
+        Plain data, as a config.yaml has them.
+    cameras : Mapping[str, Any]
+        Reference -> plain data of the prescription.
     """
     own = {key: value for key, value in instrument.items() if key not in _NOT_THE_INSTRUMENT}
     monitor = own.get("monitor")

@@ -56,18 +56,28 @@ USED = ("monitor", "temperature")
 class History:
     """The record of one instrument in a database.
 
-    Args:
-        place: folder or address of the record.
-        until: of the record as it was: by the times of the readings nothing later is in it, and nothing is added to it
-            but what was traced of the instrument; None for the whole record.
+    Parameters
+    ----------
+    place
+        Folder or address of the record.
+    until
+        Of the record as it was: by the times of the readings nothing later is in it, and nothing is added to it but
+        what was traced of the instrument; None for the whole record.
 
-    Attributes:
-        url: of the database, without its password.
-        name: of the instrument.
-        sha256: by which the instrument is recognised.
-        temperature: of the instrument as its file states it, kelvin.
-        simulated: whether its times are not compared with the computer's clock.
-        bodies: ``warm``, paths of those that have a temperature; ``cameras``, their names.
+    Attributes
+    ----------
+    url
+        Of the database, without its password.
+    name
+        Of the instrument.
+    sha256
+        By which the instrument is recognised.
+    temperature
+        Of the instrument as its file states it, kelvin.
+    simulated
+        Whether its times are not compared with the computer's clock.
+    bodies
+        ``warm``, paths of those that have a temperature; ``cameras``, their names.
     """
 
     def __init__(self, place: str, until: int | None = None) -> None:
@@ -103,13 +113,19 @@ class History:
     def take(self, given: Given, late: bool = False) -> Taken:
         """Add what a file holds, all of it in one step: after an interruption all of it is there, or nothing.
 
-        Args:
-            given: the file.
-            late: whether readings may be older than the newest of their sort and subject in the record.
+        Parameters
+        ----------
+        given : Given
+            The file.
+        late : bool
+            Whether readings may be older than the newest of their sort and subject in the record.
 
-        Raises:
-            RecordFailed: nothing was added.
-            TypeError: into the record as it was.
+        Raises
+        ------
+        RecordFailed
+            Nothing was added.
+        TypeError
+            Into the record as it was.
         """
         if self._until is not None:
             raise TypeError("nothing is taken into a record as it was")
@@ -126,16 +142,24 @@ class History:
         """Exclude an entry from the estimate, or include it whatever speaks against it, by an entry of its own: the
         newest decision on an entry counts.
 
-        Args:
-            number: id of the entry, a reading of the monitor or a temperature.
-            included: whether it counts from now on.
-            why: the reason.
+        Parameters
+        ----------
+        number : int
+            Id of the entry, a reading of the monitor or a temperature.
+        included : bool
+            Whether it counts from now on.
+        why : str
+            The reason.
 
-        Returns:
+        Returns
+        -------
+        dict[str, Any]
             ``entry``, ``kind``, ``subject``, ``time_utc``, ``included`` and ``why``.
 
-        Raises:
-            Problem: there is no such reading, or the same was decided before.
+        Raises
+        ------
+        Problem
+            There is no such reading, or the same was decided before.
         """
         c = ENTRY.c
         with writing(self._engine) as connection:
@@ -166,11 +190,16 @@ class History:
 
         SQLite has no writer while they are read: take what is wanted, and write then.
 
-        Args:
-            kind: of reading; all if empty.
-            after_us: those after this time, microseconds of TAI since 2000.
+        Parameters
+        ----------
+        kind : str
+            Of reading; all if empty.
+        after_us : int | None
+            Those after this time, microseconds of TAI since 2000.
 
-        Yields:
+        Yields
+        ------
+        dict[str, Any]
             ``id``, ``kind``, ``subject``, ``time_us``, ``time_utc``, ``sha256``, ``line``, ``file`` and ``content``,
             which is plain data.
         """
@@ -234,11 +263,16 @@ class History:
     def keep_plan(self, file: str, content: Mapping[str, Any]) -> bool:
         """Keep a plan of operation, which from now on counts.
 
-        Args:
-            file: from which it is.
-            content: plain data.
+        Parameters
+        ----------
+        file : str
+            From which it is.
+        content : Mapping[str, Any]
+            Plain data.
 
-        Returns:
+        Returns
+        -------
+        bool
             Whether it is another one than before.
         """
         digest = digest_of_data(content)
@@ -286,9 +320,12 @@ class History:
     def came_late(self, after_id: int, until_us: int) -> bool:
         """Whether an entry up to a time was taken after another one.
 
-        Args:
-            after_id: the id of that.
-            until_us: the time, microseconds of TAI since 2000.
+        Parameters
+        ----------
+        after_id : int
+            The id of that.
+        until_us : int
+            The time, microseconds of TAI since 2000.
         """
         with self.reading() as connection:
             return _is_newer(connection, after_id, until_us)
@@ -298,12 +335,17 @@ class History:
     ) -> Row[Any] | None:
         """The newest of what was kept of an estimate, as a row of the table; None for none.
 
-        Args:
-            plan: as of `save_checkpoint`.
-            number: the one of this number alone; without it none of a negative number, and where a time is asked for
-                none of number 0, which is not kept for good.
-            before_us: the newest before this time, microseconds of TAI since 2000.
-            valid: only one up to whose time no reading has come since it was kept.
+        Parameters
+        ----------
+        plan : str
+            As of `save_checkpoint`.
+        number : int | None
+            The one of this number alone; without it none of a negative number, and where a time is asked for none of
+            number 0, which is not kept for good.
+        before_us : int | None
+            The newest before this time, microseconds of TAI since 2000.
+        valid : bool
+            Only one up to whose time no reading has come since it was kept.
         """
         c, e = CHECKPOINT.c, ENTRY.c
         if self._until is not None:
@@ -318,8 +360,10 @@ class History:
     def checkpoints(self, plan: str) -> list[Row[Any]]:
         """Where the estimate under a plan stood, in the order of time, as rows of the table.
 
-        Args:
-            plan: digest of all that the estimate rests on besides the readings.
+        Parameters
+        ----------
+        plan : str
+            Digest of all that the estimate rests on besides the readings.
         """
         c = CHECKPOINT.c
         query = select(CHECKPOINT).where(c.plan == plan, *_not_after(c.time_us, self._until))
@@ -329,14 +373,22 @@ class History:
     def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
         """Keep where an estimate stands, in place of what was kept under the number.
 
-        Args:
-            plan: digest of all that the estimate rests on besides the readings.
-            number: counts the checkpoints of a plan.
-            time_us: up to which readings are in it.
-            entry_id: the largest id that the record had when they were read.
-            content: the estimate.
+        Parameters
+        ----------
+        plan : str
+            Digest of all that the estimate rests on besides the readings.
+        number : int
+            Counts the checkpoints of a plan.
+        time_us : int
+            Up to which readings are in it.
+        entry_id : int
+            The largest id that the record had when they were read.
+        content : bytes
+            The estimate.
 
-        Returns:
+        Returns
+        -------
+        bool
             Whether it is kept; it is not if a reading up to that time has come since.
         """
         if self._until is not None and number >= 0:  # the newest estimate stays where it is
@@ -361,7 +413,9 @@ class History:
     def raise_alarm(self, alarm: Alarm) -> bool:
         """Add an alarm, once.
 
-        Returns:
+        Returns
+        -------
+        bool
             Whether it is new.
         """
         if self._until is not None:  # what was to be told then was told then
@@ -395,13 +449,19 @@ class History:
     def acknowledge(self, alarm: int, by: str, note: str) -> None:
         """Say who has seen an alarm, and what is done about it.
 
-        Args:
-            alarm: its id.
-            by: name of a person.
-            note: what is done.
+        Parameters
+        ----------
+        alarm : int
+            Its id.
+        by : str
+            Name of a person.
+        note : str
+            What is done.
 
-        Raises:
-            Problem: there is no such alarm, or somebody has said so.
+        Raises
+        ------
+        Problem
+            There is no such alarm, or somebody has said so.
         """
         a = ACKNOWLEDGEMENT.c
         with writing(self._engine) as connection:
@@ -477,17 +537,26 @@ def bodies_of(job: ResolvedJob) -> dict[str, list[str]]:
 def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[int, ...]:
     """Make a record where there is none.
 
-    Args:
-        place: folder, or address of a database.
-        job: one on the instrument.
-        simulated: whether times are not compared with the computer's clock.
+    Parameters
+    ----------
+    place : str
+        Folder, or address of a database.
+    job : ResolvedJob
+        One on the instrument.
+    simulated : bool
+        Whether times are not compared with the computer's clock.
 
-    Returns:
+    Returns
+    -------
+    tuple[int, ...]
         The version of a new record; nothing where there was one.
 
-    Raises:
-        NotARecord: there is one of another instrument, or of another version.
-        RecordFailed: it cannot be made.
+    Raises
+    ------
+    NotARecord
+        There is one of another instrument, or of another version.
+    RecordFailed
+        It cannot be made.
     """
     url = url_of(place)
     folder = Path(str(url.database)).parent if url.get_backend_name() == "sqlite" and "://" not in place else None

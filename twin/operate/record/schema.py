@@ -269,8 +269,10 @@ _LOCK = 7_236_001
 def url_of(place: str) -> URL:
     """Address of the database of a folder, or the address itself.
 
-    Raises:
-        NotARecord: not an address that SQLAlchemy knows.
+    Raises
+    ------
+    NotARecord
+        Not an address that SQLAlchemy knows.
     """
     if (file := file_of(place)) is not None:
         return URL.create("sqlite", database=str(file))

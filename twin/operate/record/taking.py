@@ -32,13 +32,20 @@ Before = Mapping[tuple[str, str, str], tuple[float, float]]
 class Taken:
     """What became of one file.
 
-    Attributes:
-        file: its path.
-        new: readings and events that are now in the record.
-        known: that were in it already.
-        refused: what was not taken: line, reason.
-        before: whether the same file had been taken before.
-        refused_before: how many of these had been refused before, and are not counted again.
+    Attributes
+    ----------
+    file : str
+        Its path.
+    new : int
+        Readings and events that are now in the record.
+    known : int
+        That were in it already.
+    refused : tuple[tuple[int | None, str], ...]
+        What was not taken: line, reason.
+    before : bool
+        Whether the same file had been taken before.
+    refused_before : int
+        How many of these had been refused before, and are not counted again.
     """
 
     file: str
@@ -58,10 +65,14 @@ class Taken:
 class Taking:
     """One file on its way into the record.
 
-    Args:
-        connection: in the transaction of the one writer of this moment.
-        simulated: whether times are not compared with the computer's clock.
-        late: whether readings may be older than the newest of their sort and subject in the record.
+    Parameters
+    ----------
+    connection
+        In the transaction of the one writer of this moment.
+    simulated
+        Whether times are not compared with the computer's clock.
+    late
+        Whether readings may be older than the newest of their sort and subject in the record.
     """
 
     def __init__(self, connection: Connection, simulated: bool, late: bool) -> None:
@@ -193,12 +204,18 @@ class Taking:
     ) -> None:
         """Add rows to the record, and drop what was kept of estimates that these change.
 
-        Args:
-            given: what they come from.
-            taking: digest by which that is recognised.
-            source: its id; None where the record does not have it yet.
-            kept: entries with their digests.
-            refused: what is not taken for the first time, by its digest, with that of its entry where it has one.
+        Parameters
+        ----------
+        given : Given
+            What they come from.
+        taking : str
+            Digest by which that is recognised.
+        source : int | None
+            Its id; None where the record does not have it yet.
+        kept : list[tuple[Entry, str]]
+            Entries with their digests.
+        refused : Mapping[str, tuple[Refused, str | None]]
+            What is not taken for the first time, by its digest, with that of its entry where it has one.
         """
         moment = utc_text(now())
         if source is None:

@@ -74,12 +74,18 @@ def kind_of_run(folder: Path) -> str:
 def run_entries(place: Path, kind: str, moment: int, history: History, stated: bool) -> Given:
     """The readings of a run folder; what is wrong with it stands in their place.
 
-    Args:
-        place: the folder, or the file of results in it.
-        kind: of reading; empty for the one that it holds.
-        moment: of it, or of the beginning of a series, microseconds of TAI since 2000.
-        history: the record.
-        stated: whether somebody says that the run is of the record's instrument, of a run that does not say it itself.
+    Parameters
+    ----------
+    place : Path
+        The folder, or the file of results in it.
+    kind : str
+        Of reading; empty for the one that it holds.
+    moment : int
+        Of it, or of the beginning of a series, microseconds of TAI since 2000.
+    history : History
+        The record.
+    stated : bool
+        Whether somebody says that the run is of the record's instrument, of a run that does not say it itself.
     """
     folder = place.parent if place.name in RESULTS.values() else place
     kind = kind or kind_of_run(folder)
@@ -180,8 +186,10 @@ UNIT = 1e-3
 def read_telemetry(path: Path, history: History) -> TelemetrySpec:
     """What tables hold, as a file says.
 
-    Raises:
-        InputError: it cannot be read, is not valid, or is of another instrument than the record.
+    Raises
+    ------
+    InputError
+        It cannot be read, is not valid, or is of another instrument than the record.
     """
     spec = validate(TelemetrySpec, read_yaml(path))
     digest = digest_of_job(resolve_on(spec, spec.instrument))
@@ -200,8 +208,10 @@ def read_telemetry(path: Path, history: History) -> TelemetrySpec:
 def tables_of(spec: TelemetrySpec, table: ReadingTableSpec) -> list[Path]:
     """The files of a table that are there, by name.
 
-    Raises:
-        InputError: not the name of files.
+    Raises
+    ------
+    InputError
+        Not the name of files.
     """
     folder = Path(spec.source.file).parent
     try:
@@ -401,12 +411,18 @@ def time_of_name(name: str) -> int | None:
 class Sources:
     """What was named to be taken into a record.
 
-    Attributes:
-        places: YAML files, run folders, folders with some of these.
-        moment: of a run folder that is named itself, microseconds; None where its name says it.
-        stated: whether run folders that do not say it are of the record's instrument.
-        watching: whether it is looked at more than once, and then only what has changed since is read.
-        seen: path -> how it was when it was read.
+    Attributes
+    ----------
+    places : Sequence[Path]
+        YAML files, run folders, folders with some of these.
+    moment : int | None
+        Of a run folder that is named itself, microseconds; None where its name says it.
+    stated : bool
+        Whether run folders that do not say it are of the record's instrument.
+    watching : bool
+        Whether it is looked at more than once, and then only what has changed since is read.
+    seen : dict[str, State]
+        Path -> how it was when it was read.
     """
 
     places: Sequence[Path]
@@ -418,9 +434,12 @@ class Sources:
     def look(self, history: History) -> Iterator[Given]:
         """What they hold now; of what is watched only what has changed since the last look.
 
-        Raises:
-            InputErrorText: nothing is there, or a run folder that was named has no time.
-            InputError: a YAML file is not valid.
+        Raises
+        ------
+        InputErrorText
+            Nothing is there, or a run folder that was named has no time.
+        InputError
+            a YAML file is not valid.
         """
         for place in self.places:
             if place.suffix not in _YAML and is_run_folder(place if place.is_dir() else place.parent):

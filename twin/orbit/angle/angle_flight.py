@@ -47,11 +47,14 @@ if TYPE_CHECKING:
 class AngleCamera:
     """Lines on their common base.
 
-    Attributes:
-        laboratory: line -> what was measured before launch, which the analysis knows.
-        cameras: line -> what it is in orbit.
-        trace: angle -> how it has changed by `twin.monitor.truth.trace_truth`, radians; only for the two cameras of a
-            pair.
+    Attributes
+    ----------
+    laboratory : Mapping[str, LineCamera]
+        Line -> what was measured before launch, which the analysis knows.
+    cameras : Mapping[str, LineCamera]
+        Line -> what it is in orbit.
+    trace : Mapping[str, float]
+        Angle -> how it has changed by `twin.monitor.truth.trace_truth`, radians; only for the two cameras of a pair.
     """
 
     laboratory: Mapping[str, LineCamera]
@@ -62,13 +65,19 @@ class AngleCamera:
 def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
     """The lines of a payload turned as the test says, or those of an instrument traced without and with its changes.
 
-    Args:
-        setup: the test with its camera.
-        backend: where to trace an instrument; a payload needs none.
+    Parameters
+    ----------
+    setup : AngleSetup
+        The test with its camera.
+    backend : Backend | None
+        Where to trace an instrument; a payload needs none.
 
-    Raises:
-        InputError: a change of what the instrument does not have, or a temperature that cannot be.
-        BenchError: the changes move the image off the mirrors.
+    Raises
+    ------
+    InputError
+        a change of what the instrument does not have, or a temperature that cannot be.
+    BenchError
+        The changes move the image off the mirrors.
     """
     spec = setup.test
     if setup.camera is not None:
@@ -93,8 +102,10 @@ def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
 def _changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
     """The state that a test's changes put an instrument into.
 
-    Raises:
-        InputError: a node that does not exist or does not allow what is done to it, or a temperature that cannot be.
+    Raises
+    ------
+    InputError
+        a node that does not exist or does not allow what is done to it, or a temperature that cannot be.
     """
     issues = [
         issue
@@ -124,17 +135,26 @@ _LEAST_CONVERGENCE = np.radians(1.0)
 class Measurement:
     """What the analysis gets. Coordinates in one Cartesian frame, metres.
 
-    Attributes:
-        pairs: angle -> the two lines that it lies between.
-        station: measured, with its covariance.
-        strips: line -> measured ground points with their covariance.
-        tangent: line -> laboratory's tangents of the points' directions from the line's centre, across the line and
-            along it, (n, 2); X forward, Y to the right.
-        along: line -> tangent of the angle of each point from the line's centre along the line, (n,).
-        look: line -> laboratory's angle of the line's centre from the body's Z about its Y, radians.
-        offset: line -> laboratory's projection centre of each point, in the axes of its tangents, (n, 3), metres.
-        bow: line -> what a direction needs, in the axes of its tangents, to lie in one plane with the line's centre and
-            its middle direction, (n, 3): the image of a mirror camera's line is bent.
+    Attributes
+    ----------
+    pairs : Mapping[str, tuple[str, str]]
+        Angle -> the two lines that it lies between.
+    station : Station
+        Measured, with its covariance.
+    strips : Mapping[str, Strip]
+        Line -> measured ground points with their covariance.
+    tangent : Mapping[str, np.ndarray]
+        Line -> laboratory's tangents of the points' directions from the line's centre, across the line and along it,
+        (n, 2); X forward, Y to the right.
+    along : Mapping[str, np.ndarray]
+        Line -> tangent of the angle of each point from the line's centre along the line, (n,).
+    look : Mapping[str, float]
+        Line -> laboratory's angle of the line's centre from the body's Z about its Y, radians.
+    offset : Mapping[str, np.ndarray]
+        Line -> laboratory's projection centre of each point, in the axes of its tangents, (n, 3), metres.
+    bow : Mapping[str, np.ndarray]
+        Line -> what a direction needs, in the axes of its tangents, to lie in one plane with the line's centre and its
+        middle direction, (n, 3): the image of a mirror camera's line is bent.
     """
 
     pairs: Mapping[str, tuple[str, str]]
@@ -150,10 +170,14 @@ class Measurement:
     def of(cls, laboratory: LineAngles, station: Station, strips: Mapping[str, Strip]) -> Measurement:
         """Measured station and points, with what the laboratory knows of the lines' pixels.
 
-        Args:
-            laboratory: the lines as the laboratory measured them, and the places of the points on them.
-            station: measured.
-            strips: line -> measured ground points; angles are found between these lines.
+        Parameters
+        ----------
+        laboratory : LineAngles
+            The lines as the laboratory measured them, and the places of the points on them.
+        station : Station
+            measured.
+        strips : Mapping[str, Strip]
+            Line -> measured ground points; angles are found between these lines.
         """
         inside = {name: _interior(laboratory.cameras[name], laboratory.pixel[name]) for name in strips}
         known = {key: {name: one[key] for name, one in inside.items()} for key in next(iter(inside.values()))}
@@ -168,9 +192,12 @@ class Measurement:
     def in_frame(self, axes: np.ndarray, origin: np.ndarray) -> Measurement:
         """The measurement in another frame.
 
-        Args:
-            axes: of that frame as rows in the present one, (3, 3).
-            origin: of that frame in the present one, (3,), metres.
+        Parameters
+        ----------
+        axes : np.ndarray
+            Of that frame as rows in the present one, (3, 3).
+        origin : np.ndarray
+            Of that frame in the present one, (3,), metres.
         """
         station = Station((self.station.position - origin) @ axes.T, axes @ self.station.covariance @ axes.T)
         strips = {
@@ -186,14 +213,20 @@ class AnglePass(LineAngles):
 
     The cameras are those in orbit, and so the angles are the true ones.
 
-    Attributes:
-        spec: the test.
-        earth: its rotation and ellipsoid.
-        trajectory: true orbit and attitude.
-        laboratory: line -> camera as it was measured before launch.
-        trace: angle -> its change by `twin.monitor.truth.trace_truth`, radians; empty where no trace of two cameras
-            tells it.
-        height: line -> heights of its points above the ellipsoid, (n,).
+    Attributes
+    ----------
+    spec : OrbitAngleSpec
+        The test.
+    earth : Earth
+        Its rotation and ellipsoid.
+    trajectory : Trajectory
+        True orbit and attitude.
+    laboratory : Mapping[str, LineCamera]
+        Line -> camera as it was measured before launch.
+    trace : Mapping[str, float]
+        Angle -> its change by `twin.monitor.truth.trace_truth`, radians; empty where no trace of two cameras tells it.
+    height : Mapping[str, np.ndarray]
+        Line -> heights of its points above the ellipsoid, (n,).
     """
 
     spec: OrbitAngleSpec
@@ -263,8 +296,10 @@ class AnglePass(LineAngles):
     def ground(self, effects: LightEffects) -> dict[str, np.ndarray]:
         """Line -> true ground points, (n, 3), when these effects act on the light.
 
-        Raises:
-            BenchError: a look misses the Earth, or the time is too near the end of the orbit.
+        Raises
+        ------
+        BenchError
+            a look misses the Earth, or the time is too near the end of the orbit.
         """
         points = {
             name: self._sensor(name, effects).ground(np.zeros(1), self.pixel[name], self.height[name])
@@ -283,11 +318,16 @@ class AnglePass(LineAngles):
     ) -> Measurement:
         """Station and points as they are measured.
 
-        Args:
-            points: line -> true points, (n, 3).
-            seed: of the errors; None for none but the datum's.
-            corrected: effects that are taken out of the points.
-            datum: shift of all points, east, north, up, metres; None for the file's.
+        Parameters
+        ----------
+        points : Mapping[str, np.ndarray]
+            Line -> true points, (n, 3).
+        seed : np.random.SeedSequence | None
+            Of the errors; None for none but the datum's.
+        corrected : LightEffects
+            Effects that are taken out of the points.
+        datum : tuple[float, float, float] | None
+            Shift of all points, east, north, up, metres; None for the file's.
         """
         errors, lines = self.spec.errors, self.lines
         noise = np.zeros((1 + sum(len(points[name]) for name in lines), 3))
@@ -352,13 +392,19 @@ class AnglePass(LineAngles):
 def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) -> AnglePass:
     """Put the satellite into its orbit and draw the terrain.
 
-    Args:
-        setup: the test.
-        camera: its lines, by `angle_camera`.
-        seed: of the terrain.
+    Parameters
+    ----------
+    setup : AngleSetup
+        The test.
+    camera : AngleCamera
+        Its lines, by `angle_camera`.
+    seed : np.random.SeedSequence
+        Of the terrain.
 
-    Raises:
-        BenchError: there is no such orbit.
+    Raises
+    ------
+    BenchError
+        There is no such orbit.
     """
     spec = setup.test
     earth = Earth.from_spec(spec.earth)
@@ -416,14 +462,22 @@ def without_effects(
 ) -> np.ndarray:
     """Where ground points (N, 3) would lie on the lines of sight that see them, if nothing happened to the light.
 
-    Args:
-        points: ITRS, metres.
-        station: (3,), metres.
-        velocity: of the satellite against the stars in axes of the ITRS, (3,), m/s.
-        earth: the ellipsoid.
-        effects: to take out.
+    Parameters
+    ----------
+    points : np.ndarray
+        ITRS, metres.
+    station : np.ndarray
+        (3,), metres.
+    velocity : np.ndarray
+        Of the satellite against the stars in axes of the ITRS, (3,), m/s.
+    earth : Earth
+        The ellipsoid.
+    effects : LightEffects
+        To take out.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (N, 3), at the distances of the points.
     """
     source = points

@@ -59,13 +59,20 @@ line of `gf7` by 1e-5 arcsec, and a turn of its focal plane by 2 arcsec about th
 class Estimate:
     """Angles from one measurement, in the order of the test's file.
 
-    Attributes:
-        planes: method -> planes of the lines.
-        angles: method -> their dihedral angles.
-        look: angles between the lines of sight of the lines' centres, from tls planes and places on the line, radians.
-        along: their signed part along the track.
-        resection: the second method.
-        resected: its angles, signed like those along the track.
+    Attributes
+    ----------
+    planes : Mapping[Method, tuple[PlaneFit, ...]]
+        Method -> planes of the lines.
+    angles : Mapping[Method, PlaneAngles]
+        Method -> their dihedral angles.
+    look : np.ndarray
+        Angles between the lines of sight of the lines' centres, from tls planes and places on the line, radians.
+    along : AlongTrackAngles
+        Their signed part along the track.
+    resection : Resection
+        The second method.
+    resected : AlongTrackAngles
+        Its angles, signed like those along the track.
     """
 
     planes: Mapping[Method, tuple[PlaneFit, ...]]
@@ -80,13 +87,20 @@ class Estimate:
 class FrameRow:
     """One method in one frame.
 
-    Attributes:
-        frame: its name.
-        method: of the planes.
-        values: the angles, radians; NaN where the method found a plane singular.
-        sigma: that it claims, radians.
-        steepest: smallest size of the z component of the three unit normals; 0 for a vertical plane.
-        warned: the fit itself says that it is biased.
+    Attributes
+    ----------
+    frame : str
+        Its name.
+    method : Method
+        Of the planes.
+    values : np.ndarray
+        The angles, radians; NaN where the method found a plane singular.
+    sigma : np.ndarray
+        That it claims, radians.
+    steepest : float
+        Smallest size of the z component of the three unit normals; 0 for a vertical plane.
+    warned : bool
+        The fit itself says that it is biased.
     """
 
     frame: str
@@ -101,11 +115,16 @@ class FrameRow:
 class EffectRow:
     """What an effect on the light, or a common shift of the points, does to the angles of tls planes, radians.
 
-    Attributes:
-        names: of the angles.
-        what: name of the effect.
-        bias: angles minus the truth without correction.
-        left: the same after the analysis has taken it out; NaN where it cannot.
+    Attributes
+    ----------
+    names : tuple[str, ...]
+        Of the angles.
+    what : str
+        Name of the effect.
+    bias : np.ndarray
+        Angles minus the truth without correction.
+    left : np.ndarray
+        The same after the analysis has taken it out; NaN where it cannot.
     """
 
     names: tuple[str, ...]
@@ -118,11 +137,16 @@ class EffectRow:
 class Scatter:
     """Repeated passes with errors drawn anew, of one estimator of m angles.
 
-    Attributes:
-        names: of the angles.
-        values: (passes, m), radians.
-        covariance: that the estimator claims, mean over the passes, (m, m), rad^2.
-        truth: what it estimates, (m,), radians.
+    Attributes
+    ----------
+    names : tuple[str, ...]
+        Of the angles.
+    values : np.ndarray
+        (passes, m), radians.
+    covariance : np.ndarray
+        That the estimator claims, mean over the passes, (m, m), rad^2.
+    truth : np.ndarray
+        What it estimates, (m,), radians.
     """
 
     names: tuple[str, ...]
@@ -163,14 +187,22 @@ class Scatter:
 class PassAngles:
     """Angles of one pass, simulated or measured.
 
-    Attributes:
-        name: of the pass.
-        time: of the moment, seconds from the epoch.
-        laboratory: angles between the lines as the laboratory knows them.
-        ids: line -> names of its points, (n,).
-        span: line -> first and last time of its points from the moment, seconds.
-        measurement: points as the lines would see them at the moment.
-        estimate: from it.
+    Attributes
+    ----------
+    name : str
+        Of the pass.
+    time : float
+        Of the moment, seconds from the epoch.
+    laboratory : LineAngles
+        Angles between the lines as the laboratory knows them.
+    ids : Mapping[str, np.ndarray]
+        Line -> names of its points, (n,).
+    span : Mapping[str, tuple[float, float]]
+        Line -> first and last time of its points from the moment, seconds.
+    measurement : Measurement
+        Points as the lines would see them at the moment.
+    estimate : Estimate
+        From it.
     """
 
     name: str
@@ -196,10 +228,14 @@ class PassAngles:
 class AngleRun:
     """A finished test, simulated or on measurements.
 
-    Attributes:
-        setup: what its file says.
-        seed: of all random numbers.
-        passes: measured, one by one; of a simulation the one that is shown.
+    Attributes
+    ----------
+    setup : AnyAngle
+        What its file says.
+    seed : int
+        Of all random numbers.
+    passes : tuple[PassAngles, ...]
+        Measured, one by one; of a simulation the one that is shown.
     """
 
     setup: AnyAngle
@@ -211,15 +247,22 @@ class AngleRun:
 class SimulatedAngleRun(AngleRun):
     """A simulated test, which also knows the truth.
 
-    Attributes:
-        flight: the truth.
-        frames: all methods in all frames.
-        effects: each alone and all together, without errors.
-        planes, resection, along: scatter of the dihedral angles (tls), of the resection's, and of the planes' angles
-            along the track.
-        difference_sigma: standard deviation of planes minus resection over the passes, (m,), radians.
-        table: sensitivity of tls planes in the Earth-fixed frame.
-        height: angle -> height error of one arcsecond, metres; None where the orbit is too short.
+    Attributes
+    ----------
+    flight : AnglePass
+        The truth.
+    frames : tuple[FrameRow, ...]
+        All methods in all frames.
+    effects : tuple[EffectRow, ...]
+        Each alone and all together, without errors.
+    planes, resection, along : Scatter
+        Scatter of the dihedral angles (tls), of the resection's, and of the planes' angles along the track.
+    difference_sigma : np.ndarray
+        Standard deviation of planes minus resection over the passes, (m,), radians.
+    table : tuple[Sensitivity, ...]
+        Sensitivity of tls planes in the Earth-fixed frame.
+    height : Mapping[str, float | None]
+        Angle -> height error of one arcsecond, metres; None where the orbit is too short.
     """
 
     setup: AngleSetup
@@ -285,15 +328,23 @@ def values_of(angles: Mapping[str, float]) -> np.ndarray:
 def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> SimulatedAngleRun:
     """Fly, measure and estimate: ``python -m twin.orbit angle``.
 
-    Args:
-        setup: the test and its camera.
-        backend: where to trace an instrument; a payload needs none.
-        seed: of all random numbers.
-        advance: told of the progress.
+    Parameters
+    ----------
+    setup : AngleSetup
+        The test and its camera.
+    backend : Backend | None
+        Where to trace an instrument; a payload needs none.
+    seed : int
+        Of all random numbers.
+    advance : Advance
+        Told of the progress.
 
-    Raises:
-        InputError: an instrument's changes are not possible.
-        BenchError: the test cannot be carried out as its file says.
+    Raises
+    ------
+    InputError
+        An instrument's changes are not possible.
+    BenchError
+        The test cannot be carried out as its file says.
     """
     terrain, shown, repeats = _streams(seed)
     flight = fly(setup, angle_camera(setup, backend), terrain)

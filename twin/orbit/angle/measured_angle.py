@@ -46,8 +46,10 @@ if TYPE_CHECKING:
 def run_angle_test(setup: AnyAngle, backend: Backend | None, seed: int, advance: Advance = silent) -> AngleRun:
     """On measurements, or on a simulation: ``python -m twin.orbit angle``.
 
-    Raises:
-        InputError, BenchError: as `run_angle` and `run_measured_angle`.
+    Raises
+    ------
+    InputError, BenchError
+        As `run_angle` and `run_measured_angle`.
     """
     if isinstance(setup, MeasuredAngleSetup):
         return run_measured_angle(setup, seed, advance)
@@ -58,9 +60,12 @@ def run_angle_test(setup: AnyAngle, backend: Backend | None, seed: int, advance:
 def run_measured_angle(setup: MeasuredAngleSetup, seed: int = 0, advance: Advance = silent) -> AngleRun:
     """Read and estimate; nothing is drawn, so that the seed is not used.
 
-    Raises:
-        InputError: files that cannot be used, or angles of lines that have no points.
-        BenchError: the points do not determine the angles.
+    Raises
+    ------
+    InputError
+        Files that cannot be used, or angles of lines that have no points.
+    BenchError
+        The points do not determine the angles.
     """
     passes = []
     for one in read_measurements(setup.data, setup.camera, advance, needed={}):
@@ -75,14 +80,21 @@ def run_measured_angle(setup: MeasuredAngleSetup, seed: int = 0, advance: Advanc
 def _measured_angles(setup: MeasuredAngleSetup, one: PassMeasurements) -> PassAngles:
     """Angles of one pass.
 
-    Args:
-        setup: the test.
-        one: the pass.
+    Parameters
+    ----------
+    setup : MeasuredAngleSetup
+        The test.
+    one : PassMeasurements
+        The pass.
 
-    Raises:
-        InputError: angles of lines that have no points.
-        PlaneError, AngleError, ResectionError: the points do not determine them.
-        ValueError: a moment at which orbit or attitude are not known.
+    Raises
+    ------
+    InputError
+        Angles of lines that have no points.
+    PlaneError, AngleError, ResectionError
+        The points do not determine them.
+    ValueError
+        a moment at which orbit or attitude are not known.
     """
     test = setup.test
     given = one.ground.role != "tie"
@@ -185,10 +197,14 @@ def _shared(away: np.ndarray, path: TabulatedTrajectory, errors: ReadingErrorsSp
     Points of one reading err alike: each of n is given n times the variance, so that their mean has the right one. A
     point of the moment's own reading errs like the moment, which leaves the angles as they are.
 
-    Args:
-        away: times of the points from the moment, (n,), seconds.
-        path: for the intervals of the readings.
-        errors: of the readings.
+    Parameters
+    ----------
+    away : np.ndarray
+        Times of the points from the moment, (n,), seconds.
+    path : TabulatedTrajectory
+        For the intervals of the readings.
+    errors : ReadingErrorsSpec
+        Of the readings.
     """
     tracker, gps = errors.star_tracker, errors.gps
     turn = _of_readings(away, tracker.interval or path.attitude_interval, tracker.noise)
@@ -214,8 +230,10 @@ _IMAGE_SIGMA = 1e-6
 def angle_exported(run: AngleRun) -> dict[str, str]:
     """Path -> text of the files: the pass that is shown, with the errors that were drawn for it.
 
-    Raises:
-        InputError: the measurements are files already, or the lines are an instrument's, which no payload's file says.
+    Raises
+    ------
+    InputError
+        The measurements are files already, or the lines are an instrument's, which no payload's file says.
     """
     test = run.setup.test
     if not isinstance(run, SimulatedAngleRun):

@@ -48,13 +48,18 @@ NOTHING = "ties alone"
 class Worth:
     """The block with some of its sensors.
 
-    Attributes:
-        left_out: sensors that were not used.
-        predicted: errors at check points by their covariances; at all tie points where there are no check points.
-        found: by their true or given places; None without check points.
-        agreement: mean square of the errors over their sigmas, of the three coordinates: 1 where sigmas are right;
-            None likewise.
-        plan, height: CE90 and LE90 by the covariances, over those with all sensors.
+    Attributes
+    ----------
+    left_out : tuple[str, ...]
+        Sensors that were not used.
+    predicted : Accuracy
+        Errors at check points by their covariances; at all tie points where there are no check points.
+    found : Accuracy | None
+        By their true or given places; None without check points.
+    agreement : float | None
+        Mean square of the errors over their sigmas, of the three coordinates: 1 where sigmas are right; None likewise.
+    plan, height : float
+        CE90 and LE90 by the covariances, over those with all sensors.
     """
 
     left_out: tuple[str, ...]
@@ -93,19 +98,32 @@ class _Known:
 class BlockRun:
     """Everything that was computed.
 
-    Attributes:
-        setup: what the file says.
-        seed: of all that was drawn.
-        drawn: the block and its truth; None for a measured block.
-        adjustment: with all sensors that the file does not leave out.
-        worth: case -> check points: all sensors, without each, and ties alone.
-        network: how scenes hang together.
-        open: what observations leave to the priors.
-        laws: tests of the laws in time.
-        datum: of the control points against the rest; None without control points.
-        cameras: scene -> its camera.
-        check: (k,) check points, (k, 3) errors east, north and up, metres, and (k, 3) their sigmas.
-        rejected: point and set of observations of every gross error that was left out.
+    Attributes
+    ----------
+    setup : AnyAdjust
+        What the file says.
+    seed : int
+        Of all that was drawn.
+    drawn : DrawnBlock | None
+        The block and its truth; None for a measured block.
+    adjustment : BlockAdjustment
+        With all sensors that the file does not leave out.
+    worth : Mapping[str, Worth]
+        Case -> check points: all sensors, without each, and ties alone.
+    network : Network
+        How scenes hang together.
+    open : tuple[Open, ...]
+        What observations leave to the priors.
+    laws : tuple[LawTest, ...]
+        Tests of the laws in time.
+    datum : DatumTest | None
+        Of the control points against the rest; None without control points.
+    cameras : Mapping[str, CameraChange]
+        Scene -> its camera.
+    check : tuple[np.ndarray, np.ndarray, np.ndarray]
+        (k,) check points, (k, 3) errors east, north and up, metres, and (k, 3) their sigmas.
+    rejected : Rejected
+        Point and set of observations of every gross error that was left out.
     """
 
     setup: AnyAdjust
@@ -143,17 +161,27 @@ def run_adjustment(
 ) -> BlockRun:
     """Draw or read a block and adjust it. Nothing is traced: the backend is not used.
 
-    Args:
-        setup: what the file says.
-        backend: not used.
-        seed: of all that is drawn.
-        advance: told of the progress.
-        pool: processes that reduce the points; None for this one alone.
-        monitor: what a record says of the cameras, where the file names one.
+    Parameters
+    ----------
+    setup : AnyAdjust
+        What the file says.
+    backend : Backend | None
+        Not used.
+    seed : int
+        Of all that is drawn.
+    advance : Advance
+        Told of the progress.
+    pool : Pool | None
+        Processes that reduce the points; None for this one alone.
+    monitor : MonitorSource | None
+        What a record says of the cameras, where the file names one.
 
-    Raises:
-        InputError: tables that cannot be used.
-        BenchError: no such orbit, or a block that cannot be adjusted.
+    Raises
+    ------
+    InputError
+        Tables that cannot be used.
+    BenchError
+        No such orbit, or a block that cannot be adjusted.
     """
     spec = setup.test
     advance("block", 0, 2)
@@ -298,9 +326,12 @@ _LOST = "a worker was lost with its share of the points; adjust the block again"
 class PointWorkers:
     """Workers as `analysis.block.point_reduction` uses them: one share for each of those that there are at the start.
 
-    Attributes:
-        workers: the processes.
-        count: of them.
+    Attributes
+    ----------
+    workers : Workers
+        The processes.
+    count : int
+        Of them.
     """
 
     workers: Workers
@@ -317,9 +348,12 @@ class PointWorkers:
     def results(self, work: Callable[[tuple[Any, ...]], Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Work done with each of the arguments, in their order.
 
-        Raises:
-            MeasurementError: a share that cannot be reduced.
-            ClusterError: a worker or the scheduler is gone.
+        Raises
+        ------
+        MeasurementError
+            a share that cannot be reduced.
+        ClusterError
+            a worker or the scheduler is gone.
         """
         futures = [self.workers.submit(_on_one_thread, (work, *one)) for one in arguments]
 
@@ -350,14 +384,21 @@ def point_workers(
 ) -> Iterator[PointWorkers | None]:
     """Workers inside the block; none where neither a number nor a scheduler is given.
 
-    Args:
-        count: of processes of this machine.
-        scheduler: address of a running cluster.
-        warn: told what the user should know.
+    Parameters
+    ----------
+    count : int | None
+        Of processes of this machine.
+    scheduler : str | None
+        Address of a running cluster.
+    warn : Callable[[str], None]
+        Told what the user should know.
 
-    Raises:
-        InputErrorText: both are given, or a cluster that cannot be used.
-        ClusterError: a cluster without workers.
+    Raises
+    ------
+    InputErrorText
+        Both are given, or a cluster that cannot be used.
+    ClusterError
+        a cluster without workers.
     """
     if scheduler is None and (count is None or count < 2):
         yield None

@@ -58,11 +58,16 @@ _PLACES, _IMAGES, _LASER, _TERRAIN, _CONTROL, _COURSES, _CAMERAS, _GROSS = range
 class TruePlatform:
     """What the readings depart from, on the readings' own time.
 
-    Attributes:
-        readings: a smooth orbit.
-        axes: (3, 3) body axes in the middle of the pass as columns, ITRS.
-        turn: of times of the block (n,) to rotation vectors (n, 3), radians. shift: likewise, metres along `axes`.
-        begin: of the readings' time on that of the block, seconds.
+    Attributes
+    ----------
+    readings : Platform
+        a smooth orbit.
+    axes : np.ndarray
+        (3, 3) body axes in the middle of the pass as columns, ITRS.
+    turn : Course
+        Of times of the block (n,) to rotation vectors (n, 3), radians. shift: likewise, metres along `axes`.
+    begin : float
+        Of the readings' time on that of the block, seconds.
     """
 
     readings: Platform
@@ -90,12 +95,18 @@ class TruePlatform:
 class DrawnBlock:
     """A block and its truth.
 
-    Attributes:
-        block: what is known and measured.
-        ground: (m, 3) true points, ITRS, metres.
-        change: scene -> (4,) true changes of its camera, radians and metres.
-        platforms: pass -> the true one.
-        gross: scene -> (k,) image points that are wrong.
+    Attributes
+    ----------
+    block : known.Block
+        What is known and measured.
+    ground : np.ndarray
+        (m, 3) true points, ITRS, metres.
+    change : Mapping[str, np.ndarray]
+        Scene -> (4,) true changes of its camera, radians and metres.
+    platforms : Mapping[str, TruePlatform]
+        Pass -> the true one.
+    gross : Mapping[str, np.ndarray]
+        Scene -> (k,) image points that are wrong.
     """
 
     block: known.Block
@@ -224,13 +235,19 @@ def _trajectory(spec: OrbitAdjustSpec, name: str, one: BlockPassSpec, earth: Ear
 def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence, monitor: MonitorSource | None = None) -> DrawnBlock:
     """Fly all passes and measure.
 
-    Args:
-        setup: what the file says.
-        seed: of all that is drawn.
-        monitor: what a record says of the cameras, from which the true ones are drawn.
+    Parameters
+    ----------
+    setup : AdjustSetup
+        What the file says.
+    seed : np.random.SeedSequence
+        Of all that is drawn.
+    monitor : MonitorSource | None
+        What a record says of the cameras, from which the true ones are drawn.
 
-    Raises:
-        BenchError: no such orbit, or too few places that two scenes see.
+    Raises
+    ------
+    BenchError
+        No such orbit, or too few places that two scenes see.
     """
     spec, payload = setup.test, setup.camera
     earth = Earth.from_spec(spec.earth)

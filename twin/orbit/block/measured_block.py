@@ -54,10 +54,14 @@ def change_covariance(spec: CameraChangeSpec, days: np.ndarray) -> np.ndarray:
 def monitored_camera(law: np.ndarray, reading: np.ndarray, sigma: np.ndarray) -> CameraKnowledge:
     """A camera's changes after the monitor's readings.
 
-    Args:
-        law: covariance before them, (4 T, 4 T).
-        reading: of the changes, (4 T,), radians and metres.
-        sigma: of the readings, (4 T,); infinite where there is none.
+    Parameters
+    ----------
+    law : np.ndarray
+        Covariance before them, (4 T, 4 T).
+    reading : np.ndarray
+        Of the changes, (4 T,), radians and metres.
+    sigma : np.ndarray
+        Of the readings, (4 T,); infinite where there is none.
     """
     use = np.flatnonzero(np.isfinite(sigma))
     gain = law[:, use] @ np.linalg.inv(law[np.ix_(use, use)] + np.diag(sigma[use] ** 2))
@@ -82,9 +86,12 @@ def measured_block(
 ) -> tuple[known.Block, np.ndarray]:
     """The block of the tables of all passes, and the given coordinates of its points (m, 3), ITRS, metres, NaN of ties.
 
-    Raises:
-        InputError: a table that cannot be used.
-        BenchError: points that cannot be intersected, or a line of which it is not said how it may change.
+    Raises
+    ------
+    InputError
+        a table that cannot be used.
+    BenchError
+        Points that cannot be intersected, or a line of which it is not said how it may change.
     """
     spec, payload = setup.test, setup.camera
     passes = read_measurements(setup.data, payload, advance, {})

@@ -147,9 +147,12 @@ _SCREENED = {
 def _sums(meanings: Mapping[str, str], parts: Callable[[Any], Any] = lambda parts: parts) -> list[Quantity[Any]]:
     """Counts that are sums over line images or fields.
 
-    Args:
-        meanings: attribute of a part, which is the key, too -> what it counts.
-        parts: of a source; the source itself if not given.
+    Parameters
+    ----------
+    meanings : Mapping[str, str]
+        Attribute of a part, which is the key, too -> what it counts.
+    parts : Callable[[Any], Any]
+        Of a source; the source itself if not given.
     """
 
     def total(name: str) -> Callable[[Any], int]:

@@ -80,11 +80,15 @@ _TIE = 1.7e5
 class FieldResult:
     """A field calibrated by itself, with paper 003's twelve unknowns.
 
-    Attributes:
-        adjustment: simultaneous.
-        orbit: third differences of the measured positions, ITRS; None for fewer than five even readings.
-        attitude: third differences of the measured attitude against the orbital frame, roll, pitch, yaw, by readings
-            within the orbit's; None likewise.
+    Attributes
+    ----------
+    adjustment : Adjustment
+        simultaneous.
+    orbit : ThirdDifference | None
+        Third differences of the measured positions, ITRS; None for fewer than five even readings.
+    attitude : ThirdDifference | None
+        Third differences of the measured attitude against the orbital frame, roll, pitch, yaw, by readings within the
+        orbit's; None likewise.
     """
 
     adjustment: Adjustment
@@ -96,28 +100,49 @@ class FieldResult:
 class CalibrationRun:
     """All that was computed.
 
-    Attributes:
-        setup: what its file says.
-        seed: of all random numbers.
-        campaign: truth and measurements.
-        together: simultaneous adjustment of all fields, with the orbit's offsets and, where the latitude fit tells it,
-            the drift of the biases during the passes.
-        truth: (P,) true values of its unknowns; None where nobody knows them.
-        fields: name -> that field by itself.
-        stepwise: the first scheme's first field by the stepwise solution, bias and interior in turn.
-        before: field -> errors with the laboratory's camera.
-        schemes: scheme, "1" on -> field -> errors; the last lets each field use its own parameters.
-        scheme_means: over the fields; None for a single scheme of averaged parameters.
-        latitude: the biases against latitude, roll, pitch, yaw; empty for too few fields.
-        repeatability: of the parameters from field to field; empty for one field.
-        light: what effects on the light do where they are left in.
-        datum: what a wrong datum does.
-        surprises: estimates beyond what is expected of them.
-        drift: of the attitude within the passes, by the residuals.
-        chip_steps: within the lines, by the residuals.
-        repeats: campaigns repeated with everything drawn anew; None for none.
-        monitoring: what a monitor of drifting cameras buys; None for cameras that keep.
-        strips: passes adjusted on tie points; None for none.
+    Attributes
+    ----------
+    setup : AnyCalibration
+        What its file says.
+    seed : int
+        Of all random numbers.
+    campaign : Campaign
+        Truth and measurements.
+    together : Adjustment
+        Simultaneous adjustment of all fields, with the orbit's offsets and, where the latitude fit tells it, the drift
+        of the biases during the passes.
+    truth : np.ndarray | None
+        (P,) true values of its unknowns; None where nobody knows them.
+    fields : Mapping[str, FieldResult]
+        Name -> that field by itself.
+    stepwise : Stepwise
+        The first scheme's first field by the stepwise solution, bias and interior in turn.
+    before : Mapping[str, CheckErrors]
+        Field -> errors with the laboratory's camera.
+    schemes : Mapping[str, Mapping[str, CheckErrors]]
+        Scheme, "1" on -> field -> errors; the last lets each field use its own parameters.
+    scheme_means : SchemeMeans | None
+        Over the fields; None for a single scheme of averaged parameters.
+    latitude : tuple[LatitudeFit, ...]
+        The biases against latitude, roll, pitch, yaw; empty for too few fields.
+    repeatability : tuple[Repeatability, ...]
+        Of the parameters from field to field; empty for one field.
+    light : tuple[LightRow, ...]
+        What effects on the light do where they are left in.
+    datum : tuple[DatumRow, ...]
+        What a wrong datum does.
+    surprises : tuple[Surprise, ...]
+        Estimates beyond what is expected of them.
+    drift : AttitudeDrift
+        Of the attitude within the passes, by the residuals.
+    chip_steps : tuple[ChipStep, ...]
+        Within the lines, by the residuals.
+    repeats : Repeats | None
+        Campaigns repeated with everything drawn anew; None for none.
+    monitoring : Monitoring | None
+        What a monitor of drifting cameras buys; None for cameras that keep.
+    strips : Strips | None
+        Passes adjusted on tie points; None for none.
     """
 
     setup: AnyCalibration
@@ -158,14 +183,22 @@ def unit(name: str) -> str:
 class Unknown:
     """An unknown of the adjustment of all fields, in SI units.
 
-    Attributes:
-        name: of the unknown.
-        value: estimated.
-        sigma: with the gauge's held unknowns exact; 0 where held.
-        sigma_with_gauge: with what launch leaves to expect of the held unknowns.
-        from_start: share of its variance that comes from the sigmas of launch and season, not from the points, 0 to 1.
-        held: by the gauge.
-        truth: None where nobody knows it.
+    Attributes
+    ----------
+    name : str
+        Of the unknown.
+    value : float
+        estimated.
+    sigma : float
+        With the gauge's held unknowns exact; 0 where held.
+    sigma_with_gauge : float
+        With what launch leaves to expect of the held unknowns.
+    from_start : float
+        Share of its variance that comes from the sigmas of launch and season, not from the points, 0 to 1.
+    held : bool
+        By the gauge.
+    truth : float | None
+        None where nobody knows it.
     """
 
     name: str
@@ -202,8 +235,10 @@ def run_calibration(
 ) -> CalibrationRun:
     """Fly or read, calibrate, test: ``python -m twin.orbit calibrate``. Nothing is traced: the backend is not used.
 
-    Raises:
-        BenchError: the orbit, the points or the adjustment do not allow it.
+    Raises
+    ------
+    BenchError
+        The orbit, the points or the adjustment do not allow it.
     """
     try:
         return _run(setup, seed, advance)
@@ -303,14 +338,21 @@ def source_of(setup: AnyCalibration, seed: np.random.SeedSequence, advance: Adva
     """The campaign of a test: read from its files where it names measurements, else flown; and screened where points
     were measured in images.
 
-    Args:
-        setup: the test.
-        seed: of a simulation.
-        advance: how far it is.
+    Parameters
+    ----------
+    setup : AnyCalibration
+        The test.
+    seed : np.random.SeedSequence
+        Of a simulation.
+    advance : Advance
+        How far it is.
 
-    Raises:
-        InputError: files that cannot be used.
-        BenchError, CalibrationError: as `fly_fields`.
+    Raises
+    ------
+    InputError
+        Files that cannot be used.
+    BenchError, CalibrationError
+        As `fly_fields`.
     """
     if isinstance(setup, MeasuredCalibrationSetup):
         measured = read_measurements(setup.data, setup.camera, advance)

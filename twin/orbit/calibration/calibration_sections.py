@@ -38,9 +38,12 @@ Rows = list[tuple[Cell, ...]]
 def sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[Section, ...]:
     """Return the sections that a calibration has.
 
-    Args:
-        run: the calibration.
-        data: of calibration.json.
+    Parameters
+    ----------
+    run : CalibrationRun
+        The calibration.
+    data : Mapping[str, Any]
+        Of calibration.json.
     """
     found = (
         _schemes(run),

@@ -70,18 +70,28 @@ def light_shift(
 ) -> np.ndarray:
     """From image points as they are measured to where they would lie if nothing happened to the light.
 
-    Args:
-        sensor: the laboratory's line on the measured trajectory, with the effects that are to be taken out.
-        model: the same line as the adjustment has it.
-        line: of the image points, (n,).
-        pixel: likewise.
-        height: of the ground that they show, above the ellipsoid, metres, (n,).
+    Parameters
+    ----------
+    sensor : Sensor
+        The laboratory's line on the measured trajectory, with the effects that are to be taken out.
+    model : LineModel
+        The same line as the adjustment has it.
+    line : np.ndarray
+        Of the image points, (n,).
+    pixel : np.ndarray
+        likewise.
+    height : np.ndarray
+        Of the ground that they show, above the ellipsoid, metres, (n,).
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (n, 2) x and y in the focal plane, metres, to be added.
 
-    Raises:
-        ValueError: a point outside the image, or a look that misses the Earth.
+    Raises
+    ------
+    ValueError
+        a point outside the image, or a look that misses the Earth.
     """
     if sensor.effects == NO_EFFECTS or not any_effect(sensor.effects):
         return np.zeros((len(line), 2))
@@ -115,15 +125,23 @@ _HEIGHTS = (-500.0, 9000.0)
 class PassData:
     """What is known of a pass beside its image points; nothing of it is the truth.
 
-    Attributes:
-        name: of the field.
-        sensors: line -> the laboratory's camera on the measured trajectory. Its effects do not matter.
-        models: line -> the same camera as the adjustment has it.
-        pitch: line -> of its pixels, metres.
-        height: mean of the ground above the ellipsoid, metres.
-        lines: line -> what the payload's file says of it.
-        unit: metres in the focal plane; every ray carries the covariance of its own image point in units of it
-            squared. None: rays carry none.
+    Attributes
+    ----------
+    name : str
+        Of the field.
+    sensors : Mapping[str, Sensor]
+        Line -> the laboratory's camera on the measured trajectory. Its effects do not matter.
+    models : Mapping[str, LineModel]
+        Line -> the same camera as the adjustment has it.
+    pitch : Mapping[str, float]
+        Line -> of its pixels, metres.
+    height : float
+        Mean of the ground above the ellipsoid, metres.
+    lines : Mapping[str, LineCameraSpec]
+        Line -> what the payload's file says of it.
+    unit : float | None
+        Metres in the focal plane; every ray carries the covariance of its own image point in units of it squared. None:
+        rays carry none.
     """
 
     name: str
@@ -180,8 +198,10 @@ class PassData:
     def rays(self, images: Mapping[str, ImagePoints]) -> dict[str, Rays]:
         """Rays of image points with what happened to the light left in.
 
-        Raises:
-            ValueError: a line outside the image.
+        Raises
+        ------
+        ValueError
+            a line outside the image.
         """
         found = {}
         for name, row in images.items():
@@ -209,17 +229,26 @@ class PassData:
     ) -> CalibrationField:
         """Control points for the calibration.
 
-        Args:
-            images: line -> their image points.
-            ground: (m, 3) given coordinates, ITRS, metres.
-            covariance: (m, 3, 3) of the coordinates, m^2, of ties not used; or a sigma of each coordinate, or of each
-                axis in plan and of the height, metres.
-            removed: effects on the light that are taken out.
-            control: (m,) which of them are control, the others are ties; None for all.
+        Parameters
+        ----------
+        images : Mapping[str, ImagePoints]
+            Line -> their image points.
+        ground : np.ndarray
+            (m, 3) given coordinates, ITRS, metres.
+        covariance : float | tuple[float, float] | np.ndarray
+            (m, 3, 3) of the coordinates, m^2, of ties not used; or a sigma of each coordinate, or of each axis in plan
+            and of the height, metres.
+        removed : LightEffects
+            Effects on the light that are taken out.
+        control : np.ndarray | None
+            (m,) which of them are control, the others are ties; None for all.
 
-        Raises:
-            CalibrationError: coordinates that cannot be used, such as geodetic ones.
-            ValueError: a point outside the image.
+        Raises
+        ------
+        CalibrationError
+            Coordinates that cannot be used, such as geodetic ones.
+        ValueError
+            a point outside the image.
         """
         # the calibration's own check comes first: a place without a height has no refraction
         field = CalibrationField.of(self.name, self.rays(images), ground, covariance, control)
@@ -231,9 +260,12 @@ class PassData:
         Refraction depends on the height of the ground, 8% of it on 700 m. It is taken from a first intersection by the
         laboratory's camera, 100 m wrong, of the rays as they are.
 
-        Raises:
-            CalibrationError: the rays cannot be intersected.
-            ValueError: a point outside the image.
+        Raises
+        ------
+        CalibrationError
+            The rays cannot be intersected.
+        ValueError
+            a point outside the image.
         """
         rays = self.rays(images)
         return self.corrected(rays, images, removed, self._heights(intersect(rays, self.models, noise).ground))
@@ -243,14 +275,21 @@ class PassData:
     ) -> dict[str, Rays]:
         """The rays without these effects.
 
-        Args:
-            rays: line -> rays of the image points.
-            images: line -> the image points.
-            removed: effects on the light that are taken out.
-            height: of the ground points, (m,), NaN where not known, metres.
+        Parameters
+        ----------
+        rays : Mapping[str, Rays]
+            Line -> rays of the image points.
+        images : Mapping[str, ImagePoints]
+            Line -> the image points.
+        removed : LightEffects
+            Effects on the light that are taken out.
+        height : np.ndarray
+            Of the ground points, (m,), NaN where not known, metres.
 
-        Raises:
-            ValueError: a point outside the image.
+        Raises
+        ------
+        ValueError
+            a point outside the image.
         """
         known = np.clip(np.where(np.isfinite(height), height, self.height), *_HEIGHTS)
         found = {}
@@ -271,13 +310,20 @@ class PassData:
 class FieldPoints:
     """What was measured of a field's points.
 
-    Attributes:
-        control_images: line -> image points of the control points, and of the tie points after them.
-        control_ground: (n, 3) given coordinates of control points, first guesses of ties, ITRS, metres.
-        control: (n,) bool: which are control.
-        sigma: of given coordinates, of each axis in plan and of the height, metres.
-        check_images: line -> image points of the check points.
-        check_ground: (m, 3) true coordinates of the check points, ITRS, metres.
+    Attributes
+    ----------
+    control_images : Mapping[str, ImagePoints]
+        Line -> image points of the control points, and of the tie points after them.
+    control_ground : np.ndarray
+        (n, 3) given coordinates of control points, first guesses of ties, ITRS, metres.
+    control : np.ndarray
+        (n,) bool: which are control.
+    sigma : tuple[float, float]
+        Of given coordinates, of each axis in plan and of the height, metres.
+    check_images : Mapping[str, ImagePoints]
+        Line -> image points of the check points.
+    check_ground : np.ndarray
+        (m, 3) true coordinates of the check points, ITRS, metres.
     """
 
     control_images: Mapping[str, ImagePoints]
@@ -298,12 +344,18 @@ def image_sigma(images: Mapping[str, ImagePoints], data: PassData) -> float:
 class PassTruth:
     """What a simulation knows of a pass.
 
-    Attributes:
-        bias: (3,) true roll, pitch, yaw at the field's middle, radians: from measured to true attitude.
-        offset: (3,) true minus measured station at the field's middle, along X, Y, Z of the orbital frame, metres.
-        trajectory: the true one.
-        errors: of the readings.
-        drift: line -> (4,) true d_alpha, d_beta, d_gamma, d_f of its camera, radians and metres; empty for no drift.
+    Attributes
+    ----------
+    bias : np.ndarray
+        (3,) true roll, pitch, yaw at the field's middle, radians: from measured to true attitude.
+    offset : np.ndarray
+        (3,) true minus measured station at the field's middle, along X, Y, Z of the orbital frame, metres.
+    trajectory : Trajectory
+        The true one.
+    errors : MeasurementErrors
+        Of the readings.
+    drift : Mapping[str, np.ndarray]
+        Line -> (4,) true d_alpha, d_beta, d_gamma, d_f of its camera, radians and metres; empty for no drift.
     """
 
     bias: np.ndarray
@@ -325,9 +377,12 @@ class PassTruth:
 class PatchRecord:
     """One patch and how its points were matched.
 
-    Attributes:
-        points: measured.
-        judgements: ``control`` (with the check points) or ``tie`` -> line -> against the truth.
+    Attributes
+    ----------
+    points : PatchPoints
+        measured.
+    judgements : Mapping[str, Mapping[str, LineJudgement]]
+        ``control`` (with the check points) or ``tie`` -> line -> against the truth.
     """
 
     points: PatchPoints
@@ -338,13 +393,20 @@ class PatchRecord:
 class FieldImages:
     """What became of a field's points.
 
-    Attributes:
-        name: of the field.
-        patches: one by one.
-        shown: the first patch itself, for a figure.
-        wrong: line -> (n,) whether the place of a control or tie point is wrong, by number of the point.
-        wrong_check: line -> (m,) likewise for check points.
-        screening: what the adjustment has left out; None before it.
+    Attributes
+    ----------
+    name : str
+        Of the field.
+    patches : tuple[PatchRecord, ...]
+        One by one.
+    shown : Patch
+        The first patch itself, for a figure.
+    wrong : Mapping[str, np.ndarray]
+        Line -> (n,) whether the place of a control or tie point is wrong, by number of the point.
+    wrong_check : Mapping[str, np.ndarray]
+        Line -> (m,) likewise for check points.
+    screening : Screening | None
+        What the adjustment has left out; None before it.
     """
 
     name: str
@@ -359,12 +421,18 @@ class FieldImages:
 class Screening:
     """What the adjustment has left out of a field; counts are of image points, by truth where wrong or right.
 
-    Attributes:
-        entered, left: image points of control and tie points before and after.
-        wrong_entered, wrong_left: wrong ones among them.
-        right_lost: right ones that were left out.
-        check_entered, check_left: check points before and after the test of their intersection.
-        wrong_check_left: of these, with a wrong place in a line.
+    Attributes
+    ----------
+    entered, left : int
+        Image points of control and tie points before and after.
+    wrong_entered, wrong_left : int
+        Wrong ones among them.
+    right_lost : int
+        Right ones that were left out.
+    check_entered, check_left : int
+        Check points before and after the test of their intersection.
+    wrong_check_left : int
+        Of these, with a wrong place in a line.
     """
 
     entered: int
@@ -381,24 +449,42 @@ class Screening:
 class FieldPass:
     """One pass over one field.
 
-    Attributes:
-        measurements: as they came.
-        data: what is known of the pass beside its points.
-        latitude: mean of the control points, radians.
-        control_images: line -> image points of control points, and of tie points that calibrate with them.
-        control_ground: (n, 3) their given coordinates, of ties those of a first intersection, ITRS, metres.
-        control_covariance: (n, 3, 3) of given coordinates, m^2.
-        is_control: (n,) which of them are control.
-        control_ids: (n,) names.
-        check_images: line -> image points of the check points.
-        check_ground: (m, 3) given coordinates of the check points, ITRS, metres.
-        check_ids: (m,) names.
-        tie_images: line -> image points of tie points that are kept apart for the strip; empty for none.
-        control: what the calibration gets.
-        check: line -> rays of the check points.
-        ties: line -> rays of the ties apart.
-        readings: line -> (4,) what a monitor reads of its camera; empty for no monitor.
-        known_truth: of a simulated pass.
+    Attributes
+    ----------
+    measurements : PassMeasurements
+        As they came.
+    data : PassData
+        What is known of the pass beside its points.
+    latitude : float
+        Mean of the control points, radians.
+    control_images : Mapping[str, ImagePoints]
+        Line -> image points of control points, and of tie points that calibrate with them.
+    control_ground : np.ndarray
+        (n, 3) their given coordinates, of ties those of a first intersection, ITRS, metres.
+    control_covariance : np.ndarray
+        (n, 3, 3) of given coordinates, m^2.
+    is_control : np.ndarray
+        (n,) which of them are control.
+    control_ids : np.ndarray
+        (n,) names.
+    check_images : Mapping[str, ImagePoints]
+        Line -> image points of the check points.
+    check_ground : np.ndarray
+        (m, 3) given coordinates of the check points, ITRS, metres.
+    check_ids : np.ndarray
+        (m,) names.
+    tie_images : Mapping[str, ImagePoints]
+        Line -> image points of tie points that are kept apart for the strip; empty for none.
+    control : CalibrationField
+        What the calibration gets.
+    check : Mapping[str, Rays]
+        Line -> rays of the check points.
+    ties : Mapping[str, Rays]
+        Line -> rays of the ties apart.
+    readings : Mapping[str, np.ndarray]
+        Line -> (4,) what a monitor reads of its camera; empty for no monitor.
+    known_truth : PassTruth | None
+        Of a simulated pass.
     """
 
     measurements: PassMeasurements
@@ -511,15 +597,24 @@ class FieldPass:
 class Campaign:
     """All passes, and the camera as the laboratory knows it.
 
-    Attributes:
-        spec: the test.
-        laboratory: line -> camera as it was measured before launch; what the analysis starts from.
-        noise: what the analysis is told of the independent errors.
-        passes: in the file's order.
-        images: what became of points measured in simulated images, by field; None otherwise.
-        known_truth: line -> camera as it is, without the drift of single fields; None where nobody knows.
-        rejected: field -> what the adjustment has left out; empty where nothing was looked for.
-        drifts: what residuals showed of a drift of the attitude that nobody stated; None where they show none.
+    Attributes
+    ----------
+    spec : OrbitCalibrationSpec | MeasuredCalibrationSpec
+        The test.
+    laboratory : Mapping[str, LineModel]
+        Line -> camera as it was measured before launch; what the analysis starts from.
+    noise : Noise
+        What the analysis is told of the independent errors.
+    passes : tuple[FieldPass, ...]
+        In the file's order.
+    images : tuple[FieldImages, ...] | None
+        What became of points measured in simulated images, by field; None otherwise.
+    known_truth : Mapping[str, LineModel] | None
+        Line -> camera as it is, without the drift of single fields; None where nobody knows.
+    rejected : Mapping[str, Rejected]
+        Field -> what the adjustment has left out; empty where nothing was looked for.
+    drifts : FoundDrift | None
+        What residuals showed of a drift of the attitude that nobody stated; None where they show none.
     """
 
     spec: OrbitCalibrationSpec | MeasuredCalibrationSpec
@@ -580,8 +675,10 @@ class Campaign:
     def without_effects(self, removed: LightEffects) -> Campaign:
         """The campaign with these effects on the light taken out of its image points.
 
-        Raises:
-            CalibrationError: control coordinates that cannot be used, or check points that cannot be intersected.
+        Raises
+        ------
+        CalibrationError
+            Control coordinates that cannot be used, or check points that cannot be intersected.
         """
         passes = tuple(
             replace(
@@ -609,10 +706,14 @@ class Campaign:
 class FoundDrift:
     """A drift of the attitude during the passes that nobody stated and residuals show.
 
-    Attributes:
-        rate: standard deviation of the rates about body X, Y, Z that is assumed since, radians per second.
-        walk: likewise of a random walk, what it gains in a second, radians.
-        rate_p_value, course_p_value: chance of such residuals without rates, and without errors that change slowly.
+    Attributes
+    ----------
+    rate : tuple[float, float, float]
+        Standard deviation of the rates about body X, Y, Z that is assumed since, radians per second.
+    walk : float
+        Likewise of a random walk, what it gains in a second, radians.
+    rate_p_value, course_p_value : float
+        Chance of such residuals without rates, and without errors that change slowly.
     """
 
     rate: tuple[float, float, float]
@@ -625,13 +726,18 @@ class FoundDrift:
 class Rejected:
     """What the adjustment has left out of a pass.
 
-    Attributes:
-        entered, left: image points of control and tie points before and after.
-        points: names of control and tie points with a rejected image point, and its line camera.
-        check_entered, check_left: check points before and after the test of their intersection.
-        check_points: names of those that were left out.
-        factors: line -> on the sigmas of its image points, by the residuals of those that remain; 1 where they are
-            right.
+    Attributes
+    ----------
+    entered, left : int
+        Image points of control and tie points before and after.
+    points : tuple[tuple[str, str], ...]
+        Names of control and tie points with a rejected image point, and its line camera.
+    check_entered, check_left : int
+        Check points before and after the test of their intersection.
+    check_points : tuple[str, ...]
+        Names of those that were left out.
+    factors : Mapping[str, float]
+        Line -> on the sigmas of its image points, by the residuals of those that remain; 1 where they are right.
     """
 
     entered: int
@@ -688,13 +794,20 @@ def pass_data(
 ) -> PassData:
     """Return what is known of a pass: its lines by the laboratory's camera and the readings of the platform.
 
-    Args:
-        name: of the pass.
-        payload: camera as the laboratory measured it.
-        platform: orbit and attitude as they were read.
-        times: line camera -> when its lines were exposed.
-        height: of the ground above the ellipsoid, metres.
-        unit: sigma of an image point of weight 1, metres; None for points that weigh alike.
+    Parameters
+    ----------
+    name : str
+        Of the pass.
+    payload : ThreeLineCameraSpec
+        Camera as the laboratory measured it.
+    platform : Platform
+        Orbit and attitude as they were read.
+    times : Mapping[str, LineTimes]
+        Line camera -> when its lines were exposed.
+    height : float
+        Of the ground above the ellipsoid, metres.
+    unit : float | None
+        Sigma of an image point of weight 1, metres; None for points that weigh alike.
     """
     cameras, earth = line_cameras(payload), Earth()
     sensors = {line: Sensor.of_lines(cameras[line], platform, earth, at, NO_EFFECTS) for line, at in times.items()}
@@ -711,14 +824,21 @@ def campaign_of(
 ) -> Campaign:
     """The campaign of measured passes, with the effects on the light taken out where the test says so.
 
-    Args:
-        spec: the test.
-        payload: as the laboratory knows it.
-        measured: the passes.
-        ties_apart: whether tie points are kept for the strip, and do not calibrate.
+    Parameters
+    ----------
+    spec : OrbitCalibrationSpec | MeasuredCalibrationSpec
+        The test.
+    payload : ThreeLineCameraSpec
+        As the laboratory knows it.
+    measured : Sequence[PassMeasurements]
+        The passes.
+    ties_apart : bool
+        Whether tie points are kept for the strip, and do not calibrate.
 
-    Raises:
-        CalibrationError: points that cannot be used.
+    Raises
+    ------
+    CalibrationError
+        Points that cannot be used.
     """
     seen = {name for one in measured for name in one.images}
     laboratory = FrozenMap({name: line_model(payload, name) for name in payload.lines if name in seen})
@@ -733,10 +853,14 @@ def campaign_of(
 def _noise_of(errors: ErrorsSpec | ReadingErrorsSpec, image: float, paths: Sequence[TabulatedTrajectory] = ()) -> Noise:
     """Sigmas of readings as given, root mean square over axes, and their intervals.
 
-    Args:
-        errors: of the readings.
-        image: unit of the image points, metres.
-        paths: their tables, for intervals that are not given.
+    Parameters
+    ----------
+    errors : ErrorsSpec | ReadingErrorsSpec
+        Of the readings.
+    image : float
+        Unit of the image points, metres.
+    paths : Sequence[TabulatedTrajectory]
+        Their tables, for intervals that are not given.
     """
     if not getattr(errors, "switched_on", True):
         return Noise(image)

@@ -61,10 +61,14 @@ def _rates_of(campaign: Campaign) -> np.ndarray:
 def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequence[Prior] = ()) -> tuple[Prior, ...]:
     """Priors on the rate of each pass; empty where none drifts by itself.
 
-    Args:
-        campaign: for what is stated.
-        passes: that are adjusted.
-        common: what is known of a rate that all of them have; its error then counts as one of each.
+    Parameters
+    ----------
+    campaign : Campaign
+        For what is stated.
+    passes : Sequence[FieldPass]
+        That are adjusted.
+    common : Sequence[Prior]
+        What is known of a rate that all of them have; its error then counts as one of each.
     """
     sigma = _rates_of(campaign)
     if not np.any(sigma):
@@ -81,12 +85,17 @@ def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequen
 def calibrated_alone(campaign: Campaign, one: FieldPass) -> Adjustment:
     """A field by itself, with paper 003's twelve unknowns less the gauge, and its rate where the attitude drifts.
 
-    Args:
-        campaign: for the laboratory's camera and the noise.
-        one: the field.
+    Parameters
+    ----------
+    campaign : Campaign
+        For the laboratory's camera and the noise.
+    one : FieldPass
+        The field.
 
-    Raises:
-        CalibrationError: it cannot be solved.
+    Raises
+    ------
+    CalibrationError
+        It cannot be solved.
     """
     rates = _rate_priors(campaign, [one])
     return adjust(
@@ -103,12 +112,17 @@ def drift_looked_for(campaign: Campaign, rates: tuple[Prior, ...] = ()) -> Campa
     """The campaign, or where residuals show a drift of the attitude that nobody stated, with this among its noise: a
     random walk by its variance component, and a rate of each pass. False alarms: `FALSE_ALARM` for either test.
 
-    Args:
-        campaign: as it is stated.
-        rates: what is known of a rate that all passes have.
+    Parameters
+    ----------
+    campaign : Campaign
+        As it is stated.
+    rates : tuple[Prior, ...]
+        What is known of a rate that all passes have.
 
-    Raises:
-        CalibrationError: it cannot be solved.
+    Raises
+    ------
+    CalibrationError
+        It cannot be solved.
     """
     found = simultaneous(campaign, rates)
     rate_chance = 1.0 if found.rates is None else found.rates.p_value
@@ -138,16 +152,25 @@ def simultaneous(
 ) -> Adjustment:
     """All fields at once: one interior, a bias and, where the orbit drifts, an offset with its prior for each field.
 
-    Args:
-        campaign: the fields.
-        rates: what is known of a drift of the bias that all passes have.
-        robust: weights of the image points.
-        drift: whether the cameras' changes in each pass are unknowns, too; `monitor` must tell them.
-        monitor: what an on-board monitor tells of these.
-        components: groups whose variance is estimated.
+    Parameters
+    ----------
+    campaign : Campaign
+        The fields.
+    rates : tuple[Prior, ...]
+        What is known of a drift of the bias that all passes have.
+    robust : Robust | None
+        Weights of the image points.
+    drift : bool
+        Whether the cameras' changes in each pass are unknowns, too; `monitor` must tell them.
+    monitor : tuple[Prior, ...]
+        What an on-board monitor tells of these.
+    components : Sequence[str]
+        Groups whose variance is estimated.
 
-    Raises:
-        CalibrationError: it cannot be solved.
+    Raises
+    ------
+    CalibrationError
+        It cannot be solved.
     """
     errors = campaign.spec.errors
     offsets = bool(errors.switched_on and any(errors.gps.drift))
@@ -182,14 +205,22 @@ _ONE_LATITUDE = np.radians(1.0)
 class LatitudeFit:
     """One axis.
 
-    Attributes:
-        axis: of roll, pitch, yaw.
-        latitude: (K,) of the fields, radians. reference: where the sine vanishes, radians.
-        value, sigma: (K,) biases of the fields, radians.
-        fit: (K,) fitted.
-        amplitude, constant: radians, with their sigmas, which contain what remains.
-        chi_square: with the biases' own covariance. degrees_of_freedom: K - 2.
-        remainder: standard deviation of what remains beside the biases' own sigmas, radians; 0 when these explain it.
+    Attributes
+    ----------
+    axis : str
+        Of roll, pitch, yaw.
+    latitude : np.ndarray
+        (K,) of the fields, radians. reference: where the sine vanishes, radians.
+    value, sigma : np.ndarray
+        (K,) biases of the fields, radians.
+    fit : np.ndarray
+        (K,) fitted.
+    amplitude, constant : float
+        Radians, with their sigmas, which contain what remains.
+    chi_square : float
+        With the biases' own covariance. degrees_of_freedom: K - 2.
+    remainder : float
+        Standard deviation of what remains beside the biases' own sigmas, radians; 0 when these explain it.
     """
 
     axis: str

@@ -82,13 +82,20 @@ _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
 class Imager:
     """Renders and measures fields, and says how far it is.
 
-    Attributes:
-        setup: test and camera.
-        spec: of the images.
-        optics: line -> lens and CCD.
-        pattern: seed of the pixels' differences, the same over all fields.
-        advance: told of each patch.
-        done: patches so far.
+    Attributes
+    ----------
+    setup : CalibrationSetup
+        Test and camera.
+    spec : CalibrationImagesSpec
+        Of the images.
+    optics : Mapping[str, LineOptics]
+        Line -> lens and CCD.
+    pattern : np.random.SeedSequence
+        Seed of the pixels' differences, the same over all fields.
+    advance : Advance
+        Told of each patch.
+    done : int
+        Patches so far.
     """
 
     setup: CalibrationSetup
@@ -116,15 +123,23 @@ class Imager:
     ) -> tuple[FieldPoints, FieldImages]:
         """Points of one field.
 
-        Args:
-            place: the field.
-            sensors: the true ones.
-            data: what is known of the pass.
-            effects: on the light, which the user knows as well.
-            seed: of the ground, of the control's errors and of the frames' noise.
+        Parameters
+        ----------
+        place : FieldSpec
+            The field.
+        sensors : Mapping[str, Sensor]
+            The true ones.
+        data : PassData
+            What is known of the pass.
+        effects : LightEffects
+            On the light, which the user knows as well.
+        seed : np.random.SeedSequence
+            Of the ground, of the control's errors and of the frames' noise.
 
-        Raises:
-            BenchError: a patch that cannot be imaged, points that cannot be measured, too few of them.
+        Raises
+        ------
+        BenchError
+            a patch that cannot be imaged, points that cannot be measured, too few of them.
         """
         users = {name: replace(sensor, effects=effects) for name, sensor in data.sensors.items()}
         lines = imaged_lines(sensors, users, {name: self.optics[name] for name in sensors}, self.pattern)
@@ -276,9 +291,12 @@ def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> F
 
     The draws of a line are the same whatever their sigmas are.
 
-    Args:
-        spec: the test.
-        seed: of the field.
+    Parameters
+    ----------
+    spec : OrbitCalibrationSpec
+        The test.
+    seed : np.random.SeedSequence
+        Of the field.
     """
     if not spec.drift:
         return FrozenMap({})
@@ -292,10 +310,14 @@ def _sample_readings(
 ) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) what the monitor reads, in the same units; empty for no monitor.
 
-    Args:
-        spec: the test.
-        drift: the true one.
-        seed: of the field.
+    Parameters
+    ----------
+    spec : OrbitCalibrationSpec
+        The test.
+    drift : Mapping[str, np.ndarray]
+        The true one.
+    seed : np.random.SeedSequence
+        Of the field.
     """
     if spec.monitor is None:
         return FrozenMap({})
@@ -325,9 +347,12 @@ _MARGIN = 6.0
 def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance = silent) -> Campaign:
     """Pass over every field once; image points are drawn or, where the file has a section `images`, measured.
 
-    Raises:
-        BenchError: no such orbit, or the lines do not all see enough points.
-        CalibrationError: the measured points cannot be used.
+    Raises
+    ------
+    BenchError
+        No such orbit, or the lines do not all see enough points.
+    CalibrationError
+        The measured points cannot be used.
     """
     spec, payload = setup.test, setup.camera
     changed = changed_payload(spec, payload)
@@ -431,13 +456,20 @@ def _measurements_of(
 ) -> PassMeasurements:
     """What was measured of a simulated pass, as files would have it.
 
-    Args:
-        name: of the pass.
-        platform: readings.
-        times: of every line.
-        points: control, tie and check points.
-        ties: line -> image points of further tie points, counted from 0.
-        datum: by which control points are given too far east, north and up, metres.
+    Parameters
+    ----------
+    name : str
+        Of the pass.
+    platform : PlatformTable
+        readings.
+    times : LineTimes
+        Of every line.
+    points : FieldPoints
+        Control, tie and check points.
+    ties : Mapping[str, ImagePoints]
+        Line -> image points of further tie points, counted from 0.
+    datum : tuple[float, float, float]
+        By which control points are given too far east, north and up, metres.
     """
     given, is_control = points.control_ground, points.control
     if any(datum):

@@ -44,14 +44,22 @@ _TRIAL_SHIFT = 100.0
 class LightRow:
     """One case of what is left in the image points.
 
-    Attributes:
-        left: effects that are not taken out, of `EFFECTS`.
-        moved: line -> (2,) RMS of what they move the check points' image points by, x and y, metres.
-        before: mean of the fields' RMS with the laboratory's camera.
-        after: likewise, each field with its own parameters.
-        shift: name -> change of a parameter of the simultaneous adjustment from the case that nothing is left in.
-        sigma: name -> its sigma.
-        p_value: of the adjustment.
+    Attributes
+    ----------
+    left : tuple[str, ...]
+        Effects that are not taken out, of `EFFECTS`.
+    moved : Mapping[str, np.ndarray]
+        Line -> (2,) RMS of what they move the check points' image points by, x and y, metres.
+    before : FieldErrors
+        Mean of the fields' RMS with the laboratory's camera.
+    after : FieldErrors
+        Likewise, each field with its own parameters.
+    shift : Mapping[str, float]
+        Name -> change of a parameter of the simultaneous adjustment from the case that nothing is left in.
+    sigma : Mapping[str, float]
+        Name -> its sigma.
+    p_value : float
+        Of the adjustment.
     """
 
     left: tuple[str, ...]
@@ -73,17 +81,28 @@ class LightRow:
 class DatumRow:
     """What a common shift of all control points does.
 
-    Attributes:
-        shift: east, north, up, metres.
-        bias: (3,) mean change of the fields' roll, pitch and yaw, radians.
-        interior: name -> change, metres.
-        offset: (3,) mean change of the orbit's offsets along, across, down, metres; zero where not solved for.
-        fit: change of the chi-square of the simultaneous adjustment.
-        p_value: of the adjustment with the shift.
-        after: mean of the fields' RMS against the right datum, each field with its own parameters, plan and height.
-        late: seconds by which the times of the lines are too late, in place of a shift.
-        sigma: name -> of the elements of the interior.
-        warned: shift in metres, or time in seconds, from which on `surprises` tells of it; None where it never does.
+    Attributes
+    ----------
+    shift : tuple[float, float, float]
+        East, north, up, metres.
+    bias : np.ndarray
+        (3,) mean change of the fields' roll, pitch and yaw, radians.
+    interior : Mapping[str, float]
+        Name -> change, metres.
+    offset : np.ndarray
+        (3,) mean change of the orbit's offsets along, across, down, metres; zero where not solved for.
+    fit : float
+        Change of the chi-square of the simultaneous adjustment.
+    p_value : float
+        Of the adjustment with the shift.
+    after : FieldErrors
+        Mean of the fields' RMS against the right datum, each field with its own parameters, plan and height.
+    late : float
+        Seconds by which the times of the lines are too late, in place of a shift.
+    sigma : Mapping[str, float]
+        Name -> of the elements of the interior.
+    warned : float | None
+        Shift in metres, or time in seconds, from which on `surprises` tells of it; None where it never does.
     """
 
     shift: tuple[float, float, float]
@@ -133,12 +152,17 @@ class Surprise:
 def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow, ...]:
     """Nothing left in, each effect alone, all of them; only effects that are on.
 
-    Args:
-        campaign: the measurements.
-        sigma: name -> sigma of a parameter of the simultaneous adjustment.
+    Parameters
+    ----------
+    campaign : Campaign
+        The measurements.
+    sigma : Mapping[str, float]
+        Name -> sigma of a parameter of the simultaneous adjustment.
 
-    Raises:
-        CalibrationError: a case cannot be solved.
+    Raises
+    ------
+    CalibrationError
+        a case cannot be solved.
     """
     on = [name for name in EFFECTS if getattr(campaign.effects, name)]
     cases = [(), *((name,) for name in on), *([tuple(on)] if len(on) > 1 else [])]
@@ -176,8 +200,10 @@ def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow
 def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
     """The file's datum, or 100 m along each axis and lines that are 10 ms late where it has none.
 
-    Raises:
-        CalibrationError: a case cannot be solved.
+    Raises
+    ------
+    CalibrationError
+        a case cannot be solved.
     """
     errors = campaign.spec.errors
     right = campaign.independent
@@ -250,16 +276,22 @@ def _after(campaign: Campaign) -> FieldErrors:
 class AttitudeDrift:
     """Drift of the attitude during the passes.
 
-    Attributes:
-        seconds: from when the first line sees a field to when the last one does, mean of the passes.
-        sigmas_per_arcsec: name of an unknown -> its change, in its sigmas, for a drift of 1 arcsec in these seconds
-            (one standard deviation about each axis in each pass) that is no unknown; None where rates are unknowns.
-        seen: (3,) drift about body X, Y, Z in these seconds that residuals show in half of all cases, radians; None
-            likewise.
-        unseen_sigmas: by how many of its sigmas the most sensitive unknown is then wrong; None likewise.
-        rate_p_value, course_p_value: chance of the residuals without rates, and without errors that change slowly along
-            the lines; below `FALSE_ALARM` they count as found.
-        assumed: what was taken into the noise since; None where nothing was found.
+    Attributes
+    ----------
+    seconds : float
+        From when the first line sees a field to when the last one does, mean of the passes.
+    sigmas_per_arcsec : Mapping[str, float] | None
+        Name of an unknown -> its change, in its sigmas, for a drift of 1 arcsec in these seconds (one standard
+        deviation about each axis in each pass) that is no unknown; None where rates are unknowns.
+    seen : np.ndarray | None
+        (3,) drift about body X, Y, Z in these seconds that residuals show in half of all cases, radians; None likewise.
+    unseen_sigmas : float | None
+        By how many of its sigmas the most sensitive unknown is then wrong; None likewise.
+    rate_p_value, course_p_value : float | None
+        Chance of the residuals without rates, and without errors that change slowly along the lines; below
+        `FALSE_ALARM` they count as found.
+    assumed : FoundDrift | None
+        What was taken into the noise since; None where nothing was found.
     """
 
     seconds: float
@@ -330,14 +362,22 @@ def drift_warnings(campaign: Campaign, drift: AttitudeDrift) -> list[str]:
 class ChipStep:
     """A step of x (along the track) or y within a line.
 
-    Attributes:
-        line: camera.
-        axis: x or y.
-        place: y of the joint in the focal plane, metres.
-        step: what the residuals say of it, of everything beyond the joint, metres.
-        sigma: of that, all steps together.
-        seen_from: step that is told in half of all cases; None where the points tell none.
-        found: whether this one is told, false alarm 1e-4 for all together.
+    Attributes
+    ----------
+    line : str
+        camera.
+    axis : str
+        x or y.
+    place : float
+        y of the joint in the focal plane, metres.
+    step : float
+        What the residuals say of it, of everything beyond the joint, metres.
+    sigma : float | None
+        Of that, all steps together.
+    seen_from : float | None
+        Step that is told in half of all cases; None where the points tell none.
+    found : bool
+        Whether this one is told, false alarm 1e-4 for all together.
     """
 
     line: str

@@ -78,10 +78,14 @@ def meets(errors: Mapping[str, CheckErrors], limits: MapLimitsSpec) -> bool:
 class SchemeMeans:
     """Errors of the schemes of averaged parameters over the fields, fewest fields first.
 
-    Attributes:
-        plan: mean over the fields of the RMS in plan, metres, each scheme.
-        plan_spread: standard deviation over the fields.
-        height, height_spread: likewise.
+    Attributes
+    ----------
+    plan : np.ndarray
+        Mean over the fields of the RMS in plan, metres, each scheme.
+    plan_spread : np.ndarray
+        Standard deviation over the fields.
+    height, height_spread : np.ndarray
+        likewise.
     """
 
     plan: np.ndarray
@@ -114,9 +118,12 @@ _LEAST_SCHEMES = 3
 class Repeats:
     """Campaigns over the same fields with everything drawn anew.
 
-    Attributes:
-        schemes: names, the last lets each field use its own parameters.
-        plan, height: (N, schemes, fields) RMS at check points, metres.
+    Attributes
+    ----------
+    schemes : tuple[str, ...]
+        Names, the last lets each field use its own parameters.
+    plan, height : np.ndarray
+        (N, schemes, fields) RMS at check points, metres.
     """
 
     schemes: tuple[str, ...]
@@ -144,10 +151,14 @@ def by_scheme(
 ) -> FrozenMap[str, FrozenMap[str, T]]:
     """Return what a test of the schemes gives, scheme -> field.
 
-    Args:
-        campaign: schemes and fields.
-        alone: field -> it calibrated by itself.
-        test: of a field by cameras and bias, which are means of the scheme's fields; by its own in the last scheme.
+    Parameters
+    ----------
+    campaign : Campaign
+        Schemes and fields.
+    alone : Mapping[str, Adjustment]
+        Field -> it calibrated by itself.
+    test : Callable[[FieldPass, Mapping[str, LineModel], np.ndarray], T]
+        Of a field by cameras and bias, which are means of the scheme's fields; by its own in the last scheme.
     """
     found = {}
     for k, scheme in enumerate((*campaign.spec.schemes, None)):
@@ -177,8 +188,10 @@ def tested(campaign: Campaign, one: FieldPass, cameras: Mapping[str, LineModel],
 def repeated(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Repeats | None:
     """Fly and calibrate as many campaigns as the file asks for; None for none. Only errors at check points count.
 
-    Raises:
-        CalibrationError: one of them cannot be solved.
+    Raises
+    ------
+    CalibrationError
+        One of them cannot be solved.
     """
     count = setup.test.repeats
     test = setup.test
@@ -213,11 +226,16 @@ def averaged(
 class Repeatability:
     """One parameter over the fields, each calibrated by itself, metres or radians.
 
-    Attributes:
-        name: of the parameter, without a field.
-        scatter: standard deviation over the fields.
-        sigma: that the adjustments claim, root mean square; 0 where held.
-        p_value: chance of such a scatter or a larger one if the parameter is the same in all fields; None where held.
+    Attributes
+    ----------
+    name : str
+        Of the parameter, without a field.
+    scatter : float
+        Standard deviation over the fields.
+    sigma : float
+        That the adjustments claim, root mean square; 0 where held.
+    p_value : float | None
+        Chance of such a scatter or a larger one if the parameter is the same in all fields; None where held.
     """
 
     name: str
@@ -229,9 +247,12 @@ class Repeatability:
 def repeatability(campaign: Campaign, alone: Mapping[str, Adjustment]) -> tuple[Repeatability, ...]:
     """Interior orientation, then biases; empty for fewer than two fields.
 
-    Args:
-        campaign: the fields.
-        alone: field -> it calibrated by itself.
+    Parameters
+    ----------
+    campaign : Campaign
+        The fields.
+    alone : Mapping[str, Adjustment]
+        Field -> it calibrated by itself.
     """
     if len(alone) < 2:
         return ()
@@ -254,12 +275,17 @@ def repeatability(campaign: Campaign, alone: Mapping[str, Adjustment]) -> tuple[
 class Strips:
     """Passes adjusted on their tie points.
 
-    Attributes:
-        ties: field -> how many tie points two lines or more see.
-        schemes: scheme -> field -> errors at its check points, calibrated on control and tie points and adjusted on tie
-            points; the last lets each field use its own parameters.
-        p_values: field -> chance of the fit of its strip with its own parameters.
-        datum: of the first field with these: turns of the whole pass, sigma before and after.
+    Attributes
+    ----------
+    ties : Mapping[str, int]
+        Field -> how many tie points two lines or more see.
+    schemes : Mapping[str, Mapping[str, CheckErrors]]
+        Scheme -> field -> errors at its check points, calibrated on control and tie points and adjusted on tie points;
+        the last lets each field use its own parameters.
+    p_values : Mapping[str, float]
+        Field -> chance of the fit of its strip with its own parameters.
+    datum : tuple[Datum, ...]
+        Of the first field with these: turns of the whole pass, sigma before and after.
     """
 
     ties: Mapping[str, int]
@@ -271,12 +297,17 @@ class Strips:
 def strips_adjusted(campaign: Campaign, advance: Advance) -> Strips | None:
     """Every field by every scheme; None for a file without a strip.
 
-    Args:
-        campaign: measurements and schemes.
-        advance: how far it is.
+    Parameters
+    ----------
+    campaign : Campaign
+        Measurements and schemes.
+    advance : Advance
+        How far it is.
 
-    Raises:
-        CalibrationError: a strip cannot be adjusted.
+    Raises
+    ------
+    CalibrationError
+        a strip cannot be adjusted.
     """
     spec = campaign.spec
     if not spec.strip:
@@ -332,8 +363,10 @@ def adjusted_strip(
 ) -> StripAdjustment:
     """One pass on its tie points; where points are measured in images, on all those that the calibration uses.
 
-    Raises:
-        CalibrationError: it cannot be adjusted.
+    Raises
+    ------
+    CalibrationError
+        It cannot be adjusted.
     """
     return adjust_strip(one.ties or one.control.rays, cameras, campaign.noise, bias=bias)
 
@@ -354,10 +387,14 @@ FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
 class Treatment:
     """One campaign in one treatment.
 
-    Attributes:
-        together: all fields adjusted at once, each field with its own bias.
-        p_value: of that adjustment.
-        schemes: scheme -> all fields without ground control; the last lets each field use its own parameters.
+    Attributes
+    ----------
+    together : FieldErrors
+        All fields adjusted at once, each field with its own bias.
+    p_value : float
+        Of that adjustment.
+    schemes : Mapping[str, FieldErrors]
+        Scheme -> all fields without ground control; the last lets each field use its own parameters.
     """
 
     together: FieldErrors
@@ -369,10 +406,14 @@ class Treatment:
 class DriftSize:
     """A drift of one size.
 
-    Attributes:
-        factor: against the file's.
-        without: adjusted as if nothing drifted.
-        monitored: with the monitor's readings; None without a monitor.
+    Attributes
+    ----------
+    factor : float
+        Against the file's.
+    without : Treatment
+        Adjusted as if nothing drifted.
+    monitored : Treatment | None
+        With the monitor's readings; None without a monitor.
     """
 
     factor: float
@@ -384,10 +425,14 @@ class DriftSize:
 class Monitoring:
     """Drift and monitor.
 
-    Attributes:
-        sizes: of `FACTORS`.
-        angle: root mean square over the lines that drift of the file's sigma of d_alpha, radians.
-        metres: by which heights change for 1 arcsec of d_alpha of the forward line, mean of the first field.
+    Attributes
+    ----------
+    sizes : tuple[DriftSize, ...]
+        Of `FACTORS`.
+    angle : float
+        Root mean square over the lines that drift of the file's sigma of d_alpha, radians.
+    metres : float
+        By which heights change for 1 arcsec of d_alpha of the forward line, mean of the first field.
     """
 
     sizes: tuple[DriftSize, ...]
@@ -402,14 +447,21 @@ class Monitoring:
 def monitored(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Monitoring | None:
     """Fly the same campaign with drifts of several sizes; None for a file without drift.
 
-    Args:
-        setup: test and camera.
-        seed: of the campaign. It is left as it is.
-        advance: how far it is.
+    Parameters
+    ----------
+    setup : CalibrationSetup
+        Test and camera.
+    seed : np.random.SeedSequence
+        Of the campaign. It is left as it is.
+    advance : Advance
+        How far it is.
 
-    Raises:
-        CalibrationError: a campaign cannot be adjusted.
-        BenchError: it cannot be flown.
+    Raises
+    ------
+    CalibrationError
+        a campaign cannot be adjusted.
+    BenchError
+        It cannot be flown.
     """
     if not setup.test.drift:
         return None

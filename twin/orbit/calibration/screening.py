@@ -53,7 +53,9 @@ def mislabelled(campaign: Campaign, one: FieldPass) -> tuple[dict[str, np.ndarra
     The camera's and the platform's errors move the image points of a line alike, turned and scaled a little: a straight
     line in the pixel through the medians of misclosures, which half of the points may miss.
 
-    Returns:
+    Returns
+    -------
+    tuple[dict[str, np.ndarray], np.ndarray]
         Line -> mask of its image points (n,), of control points alone; mask of the check points (m,) that some line
         shows elsewhere.
     """
@@ -84,8 +86,10 @@ def mislabelled(campaign: Campaign, one: FieldPass) -> tuple[dict[str, np.ndarra
 def require_labelled(campaign: Campaign) -> None:
     """Refuse a campaign whose image points show other places than the ground points of their names.
 
-    Raises:
-        FarPointsError: some do; with their names.
+    Raises
+    ------
+    FarPointsError
+        Some do; with their names.
     """
     for name, gone in _relabelled(campaign)[1].items():
         if gone.points:
@@ -116,8 +120,10 @@ def screened(campaign: Campaign) -> Campaign:
     """The campaign without what is mislabelled or the adjustment rejects, with sigmas of the image points that fit the
     residuals.
 
-    Raises:
-        CalibrationError: it cannot be adjusted.
+    Raises
+    ------
+    CalibrationError
+        It cannot be adjusted.
     """
     gross: dict[str, Rejected] = {}
     if campaign.images is None:  # names of points that were matched here are right
@@ -278,9 +284,12 @@ def _counted(one: FieldPass, shown: FieldImages, kept: dict[str, np.ndarray], ch
 class Meeting:
     """How well the rays of check points meet, by the sigmas of image points and readings.
 
-    Attributes:
-        chi_square: of all of them.
-        degrees_of_freedom: two for each ray less three for each point.
+    Attributes
+    ----------
+    chi_square : float
+        Of all of them.
+    degrees_of_freedom : int
+        Two for each ray less three for each point.
     """
 
     chi_square: float
@@ -297,8 +306,10 @@ class Meeting:
 def meeting_of(campaign: Campaign, one: FieldPass, adjustment: Adjustment) -> Meeting:
     """Intersect a pass's check points by the cameras and the bias of an adjustment.
 
-    Raises:
-        CalibrationError: they cannot be intersected.
+    Raises
+    ------
+    CalibrationError
+        They cannot be intersected.
     """
     found = intersect(one.check, adjustment.cameras_of(one.name), campaign.noise, bias=adjustment.bias(one.name))
     seen = found.rays > 1

@@ -58,10 +58,14 @@ _MOST_WRONG = 0.3
 class Tried:
     """A reading and what came of it.
 
-    Attributes:
-        changes: from the stated one.
-        fit: None if the points cannot have been imaged so.
-        why: that is.
+    Attributes
+    ----------
+    changes : Changes
+        From the stated one.
+    fit : Fit | None
+        None if the points cannot have been imaged so.
+    why : str
+        That is.
     """
 
     changes: Changes
@@ -78,13 +82,19 @@ class Tried:
 class Answer:
     """What the points say of one value of a question, the others as in the best reading.
 
-    Attributes:
-        value: of the question.
-        stated, best: whether it is the stated one, and that of the best reading.
-        excess: cost beyond that of the best reading, over the factor of the sigmas.
-        moved: by how much the points lie elsewhere than in the best reading, root mean square, metres; None if they lie
-            nowhere.
-        why: it is impossible; empty if it is not.
+    Attributes
+    ----------
+    value : Any
+        Of the question.
+    stated, best : bool
+        Whether it is the stated one, and that of the best reading.
+    excess : float
+        Cost beyond that of the best reading, over the factor of the sigmas.
+    moved : float | None
+        By how much the points lie elsewhere than in the best reading, root mean square, metres; None if they lie
+        nowhere.
+    why : str
+        It is impossible; empty if it is not.
     """
 
     value: Any
@@ -104,20 +114,32 @@ class Answer:
 class Check:
     """What a check found.
 
-    Attributes:
-        setup: what its file says.
-        readings: of the files.
-        stated: reading.
-        tried: readings with a fit, the likeliest first, then those that are impossible.
-        best: of those that explain the points as well as any, the one with the fewest changes.
-        verdict: the stated reading stands, another one does, or none explains the points.
-        factor: chi-square of the best reading over its freedom, at least 1: by how much the sigmas' squares are too
-            small.
-        answers: question -> its values.
-        first_points: line -> rows of the ground points whose places are listed.
-        places: changes of one question -> where the first points of each line fall, ITRS, metres, or why nowhere.
-        count: how many readings were tried.
-        wrong: line -> names of points that were left out as gross errors.
+    Attributes
+    ----------
+    setup : CheckSetup
+        What its file says.
+    readings : PassReadings
+        Of the files.
+    stated : PassConventions
+        reading.
+    tried : tuple[Tried, ...]
+        Readings with a fit, the likeliest first, then those that are impossible.
+    best : Tried
+        Of those that explain the points as well as any, the one with the fewest changes.
+    verdict : Verdict
+        The stated reading stands, another one does, or none explains the points.
+    factor : float
+        Chi-square of the best reading over its freedom, at least 1: by how much the sigmas' squares are too small.
+    answers : dict[str, tuple[Answer, ...]]
+        Question -> its values.
+    first_points : dict[str, np.ndarray]
+        Line -> rows of the ground points whose places are listed.
+    places : dict[Changes, dict[str, np.ndarray] | str]
+        Changes of one question -> where the first points of each line fall, ITRS, metres, or why nowhere.
+    count : int
+        How many readings were tried.
+    wrong : dict[str, tuple[str, ...]]
+        Line -> names of points that were left out as gross errors.
     """
 
     setup: CheckSetup
@@ -155,8 +177,10 @@ class Check:
 def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Check:
     """Try every reading; nothing is traced or drawn.
 
-    Raises:
-        InputError: files that cannot be read, or fewer than three points.
+    Raises
+    ------
+    InputError
+        Files that cannot be read, or fewer than three points.
     """
     advance("readings", 0, 3)
     readings, stated = pass_readings.read_pass(setup.test, setup.camera, Path())
@@ -311,8 +335,10 @@ def _first_places(
 def exported(run: Check) -> dict[str, str]:
     """Path -> text of a folder of measurements, in the project's own conventions.
 
-    Raises:
-        InputError: the stated conventions do not stand.
+    Raises
+    ------
+    InputError
+        The stated conventions do not stand.
     """
     if run.verdict != "stands":
         problem = "nothing is exported of a pass whose stated conventions do not stand"

@@ -60,9 +60,12 @@ _LEAST_AROUND = 12
 class LineClock:
     """When lines were exposed, as a clock showed it.
 
-    Attributes:
-        line: (K,) numbers of lines, rising.
-        clock: K readings.
+    Attributes
+    ----------
+    line : np.ndarray
+        (K,) numbers of lines, rising.
+    clock : Readings
+        K readings.
     """
 
     line: np.ndarray
@@ -73,15 +76,24 @@ class LineClock:
 class PassConventions:
     """What the numbers of a pass mean.
 
-    Attributes:
-        platform: orbit and attitude.
-        line_scale: time scale of the lines.
-        line_offset: seconds to be added to their times.
-        moment: which moment of its exposure a line's time is: start, middle or end.
-        line_origin: image coordinate of the middle of the line that the table of times calls 0.
-        pixel_origin: image coordinate of the middle of the first pixel.
-        sees: to which side of the track the first pixel looks.
-        backward: whether lines are counted from the last.
+    Attributes
+    ----------
+    platform : Conventions
+        Orbit and attitude.
+    line_scale : str
+        Time scale of the lines.
+    line_offset : float
+        Seconds to be added to their times.
+    moment : str
+        Which moment of its exposure a line's time is: start, middle or end.
+    line_origin : float
+        Image coordinate of the middle of the line that the table of times calls 0.
+    pixel_origin : float
+        Image coordinate of the middle of the first pixel.
+    sees : str
+        To which side of the track the first pixel looks.
+    backward : bool
+        Whether lines are counted from the last.
     """
 
     platform: Conventions
@@ -98,11 +110,16 @@ class PassConventions:
 class PassReadings:
     """What the files of a pass hold.
 
-    Attributes:
-        platform: orbit and attitude about the lines' times.
-        lines: camera -> line times.
-        ground: points on the ground.
-        images: camera -> image points, line and pixel as they are written.
+    Attributes
+    ----------
+    platform : PlatformReadings
+        Orbit and attitude about the lines' times.
+    lines : Mapping[str, LineClock]
+        Camera -> line times.
+    ground : GroundFile
+        Points on the ground.
+    images : Mapping[str, ImagePoints]
+        Camera -> image points, line and pixel as they are written.
     """
 
     platform: PlatformReadings
@@ -114,13 +131,19 @@ class PassReadings:
 def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -> tuple[PassReadings, PassConventions]:
     """What the files of a pass hold, and what is stated of it.
 
-    Args:
-        spec: the files.
-        camera: its lines.
-        folder: that relative paths start from.
+    Parameters
+    ----------
+    spec : OrbitCheckSpec
+        The files.
+    camera : ThreeLineCameraSpec
+        Its lines.
+    folder : Path
+        That relative paths start from.
 
-    Raises:
-        InputError: a file that cannot be read, or names in one that another does not have.
+    Raises
+    ------
+    InputError
+        a file that cannot be read, or names in one that another does not have.
     """
     platform, meant = read_platform(spec.platform, folder)
     lines = read_line_clocks(spec.lines, tuple(camera.lines), folder)
@@ -145,14 +168,19 @@ def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -
 def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path) -> dict[str, LineClock]:
     """Line times of every camera that the table has.
 
-    Args:
-        spec: the table, and what it does not say itself.
-        cameras: names that may stand in it.
-        folder: that relative paths start from.
+    Parameters
+    ----------
+    spec : LineTimesFileSpec
+        The table, and what it does not say itself.
+    cameras : tuple[str, ...]
+        Names that may stand in it.
+    folder : Path
+        That relative paths start from.
 
-    Raises:
-        InputError: the table cannot be read, a camera that is none, fewer than two lines of one, lines or times that do
-            not rise.
+    Raises
+    ------
+    InputError
+        The table cannot be read, a camera that is none, fewer than two lines of one, lines or times that do not rise.
     """
     if is_dimap(list(first_lines(folder / spec.file, "line times: CSV, or DIMAP"))):
         return _scene_lines(spec, cameras, folder)
@@ -265,12 +293,18 @@ _TURNED = {"forward": "back", "back": "forward", "right": "left", "left": "right
 class Question:
     """A convention and what it may be.
 
-    Attributes:
-        title: for readers.
-        get: of a reading.
-        put: a reading with another value of it.
-        values: that it may have, for a stated reading.
-        text: of a value, for readers.
+    Attributes
+    ----------
+    title : str
+        For readers.
+    get : Callable[[PassConventions], Any]
+        Of a reading.
+    put : Callable[[PassConventions, Any], PassConventions]
+        a reading with another value of it.
+    values : Callable[[PassConventions], tuple[Any, ...]]
+        That it may have, for a stated reading.
+    text : Callable[[Any], str]
+        Of a value, for readers.
     """
 
     title: str
@@ -342,9 +376,12 @@ QUESTIONS: Mapping[str, Question] = FrozenMap(
 def asked(stated: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ...]]:
     """Question -> values that it may have beside the stated one; those that do not arise are left out.
 
-    Args:
-        stated: the reading that the file states.
-        quaternions: whether the attitude is one of quaternions, and not of angles.
+    Parameters
+    ----------
+    stated : PassConventions
+        The reading that the file states.
+    quaternions : bool
+        Whether the attitude is one of quaternions, and not of angles.
     """
     without = {"angle_sequence"} if quaternions else {"quaternion_scalar", "quaternion_turns"}
     found = {}
@@ -363,9 +400,12 @@ Changes = tuple[tuple[str, Any], ...]
 def singles_and_pairs(others: Mapping[str, tuple[Any, ...]], start: Changes = ()) -> Iterator[Changes]:
     """Changes of one or two questions, beside those of `start`, which comes first.
 
-    Args:
-        others: question -> values beside the stated one.
-        start: changes that all of them have.
+    Parameters
+    ----------
+    others : Mapping[str, tuple[Any, ...]]
+        Question -> values beside the stated one.
+    start : Changes
+        Changes that all of them have.
     """
     yield start
     taken = {name for name, _ in start}
@@ -420,15 +460,24 @@ class _Turned:
 class Fit:
     """What a reading leaves of the points.
 
-    Attributes:
-        residual: (n, 2) east and north, metres.
-        rms: of both together, root mean square, metres.
-        rms_pixels: root mean square along the lines' own axes, pixels.
-        left: (n, 2) of the residuals when the likeliest errors of camera and platform are taken out, metres.
-        noise: (n, 2, 2) covariance of each point's residual without what it shares with others, m^2.
-        chi_square: of the residuals by their covariance.
-        cost: chi-square and the logarithm of the covariance's determinant: minus twice the log likelihood.
-        freedom: number of residuals.
+    Attributes
+    ----------
+    residual : np.ndarray
+        (n, 2) east and north, metres.
+    rms : float
+        Of both together, root mean square, metres.
+    rms_pixels : float
+        Root mean square along the lines' own axes, pixels.
+    left : np.ndarray
+        (n, 2) of the residuals when the likeliest errors of camera and platform are taken out, metres.
+    noise : np.ndarray
+        (n, 2, 2) covariance of each point's residual without what it shares with others, m^2.
+    chi_square : float
+        Of the residuals by their covariance.
+    cost : float
+        Chi-square and the logarithm of the covariance's determinant: minus twice the log likelihood.
+    freedom : int
+        Number of residuals.
     """
 
     residual: np.ndarray
@@ -445,12 +494,18 @@ class Fit:
 class PassBench:
     """Tries readings on a pass.
 
-    Attributes:
-        readings: of its files.
-        cameras: line -> what its pixels look along.
-        uncertainty: of camera and platform.
-        effects: on the light.
-        epoch: from which times count.
+    Attributes
+    ----------
+    readings : PassReadings
+        Of its files.
+    cameras : Mapping[str, LineCamera]
+        Line -> what its pixels look along.
+    uncertainty : UncertaintySpec
+        Of camera and platform.
+    effects : LightEffects
+        On the light.
+    epoch : str
+        From which times count.
     """
 
     readings: PassReadings
@@ -488,12 +543,17 @@ class PassBench:
     def places(self, meant: PassConventions, most: int | None = None) -> dict[str, np.ndarray]:
         """Line -> where image points lie on the ground, ITRS, (n, 3), metres.
 
-        Args:
-            meant: the reading.
-            most: points of each line, spread over them; None for all.
+        Parameters
+        ----------
+        meant : PassConventions
+            The reading.
+        most : int | None
+            Points of each line, spread over them; None for all.
 
-        Raises:
-            ImpossibleError: they cannot lie anywhere.
+        Raises
+        ------
+        ImpossibleError
+            They cannot lie anywhere.
         """
         found = {}
         for name, raw in self.readings.images.items():
@@ -604,14 +664,21 @@ class PassBench:
 def line_times(clock: LineClock, meant: PassConventions, epoch: str, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Middles of the exposures of lines and time from one line to the next, seconds, (n,) each.
 
-    Args:
-        clock: readings at lines.
-        meant: the reading.
-        epoch: from which times count.
-        line: (n,) as the table of times numbers them.
+    Parameters
+    ----------
+    clock : LineClock
+        Readings at lines.
+    meant : PassConventions
+        The reading.
+    epoch : str
+        From which times count.
+    line : np.ndarray
+        (n,) as the table of times numbers them.
 
-    Raises:
-        ImpossibleError: the clock cannot show what it shows.
+    Raises
+    ------
+    ImpossibleError
+        The clock cannot show what it shows.
     """
     try:
         seconds = clock.clock.instants(meant.line_scale).since(epoch) + meant.line_offset

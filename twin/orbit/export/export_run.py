@@ -52,10 +52,14 @@ if TYPE_CHECKING:
 class ControlPoints:
     """Control points with their places in images.
 
-    Attributes:
-        file: that they are from.
-        read: what it holds; places count from the centre of the first pixel.
-        kind: of the correction that they determine.
+    Attributes
+    ----------
+    file : str
+        That they are from.
+    read : GroundFile
+        What it holds; places count from the centre of the first pixel.
+    kind : Kind
+        Of the correction that they determine.
     """
 
     file: str
@@ -67,10 +71,14 @@ class ControlPoints:
 class Controlled:
     """A line's polynomials after control.
 
-    Attributes:
-        names: (N,) of the points.
-        correction: of the image.
-        after: polynomials with the correction inside.
+    Attributes
+    ----------
+    names : NDArray[np.object_]
+        (N,) of the points.
+    correction : ImageCorrection
+        Of the image.
+    after : RationalPolynomial
+        Polynomials with the correction inside.
     """
 
     names: NDArray[np.object_]
@@ -88,12 +96,18 @@ class ProductPolynomial:
     """Rational polynomials that came with a product, against its rigorous model, over the image and the heights that
     the polynomials cover; polynomials minus rigorous.
 
-    Attributes:
-        file: where they are from.
-        mean: mean difference of line and sample, pixels.
-        rms: root mean square about the mean, likewise.
-        most: largest of all differences, pixels.
-        heights: lowest and highest ground that the polynomials cover, metres.
+    Attributes
+    ----------
+    file : str
+        Where they are from.
+    mean : tuple[float, float]
+        Mean difference of line and sample, pixels.
+    rms : tuple[float, float]
+        Root mean square about the mean, likewise.
+    most : float
+        Largest of all differences, pixels.
+    heights : tuple[float, float]
+        Lowest and highest ground that the polynomials cover, metres.
     """
 
     file: str
@@ -107,10 +121,14 @@ class ProductPolynomial:
 class Quality:
     """What the models of an export are worth.
 
-    Attributes:
-        maps: line, or `together` for points that all lines intersect -> errors on the ground; empty where nobody asked.
-        control: line -> how control points corrected its polynomials.
-        products: line -> polynomials that came with it.
+    Attributes
+    ----------
+    maps : Mapping[str, AccuracyMap]
+        Line, or `together` for points that all lines intersect -> errors on the ground; empty where nobody asked.
+    control : Mapping[str, Controlled]
+        Line -> how control points corrected its polynomials.
+    products : Mapping[str, ProductPolynomial]
+        Line -> polynomials that came with it.
     """
 
     maps: Mapping[str, AccuracyMap] = field(default_factory=FrozenMap)
@@ -121,12 +139,17 @@ class Quality:
 def read_control(path: Path, kind: Kind) -> ControlPoints:
     """Control points of a .gcp file of the Ames Stereo Pipeline.
 
-    Args:
-        path: of it; without a header `# WKT:` its latitudes and longitudes are those of WGS 84, heights above it.
-        kind: of the correction.
+    Parameters
+    ----------
+    path : Path
+        Of it; without a header `# WKT:` its latitudes and longitudes are those of WGS 84, heights above it.
+    kind : Kind
+        Of the correction.
 
-    Raises:
-        InputError: it cannot be read, or has no places in images.
+    Raises
+    ------
+    InputError
+        It cannot be read, or has no places in images.
     """
     if path.suffix.lower() != ".gcp":
         raise InputError(Issue("not a .gcp file", str(path), allowed="control points with places in images, .gcp"))
@@ -148,12 +171,18 @@ _PAYLOAD_HINT = "a payload has no orbit: the YAML file of a simulation or of a t
 class ExportSource:
     """What was read.
 
-    Attributes:
-        setup: of the test.
-        config: it, as YAML with all that it refers to.
-        folder: of a simulation's run, None for a file.
-        seed: of the measured orbit and attitude.
-        windows: line -> its first line, first pixel, lines and pixels, of the images of a run.
+    Attributes
+    ----------
+    setup : SimulateSetup | AngleSetup
+        Of the test.
+    config : str
+        It, as YAML with all that it refers to.
+    folder : Path | None
+        Of a simulation's run, None for a file.
+    seed : int
+        Of the measured orbit and attitude.
+    windows : Mapping[str, tuple[int, int, int, int]]
+        Line -> its first line, first pixel, lines and pixels, of the images of a run.
     """
 
     setup: SimulateSetup | AngleSetup
@@ -167,9 +196,12 @@ class ExportSource:
 class SceneSource:
     """The scene of a DIMAP file.
 
-    Attributes:
-        scene: what the file tells.
-        config: its path and what was chosen of it, as YAML.
+    Attributes
+    ----------
+    scene : DimapScene
+        What the file tells.
+    config : str
+        Its path and what was chosen of it, as YAML.
     """
 
     scene: DimapScene
@@ -190,13 +222,20 @@ class SceneSource:
 class ImagedWindow:
     """A line's image, or where it would be.
 
-    Attributes:
-        name: of the line.
-        sensor: its lines are those of the window.
-        first_pixel, pixels: of the window on the line.
-        pitch: of the pixels, metres.
-        frame: grey values, (lines, pixels); None where nothing was rendered.
-        calibrated: the line before its estimated change; None where none was estimated.
+    Attributes
+    ----------
+    name : str
+        Of the line.
+    sensor : Sensor
+        Its lines are those of the window.
+    first_pixel, pixels : int
+        Of the window on the line.
+    pitch : float
+        Of the pixels, metres.
+    frame : np.ndarray | None
+        Grey values, (lines, pixels); None where nothing was rendered.
+    calibrated : CalibratedLine | None
+        The line before its estimated change; None where none was estimated.
     """
 
     name: str
@@ -212,12 +251,18 @@ class ImagedWindow:
 class ExportedLine:
     """A line as other software gets it.
 
-    Attributes:
-        window: of it.
-        scanner: community sensor model.
-        polynomial: rational polynomials; None where they cannot be, and why.
-        refused: why there are no polynomials, empty where there are.
-        ground: what is uncertain of the camera's estimated change, on the ground; None where none was estimated.
+    Attributes
+    ----------
+    window : ImagedWindow
+        Of it.
+    scanner : LineScanner
+        Community sensor model.
+    polynomial : RationalPolynomial | None
+        Rational polynomials; None where they cannot be, and why.
+    refused : str
+        Why there are no polynomials, empty where there are.
+    ground : GroundSigma | None
+        What is uncertain of the camera's estimated change, on the ground; None where none was estimated.
     """
 
     window: ImagedWindow
@@ -231,13 +276,20 @@ class ExportedLine:
 class Export:
     """All that is written.
 
-    Attributes:
-        source: what was read.
-        epoch: UTC of second 0 of the orbit.
-        truth: whether camera and orbit are the true ones.
-        heights: of the ground above the ellipsoid that models were fitted to: lowest, middle, highest, metres.
-        lines: by name.
-        quality: what they are worth; None where it was not looked at.
+    Attributes
+    ----------
+    source : ExportSource | SceneSource
+        What was read.
+    epoch : str
+        UTC of second 0 of the orbit.
+    truth : bool
+        Whether camera and orbit are the true ones.
+    heights : tuple[float, float, float]
+        Of the ground above the ellipsoid that models were fitted to: lowest, middle, highest, metres.
+    lines : Mapping[str, ExportedLine]
+        By name.
+    quality : Quality
+        What they are worth; None where it was not looked at.
     """
 
     source: ExportSource | SceneSource
@@ -251,13 +303,19 @@ class Export:
 def read_exportable(path: Path, seed: int | None = None, band: str | None = None) -> ExportSource | SceneSource:
     """Whatever has a camera and its way: what `read_source` takes, or the DIMAP file of a scene.
 
-    Args:
-        path: of it.
-        seed: in place of the file's.
-        band: of a scene whose bands do not look alike.
+    Parameters
+    ----------
+    path : Path
+        Of it.
+    seed : int | None
+        In place of the file's.
+    band : str | None
+        Of a scene whose bands do not look alike.
 
-    Raises:
-        InputError: it is neither, or cannot be read.
+    Raises
+    ------
+    InputError
+        It is neither, or cannot be read.
     """
     if path.is_file() and path.suffix.lower() in _SCENES:
         return SceneSource(read_scene(path, band), dump_yaml({"source": str(path)} | ({"band": band} if band else {})))
@@ -281,12 +339,17 @@ _NITF = (".ntf", ".nitf", ".nsf")
 def read_source(path: Path, seed: int | None = None) -> ExportSource:
     """The run folder of a simulation or of a test of angles, or the YAML file of one.
 
-    Args:
-        path: of it.
-        seed: in place of the file's.
+    Parameters
+    ----------
+    path : Path
+        Of it.
+    seed : int | None
+        In place of the file's.
 
-    Raises:
-        InputError: it is neither, or cannot be read.
+    Raises
+    ------
+    InputError
+        It is neither, or cannot be read.
     """
     if path.is_dir():
         return _of_run(path)
@@ -334,19 +397,30 @@ def run_export(
 ) -> Export:
     """Fit the models of all lines.
 
-    Args:
-        source: what was read.
-        backend: where the lines of an instrument are traced.
-        heights: lowest and highest ground above the ellipsoid, metres; None for those of a run's elevation model, else
-            for 0 to 2 000 m.
-        truth: camera and orbit as they are in place of those that the user knows.
-        advance: told how far it is.
-        changes: camera -> what is estimated of it in orbit; of an instrument, and not of the truth.
+    Parameters
+    ----------
+    source : ExportSource | SceneSource
+        What was read.
+    backend : Backend
+        Where the lines of an instrument are traced.
+    heights : tuple[float, float] | None
+        Lowest and highest ground above the ellipsoid, metres; None for those of a run's elevation model, else for 0 to
+        2 000 m.
+    truth : bool
+        Camera and orbit as they are in place of those that the user knows.
+    advance : Advance
+        Told how far it is.
+    changes : Mapping[str, EstimatedChange] | None
+        Camera -> what is estimated of it in orbit; of an instrument, and not of the truth.
 
-    Raises:
-        InputError: an image of the run is missing or another one.
-        BenchError: no such orbit, or ground that cannot be modelled.
-        ValueError: changes of a payload, or of the truth.
+    Raises
+    ------
+    InputError
+        An image of the run is missing or another one.
+    BenchError
+        No such orbit, or ground that cannot be modelled.
+    ValueError
+        Changes of a payload, or of the truth.
     """
     setup = None if isinstance(source, SceneSource) else source.setup
     if changes is not None and (truth or not isinstance(setup, AngleSetup) or setup.instrument is None):

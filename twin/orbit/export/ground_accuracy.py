@@ -44,12 +44,17 @@ _EDGE = 0.5
 class CameraUncertainty:
     """What is uncertain of a camera and of its way, as covariances.
 
-    Attributes:
-        platform: (6, 6) of the position along X, Y, Z of the body, metres, and of turns about X, Y, Z of the body,
-            radians; constant over the pass and shared by its lines.
-        interior: (3, 3) of line and pixel, pixels, and of the principal distance, relative; of each line on its own.
-        image: (2, 2) of a point's measured line and pixel, pixels^2; another in every point.
-        height: standard deviation of the heights that points of one line have from elsewhere, metres.
+    Attributes
+    ----------
+    platform : Array
+        (6, 6) of the position along X, Y, Z of the body, metres, and of turns about X, Y, Z of the body, radians;
+        constant over the pass and shared by its lines.
+    interior : Array
+        (3, 3) of line and pixel, pixels, and of the principal distance, relative; of each line on its own.
+    image : Array
+        (2, 2) of a point's measured line and pixel, pixels^2; another in every point.
+    height : float
+        Standard deviation of the heights that points of one line have from elsewhere, metres.
     """
 
     platform: Array
@@ -69,13 +74,20 @@ class CameraUncertainty:
     ) -> CameraUncertainty:
         """Independent errors, alike along and about all axes.
 
-        Args:
-            position: standard deviation along each axis, metres.
-            attitude: about each axis, radians.
-            interior: of line and pixel, pixels.
-            scale: of the principal distance, relative.
-            image: of a measured line and pixel, pixels.
-            height: of heights from elsewhere, metres.
+        Parameters
+        ----------
+        position : float
+            Standard deviation along each axis, metres.
+        attitude : float
+            About each axis, radians.
+        interior : float
+            Of line and pixel, pixels.
+        scale : float
+            Of the principal distance, relative.
+        image : float
+            Of a measured line and pixel, pixels.
+        height : float
+            Of heights from elsewhere, metres.
         """
         platform = np.diag([position**2] * 3 + [attitude**2] * 3)
         return cls(platform, np.diag([interior**2, interior**2, scale**2]), image**2 * np.eye(2), height)
@@ -85,14 +97,22 @@ class CameraUncertainty:
 class AccuracyMap:
     """Covariances of points over a scene.
 
-    Attributes:
-        line, pixel: (N,) of the grid, in the image that it is of.
-        longitude, latitude: (N,) radians; NaN where a look misses the Earth or, of several lines, fewer than two see.
-        height: of the ground above the ellipsoid, metres.
-        constant: (N, 3, 3) to the east, to the north and up, m^2, of what points have in common.
-        random: (N, 3, 3) of what is another in every point: its measured places.
-        heights: (N, 3, 3) of the heights that points of one line have from elsewhere, which move them in plan as well.
-        shape: of the grid.
+    Attributes
+    ----------
+    line, pixel : Array
+        (N,) of the grid, in the image that it is of.
+    longitude, latitude : Array
+        (N,) radians; NaN where a look misses the Earth or, of several lines, fewer than two see.
+    height : float
+        Of the ground above the ellipsoid, metres.
+    constant : Array
+        (N, 3, 3) to the east, to the north and up, m^2, of what points have in common.
+    random : Array
+        (N, 3, 3) of what is another in every point: its measured places.
+    heights : Array
+        (N, 3, 3) of the heights that points of one line have from elsewhere, which move them in plan as well.
+    shape : tuple[int, int]
+        Of the grid.
     """
 
     line: Array
@@ -141,11 +161,16 @@ class AccuracyMap:
 class _Derivatives:
     """Of where pixels (N,) see a height, east and north, metres.
 
-    Attributes:
-        place: (N, 2, 2) by line and pixel.
-        platform: (N, 2, 6) by the errors of the platform.
-        interior: (N, 2, 3) by those of the interior.
-        height: (N, 2) by the height.
+    Attributes
+    ----------
+    place : Array
+        (N, 2, 2) by line and pixel.
+    platform : Array
+        (N, 2, 6) by the errors of the platform.
+    interior : Array
+        (N, 2, 3) by those of the interior.
+    height : Array
+        (N, 2) by the height.
     """
 
     place: Array
@@ -189,15 +214,23 @@ def single_accuracy(
 ) -> AccuracyMap:
     """Errors of points of known height that one line locates.
 
-    Args:
-        sensor: of the line; its lines are those of the image.
-        uncertainty: of camera and way.
-        height: of the ground above the ellipsoid, metres.
-        first_pixel: of the image on the line.
-        pixels: of the image; None for the whole line.
+    Parameters
+    ----------
+    sensor : Sensor
+        Of the line; its lines are those of the image.
+    uncertainty : CameraUncertainty
+        Of camera and way.
+    height : float
+        Of the ground above the ellipsoid, metres.
+    first_pixel : int
+        Of the image on the line.
+    pixels : int | None
+        Of the image; None for the whole line.
 
-    Raises:
-        ValueError: no look meets the Earth.
+    Raises
+    ------
+    ValueError
+        No look meets the Earth.
     """
     line, pixel = _grid(sensor, first_pixel, sensor.camera.pixels if pixels is None else pixels)
     longitude, latitude, level = _places(sensor, line, pixel, height)
@@ -219,15 +252,23 @@ def intersected_accuracy(
 ) -> AccuracyMap:
     """Errors of points that several lines of one pass see and that are intersected from them.
 
-    Args:
-        sensors: line -> its sensor; the grid is that of the first one's image.
-        uncertainty: of camera and way; heights from elsewhere are not used.
-        height: of the ground above the ellipsoid, metres.
-        first_pixel: of the first one's image on its line.
-        pixels: of it; None for the whole line.
+    Parameters
+    ----------
+    sensors : Mapping[str, Sensor]
+        Line -> its sensor; the grid is that of the first one's image.
+    uncertainty : CameraUncertainty
+        Of camera and way; heights from elsewhere are not used.
+    height : float
+        Of the ground above the ellipsoid, metres.
+    first_pixel : int
+        Of the first one's image on its line.
+    pixels : int | None
+        Of it; None for the whole line.
 
-    Raises:
-        ValueError: fewer than two lines, no look meets the Earth, images that nowhere show the same ground.
+    Raises
+    ------
+    ValueError
+        Fewer than two lines, no look meets the Earth, images that nowhere show the same ground.
     """
     if len(sensors) < 2:
         raise ValueError("an intersection takes two lines or more")
@@ -290,13 +331,19 @@ def maps_of(
 ) -> dict[str, AccuracyMap]:
     """The map of each line by itself and, of several whose images overlap, of points that are intersected, `together`.
 
-    Args:
-        sensors: line -> its sensor, and first pixel and number of pixels of its image.
-        uncertainty: of camera and way.
-        height: of the ground above the ellipsoid, metres.
+    Parameters
+    ----------
+    sensors : Mapping[str, tuple[Sensor, int, int]]
+        Line -> its sensor, and first pixel and number of pixels of its image.
+    uncertainty : CameraUncertainty
+        Of camera and way.
+    height : float
+        Of the ground above the ellipsoid, metres.
 
-    Raises:
-        ValueError: no look meets the Earth.
+    Raises
+    ------
+    ValueError
+        No look meets the Earth.
     """
     found = {name: single_accuracy(one, uncertainty, height, at, count) for name, (one, at, count) in sensors.items()}
     if len(sensors) > 1 and np.any(uncertainty.image):
@@ -326,11 +373,16 @@ track."""
 class EstimatedChange:
     """A camera's change since its calibration.
 
-    Attributes:
-        values: (4,) d_alpha, d_beta, d_gamma (rad) and d_f (m).
-        constant: (4, 4) covariance of their error, as far as it goes on from image to image.
-        random: (4, 4) covariance of what is another in every image.
-        notes: on the estimate, for formats that hold remarks.
+    Attributes
+    ----------
+    values : Array
+        (4,) d_alpha, d_beta, d_gamma (rad) and d_f (m).
+    constant : Array
+        (4, 4) covariance of their error, as far as it goes on from image to image.
+    random : Array
+        (4, 4) covariance of what is another in every image.
+    notes : tuple[str, ...]
+        On the estimate, for formats that hold remarks.
     """
 
     values: Array
@@ -344,12 +396,18 @@ class GroundSigma:
     """Horizontal error on the ground of points of known height that an image's model locates, root mean square over the
     image; the camera's change alone makes it, and not the orbit or the attitude.
 
-    Attributes:
-        height_m: of the points above the ellipsoid.
-        bias_m: that other images near in time have as well, of each horizontal axis: ERR_BIAS.
-        random_m: likewise of what is another in every image.
-        bias_east_m, bias_north_m: the two axes, whose mean square is that of ``bias_m``.
-        random_east_m, random_north_m: likewise of ``random_m``.
+    Attributes
+    ----------
+    height_m : float
+        Of the points above the ellipsoid.
+    bias_m : float
+        That other images near in time have as well, of each horizontal axis: ERR_BIAS.
+    random_m : float
+        Likewise of what is another in every image.
+    bias_east_m, bias_north_m : float
+        The two axes, whose mean square is that of ``bias_m``.
+    random_east_m, random_north_m : float
+        Likewise of ``random_m``.
     """
 
     height_m: float
@@ -365,14 +423,21 @@ def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, heigh
     """Derivatives of where pixels over an image see the ground by their camera's change, (N, 2, 4): east and north in
     metres per rad and per metre of principal distance.
 
-    Args:
-        sensor: with the corrected line.
-        calibrated: the line without the change.
-        values: (4,) of the change.
-        height: of the ground above the ellipsoid, metres.
+    Parameters
+    ----------
+    sensor : Sensor
+        With the corrected line.
+    calibrated : CalibratedLine
+        The line without the change.
+    values : Array
+        (4,) of the change.
+    height : float
+        Of the ground above the ellipsoid, metres.
 
-    Raises:
-        ValueError: a look misses the Earth.
+    Raises
+    ------
+    ValueError
+        a look misses the Earth.
     """
     line = np.linspace(-0.5, sensor.lines - 0.5, _CHANGE_GRID[0])
     pixel = np.linspace(-0.5, sensor.camera.pixels - 0.5, _CHANGE_GRID[1])
@@ -397,14 +462,21 @@ def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, heigh
 def ground_sigma(sensor: Sensor, calibrated: CalibratedLine, change: EstimatedChange, height: float) -> GroundSigma:
     """Return the error of an estimated change on the ground.
 
-    Args:
-        sensor: with the corrected line.
-        calibrated: the line without the change.
-        change: that is estimated.
-        height: of the ground above the ellipsoid, metres.
+    Parameters
+    ----------
+    sensor : Sensor
+        With the corrected line.
+    calibrated : CalibratedLine
+        The line without the change.
+    change : EstimatedChange
+        That is estimated.
+    height : float
+        Of the ground above the ellipsoid, metres.
 
-    Raises:
-        ValueError: a look misses the Earth.
+    Raises
+    ------
+    ValueError
+        a look misses the Earth.
     """
     rows = ground_rows(sensor, calibrated, change.values, height)
     spreads = [rows @ covariance @ np.swapaxes(rows, 1, 2) for covariance in (change.constant, change.random)]

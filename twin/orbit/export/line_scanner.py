@@ -47,16 +47,26 @@ _CUBIC = (0, 2, 5, 9)
 class EffectiveCamera:
     """A camera and its way that see, with straight light, what a sensor sees at one height.
 
-    Attributes:
-        seconds: of the nodes, evenly spaced, (N,), of the trajectory.
-        station: projection centre, ITRS, (N, 3), metres.
-        velocity: of it, (N, 3), m/s.
-        rotation: from the camera's axes to the ITRS; X along the flight, Y along the line, Z toward the scene.
-        focal_length: metres.
-        pitch: of the pixels, metres.
-        pixels: of the line.
-        along: (4,) coefficients of the real y by powers of the ideal one, both in millimetres.
-        across: (4,) likewise, what is added to the ideal x of a point on the line to make it 0.
+    Attributes
+    ----------
+    seconds : Array
+        Of the nodes, evenly spaced, (N,), of the trajectory.
+    station : Array
+        Projection centre, ITRS, (N, 3), metres.
+    velocity : Array
+        Of it, (N, 3), m/s.
+    rotation : Rotation
+        From the camera's axes to the ITRS; X along the flight, Y along the line, Z toward the scene.
+    focal_length : float
+        metres.
+    pitch : float
+        Of the pixels, metres.
+    pixels : int
+        Of the line.
+    along : Array
+        (4,) coefficients of the real y by powers of the ideal one, both in millimetres.
+    across : Array
+        (4,) likewise, what is added to the ideal x of a point on the line to make it 0.
     """
 
     seconds: Array
@@ -107,10 +117,14 @@ class ModelError:
 class LineScanner:
     """An ISD, and how well it agrees.
 
-    Attributes:
-        isd: contents of the file, plain data.
-        camera: that it describes.
-        errors: at the heights that were asked for.
+    Attributes
+    ----------
+    isd : Mapping[str, Any]
+        Contents of the file, plain data.
+    camera : EffectiveCamera
+        That it describes.
+    errors : tuple[ModelError, ...]
+        At the heights that were asked for.
     """
 
     isd: Mapping[str, Any]
@@ -129,17 +143,27 @@ def line_scanner(
 ) -> LineScanner:
     """The ISD of an image, or of a window of it.
 
-    Args:
-        sensor: the line on its trajectory; its lines are those of the window, its camera is the whole line.
-        name: of the line.
-        epoch: UTC of the trajectory's second 0, ISO 8601.
-        pitch: of the pixels, metres.
-        heights: of the ground above the ellipsoid, lowest, middle, highest, metres; it is right at the middle one.
-        window: its first pixel on the line, and how many; None for the whole line.
-        notes: more of them, on what the line is taken to be.
+    Parameters
+    ----------
+    sensor : Sensor
+        The line on its trajectory; its lines are those of the window, its camera is the whole line.
+    name : str
+        Of the line.
+    epoch : str
+        UTC of the trajectory's second 0, ISO 8601.
+    pitch : float
+        Of the pixels, metres.
+    heights : tuple[float, float, float]
+        Of the ground above the ellipsoid, lowest, middle, highest, metres; it is right at the middle one.
+    window : tuple[int, int] | None
+        Its first pixel on the line, and how many; None for the whole line.
+    notes : tuple[str, ...]
+        More of them, on what the line is taken to be.
 
-    Raises:
-        ValueError: a look misses the Earth, or the trajectory is too rough for `_MOST` nodes.
+    Raises
+    ------
+    ValueError
+        a look misses the Earth, or the trajectory is too rough for `_MOST` nodes.
     """
     camera = _effective_camera(sensor, pitch, heights[1], epoch)
     first, pixels = (0, camera.pixels) if window is None else window
@@ -152,14 +176,21 @@ def line_scanner(
 def _effective_camera(sensor: Sensor, pitch: float, height: float, epoch: str) -> EffectiveCamera:
     """The camera with straight light that sees what a sensor sees at a height above the ellipsoid, metres.
 
-    Args:
-        sensor: the line on its trajectory.
-        pitch: of its pixels, metres.
-        height: metres.
-        epoch: UTC of the trajectory's second 0; only its fraction of a second matters.
+    Parameters
+    ----------
+    sensor : Sensor
+        The line on its trajectory.
+    pitch : float
+        Of its pixels, metres.
+    height : float
+        metres.
+    epoch : str
+        UTC of the trajectory's second 0; only its fraction of a second matters.
 
-    Raises:
-        ValueError: as `line_scanner`.
+    Raises
+    ------
+    ValueError
+        As `line_scanner`.
     """
     count = _FEWEST
     while True:

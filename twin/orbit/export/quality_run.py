@@ -48,13 +48,19 @@ _COMPARED = (15, 15, 3)
 def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: ControlPoints | None) -> Export:
     """The export with what was asked for: corrected polynomials, ERR_BIAS and ERR_RAND in them, notes in the ISD.
 
-    Args:
-        run: its models.
-        uncertainty: of camera and way; None for no map.
-        points: that correct the polynomials; None for none.
+    Parameters
+    ----------
+    run : Export
+        Its models.
+    uncertainty : CameraUncertainty | None
+        Of camera and way; None for no map.
+    points : ControlPoints | None
+        That correct the polynomials; None for none.
 
-    Raises:
-        InputError: control points that are of none of the images, or do not determine a correction.
+    Raises
+    ------
+    InputError
+        Control points that are of none of the images, or do not determine a correction.
     """
     lines = dict(run.lines)
     products = _products(run, run.source.scene) if isinstance(run.source, SceneSource) else {}
@@ -105,14 +111,21 @@ def controlled_line(
 ) -> Controlled | None:
     """Polynomials of an image after control; None where no point is in it.
 
-    Args:
-        control: points with their places in images.
-        name: of the image, without its ending.
-        polynomial: of it.
-        alone: whether it is the only one, whatever the points' only image is called.
+    Parameters
+    ----------
+    control : ControlPoints
+        Points with their places in images.
+    name : str
+        Of the image, without its ending.
+    polynomial : RationalPolynomial
+        Of it.
+    alone : bool
+        Whether it is the only one, whatever the points' only image is called.
 
-    Raises:
-        InputError: points that do not determine a correction.
+    Raises
+    ------
+    InputError
+        Points that do not determine a correction.
     """
     images = control.read.images
     rows = next((places for image, places in images.items() if name in (image, Path(image).stem)), None)
@@ -169,11 +182,16 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
 class PolynomialSource:
     """Rational polynomials of a file.
 
-    Attributes:
-        name: of the image that they belong to, as far as the file's name tells it.
-        file: that they are from.
-        polynomial: as they were read.
-        config: the file's path, as YAML.
+    Attributes
+    ----------
+    name : str
+        Of the image that they belong to, as far as the file's name tells it.
+    file : str
+        That they are from.
+    polynomial : RationalPolynomial
+        As they were read.
+    config : str
+        The file's path, as YAML.
     """
 
     name: str
@@ -186,9 +204,12 @@ class PolynomialSource:
 class PolynomialExport:
     """Polynomials after control.
 
-    Attributes:
-        source: what was read.
-        control: what the points made of it.
+    Attributes
+    ----------
+    source : PolynomialSource
+        What was read.
+    control : Controlled
+        What the points made of it.
     """
 
     source: PolynomialSource
@@ -198,12 +219,17 @@ class PolynomialExport:
 def read_polynomial_source(path: Path, band: str | None = None) -> PolynomialSource | None:
     """Rational polynomials, where a file holds them alone; None for another file.
 
-    Args:
-        path: of it.
-        band: that was asked for, which polynomials do not have.
+    Parameters
+    ----------
+    path : Path
+        Of it.
+    band : str | None
+        That was asked for, which polynomials do not have.
 
-    Raises:
-        InputError: it holds polynomials that cannot be read, or a band is asked for.
+    Raises
+    ------
+    InputError
+        It holds polynomials that cannot be read, or a band is asked for.
     """
     if not path.is_file() or not is_rpc(path):
         return None
@@ -218,14 +244,19 @@ def run_polynomial_export(
 ) -> PolynomialExport:
     """Correct the polynomials.
 
-    Args:
-        source: what was read.
-        uncertainty: which only a rigorous model can have.
-        points: that correct them.
+    Parameters
+    ----------
+    source : PolynomialSource
+        What was read.
+    uncertainty : CameraUncertainty | None
+        Which only a rigorous model can have.
+    points : ControlPoints | None
+        That correct them.
 
-    Raises:
-        InputError: there are none, they do not determine a correction, or something was asked for that takes a rigorous
-            model.
+    Raises
+    ------
+    InputError
+        There are none, they do not determine a correction, or something was asked for that takes a rigorous model.
     """
     if uncertainty is not None:
         allowed = "a source with a rigorous model for --position-sigma, --attitude-sigma and the like"

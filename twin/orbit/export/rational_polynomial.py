@@ -56,17 +56,24 @@ _DAMPING = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
 class RationalPolynomial:
     """The model, and how well it agrees.
 
-    Attributes:
-        offset: of line, sample, latitude, longitude (degrees) and height (metres), (5,).
-        scale: likewise.
-        line_numerator, line_denominator, sample_numerator, sample_denominator: (20,) each.
-        error_px: largest difference from the rigorous sensor at places that were not fitted, lines and samples; NaN of
-            polynomials that were read.
-        rms_px: root mean square of them.
-        bias_m: ERR_BIAS, metres: root mean square error on the ground of each horizontal axis that does not go with
-            time, so that points and images have it in common (GDAL's RFC 22; 68 % in STDI-0002); None where nobody
-            states it.
-        random_m: ERR_RAND, likewise of what goes with time and is another in every image or point.
+    Attributes
+    ----------
+    offset : Array
+        Of line, sample, latitude, longitude (degrees) and height (metres), (5,).
+    scale : Array
+        likewise.
+    line_numerator, line_denominator, sample_numerator, sample_denominator : Array
+        (20,) each.
+    error_px : tuple[float, float]
+        Largest difference from the rigorous sensor at places that were not fitted, lines and samples; NaN of
+        polynomials that were read.
+    rms_px : tuple[float, float]
+        Root mean square of them.
+    bias_m : float | None
+        ERR_BIAS, metres: root mean square error on the ground of each horizontal axis that does not go with time, so
+        that points and images have it in common (GDAL's RFC 22; 68 % in STDI-0002); None where nobody states it.
+    random_m : float | None
+        ERR_RAND, likewise of what goes with time and is another in every image or point.
     """
 
     offset: Array
@@ -84,14 +91,21 @@ class RationalPolynomial:
     def fit(cls, sensor: Sensor, first_pixel: int, pixels: int, heights: tuple[float, float]) -> RationalPolynomial:
         """Rational polynomials of an image, or of a window of it.
 
-        Args:
-            sensor: the line on its trajectory; its lines are those of the window.
-            first_pixel: of the window on the line.
-            pixels: of the window.
-            heights: lowest and highest ground above the ellipsoid, metres.
+        Parameters
+        ----------
+        sensor : Sensor
+            The line on its trajectory; its lines are those of the window.
+        first_pixel : int
+            Of the window on the line.
+        pixels : int
+            Of the window.
+        heights : tuple[float, float]
+            Lowest and highest ground above the ellipsoid, metres.
 
-        Raises:
-            ValueError: a look misses the Earth, or the ground crosses a pole or the 180th meridian.
+        Raises
+        ------
+        ValueError
+            a look misses the Earth, or the ground crosses a pole or the 180th meridian.
         """
         fitted = _seen(sensor, first_pixel, pixels, heights, _GRID, at_ends=True)
         others = tuple(count - 1 for count in _GRID)
@@ -101,12 +115,17 @@ class RationalPolynomial:
     def through(cls, fitted: Array, checked: Array) -> RationalPolynomial:
         """Rational polynomials through places of an image and of the ground.
 
-        Args:
-            fitted: (N, 5) line, sample, latitude, longitude (degrees) and height (metres).
-            checked: (M, 5) of the same, between them.
+        Parameters
+        ----------
+        fitted : Array
+            (N, 5) line, sample, latitude, longitude (degrees) and height (metres).
+        checked : Array
+            (M, 5) of the same, between them.
 
-        Raises:
-            ValueError: the ground crosses a pole or the 180th meridian.
+        Raises
+        ------
+        ValueError
+            The ground crosses a pole or the 180th meridian.
         """
         ends = np.stack([np.min(fitted, axis=0), np.max(fitted, axis=0)])
         if ends[1, 3] - ends[0, 3] > _WIDEST:
@@ -181,8 +200,10 @@ class RationalPolynomial:
 def axis_sigma(covariance: Array) -> float:
     """Return the root mean square error of a horizontal axis, metres, as ERR_BIAS and ERR_RAND state it.
 
-    Args:
-        covariance: (N, 2, 2) to the east and to the north over an image, m^2.
+    Parameters
+    ----------
+    covariance : Array
+        (N, 2, 2) to the east and to the north over an image, m^2.
     """
     return float(np.sqrt(0.5 * np.mean(np.trace(covariance, axis1=-2, axis2=-1))))
 
@@ -284,11 +305,15 @@ _LEAST_SCALE = 1e-9
 def read_rpc(path: str | Path) -> RationalPolynomial:
     """The polynomials of a file; its contents or ending decide on the format.
 
-    Args:
-        path: of it.
+    Parameters
+    ----------
+    path : str | Path
+        Of it.
 
-    Raises:
-        InputError: it cannot be read, or is not whole; with file, line and key.
+    Raises
+    ------
+    InputError
+        It cannot be read, or is not whole; with file, line and key.
     """
     if Path(path).suffix.lower() in _TIFF:
         return _from_tiff(Path(path))
@@ -300,8 +325,10 @@ def read_rpc(path: str | Path) -> RationalPolynomial:
 def is_rpc(path: Path) -> bool:
     """Whether a file holds rational polynomials alone: NAME_RPC.TXT, a GeoTIFF, or the RPC file of DIMAP.
 
-    Raises:
-        InputError: it is XML that cannot be read.
+    Raises
+    ------
+    InputError
+        It is XML that cannot be read.
     """
     match path.suffix.lower():
         case ".tif" | ".tiff" | ".txt":
@@ -409,17 +436,27 @@ def polynomial_correction(
 ) -> ImageCorrection:
     """By how much polynomials are off in the image.
 
-    Args:
-        polynomial: of the image.
-        itrs: (N, 3) of the points, metres.
-        ground_covariance: (N, 3, 3) in its axes, m^2.
-        measured: (N, 2) line and sample, the centre of the first pixel being 0, 0.
-        image_covariance: (N, 2, 2), pixels^2.
-        kind: of the correction, shift or affine.
-        screened: whether points far beyond their covariances are left out.
+    Parameters
+    ----------
+    polynomial : RationalPolynomial
+        Of the image.
+    itrs : Array
+        (N, 3) of the points, metres.
+    ground_covariance : Array
+        (N, 3, 3) in its axes, m^2.
+    measured : Array
+        (N, 2) line and sample, the centre of the first pixel being 0, 0.
+    image_covariance : Array
+        (N, 2, 2), pixels^2.
+    kind : Kind
+        Of the correction, shift or affine.
+    screened : bool
+        Whether points far beyond their covariances are left out.
 
-    Raises:
-        ValueError: as `analysis.orbit.image_correction.image_correction`.
+    Raises
+    ------
+    ValueError
+        As `analysis.orbit.image_correction.image_correction`.
     """
     longitude, latitude, height = Earth().geodetic(itrs)
     slope = image_slope(polynomial, latitude, longitude, height) @ east_north_up(longitude, latitude)
@@ -454,12 +491,17 @@ def image_slope(polynomial: RationalPolynomial, latitude: Array, longitude: Arra
 def controlled(polynomial: RationalPolynomial, correction: ImageCorrection) -> RationalPolynomial:
     """Return the polynomials with a correction inside, and what is uncertain of them on the ground.
 
-    Args:
-        polynomial: of the image.
-        correction: that was found for it.
+    Parameters
+    ----------
+    polynomial : RationalPolynomial
+        Of the image.
+    correction : ImageCorrection
+        That was found for it.
 
-    Raises:
-        ValueError: polynomials that do not lead back to the ground, ground at a pole or the 180th meridian.
+    Raises
+    ------
+    ValueError
+        Polynomials that do not lead back to the ground, ground at a pole or the 180th meridian.
     """
     grids, kept = [], [0, 1, 4]
     for at_ends in (True, False):

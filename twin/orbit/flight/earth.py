@@ -51,11 +51,15 @@ def years_without_announced_leap_seconds() -> Iterator[None]:
 def tai_of(epoch: str) -> tuple[float, float]:
     """TAI of an instant given in UTC, as a Julian date in two parts, days.
 
-    Args:
-        epoch: ISO 8601 text with its zone, "2011-03-05T03:05:00Z".
+    Parameters
+    ----------
+    epoch : str
+        ISO 8601 text with its zone, "2011-03-05T03:05:00Z".
 
-    Raises:
-        ValueError: not such a text, or without its zone.
+    Raises
+    ------
+    ValueError
+        Not such a text, or without its zone.
     """
     time = datetime.fromisoformat(epoch)
     if time.tzinfo is None:
@@ -71,9 +75,12 @@ def tai_of(epoch: str) -> tuple[float, float]:
 def ut1_of(epoch: str, dut1: float) -> tuple[float, float]:
     """UT1 of an instant given in UTC, as a Julian date in two parts, days.
 
-    Args:
-        epoch: as for `tai_of`.
-        dut1: UT1 - UTC, seconds.
+    Parameters
+    ----------
+    epoch : str
+        As for `tai_of`.
+    dut1 : float
+        UT1 - UTC, seconds.
     """
     with years_without_announced_leap_seconds():
         one, two = erfa.utcut1(*erfa.taiutc(*tai_of(epoch)), dut1)
@@ -84,10 +91,14 @@ def ut1_of(epoch: str, dut1: float) -> tuple[float, float]:
 class EarthRotation:
     """Rotation GCRS -> ITRS around an epoch; made by `Earth.rotation`. Seconds are SI seconds of atomic time.
 
-    Attributes:
-        pole: spline of the celestial pole's X and Y and of the locator s, radians, over seconds.
-        angle: Earth rotation angle at the epoch, radians.
-        polar: polar motion, TIRS -> ITRS, shape (3, 3).
+    Attributes
+    ----------
+    pole : Any
+        Spline of the celestial pole's X and Y and of the locator s, radians, over seconds.
+    angle : float
+        Earth rotation angle at the epoch, radians.
+    polar : np.ndarray
+        Polar motion, TIRS -> ITRS, shape (3, 3).
     """
 
     pole: Any
@@ -125,10 +136,14 @@ class EarthRotation:
 def celestial_pole(epoch: str, first: float, last: float) -> CubicSpline:
     """Spline over time of the celestial pole's X and Y and of the locator s by IAU 2006/2000A, radians.
 
-    Args:
-        epoch: UTC, ISO 8601 text.
-        first: begin of the span, seconds; nodes stand some hours beyond it on either side.
-        last: its end, seconds.
+    Parameters
+    ----------
+    epoch : str
+        UTC, ISO 8601 text.
+    first : float
+        Begin of the span, seconds; nodes stand some hours beyond it on either side.
+    last : float
+        Its end, seconds.
     """
     one, two = tai_of(epoch)
     around = np.ceil(0.5 * (last - first) / _NODE_STEP) + _NODES_AROUND
@@ -170,9 +185,12 @@ def curvature_radii(lat: Any) -> tuple[np.ndarray, np.ndarray]:
 class Earth:
     """The Earth.
 
-    Attributes:
-        dut1: UT1 - UTC at the epoch, seconds.
-        polar_motion: x and y of the pole, radians (x toward Greenwich, y toward 90 degrees west).
+    Attributes
+    ----------
+    dut1 : float
+        UT1 - UTC at the epoch, seconds.
+    polar_motion : tuple[float, float]
+        x and y of the pole, radians (x toward Greenwich, y toward 90 degrees west).
     """
 
     dut1: float = 0.0
@@ -188,10 +206,14 @@ class Earth:
 
         UT1 runs on evenly from the epoch, also over a leap second.
 
-        Args:
-            epoch: UTC, ISO 8601 text.
-            first: begin of the span, seconds.
-            last: its end, seconds.
+        Parameters
+        ----------
+        epoch : str
+            UTC, ISO 8601 text.
+        first : float
+            Begin of the span, seconds.
+        last : float
+            Its end, seconds.
         """
         one, two = tai_of(epoch)
         polar = np.asarray(erfa.pom00(*self.polar_motion, erfa.sp00(one, two + erfa.TTMTAI / DAY)))
@@ -202,11 +224,16 @@ class Earth:
     def to_itrs(self, seconds: Any, epoch: str) -> np.ndarray:
         """Rotation GCRS -> ITRS.
 
-        Args:
-            seconds: SI seconds from the epoch, shape (...).
-            epoch: UTC, ISO 8601 text.
+        Parameters
+        ----------
+        seconds : Any
+            SI seconds from the epoch, shape (...).
+        epoch : str
+            UTC, ISO 8601 text.
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             Shape (..., 3, 3); x_itrs = matrix @ x_gcrs.
         """
         t = np.asarray(seconds, dtype=np.float64)
@@ -215,12 +242,18 @@ class Earth:
     def ecef(self, lon: Any, lat: Any, height: Any = 0.0) -> np.ndarray:
         """Points on and above the ellipsoid.
 
-        Args:
-            lon: radians, shape (...).
-            lat: radians, shape (...).
-            height: above the ellipsoid, metres.
+        Parameters
+        ----------
+        lon : Any
+            Radians, shape (...).
+        lat : Any
+            Radians, shape (...).
+        height : Any
+            Above the ellipsoid, metres.
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             Shape (..., 3), ITRS, metres.
         """
         lon, lat, h = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (lon, lat, height)))
@@ -247,12 +280,18 @@ class Earth:
         The surface of equal height is no ellipsoid; it is met by Newton steps on the geodetic height along the ray,
         begun at the ellipsoid with both axes longer by the height.
 
-        Args:
-            origin: above that height, ITRS, metres, shape (..., 3).
-            direction: of the ray, any length, shape (..., 3).
-            height: above the ellipsoid, metres, shape (...).
+        Parameters
+        ----------
+        origin : Any
+            Above that height, ITRS, metres, shape (..., 3).
+        direction : Any
+            Of the ray, any length, shape (..., 3).
+        height : Any
+            Above the ellipsoid, metres, shape (...).
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             Shape (..., 3), ITRS, metres; NaN where the ray misses, or meets the surface only behind its origin.
         """
         o, d, h = (np.asarray(a, dtype=np.float64) for a in (origin, direction, height))

@@ -29,8 +29,10 @@ def carried_with_earth(place: np.ndarray) -> np.ndarray:
 
     The Earth's axis is taken as Z: polar motion (1e-6 rad) changes it by 1 mm/s.
 
-    Args:
-        place: ITRS, (..., 3), metres.
+    Parameters
+    ----------
+    place : np.ndarray
+        ITRS, (..., 3), metres.
     """
     return EARTH_RATE * np.stack([-place[..., 1], place[..., 0], np.zeros(place.shape[:-1])], axis=-1)
 
@@ -48,11 +50,16 @@ _LAGUERRE = np.polynomial.laguerre.laggauss(12)
 class LightEffects:
     """Which effects are on.
 
-    Attributes:
-        light_time: the Earth turns while the light is under way.
-        aberration: the satellite's inertial velocity tilts what it sees.
-        refraction: the standard atmosphere bends the light.
-        wavelength: vacuum wavelength for the refraction, metres.
+    Attributes
+    ----------
+    light_time : bool
+        The Earth turns while the light is under way.
+    aberration : bool
+        The satellite's inertial velocity tilts what it sees.
+    refraction : bool
+        The standard atmosphere bends the light.
+    wavelength : float
+        Vacuum wavelength for the refraction, metres.
     """
 
     light_time: bool = True
@@ -81,11 +88,16 @@ def aberrated(direction: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     The Lorentz transformation of a direction, exact (Klioner, AJ 125, 1580 (2003), eq. 10, without gravitation). The
     source appears displaced toward the velocity. With ``-velocity`` it is its own inverse.
 
-    Args:
-        direction: unit vectors from the observer toward the source in the frame at rest, (N, 3).
-        velocity: of the observer in that frame, m/s, broadcastable to (N, 3).
+    Parameters
+    ----------
+    direction : np.ndarray
+        Unit vectors from the observer toward the source in the frame at rest, (N, 3).
+    velocity : np.ndarray
+        Of the observer in that frame, m/s, broadcastable to (N, 3).
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         Unit vectors toward the source in the observer's frame, (N, 3).
     """
     beta = np.broadcast_to(velocity, direction.shape) / SPEED_OF_LIGHT
@@ -99,11 +111,16 @@ def aberrated(direction: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 def turned_with_earth(vectors: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """Vectors in Earth-fixed axes, after they have turned eastward with the Earth for a time.
 
-    Args:
-        vectors: (N, 3).
-        seconds: (N,); negative turns back, westward.
+    Parameters
+    ----------
+    vectors : np.ndarray
+        (N, 3).
+    seconds : np.ndarray
+        (N,); negative turns back, westward.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (N, 3). A point that is fixed in space moves by ``-seconds`` in Earth-fixed axes. The axis is Z: polar motion
         (1e-6 rad) changes the turn of a light time by 1e-13 rad, below a micrometre.
     """
@@ -116,8 +133,10 @@ def turned_with_earth(vectors: np.ndarray, seconds: np.ndarray) -> np.ndarray:
 def standard_refractivity(wavelength: float) -> float:
     """Refractivity n - 1 of dry air at 15 degC and 1013.25 hPa (Peck and Reeder, JOSA 62, 958 (1972), eq. 2).
 
-    Args:
-        wavelength: in vacuum, metres; the formula holds from 230 nm to 1690 nm.
+    Parameters
+    ----------
+    wavelength : float
+        In vacuum, metres; the formula holds from 230 nm to 1690 nm.
     """
     square = (1e-6 / wavelength) ** 2
     return 1e-8 * (8060.51 + 2480990.0 / (132.274 - square) + 17455.7 / (39.32957 - square))
@@ -137,13 +156,20 @@ def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray,
     at its height, so that the whole column, which alone counts for small z, is the one that the pressure there holds
     up (2.33 m at sea level). The integral is Gauss-Laguerre's of 12 points.
 
-    Args:
-        zenith: angle z of the straight line at the ground from the vertical, radians, (N,), at most 80 degrees.
-        height: of the point above sea level, metres, broadcastable to (N,).
-        radius: of curvature of the ellipsoid, metres, broadcastable to (N,).
-        wavelength: metres.
+    Parameters
+    ----------
+    zenith : np.ndarray
+        Angle z of the straight line at the ground from the vertical, radians, (N,), at most 80 degrees.
+    height : np.ndarray
+        Of the point above sea level, metres, broadcastable to (N,).
+    radius : np.ndarray
+        Of curvature of the ellipsoid, metres, broadcastable to (N,).
+    wavelength : float
+        metres.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (N,), metres along the surface.
     """
     temperature = _TEMPERATURE - _LAPSE * np.minimum(height, _TROPOPAUSE)
@@ -166,13 +192,20 @@ def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray,
 def refracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: float) -> np.ndarray:
     """Where a look really meets the ground.
 
-    Args:
-        point: where its straight continuation from space meets a height, ITRS, metres, (N, 3).
-        station: the satellite when the light left, ITRS, metres, (N, 3).
-        earth: for the vertical at the point; the atmosphere is layered about the ellipsoid's mean sphere there.
-        wavelength: metres.
+    Parameters
+    ----------
+    point : np.ndarray
+        Where its straight continuation from space meets a height, ITRS, metres, (N, 3).
+    station : np.ndarray
+        The satellite when the light left, ITRS, metres, (N, 3).
+    earth : Earth
+        For the vertical at the point; the atmosphere is layered about the ellipsoid's mean sphere there.
+    wavelength : float
+        metres.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (N, 3), at the same height, nearer to the point below the satellite.
     """
     lon, lat, height = earth.geodetic(point)

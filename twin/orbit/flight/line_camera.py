@@ -47,9 +47,12 @@ if TYPE_CHECKING:
 class LineTimes:
     """Times at lines of an image, linear between them and as far as half a line beyond the first and the last.
 
-    Attributes:
-        line: (K,) image coordinates, increasing; the middle of the first line is 0.
-        time: (K,) middle of the exposure, seconds of the trajectory, increasing.
+    Attributes
+    ----------
+    line : Array
+        (K,) image coordinates, increasing; the middle of the first line is 0.
+    time : Array
+        (K,) middle of the exposure, seconds of the trajectory, increasing.
     """
 
     line: Array
@@ -59,12 +62,17 @@ class LineTimes:
     def of(cls, line: ArrayLike, time: ArrayLike) -> LineTimes:
         """The table, checked.
 
-        Args:
-            line: (K,), at least two.
-            time: (K,), seconds.
+        Parameters
+        ----------
+        line : ArrayLike
+            (K,), at least two.
+        time : ArrayLike
+            (K,), seconds.
 
-        Raises:
-            ValueError: shapes that do not match, fewer than two rows, values that are not finite or do not increase.
+        Raises
+        ------
+        ValueError
+            Shapes that do not match, fewer than two rows, values that are not finite or do not increase.
         """
         at, moment = np.array(line, np.float64), np.array(time, np.float64)
         if at.ndim != 1 or at.shape != moment.shape or len(at) < 2:
@@ -99,9 +107,12 @@ def changed_payload(
 ) -> ThreeLineCameraSpec:
     """The camera as it is after launch.
 
-    Args:
-        spec: a test, whose ``perturb`` names lines.
-        payload: as the laboratory has measured it.
+    Parameters
+    ----------
+    spec : OrbitCalibrationSpec | OrbitSimulateSpec
+        a test, whose ``perturb`` names lines.
+    payload : ThreeLineCameraSpec
+        As the laboratory has measured it.
     """
     lines = {}
     for name, line in payload.lines.items():
@@ -117,9 +128,12 @@ def changed_payload(
 def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray]) -> ThreeLineCameraSpec:
     """The camera with each line turned in its own axes, Rx(d_beta) Ry(d_alpha) Rz(d_gamma), and with f + d_f.
 
-    Args:
-        payload: the camera.
-        drift: line -> (4,) d_alpha, d_beta, d_gamma (radians) and d_f (metres).
+    Parameters
+    ----------
+    payload : ThreeLineCameraSpec
+        The camera.
+    drift : Mapping[str, np.ndarray]
+        Line -> (4,) d_alpha, d_beta, d_gamma (radians) and d_f (metres).
     """
     lines = dict(payload.lines)
     for name, (alpha, beta, gamma, longer) in drift.items():
@@ -147,9 +161,12 @@ _LOOK_TERMS = 12
 class LinePiece:
     """One CCD of a line.
 
-    Attributes:
-        first, last: its pixels.
-        directions: as those of `LineCamera`, over its own pixels.
+    Attributes
+    ----------
+    first, last : int
+        Its pixels.
+    directions : np.ndarray
+        As those of `LineCamera`, over its own pixels.
     """
 
     first: int
@@ -164,14 +181,19 @@ class LineCamera:
     Pixels are counted along +Y' of the real focal plane, the centre of the first is 0, so they see the scene from +Y to
     -Y of the body. A place on the line is any real number from -0.5 to pixels - 0.5.
 
-    Attributes:
-        name: of the line.
-        pixels: how many.
-        directions: Chebyshev coefficients over the line of a vector along the look, body frame, (K, 3); its length does
-            not matter.
-        origins: those of a point on the ray, body frame, (J, 3), metres.
-        pieces: of a line of several CCDs, from its first pixel on, in place of ``directions``, which then are those
-            without offsets.
+    Attributes
+    ----------
+    name : str
+        Of the line.
+    pixels : int
+        How many.
+    directions : np.ndarray
+        Chebyshev coefficients over the line of a vector along the look, body frame, (K, 3); its length does not matter.
+    origins : np.ndarray
+        Those of a point on the ray, body frame, (J, 3), metres.
+    pieces : tuple[LinePiece, ...]
+        Of a line of several CCDs, from its first pixel on, in place of ``directions``, which then are those without
+        offsets.
     """
 
     name: str
@@ -188,8 +210,10 @@ class LineCamera:
     def look(self, pixel: np.ndarray) -> np.ndarray:
         """Unit directions toward the scene, body frame: pixels (N,) -> (N, 3).
 
-        Raises:
-            ValueError: a pixel outside the line.
+        Raises
+        ------
+        ValueError
+            a pixel outside the line.
         """
         vector = self._vector(pixel)[0]
         return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
@@ -197,8 +221,10 @@ class LineCamera:
     def look_and_slope(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`look` and its derivative by the pixel, radians per pixel, both (N, 3); the derivative is square to the look.
 
-        Raises:
-            ValueError: a pixel outside the line.
+        Raises
+        ------
+        ValueError
+            a pixel outside the line.
         """
         vector, change = self._vector(pixel)
         length = np.linalg.norm(vector, axis=-1, keepdims=True)
@@ -212,8 +238,10 @@ class LineCamera:
         a solid angle of its angle along the line by its angle across, pitch x cos w / f. That is cos^4 w of a
         projection without distortion, and follows the distortion of another.
 
-        Raises:
-            ValueError: a pixel outside the line.
+        Raises
+        ------
+        ValueError
+            a pixel outside the line.
         """
         look, slope = self.look_and_slope(np.concatenate([[0.5 * (self.pixels - 1)], np.asarray(pixel, np.float64)]))
         rate = np.linalg.norm(slope, axis=-1)
@@ -222,8 +250,10 @@ class LineCamera:
     def origin(self, pixel: np.ndarray) -> np.ndarray:
         """Points on the rays, body frame: pixels (N,) -> (N, 3), metres.
 
-        Raises:
-            ValueError: a pixel outside the line.
+        Raises
+        ------
+        ValueError
+            a pixel outside the line.
         """
         return self._series(self.origins, self._checked(pixel))
 
@@ -262,11 +292,16 @@ def line_cameras(spec: ThreeLineCameraSpec) -> dict[str, LineCamera]:
 def polynomial_line(name: str, pixels: int, forward: ArrayLike, right: ArrayLike) -> LineCamera:
     """A line whose looks have polynomials of the pixel as tangents (no approximation).
 
-    Args:
-        name: of the line.
-        pixels: how many.
-        forward: coefficients (K,) of the tangent of a look's angle forward, ascending powers of the pixel.
-        right: likewise to the right.
+    Parameters
+    ----------
+    name : str
+        Of the line.
+    pixels : int
+        How many.
+    forward : ArrayLike
+        Coefficients (K,) of the tangent of a look's angle forward, ascending powers of the pixel.
+    right : ArrayLike
+        Likewise to the right.
     """
     ahead, aside = np.atleast_1d(forward), np.atleast_1d(right)
 
@@ -301,13 +336,20 @@ def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> L
 def pixel_places(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
     """Where pixels of a line lie in its focal plane, x (flight) and y (along the line) from the line's centre, metres.
 
-    Args:
-        line: of a payload.
-        pixel: places on the line, (N,).
-        pixels: how many it has.
-        pitch: of its pixels, metres.
+    Parameters
+    ----------
+    line : LineCameraSpec
+        Of a payload.
+    pixel : np.ndarray
+        Places on the line, (N,).
+    pixels : int
+        How many it has.
+    pitch : float
+        Of its pixels, metres.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (N, 2).
     """
     at = np.asarray(pixel, dtype=np.float64)
@@ -334,16 +376,24 @@ def _ccd_places(line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pi
 def traced_line_cameras(instrument: Instrument, backend: Backend, state: State | None = None) -> dict[str, LineCamera]:
     """The lines of an instrument of mirror cameras, by exact chief rays of their pixels.
 
-    Args:
-        instrument: cameras on their base, which is the satellite's body frame.
-        backend: where to trace.
-        state: what is perturbed; None for nothing.
+    Parameters
+    ----------
+    instrument : Instrument
+        Cameras on their base, which is the satellite's body frame.
+    backend : Backend
+        Where to trace.
+    state : State | None
+        What is perturbed; None for nothing.
 
-    Returns:
+    Returns
+    -------
+    dict[str, LineCamera]
         Camera -> its line. The origins are the points of the chief rays nearest to the camera's nominal origin.
 
-    Raises:
-        AimError, BeamMissedError: the perturbation moves the image off the mirrors.
+    Raises
+    ------
+    AimError, BeamMissedError
+        The perturbation moves the image off the mirrors.
     """
     names = list(instrument.cameras)
     states: list[State] = [state or {}]
@@ -405,10 +455,14 @@ def dihedral_angle(
 class LineAngles:
     """Angles between pairs of lines, radians, by the angle's name.
 
-    Attributes:
-        cameras: line -> camera.
-        pairs: angle -> the two lines that it lies between.
-        pixel: line -> places of its points, (n,), of the lines that angles are measured of.
+    Attributes
+    ----------
+    cameras : Mapping[str, LineCamera]
+        Line -> camera.
+    pairs : Mapping[str, tuple[str, str]]
+        Angle -> the two lines that it lies between.
+    pixel : Mapping[str, np.ndarray]
+        Line -> places of its points, (n,), of the lines that angles are measured of.
     """
 
     cameras: Mapping[str, LineCamera]
@@ -477,10 +531,14 @@ def _chopped(coefficients: np.ndarray) -> np.ndarray:
 def calibrated_line(line: LineCamera, axes: np.ndarray, principal_distance: float) -> CalibratedLine:
     """A traced line in the analysis's form.
 
-    Args:
-        line: of one CCD.
-        axes: (3, 3) columns X, Y, Z of its camera in the body, about which changes count.
-        principal_distance: of it, metres.
+    Parameters
+    ----------
+    line : LineCamera
+        Of one CCD.
+    axes : np.ndarray
+        (3, 3) columns X, Y, Z of its camera in the body, about which changes count.
+    principal_distance : float
+        Of it, metres.
     """
     return CalibratedLine(line.pixels, line.directions, line.origins, axes, principal_distance)
 
@@ -490,10 +548,14 @@ def calibrated_lines(
 ) -> dict[str, CalibratedLine]:
     """Lines of an instrument as its calibration knows them, by camera.
 
-    Args:
-        lines: of the unperturbed instrument, as `twin.orbit.flight.line_camera.traced_line_cameras` finds them.
-        instrument: that is unperturbed.
-        backend: where to trace.
+    Parameters
+    ----------
+    lines : Mapping[str, LineCamera]
+        Of the unperturbed instrument, as `twin.orbit.flight.line_camera.traced_line_cameras` finds them.
+    instrument : Instrument
+        That is unperturbed.
+    backend : Backend
+        Where to trace.
     """
     sight = LineSight(instrument, backend)
     distance = sight.truth([{}]).principal_distance
@@ -503,12 +565,18 @@ def calibrated_lines(
 def corrected_line(line: LineCamera, calibrated: CalibratedLine, change: ArrayLike) -> LineCamera:
     """A line after a change.
 
-    Args:
-        line: as it was calibrated.
-        calibrated: the same line, by `calibrated_lines`.
-        change: (4,) d_alpha, d_beta, d_gamma (rad) and d_f (m) since then.
+    Parameters
+    ----------
+    line : LineCamera
+        As it was calibrated.
+    calibrated : CalibratedLine
+        The same line, by `calibrated_lines`.
+    change : ArrayLike
+        (4,) d_alpha, d_beta, d_gamma (rad) and d_f (m) since then.
 
-    Raises:
-        ValueError: another shape, numbers that are not finite, no principal distance left.
+    Raises
+    ------
+    ValueError
+        Another shape, numbers that are not finite, no principal distance left.
     """
     return replace(line, directions=calibrated.corrected(change).directions)

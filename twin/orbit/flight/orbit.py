@@ -76,8 +76,10 @@ def node_rate(semi_major_axis: float, eccentricity: float, inclination: float) -
 def sun_synchronous_inclination(semi_major_axis: float, eccentricity: float = 0.0) -> float:
     """Mean inclination at which the node follows the mean Sun, radians.
 
-    Raises:
-        ValueError: the orbit is too high.
+    Raises
+    ------
+    ValueError
+        The orbit is too high.
     """
     cosine = SUN_RATE / node_rate(semi_major_axis, eccentricity, 0.0)
     if abs(cosine) > 1.0:
@@ -107,14 +109,20 @@ def _osculating_inclination(semi_major_axis: float, eccentricity: float, argumen
 class Orbit:
     """An orbit over a span of time; made by `propagate`.
 
-    Attributes:
-        epoch: UTC, ISO 8601 text; times are seconds from it.
-        earth: on which it is seen.
-        first, last: span of time, seconds.
-        to_gcrs: rotation from the frame of integration (equator of the epoch) to the GCRS, shape (3, 3).
-        rotation: the Earth's, over the span.
-        backward, forward: dense solutions before and after the epoch, in the frame of integration; None if there is no
-            such part.
+    Attributes
+    ----------
+    epoch : str
+        UTC, ISO 8601 text; times are seconds from it.
+    earth : Earth
+        On which it is seen.
+    first, last : float
+        Span of time, seconds.
+    to_gcrs : np.ndarray
+        Rotation from the frame of integration (equator of the epoch) to the GCRS, shape (3, 3).
+    rotation : EarthRotation
+        The Earth's, over the span.
+    backward, forward : Any
+        Dense solutions before and after the epoch, in the frame of integration; None if there is no such part.
     """
 
     epoch: str
@@ -133,8 +141,10 @@ class Orbit:
         """Position (..., 3), metres, and velocity (..., 3), m/s, in the frame of integration: z along the celestial
         pole, x toward the celestial intermediate origin of the epoch, not turning.
 
-        Raises:
-            ValueError: a time is not a number or outside the orbit.
+        Raises
+        ------
+        ValueError
+            a time is not a number or outside the orbit.
         """
         t = np.asarray(seconds, dtype=np.float64)
         if not np.all(in_span(t, self.first, self.last)):
@@ -177,14 +187,20 @@ class Orbit:
 def propagate(spec: OrbitSpec, earth: Earth, tolerance: float = TOLERANCE) -> Orbit:
     """Follow an orbit over its span (Dormand-Prince 8(5,3) with dense output).
 
-    Args:
-        spec: the orbit.
-        earth: on which it is seen.
-        tolerance: relative error of one step.
+    Parameters
+    ----------
+    spec : OrbitSpec
+        The orbit.
+    earth : Earth
+        On which it is seen.
+    tolerance : float
+        Relative error of one step.
 
-    Raises:
-        ValueError: no such orbit: the place lies beyond the inclination's latitudes, it is too high to be
-            sun-synchronous, or it runs into the Earth.
+    Raises
+    ------
+    ValueError
+        No such orbit: the place lies beyond the inclination's latitudes, it is too high to be sun-synchronous, or it
+        runs into the Earth.
     """
     rotation = earth.rotation(spec.epoch, -spec.before, spec.after)
     to_gcrs = rotation.celestial(0.0).T

@@ -42,15 +42,23 @@ _UNIT_TOLERANCE = 1e-3
 class PlatformTable:
     """Readings of orbit and attitude of one pass.
 
-    Attributes:
-        epoch: UTC, ISO 8601 ending in Z; all times are SI seconds from it, leap seconds counted.
-        orbit_time: (N,) seconds, increasing.
-        position: (N, 3) of the body's origin in the ITRS, metres.
-        velocity: (N, 3) against the turning Earth in axes of the ITRS, m/s; None where it was not measured.
-        attitude_time: (M,) seconds, increasing.
-        quaternion: (M, 4) x, y, z, w (scalar last) of unit length, neighbours on one side; turns body axes into those
-            of the ITRS, v_itrs = R(q) v_body.
-        usable: two times, seconds, between which the orbit may be used; readings beyond serve to join those within.
+    Attributes
+    ----------
+    epoch : str
+        UTC, ISO 8601 ending in Z; all times are SI seconds from it, leap seconds counted.
+    orbit_time : Array
+        (N,) seconds, increasing.
+    position : Array
+        (N, 3) of the body's origin in the ITRS, metres.
+    velocity : Array | None
+        (N, 3) against the turning Earth in axes of the ITRS, m/s; None where it was not measured.
+    attitude_time : Array
+        (M,) seconds, increasing.
+    quaternion : Array
+        (M, 4) x, y, z, w (scalar last) of unit length, neighbours on one side; turns body axes into those of the ITRS,
+        v_itrs = R(q) v_body.
+    usable : tuple[float, float]
+        Two times, seconds, between which the orbit may be used; readings beyond serve to join those within.
     """
 
     epoch: str
@@ -73,17 +81,26 @@ class PlatformTable:
     ) -> PlatformTable:
         """The table, checked; quaternions are made unit and brought to one side.
 
-        Args:
-            epoch: UTC, ISO 8601.
-            orbit_time: (N,), seconds.
-            position: (N, 3), ITRS, metres.
-            velocity: (N, 3), of the Earth-fixed axes, m/s, or None.
-            attitude_time: (M,), seconds.
-            quaternion: (M, 4), x, y, z, w, body to ITRS, either sign.
+        Parameters
+        ----------
+        epoch : str
+            UTC, ISO 8601.
+        orbit_time : ArrayLike
+            (N,), seconds.
+        position : ArrayLike
+            (N, 3), ITRS, metres.
+        velocity : ArrayLike | None
+            (N, 3), of the Earth-fixed axes, m/s, or None.
+        attitude_time : ArrayLike
+            (M,), seconds.
+        quaternion : ArrayLike
+            (M, 4), x, y, z, w, body to ITRS, either sign.
 
-        Raises:
-            ValueError: shapes that do not match, values that are not finite, times that do not increase, fewer than two
-                readings, or four numbers that are no rotation.
+        Raises
+        ------
+        ValueError
+            Shapes that do not match, values that are not finite, times that do not increase, fewer than two readings,
+            or four numbers that are no rotation.
         """
         times, looks = (np.array(v, np.float64) for v in (orbit_time, attitude_time))
         place, turn = np.array(position, np.float64), np.array(quaternion, np.float64)
@@ -115,10 +132,14 @@ class PlatformTable:
 def joined_quaternions(quaternion: Array) -> Array:
     """Quaternions of the same rotations whose neighbours lie on one side of the sphere, so that they interpolate.
 
-    Args:
-        quaternion: (N, 4), of which q and -q are one rotation.
+    Parameters
+    ----------
+    quaternion : Array
+        (N, 4), of which q and -q are one rotation.
 
-    Returns:
+    Returns
+    -------
+    Array
         (N, 4); the first keeps its sign.
     """
     flip = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0.0, -1.0, 1.0))
@@ -144,9 +165,12 @@ class TabulatedTrajectory:
 
     Every method raises ValueError for a time outside the readings or in a gap of them.
 
-    Attributes:
-        table: the readings.
-        law: orbital axes.
+    Attributes
+    ----------
+    table : PlatformTable
+        The readings.
+    law : Attitude
+        Orbital axes.
     """
 
     table: PlatformTable

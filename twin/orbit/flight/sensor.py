@@ -46,10 +46,14 @@ class Platform(Protocol):
 class MovedPlatform:
     """A platform that is elsewhere and holds itself otherwise.
 
-    Attributes:
-        base: without.
-        shift: in body axes, metres.
-        turn: rotation vector in body axes, radians.
+    Attributes
+    ----------
+    base : Platform
+        without.
+    shift : np.ndarray
+        In body axes, metres.
+    turn : np.ndarray
+        Rotation vector in body axes, radians.
     """
 
     base: Platform
@@ -77,18 +81,29 @@ class Sensor:
     Image coordinates are (line, pixel), real numbers; the centre of the first line's first pixel is (0, 0) and the
     image reaches from -0.5 to lines - 0.5 and to pixels - 0.5.
 
-    Attributes:
-        camera: the line.
-        trajectory: position, velocity and attitude over time.
-        earth: the ellipsoid.
-        line_time: from one line to the next, seconds.
-        first_line_time: middle of the exposure of line 0, seconds of the trajectory.
-        lines: how many lines the image has.
-        effects: which of light time, aberration and refraction are on.
-        times: of its lines, where they are given as a table; None where lines follow one another evenly.
+    Attributes
+    ----------
+    camera : LineCamera
+        The line.
+    trajectory : Platform
+        Position, velocity and attitude over time.
+    earth : Earth
+        The ellipsoid.
+    line_time : float
+        From one line to the next, seconds.
+    first_line_time : float
+        Middle of the exposure of line 0, seconds of the trajectory.
+    lines : int
+        How many lines the image has.
+    effects : LightEffects
+        Which of light time, aberration and refraction are on.
+    times : LineTimes | None
+        Of its lines, where they are given as a table; None where lines follow one another evenly.
 
-    Raises:
-        ValueError: the image begins or ends outside of the trajectory's times.
+    Raises
+    ------
+    ValueError
+        The image begins or ends outside of the trajectory's times.
     """
 
     camera: LineCamera
@@ -111,8 +126,10 @@ class Sensor:
     ) -> Sensor:
         """The sensor whose lines, counted from 0, were exposed at the times of a table.
 
-        Raises:
-            ValueError: the image begins or ends outside of the trajectory's times.
+        Raises
+        ------
+        ValueError
+            The image begins or ends outside of the trajectory's times.
         """
         lines = int(times.line[-1]) + 1
         return cls(camera, trajectory, earth, times.line_time, float(times.time[0]), lines, effects, times)
@@ -126,16 +143,24 @@ class Sensor:
     def ground(self, line: np.ndarray, pixel: np.ndarray, height: np.ndarray | float = 0.0) -> np.ndarray:
         """Where pixels see the surface of a given height.
 
-        Args:
-            line: image coordinate, broadcastable to (N,).
-            pixel: likewise.
-            height: above the ellipsoid, metres, broadcastable to (N,).
+        Parameters
+        ----------
+        line : np.ndarray
+            Image coordinate, broadcastable to (N,).
+        pixel : np.ndarray
+            likewise.
+        height : np.ndarray | float
+            Above the ellipsoid, metres, broadcastable to (N,).
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             Points in the ITRS, (N, 3), metres; NaN where the look misses the Earth.
 
-        Raises:
-            ValueError: a line or a pixel outside the image.
+        Raises
+        ------
+        ValueError
+            a line or a pixel outside the image.
         """
         line, pixel, height = (np.ravel(a) for a in np.broadcast_arrays(line, pixel, height))
         self._require_inside(line)
@@ -160,10 +185,14 @@ class Sensor:
 
         Newton's method on line and pixel, on the two components of the light's direction square to the pixel's look.
 
-        Args:
-            point: in the ITRS, (N, 3), metres.
+        Parameters
+        ----------
+        point : np.ndarray
+            In the ITRS, (N, 3), metres.
 
-        Returns:
+        Returns
+        -------
+        tuple[np.ndarray, np.ndarray]
             Line and pixel, (N,) each; both NaN for a point that the image does not hold (its mask is
             ``np.isfinite(line)``), for a NaN, and for a point that the body of the Earth hides.
         """

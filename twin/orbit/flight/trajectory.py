@@ -51,10 +51,14 @@ _MOMENTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
 class Jitter:
     """Turns of a body over time: the sum of sine and cosine terms, seen at once or in the mean of a collection.
 
-    Attributes:
-        frequency: (K,) hertz.
-        sine, cosine: (K, 3) rotation vectors about body X, Y and Z, radians.
-        collection: over which it is meant; None for its values themselves.
+    Attributes
+    ----------
+    frequency : np.ndarray
+        (K,) hertz.
+    sine, cosine : np.ndarray
+        (K, 3) rotation vectors about body X, Y and Z, radians.
+    collection : Collection | None
+        Over which it is meant; None for its values themselves.
     """
 
     frequency: np.ndarray
@@ -66,9 +70,12 @@ class Jitter:
     def of(cls, spec: JitterSpec, seed: np.random.SeedSequence) -> Jitter | None:
         """As a file states it; None where it states none.
 
-        Args:
-            spec: lines and bands.
-            seed: of random phases and of bands. Each has a stream of its own.
+        Parameters
+        ----------
+        spec : JitterSpec
+            Lines and bands.
+        seed : np.random.SeedSequence
+            Of random phases and of bands. Each has a stream of its own.
         """
         if not spec.stated:
             return None
@@ -120,13 +127,19 @@ class Jitter:
     def exposures(self, collection: Collection, pixel: float, tolerance: float) -> list[tuple[float, Jitter]]:
         """Shares of the light of a collection, and the jitter that each saw; their mean is the image.
 
-        Args:
-            collection: of the line.
-            pixel: its angle, radians.
-            tolerance: of the image's place and smear, pixels.
+        Parameters
+        ----------
+        collection : Collection
+            Of the line.
+        pixel : float
+            Its angle, radians.
+        tolerance : float
+            Of the image's place and smear, pixels.
 
-        Raises:
-            ValueError: an oscillation so fast and large that no reasonable number of moments is enough.
+        Raises
+        ------
+        ValueError
+            An oscillation so fast and large that no reasonable number of moments is enough.
         """
         own, size = replace(self, collection=None), self.amplitude / pixel
         exact = [collection.mean(k * self.frequency) for k in (1, 2)]
@@ -155,11 +168,15 @@ class Jitter:
 class Attitude:
     """A law of attitude.
 
-    Attributes:
-        geodetic: Z points along the ellipsoid's normal through the satellite; else to the Earth's centre.
-        yaw_steering: X lies along the motion of the point below over the turning Earth, so that the image of that point
-            moves square to a line along Y; else along the velocity against the stars.
-        offset: rotation vector of the body against the orbital frame, radians.
+    Attributes
+    ----------
+    geodetic : bool
+        Z points along the ellipsoid's normal through the satellite; else to the Earth's centre.
+    yaw_steering : bool
+        X lies along the motion of the point below over the turning Earth, so that the image of that point moves square
+        to a line along Y; else along the velocity against the stars.
+    offset : tuple[float, float, float]
+        Rotation vector of the body against the orbital frame, radians.
     """
 
     geodetic: bool = True
@@ -174,12 +191,18 @@ class Attitude:
     def orbital_to_itrs(self, position: np.ndarray, velocity: np.ndarray, inertial_velocity: np.ndarray) -> np.ndarray:
         """Axes of the orbital frame as columns: x_itrs = matrix @ x_orbital.
 
-        Args:
-            position: ITRS, metres, shape (..., 3).
-            velocity: against the turning Earth, m/s, shape (..., 3).
-            inertial_velocity: against the stars, in axes of the ITRS, m/s, shape (..., 3).
+        Parameters
+        ----------
+        position : np.ndarray
+            ITRS, metres, shape (..., 3).
+        velocity : np.ndarray
+            Against the turning Earth, m/s, shape (..., 3).
+        inertial_velocity : np.ndarray
+            Against the stars, in axes of the ITRS, m/s, shape (..., 3).
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             Shape (..., 3, 3).
         """
         chosen = velocity if self.yaw_steering else inertial_velocity
@@ -253,14 +276,22 @@ def _drift(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence, co
 class MeasurementErrors:
     """Errors, measured minus true; made by `_draw_errors`.
 
-    Attributes:
-        position_terms: series of position errors in the orbital frame, metres.
-        velocity_terms: series of velocity errors in the orbital frame, m/s.
-        attitude_terms: series of rotation vectors in body axes, radians.
-        bias: constant rotation vector in body axes, radians, shape (3,).
-        thermal: amplitude of what changes with latitude, radians, shape (3,).
-        reference: latitude at which that vanishes, radians.
-        rate: of a drift that vanishes at time zero, radians per second, shape (3,).
+    Attributes
+    ----------
+    position_terms : tuple[Series, ...]
+        Series of position errors in the orbital frame, metres.
+    velocity_terms : tuple[Series, ...]
+        Series of velocity errors in the orbital frame, m/s.
+    attitude_terms : tuple[Series, ...]
+        Series of rotation vectors in body axes, radians.
+    bias : np.ndarray
+        Constant rotation vector in body axes, radians, shape (3,).
+    thermal : np.ndarray
+        Amplitude of what changes with latitude, radians, shape (3,).
+    reference : float
+        Latitude at which that vanishes, radians.
+    rate : np.ndarray
+        Of a drift that vanishes at time zero, radians per second, shape (3,).
     """
 
     position_terms: tuple[Series, ...]
@@ -282,11 +313,16 @@ class MeasurementErrors:
     def attitude(self, seconds: np.ndarray, latitude: np.ndarray) -> np.ndarray:
         """Rotation vectors in body axes, radians: measured = true @ rotation_matrix(vector).
 
-        Args:
-            seconds: shape (...).
-            latitude: geodetic, of the point below, radians, shape (...).
+        Parameters
+        ----------
+        seconds : np.ndarray
+            Shape (...).
+        latitude : np.ndarray
+            Geodetic, of the point below, radians, shape (...).
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             Shape (..., 3).
         """
         shape = np.sin(np.asarray(latitude) - self.reference)
@@ -299,15 +335,23 @@ def _draw_errors(
 ) -> MeasurementErrors:
     """Errors over a span of time.
 
-    Args:
-        spec: how large they are.
-        first: begin of the span, seconds.
-        last: its end, seconds.
-        seed: of all random numbers.
-        terms: which of `TERMS` are on; the others are zero.
+    Parameters
+    ----------
+    spec : ErrorsSpec
+        How large they are.
+    first : float
+        Begin of the span, seconds.
+    last : float
+        Its end, seconds.
+    seed : int
+        Of all random numbers.
+    terms : Sequence[str]
+        Which of `TERMS` are on; the others are zero.
 
-    Raises:
-        ValueError: an unknown term.
+    Raises
+    ------
+    ValueError
+        An unknown term.
     """
     unknown = sorted(set(terms) - set(TERMS))
     if unknown:
@@ -350,12 +394,17 @@ class Trajectory:
 
     Every method raises ValueError for a time outside the orbit.
 
-    Attributes:
-        orbit: true orbit.
-        attitude: law that the true attitude follows.
-        errors: of the measured orbit and attitude; None for the truth.
-        jitter: rotation vectors (..., 3) about the body's own axes at times (...), seconds, in which the body departs
-            from the law; None for none. Of a measured trajectory it is what readings of the attitude show of it.
+    Attributes
+    ----------
+    orbit : Orbit
+        True orbit.
+    attitude : Attitude
+        Law that the true attitude follows.
+    errors : MeasurementErrors | None
+        Of the measured orbit and attitude; None for the truth.
+    jitter : Series | None
+        Rotation vectors (..., 3) about the body's own axes at times (...), seconds, in which the body departs from the
+        law; None for none. Of a measured trajectory it is what readings of the attitude show of it.
     """
 
     orbit: Orbit
@@ -367,11 +416,16 @@ class Trajectory:
     def flown(cls, orbit: Orbit, spec: AttitudeSpec, seed: int | np.random.SeedSequence, *number: int) -> Trajectory:
         """The true trajectory of an orbit.
 
-        Args:
-            orbit: where the satellite is.
-            spec: how it holds itself.
-            seed: of what is random in its jitter, in a stream of its own of this seed.
-            number: of the pass, where several share a seed.
+        Parameters
+        ----------
+        orbit : Orbit
+            Where the satellite is.
+        spec : AttitudeSpec
+            How it holds itself.
+        seed : int | np.random.SeedSequence
+            Of what is random in its jitter, in a stream of its own of this seed.
+        number : int
+            Of the pass, where several share a seed.
         """
         jitter = None if spec.jitter is None else Jitter.of(spec.jitter, stream(seed, JITTER_STREAM, *number))
         return cls(orbit, Attitude.from_spec(spec), jitter=jitter)
@@ -417,13 +471,19 @@ class Trajectory:
         """The trajectory as the satellite measures it: this one with errors, in place of those it may have, and with
         jitter as readings of the attitude show it.
 
-        Args:
-            spec: how large the errors are.
-            seed: of all random numbers.
-            terms: which errors are on, of `twin.orbit.flight.trajectory.TERMS`.
+        Parameters
+        ----------
+        spec : ErrorsSpec
+            How large the errors are.
+        seed : int
+            Of all random numbers.
+        terms : Sequence[str]
+            Which errors are on, of `twin.orbit.flight.trajectory.TERMS`.
 
-        Raises:
-            ValueError: an unknown term.
+        Raises
+        ------
+        ValueError
+            An unknown term.
         """
         errors, jitter = _draw_errors(spec, self.first, self.last, seed, terms), self.jitter
         if isinstance(jitter, Jitter):

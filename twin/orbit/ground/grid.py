@@ -35,8 +35,10 @@ _EARTH = Earth()
 class GroundFrame:
     """Coordinates about a place.
 
-    Attributes:
-        longitude, latitude: of the place, geodetic, radians.
+    Attributes
+    ----------
+    longitude, latitude : float
+        Of the place, geodetic, radians.
     """
 
     longitude: float
@@ -79,14 +81,22 @@ def fractal_field(
 ) -> np.ndarray:
     """A field of zero mean and unit rms whose amplitude spectrum falls like frequency^-exponent.
 
-    Args:
-        shape: rows and columns.
-        spacing: of the grid, metres.
-        exponent: for a surface of fractal dimension D it is 4 - D, between 1 and 2; mountains have about 2.
-        longest: wavelength above which the spectrum stays level, metres.
-        seed: of the noise.
+    Parameters
+    ----------
+    shape : tuple[int, int]
+        Rows and columns.
+    spacing : float
+        Of the grid, metres.
+    exponent : float
+        For a surface of fractal dimension D it is 4 - D, between 1 and 2; mountains have about 2.
+    longest : float
+        Wavelength above which the spectrum stays level, metres.
+    seed : np.random.SeedSequence
+        Of the noise.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         float32, of the shape.
     """
     spectrum = _white_spectrum(shape, seed)
@@ -102,13 +112,20 @@ def fractal_field(
 def correlated_field(shape: tuple[int, int], spacing: float, length: float, seed: np.random.SeedSequence) -> np.ndarray:
     """A field whose values have zero expectation, unit standard deviation and correlation exp(-(distance/length)^2/2).
 
-    Args:
-        shape: rows and columns.
-        spacing: of the grid, metres.
-        length: of the correlation, metres.
-        seed: of the noise.
+    Parameters
+    ----------
+    shape : tuple[int, int]
+        Rows and columns.
+    spacing : float
+        Of the grid, metres.
+    length : float
+        Of the correlation, metres.
+    seed : np.random.SeedSequence
+        Of the noise.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         float32, of the shape.
     """
     spare = int(np.ceil(_CORRELATION_MARGIN * length / spacing))
@@ -139,11 +156,16 @@ Beyond = Literal["mirror", "grid-wrap", "nothing"]
 class SplineGrid:
     """A cubic B-spline over a grid.
 
-    Attributes:
-        coefficients: weights of the B-splines, (rows, columns); rows go north, columns east.
-        spacing: of the grid east and north, metres.
-        first: east and north of the first row's first column, metres.
-        beyond: how it goes on outside: mirrored about the outer rows and columns, repeated, or not at all.
+    Attributes
+    ----------
+    coefficients : np.ndarray
+        Weights of the B-splines, (rows, columns); rows go north, columns east.
+    spacing : tuple[float, float]
+        Of the grid east and north, metres.
+    first : tuple[float, float]
+        East and north of the first row's first column, metres.
+    beyond : Beyond
+        How it goes on outside: mirrored about the outer rows and columns, repeated, or not at all.
     """
 
     coefficients: np.ndarray
@@ -166,8 +188,10 @@ class SplineGrid:
     def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
         """Values at places, metres, any equal shapes.
 
-        Raises:
-            ValueError: a place outside, where nothing is.
+        Raises
+        ------
+        ValueError
+            a place outside, where nothing is.
         """
         if self.beyond == "nothing":
             self._require_inside(east, north)
@@ -181,13 +205,19 @@ class SplineGrid:
     def on_grid(self, east: np.ndarray, north: np.ndarray, derivative: tuple[int, int] = (0, 0)) -> np.ndarray:
         """Values, or first derivatives, on a regular grid: east (E,) and north (N,), metres -> (N, E).
 
-        Args:
-            east: of the columns.
-            north: of the rows.
-            derivative: how often by east and by north, 0 or 1.
+        Parameters
+        ----------
+        east : np.ndarray
+            Of the columns.
+        north : np.ndarray
+            Of the rows.
+        derivative : tuple[int, int]
+            How often by east and by north, 0 or 1.
 
-        Raises:
-            ValueError: a place outside, where nothing is.
+        Raises
+        ------
+        ValueError
+            a place outside, where nothing is.
         """
         if self.beyond == "nothing":
             self._require_inside(east, north)
@@ -240,8 +270,10 @@ _MOST_POSTS = 4096
 class Terrain:
     """Heights above the ellipsoid, the same function for the renderer, for true coordinates and for elevation models.
 
-    Attributes:
-        surface: cubic spline through the posts, defined everywhere, metres.
+    Attributes
+    ----------
+    surface : SplineGrid
+        Cubic spline through the posts, defined everywhere, metres.
     """
 
     surface: SplineGrid
@@ -250,10 +282,14 @@ class Terrain:
     def from_spec(cls, spec: TerrainSpec, side: float, seed: np.random.SeedSequence) -> Terrain:
         """From what the file says.
 
-        Args:
-            spec: terrain.
-            side: of the ground that is used, metres; a fractal repeats after half as much again, or later.
-            seed: of a fractal.
+        Parameters
+        ----------
+        spec : TerrainSpec
+            terrain.
+        side : float
+            Of the ground that is used, metres; a fractal repeats after half as much again, or later.
+        seed : np.random.SeedSequence
+            Of a fractal.
         """
         match spec.kind:
             case "real":

@@ -88,11 +88,16 @@ def around(extents: Sequence[Extent]) -> Extent:
 def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence, changed: float = 0.0) -> SplineGrid:
     """Reflectance over an extent.
 
-    Args:
-        extent: of the ground.
-        spec: what the file says.
-        seed: of the ground; the same seed and extent give the same ground.
-        changed: share of the fields that look different from those of 0; which, and how, is of the same seed.
+    Parameters
+    ----------
+    extent : Extent
+        Of the ground.
+    spec : TextureSpec
+        What the file says.
+    seed : np.random.SeedSequence
+        Of the ground; the same seed and extent give the same ground.
+    changed : float
+        Share of the fields that look different from those of 0; which, and how, is of the same seed.
     """
     wild, plots, mask, ways = (stream(seed, k) for k in range(4))
     east, north = extent.axes(spec.spacing, _SPARE)
@@ -118,12 +123,18 @@ def apparent(ground: SplineGrid, terrain: Terrain, light: LightSpec) -> SplineGr
     Lambert's law for the Sun on the slopes, even light from the sky, a transmission and a constant path radiance.
     Slopes throw no shadow on others.
 
-    Args:
-        ground: reflectance.
-        terrain: under it.
-        light: Sun and air.
+    Parameters
+    ----------
+    ground : SplineGrid
+        reflectance.
+    terrain : Terrain
+        Under it.
+    light : LightSpec
+        Sun and air.
 
-    Returns:
+    Returns
+    -------
+    SplineGrid
         Cells as the ground's. Level ground in a high sun of 90 degrees looks as bright as its reflectance times the
         transmission, plus the path's share.
     """
@@ -251,9 +262,12 @@ M = TypeVar("M", bound=Map, covariant=True)
 class Maps(Generic[M]):
     """What is known of the ground.
 
-    Attributes:
-        orthophoto: grey values; of a simulated one uint16, 10 000 for an apparent reflectance of 1.
-        dem: heights above the ellipsoid, metres.
+    Attributes
+    ----------
+    orthophoto : M
+        Grey values; of a simulated one uint16, 10 000 for an apparent reflectance of 1.
+    dem : M
+        Heights above the ellipsoid, metres.
     """
 
     orthophoto: M
@@ -264,11 +278,16 @@ class Maps(Generic[M]):
 class Raster:
     """A map on a regular grid of longitude and latitude.
 
-    Attributes:
-        values: (rows, columns); rows go to the south, columns to the east.
-        frame: plane coordinates in which the grid is regular; exact longitude and latitude by `GroundFrame`.
-        west, north: of the first row's first column, its middle, metres.
-        spacing: of rows and columns, metres.
+    Attributes
+    ----------
+    values : np.ndarray
+        (rows, columns); rows go to the south, columns to the east.
+    frame : GroundFrame
+        Plane coordinates in which the grid is regular; exact longitude and latitude by `GroundFrame`.
+    west, north : float
+        Of the first row's first column, its middle, metres.
+    spacing : float
+        Of rows and columns, metres.
     """
 
     values: np.ndarray
@@ -294,9 +313,12 @@ class Raster:
 class Control(Maps[Raster]):
     """The maps of a simulated patch, with their errors.
 
-    Attributes:
-        shift: constant error in plan, map minus true, east and north, metres; belongs to the truth.
-        smooth: the rest of the error in plan, east and north, metres, over true coordinates; belongs to the truth.
+    Attributes
+    ----------
+    shift : tuple[float, float]
+        Constant error in plan, map minus true, east and north, metres; belongs to the truth.
+    smooth : tuple[SplineGrid, SplineGrid]
+        The rest of the error in plan, east and north, metres, over true coordinates; belongs to the truth.
     """
 
     shift: tuple[float, float]
@@ -318,14 +340,22 @@ def make_control(
 ) -> Control:
     """Control for a patch of ground.
 
-    Args:
-        frame: coordinates of the ground.
-        extent: of the true ground that is imaged; the map covers a little less.
-        terrain: the true one.
-        texture: the true ground's.
-        spec: what the file says.
-        ground: seed of the true ground.
-        seed: of all errors.
+    Parameters
+    ----------
+    frame : GroundFrame
+        Coordinates of the ground.
+    extent : Extent
+        Of the true ground that is imaged; the map covers a little less.
+    terrain : Terrain
+        The true one.
+    texture : TextureSpec
+        The true ground's.
+    spec : ControlSpec
+        What the file says.
+    ground : np.random.SeedSequence
+        Seed of the true ground.
+    seed : np.random.SeedSequence
+        Of all errors.
     """
     plan_seed, noise_seed, dem_seed = (stream(seed, k) for k in range(3))
     worst = max(abs(v) for v in spec.shift) + 10.0 * spec.sigma + spec.spacing * 8.0

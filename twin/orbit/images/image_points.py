@@ -48,11 +48,16 @@ matches 0.11 px where 0.06 is claimed), the attitude between its readings. A tie
 class LineFrame:
     """What a line recorded.
 
-    Attributes:
-        frame: grey values, (lines, pixels), columns as pixels of the line.
-        window: where it lies in the line's whole image.
-        measured: the line as the user knows it, on the measured trajectory.
-        sample: distance of two pixels along the line, and of two lines, on the ground in the window's middle, metres.
+    Attributes
+    ----------
+    frame : np.ndarray
+        Grey values, (lines, pixels), columns as pixels of the line.
+    window : Window
+        Where it lies in the line's whole image.
+    measured : Sensor
+        The line as the user knows it, on the measured trajectory.
+    sample : tuple[float, float]
+        Distance of two pixels along the line, and of two lines, on the ground in the window's middle, metres.
     """
 
     frame: np.ndarray
@@ -69,10 +74,14 @@ class LineFrame:
 class ImagedGround:
     """A piece of ground, imaged.
 
-    Attributes:
-        frame: plane coordinates of the ground, metres east and north of the patch's middle.
-        images: line -> what it recorded.
-        control: orthophoto and elevation model.
+    Attributes
+    ----------
+    frame : GroundFrame
+        Plane coordinates of the ground, metres east and north of the patch's middle.
+    images : Mapping[str, LineFrame]
+        Line -> what it recorded.
+    control : Maps[Map]
+        Orthophoto and elevation model.
     """
 
     frame: GroundFrame
@@ -93,9 +102,12 @@ _FOLLOWED = 8
 class ReferenceHeights:
     """Heights of a reference elevation model, a cubic spline through its posts.
 
-    Attributes:
-        raster: of the posts.
-        coefficients: of the spline.
+    Attributes
+    ----------
+    raster : Map
+        Of the posts.
+    coefficients : np.ndarray
+        Of the spline.
     """
 
     raster: Map
@@ -147,14 +159,21 @@ def _ground_of_samples(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """East, north and height (n, side, side) each, metres, of what the pixels about places see.
 
-    Args:
-        image: whose pixels; its measured sensor is used.
-        frame: coordinates of the ground.
-        heights: of the ground.
-        points: (n, 3) ITRS, metres, that the measured sensor has at the places: their height is kept, and the
-            reference heights count against theirs at the points.
-        place: (n, 2) rows and columns of the frame.
-        side: of a template, pixels.
+    Parameters
+    ----------
+    image : LineFrame
+        Whose pixels; its measured sensor is used.
+    frame : GroundFrame
+        Coordinates of the ground.
+    heights : ReferenceHeights
+        Of the ground.
+    points : np.ndarray
+        (n, 3) ITRS, metres, that the measured sensor has at the places: their height is kept, and the reference heights
+        count against theirs at the points.
+    place : np.ndarray
+        (n, 2) rows and columns of the frame.
+    side : int
+        Of a template, pixels.
     """
     east, north, height = (v[:, None, None] for v in frame.local(points))
     half = side // 2
@@ -193,12 +212,18 @@ def _templates_of_image(
 ) -> np.ndarray:
     """Templates (n, k, k) from another image.
 
-    Args:
-        source: the other image.
-        frame: coordinates of the ground.
-        samples: of the ground, as `_ground_of_samples` has them.
-        points: (n, 3) ITRS, metres, of the templates' middles.
-        place: (n, 2) where the source has them, row and column.
+    Parameters
+    ----------
+    source : LineFrame
+        The other image.
+    frame : GroundFrame
+        Coordinates of the ground.
+    samples : tuple[np.ndarray, np.ndarray, np.ndarray]
+        Of the ground, as `_ground_of_samples` has them.
+    points : np.ndarray
+        (n, 3) ITRS, metres, of the templates' middles.
+    place : np.ndarray
+        (n, 2) where the source has them, row and column.
     """
     centre = np.stack(frame.local(points))
     base = predicted(source, points)
@@ -235,16 +260,26 @@ class PointsError(PhysicalError, ValueError):
 class MatchedLine:
     """What one line's frame gave.
 
-    Attributes:
-        predicted: (n, 2) row and column in the frame at which the measured sensor has the points.
-        place: (n, 2) row and column found; NaN where matching gave none.
-        covariance: (n, 2, 2) px^2.
-        correlation: (n,) of image and fitted template.
-        status: (n,) 0 accepted, `CONSENSUS`, `SOURCE`, or why it was not matched.
-        first: line and pixel of the frame's first pixel in the whole image.
-        scatter: px; of the displacements about the smooth one beyond the covariances.
-        text: of the consensus.
-        way: smooth displacement from predicted to found; None in the frame that ties were chosen in.
+    Attributes
+    ----------
+    predicted : np.ndarray
+        (n, 2) row and column in the frame at which the measured sensor has the points.
+    place : np.ndarray
+        (n, 2) row and column found; NaN where matching gave none.
+    covariance : np.ndarray
+        (n, 2, 2) px^2.
+    correlation : np.ndarray
+        (n,) of image and fitted template.
+    status : np.ndarray
+        (n,) 0 accepted, `CONSENSUS`, `SOURCE`, or why it was not matched.
+    first : tuple[int, int]
+        Line and pixel of the frame's first pixel in the whole image.
+    scatter : float
+        Px; of the displacements about the smooth one beyond the covariances.
+    text : str
+        Of the consensus.
+    way : DisplacementField | None
+        Smooth displacement from predicted to found; None in the frame that ties were chosen in.
     """
 
     predicted: np.ndarray
@@ -285,9 +320,12 @@ class MatchedLine:
     def measured(self, rows: np.ndarray, point: np.ndarray) -> ImagePoints:
         """Return image points of some places, by mask or index, with `BEYOND` in their covariances.
 
-        Args:
-            rows: which places.
-            point: the ground point of each.
+        Parameters
+        ----------
+        rows : np.ndarray
+            Which places.
+        point : np.ndarray
+            The ground point of each.
         """
         image, spread = self.image[rows], self.covariance[rows] + BEYOND**2 * np.eye(2)
         return ImagePoints.of(point, image[:, 0], image[:, 1], spread)
@@ -309,13 +347,18 @@ class MatchedLine:
 class MatchedPoints:
     """Points and where the lines have them.
 
-    Attributes:
-        kind: places of the orthophoto, or ties.
-        east, north, height: (n,) of the map, metres; of ties where the nadir line's measured sensor meets the
-            reference heights.
-        ground: (n, 3) the same, ITRS, metres.
-        check: (n,) bool: kept apart to test with.
-        lines: name -> what its frame gave.
+    Attributes
+    ----------
+    kind : Kind
+        Places of the orthophoto, or ties.
+    east, north, height : np.ndarray
+        (n,) of the map, metres; of ties where the nadir line's measured sensor meets the reference heights.
+    ground : np.ndarray
+        (n, 3) the same, ITRS, metres.
+    check : np.ndarray
+        (n,) bool: kept apart to test with.
+    lines : Mapping[str, MatchedLine]
+        Name -> what its frame gave.
     """
 
     kind: Kind
@@ -359,8 +402,10 @@ class PatchPoints:
 def measure_points(patch: ImagedGround, spec: ImagePointsSpec) -> PatchPoints:
     """Control, check and tie points.
 
-    Raises:
-        PointsError: too little room, nothing distinct, too few matches.
+    Raises
+    ------
+    PointsError
+        Too little room, nothing distinct, too few matches.
     """
     if spec.tie and len(patch.images) < 2:
         raise PointsError("tie points need two lines")
@@ -378,8 +423,10 @@ def status_text(code: int) -> str:
 def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
     """Control and check points.
 
-    Raises:
-        PointsError: a frame too small for template and reach, nothing distinct that every line sees, too few matches.
+    Raises
+    ------
+    PointsError
+        a frame too small for template and reach, nothing distinct that every line sees, too few matches.
     """
     border = spec.template // 2 + spec.reach
     _require_room(patch, spec)
@@ -406,15 +453,22 @@ def tie_points(
 ) -> MatchedPoints:
     """Points of one line's frame, sought in the others.
 
-    Args:
-        patch: images and what is known of the ground.
-        spec: how many, and how they are matched.
-        control: of the patch; where they have lain is taken out of the prediction. Without them the heights of the
-            reference are read where the measured sensor looks, some 100 m off.
-        source: the line they are chosen in.
+    Parameters
+    ----------
+    patch : ImagedGround
+        Images and what is known of the ground.
+    spec : ImagePointsSpec
+        How many, and how they are matched.
+    control : MatchedPoints | None
+        Of the patch; where they have lain is taken out of the prediction. Without them the heights of the reference are
+        read where the measured sensor looks, some 100 m off.
+    source : str
+        The line they are chosen in.
 
-    Raises:
-        PointsError: as `map_points`.
+    Raises
+    ------
+    PointsError
+        As `map_points`.
     """
     border = spec.template // 2 + spec.reach
     _require_room(patch, spec)

@@ -49,8 +49,10 @@ def optics_of(
 ) -> dict[str, LineOptics]:
     """Lens and CCD of lines; lines that are made alike share them.
 
-    Raises:
-        ValueError: a line without an image section.
+    Raises
+    ------
+    ValueError
+        a line without an image section.
     """
     made: dict[tuple[object, ...], LineOptics] = {}
     out = {}
@@ -79,9 +81,12 @@ _TAPER = 0.75
 class ImageMotion:
     """How the image of the ground moves over the line, per line.
 
-    Attributes:
-        advance: across the line, pixels, positive.
-        drift: along the line, pixels.
+    Attributes
+    ----------
+    advance : float
+        Across the line, pixels, positive.
+    drift : float
+        Along the line, pixels.
     """
 
     advance: float
@@ -112,11 +117,16 @@ class ImageMotion:
 class LineOptics:
     """A line's lens and CCD.
 
-    Attributes:
-        ccd: the line CCD.
-        pupil: of the lens, the same all over the line.
-        f_number: of the lens.
-        transmission: of the lens.
+    Attributes
+    ----------
+    ccd : LineCcd
+        The line CCD.
+    pupil : PupilFunction
+        Of the lens, the same all over the line.
+    f_number : float
+        Of the lens.
+    transmission : float
+        Of the lens.
     """
 
     ccd: LineCcd
@@ -130,12 +140,18 @@ class LineOptics:
     ) -> LineOptics:
         """From what the files say.
 
-        Args:
-            image: image side of the line.
-            pixels: of the line.
-            pitch: of the pixels, metres.
-            line_time: from one line to the next, seconds.
-            sheet: of the CCD.
+        Parameters
+        ----------
+        image : LineImageSpec
+            Image side of the line.
+        pixels : int
+            Of the line.
+        pitch : float
+            Of the pixels, metres.
+        line_time : float
+            From one line to the next, seconds.
+        sheet : DetectorSpec
+            Of the CCD.
         """
         band = BandSpec.model_construct(
             offset=0.0,
@@ -200,7 +216,9 @@ class LineOptics:
         It is zero from `margin` pixels and lines on, faded out before: so an image does not depend on how it is cut
         into parts. What a diffraction pattern has farther out (0.3% at F/6 and 24 pixels) is left out.
 
-        Returns:
+        Returns
+        -------
+        np.ndarray
             Square, the middle sample is the pixel's centre.
         """
         half = margin * oversampling
@@ -287,8 +305,10 @@ def steady(sensor: Sensor) -> Sensor:
 def exposures(sensor: Sensor, optics: LineOptics) -> list[tuple[float, Sensor]]:
     """Shares of a pixel's light, which sum to 1, and the sensor at the moments that they stand for.
 
-    Raises:
-        ValueError: jitter that is too fast and too large.
+    Raises
+    ------
+    ValueError
+        Jitter that is too fast and too large.
     """
     jitter = _jitter(sensor)
     if jitter is None:

@@ -49,9 +49,12 @@ _PIXEL, _SAMPLE = 150.0, 47.0
 class PatchError(PhysicalError, ValueError):
     """A patch that cannot be imaged.
 
-    Attributes:
-        part: what is to be changed: ``span`` of the pass, ``place``, ``size`` or ``terrain``.
-        line: of the camera that cannot image it; empty where it is not one line's fault.
+    Attributes
+    ----------
+    part
+        What is to be changed: ``span`` of the pass, ``place``, ``size`` or ``terrain``.
+    line
+        Of the camera that cannot image it; empty where it is not one line's fault.
     """
 
     def __init__(self, problem: str, part: str, line: str = "") -> None:
@@ -63,11 +66,16 @@ class PatchError(PhysicalError, ValueError):
 class ImagedLine:
     """A line that records images.
 
-    Attributes:
-        sensor: as it is.
-        measured: as the user knows it: the laboratory's camera on the measured trajectory.
-        optics: lens and CCD.
-        pattern: its pixels' differences.
+    Attributes
+    ----------
+    sensor : Sensor
+        As it is.
+    measured : Sensor
+        As the user knows it: the laboratory's camera on the measured trajectory.
+    optics : LineOptics
+        Lens and CCD.
+    pattern : FixedPattern
+        Its pixels' differences.
     """
 
     sensor: Sensor
@@ -80,12 +88,18 @@ class ImagedLine:
 class LineImage(LineFrame):
     """What one line recorded of a patch, uint16, and what the truth knows of it.
 
-    Attributes:
-        sensor: the true one.
-        motion: of the image over the line, in the window's middle.
-        nyquist: modulation transfer at half a cycle per pixel, and per line.
-        saturated: pixels at the end of the detector's range.
-        error: of the renderer's interpolated geometry, pixels (see `RenderedPatch`).
+    Attributes
+    ----------
+    sensor : Sensor
+        The true one.
+    motion : ImageMotion
+        Of the image over the line, in the window's middle.
+    nyquist : tuple[float, float]
+        Modulation transfer at half a cycle per pixel, and per line.
+    saturated : int
+        Pixels at the end of the detector's range.
+    error : float
+        Of the renderer's interpolated geometry, pixels (see `RenderedPatch`).
     """
 
     sensor: Sensor
@@ -99,8 +113,10 @@ class LineImage(LineFrame):
 class Patch(ImagedGround):
     """A patch of simulated ground, imaged.
 
-    Attributes:
-        terrain: the true heights.
+    Attributes
+    ----------
+    terrain : Terrain
+        The true heights.
     """
 
     images: Mapping[str, LineImage]
@@ -139,19 +155,30 @@ def fly_patch(
 
     Each line's window of the same size has the patch's middle in its middle, to half a pixel.
 
-    Args:
-        lines: by name; see `imaged_lines`.
-        place: longitude and latitude of the patch's middle, radians.
-        size: lines and pixels of every window.
-        ground: terrain, texture and light.
-        control: of the orthophoto and the elevation model.
-        seed: of the ground, of the control's errors and of the frames' noise.
-        oversampling: samples of the ground along each side of a pixel.
-        advance: told of how many lines the images are made.
+    Parameters
+    ----------
+    lines : Mapping[str, ImagedLine]
+        By name; see `imaged_lines`.
+    place : tuple[float, float]
+        Longitude and latitude of the patch's middle, radians.
+    size : tuple[int, int]
+        Lines and pixels of every window.
+    ground : GroundSpec
+        Terrain, texture and light.
+    control : ControlSpec
+        Of the orthophoto and the elevation model.
+    seed : np.random.SeedSequence
+        Of the ground, of the control's errors and of the frames' noise.
+    oversampling : int
+        Samples of the ground along each side of a pixel.
+    advance : Callable[[int], None]
+        Told of how many lines the images are made.
 
-    Raises:
-        PatchError: a line does not see the patch within its image, terrain that hides a part of itself, or a patch too
-            large for the ground or the memory.
+    Raises
+    ------
+    PatchError
+        a line does not see the patch within its image, terrain that hides a part of itself, or a patch too large for
+        the ground or the memory.
     """
     for_terrain, for_ground, for_control, for_frames = (stream(seed, k) for k in range(4))
     frame = GroundFrame(*place)
@@ -209,11 +236,16 @@ def imaged_lines(
 ) -> dict[str, ImagedLine]:
     """Lines that record images.
 
-    Args:
-        sensors: the true ones, by name.
-        measured: as the user knows them.
-        optics: lens and CCD.
-        seed: of the pixels' differences, which stay the same in all images of the line.
+    Parameters
+    ----------
+    sensors : Mapping[str, Sensor]
+        The true ones, by name.
+    measured : Mapping[str, Sensor]
+        As the user knows them.
+    optics : Mapping[str, LineOptics]
+        Lens and CCD.
+    seed : np.random.SeedSequence
+        Of the pixels' differences, which stay the same in all images of the line.
     """
     return {
         name: ImagedLine(
@@ -226,8 +258,10 @@ def imaged_lines(
 def window_of(name: str, sensor: Sensor, frame: GroundFrame, height: float, size: tuple[int, int]) -> Window:
     """The window of an image with the frame's origin, at a height (metres), in its middle.
 
-    Raises:
-        PatchError: it does not lie inside the image.
+    Raises
+    ------
+    PatchError
+        It does not lie inside the image.
     """
     (line,), (pixel,) = sensor.image(frame.itrs(0.0, 0.0, height))
     if not np.isfinite(line):
@@ -308,17 +342,26 @@ WRONG = f"more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigma
 class LineJudgement:
     """One line's places against the truth.
 
-    Attributes:
-        found, matched, accepted: how many places there are, before any is rejected, how many matching and how many
-            consensus let pass.
-        wrong_found, wrong_matched, wrong_accepted: how many of these are wrong.
-        right_rejected_by_consensus: right matches that consensus has rejected.
-        error: (n, 2) found minus true, lines and pixels; NaN without a place.
-        wrong: (n,) bool, of those with a place.
-        rms: (2,) of accepted places that are not wrong, lines and pixels.
-        mean: (2,) of them.
-        chi_square: of them over their covariance.
-        degrees_of_freedom: two for each.
+    Attributes
+    ----------
+    found, matched, accepted : int
+        How many places there are, before any is rejected, how many matching and how many consensus let pass.
+    wrong_found, wrong_matched, wrong_accepted : int
+        How many of these are wrong.
+    right_rejected_by_consensus : int
+        Right matches that consensus has rejected.
+    error : np.ndarray
+        (n, 2) found minus true, lines and pixels; NaN without a place.
+    wrong : np.ndarray
+        (n,) bool, of those with a place.
+    rms : np.ndarray
+        (2,) of accepted places that are not wrong, lines and pixels.
+    mean : np.ndarray
+        (2,) of them.
+    chi_square : float
+        Of them over their covariance.
+    degrees_of_freedom : int
+        Two for each.
     """
 
     found: int

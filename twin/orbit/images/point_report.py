@@ -98,9 +98,12 @@ SORTS = {"control": "orthophoto", "tie": "tie"}
 def how_measured(spec: ImagePointsSpec, known: str) -> str:
     """Return how points are measured in images, in sentences.
 
-    Args:
-        spec: of the points.
-        known: what brings them into each line's geometry.
+    Parameters
+    ----------
+    spec : ImagePointsSpec
+        Of the points.
+    known : str
+        What brings them into each line's geometry.
     """
     return (
         "Distinct places of the orthophoto, with heights of the elevation model, and distinct places of one line's "

@@ -46,12 +46,18 @@ class SteepTerrainError(PhysicalError, ValueError):
 class LookMap:
     """The looks of a part of an image; made by `prepare`.
 
-    Attributes:
-        frame: coordinates of the ground.
-        terrain: of the ground.
-        span: first and last line, first and last pixel, lowest and highest height (metres) of the nodes.
-        east, north: Chebyshev coefficients over height, line and pixel, (heights, K, M), metres.
-        error: largest difference to the rigorous sensor that was found between the nodes, metres.
+    Attributes
+    ----------
+    frame : GroundFrame
+        Coordinates of the ground.
+    terrain : Terrain
+        Of the ground.
+    span : np.ndarray
+        First and last line, first and last pixel, lowest and highest height (metres) of the nodes.
+    east, north : np.ndarray
+        Chebyshev coefficients over height, line and pixel, (heights, K, M), metres.
+    error : float
+        Largest difference to the rigorous sensor that was found between the nodes, metres.
     """
 
     frame: GroundFrame
@@ -73,8 +79,10 @@ class LookMap:
     ) -> LookMap:
         """For the part of an image between given lines and pixels, both inclusive.
 
-        Raises:
-            ValueError: a part outside the image, a look that misses the Earth, or an attitude too rough for the nodes.
+        Raises
+        ------
+        ValueError
+            a part outside the image, a look that misses the Earth, or an attitude too rough for the nodes.
         """
         low, high = terrain.limits
         span = np.array([lines, pixels, (low - 1.0, high + 1.0)])
@@ -99,8 +107,10 @@ class LookMap:
     def ground(self, lines: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """East, north and height of the terrain that a grid of image points sees: (L,), (P,) -> (L, P) each, metres.
 
-        Raises:
-            SteepTerrainError: the terrain is as steep as the look somewhere.
+        Raises
+        ------
+        SteepTerrainError
+            The terrain is as steep as the look somewhere.
         """
         with one_blas_thread():
             along = self._basis(0, lines, self.east.shape[1])
@@ -218,10 +228,14 @@ GroundImage = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class PushbroomScene:
     """What there is to see.
 
-    Attributes:
-        frame: coordinates of the ground.
-        terrain: heights.
-        image: apparent reflectance, light and air included.
+    Attributes
+    ----------
+    frame : GroundFrame
+        Coordinates of the ground.
+    terrain : Terrain
+        heights.
+    image : GroundImage
+        Apparent reflectance, light and air included.
     """
 
     frame: GroundFrame
@@ -233,9 +247,12 @@ class PushbroomScene:
 class Window:
     """A part of an image: whole lines and pixels, counted in the image.
 
-    Attributes:
-        first_line, first_pixel: of its first sample.
-        lines, pixels: its size.
+    Attributes
+    ----------
+    first_line, first_pixel : int
+        Of its first sample.
+    lines, pixels : int
+        Its size.
     """
 
     first_line: int
@@ -268,11 +285,16 @@ class Window:
 class RenderedPatch:
     """Noise-free image of a window.
 
-    Attributes:
-        photons: expected photons in every pixel, (lines, pixels).
-        window: which pixels.
-        motion: of the image in its middle.
-        error: largest difference of an interpolated place from the rigorous one on the terrain that was found, pixels.
+    Attributes
+    ----------
+    photons : np.ndarray
+        Expected photons in every pixel, (lines, pixels).
+    window : Window
+        Which pixels.
+    motion : ImageMotion
+        Of the image in its middle.
+    error : float
+        Largest difference of an interpolated place from the rigorous one on the terrain that was found, pixels.
     """
 
     photons: np.ndarray
@@ -284,8 +306,10 @@ class RenderedPatch:
 def look_map(sensor: Sensor, frame: GroundFrame, terrain: Terrain, window: Window) -> LookMap:
     """The looks that an image of a window needs.
 
-    Raises:
-        ValueError: the window, with its margin, is not all inside the image.
+    Raises
+    ------
+    ValueError
+        The window, with its margin, is not all inside the image.
     """
     if not window.fits(sensor):
         raise UnphysicalError(
@@ -313,8 +337,10 @@ def extent_of(looks: LookMap, step: int = 16) -> Extent:
 def require_open(looks: LookMap, extent: Extent) -> None:
     """Refuse terrain that hides a part of itself from the looks.
 
-    Raises:
-        SteepTerrainError: a slope that faces away is as steep as the look.
+    Raises
+    ------
+    SteepTerrainError
+        a slope that faces away is as steep as the look.
     """
     to_east, to_north = looks.run()
     spacing = min(looks.terrain.surface.spacing)
@@ -342,18 +368,28 @@ def render_patch(
 ) -> RenderedPatch:
     """Expected photons of a window of an image.
 
-    Args:
-        sensor: the true one.
-        optics: of its line.
-        scene: what there is to see.
-        window: which lines and pixels.
-        oversampling: samples of the ground along each side of a pixel.
-        looks: `look_map` of the same, if it is there already.
+    Parameters
+    ----------
+    sensor : Sensor
+        The true one.
+    optics : LineOptics
+        Of its line.
+    scene : PushbroomScene
+        What there is to see.
+    window : Window
+        Which lines and pixels.
+    oversampling : int
+        Samples of the ground along each side of a pixel.
+    looks : LookMap | None
+        `look_map` of the same, if it is there already.
 
-    Raises:
-        ValueError: a window too near to the image's ends, ground that the scene does not know, or terrain so rough that
-            the places cannot be interpolated.
-        SteepTerrainError: terrain that hides a part of itself.
+    Raises
+    ------
+    ValueError
+        a window too near to the image's ends, ground that the scene does not know, or terrain so rough that the places
+        cannot be interpolated.
+    SteepTerrainError
+        Terrain that hides a part of itself.
     """
     looks = looks or look_map(sensor, scene.frame, scene.terrain, window)
     line, pixel = window.middle

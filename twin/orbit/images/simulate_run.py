@@ -81,13 +81,20 @@ _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
 class SimulatedFlight:
     """A pass without its images.
 
-    Attributes:
-        earth: below it.
-        truth: the camera as it is.
-        trajectory: the true one.
-        measured: what the satellite says of it.
-        sensors: line -> as it is, over the whole orbit.
-        users: line -> as the user knows it: the laboratory's camera on the measured trajectory.
+    Attributes
+    ----------
+    earth : Earth
+        Below it.
+    truth : ThreeLineCameraSpec
+        The camera as it is.
+    trajectory : Trajectory
+        The true one.
+    measured : Trajectory
+        What the satellite says of it.
+    sensors : Mapping[str, Sensor]
+        Line -> as it is, over the whole orbit.
+    users : Mapping[str, Sensor]
+        Line -> as the user knows it: the laboratory's camera on the measured trajectory.
     """
 
     earth: Earth
@@ -102,13 +109,20 @@ class SimulatedFlight:
 class Simulation(SimulatedFlight):
     """A pass and what it gave.
 
-    Attributes:
-        setup: what its file says.
-        seed: of all random numbers.
-        lines: those that are rendered, by name.
-        place: longitude and latitude of the patch's middle, radians.
-        patch: images and control.
-        points: measured in the images; None where none were asked for.
+    Attributes
+    ----------
+    setup : SimulateSetup
+        What its file says.
+    seed : int
+        Of all random numbers.
+    lines : Mapping[str, ImagedLine]
+        Those that are rendered, by name.
+    place : tuple[float, float]
+        Longitude and latitude of the patch's middle, radians.
+    patch : Patch
+        Images and control.
+    points : PatchPoints | None
+        Measured in the images; None where none were asked for.
     """
 
     setup: SimulateSetup
@@ -132,8 +146,10 @@ class Simulation(SimulatedFlight):
 def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
     """Orbit and cameras of a pass; the same for the same seed as those of `run_simulation`.
 
-    Raises:
-        BenchError: no such orbit.
+    Raises
+    ------
+    BenchError
+        No such orbit.
     """
     spec, root = setup.test, np.random.SeedSequence(seed)
     earth = Earth.from_spec(spec.earth)
@@ -152,8 +168,10 @@ def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
 def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Simulation:
     """Fly the pass: ``python -m twin.orbit simulate``; nothing is traced, so that the backend is not used.
 
-    Raises:
-        BenchError: no such orbit, a patch that a line cannot image, points that cannot be measured.
+    Raises
+    ------
+    BenchError
+        No such orbit, a patch that a line cannot image, points that cannot be measured.
     """
     spec, root = setup.test, np.random.SeedSequence(seed)
     flight = fly_simulation(setup, seed)
@@ -427,8 +445,10 @@ _EXACT = 1e-3
 def simulation_exported(run: Simulation) -> dict[str, str]:
     """Path -> text of the files of one pass over a patch, whose points were measured in its images.
 
-    Raises:
-        InputError: the test measures no points.
+    Raises
+    ------
+    InputError
+        The test measures no points.
     """
     spec = run.spec
     if run.points is None or run.points.control is None or spec.points is None:

@@ -47,13 +47,20 @@ _REMEDY = "points that several lines see, spread over the strip; a larger `heigh
 class PassJitter:
     """What was found in a pass.
 
-    Attributes:
-        setup: what the test's file says.
-        sights: what lines saw of the same points.
-        found: oscillations, spectra.
-        course: the attitude as a spline; None where none was asked for.
-        measurements: what it was found in.
-        truth: the jitter of a simulation, with what it is of lines; None on measurements.
+    Attributes
+    ----------
+    setup : AnyJitter
+        What the test's file says.
+    sights : Sights
+        What lines saw of the same points.
+    found : Found
+        Oscillations, spectra.
+    course : Course | None
+        The attitude as a spline; None where none was asked for.
+    measurements : PassMeasurements
+        What it was found in.
+    truth : Jitter | None
+        The jitter of a simulation, with what it is of lines; None on measurements.
     """
 
     setup: AnyJitter
@@ -93,9 +100,12 @@ class PassJitter:
 class Oscillation:
     """An oscillation that was found.
 
-    Attributes:
-        one: the pass.
-        number: which one, the strongest first.
+    Attributes
+    ----------
+    one : PassJitter
+        The pass.
+    number : int
+        Which one, the strongest first.
     """
 
     one: PassJitter
@@ -153,10 +163,14 @@ class Oscillation:
 class JitterRun:
     """A search.
 
-    Attributes:
-        setup: what its file says.
-        seed: of all random numbers.
-        passes: by name.
+    Attributes
+    ----------
+    setup : AnyJitter
+        What its file says.
+    seed : int
+        Of all random numbers.
+    passes : Mapping[str, PassJitter]
+        By name.
     """
 
     setup: AnyJitter
@@ -173,9 +187,12 @@ class JitterRun:
 def run_jitter(setup: AnyJitter, backend: Backend | None, seed: int, advance: Advance = silent) -> JitterRun:
     """Fly or read, and search; nothing is traced, so that the backend is not used.
 
-    Raises:
-        InputError: files that cannot be used.
-        BenchError: no such orbit, or points that tell nothing of jitter.
+    Raises
+    ------
+    InputError
+        Files that cannot be used.
+    BenchError
+        No such orbit, or points that tell nothing of jitter.
     """
     spec = setup.test
     passes: list[tuple[PassMeasurements, Jitter | None]] = []
@@ -208,8 +225,10 @@ def run_jitter(setup: AnyJitter, backend: Backend | None, seed: int, advance: Ad
 def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter | None]:
     """Places that all lines of a simulated pass saw, with noise, and the true jitter.
 
-    Raises:
-        BenchError: no such orbit, or lines that do not see enough of the strip.
+    Raises
+    ------
+    BenchError
+        No such orbit, or lines that do not see enough of the strip.
     """
     spec: OrbitJitterSpec = setup.test
     root = np.random.SeedSequence(seed)
@@ -282,14 +301,22 @@ def exported(run: JitterRun) -> dict[str, str]:
 class BlindMultiple:
     """A multiple k / dt of a pair's gap.
 
-    Attributes:
-        first: line that sees a place first.
-        second: the other.
-        gap: between their sights, seconds.
-        order: k.
-        frequency: hertz.
-        response: of all lines together there, of the worst axis as against its best.
-        blind: whether all lines together are blind there.
+    Attributes
+    ----------
+    first : str
+        Line that sees a place first.
+    second : str
+        The other.
+    gap : float
+        Between their sights, seconds.
+    order : int
+        k.
+    frequency : float
+        hertz.
+    response : float
+        Of all lines together there, of the worst axis as against its best.
+    blind : bool
+        Whether all lines together are blind there.
     """
 
     first: str

@@ -45,12 +45,18 @@ _ATTITUDE = 4
 class SteadyPlatform:
     """Position and attitude as polynomials of time, seconds; times have shape (...).
 
-    Attributes:
-        span: of the readings that they go through.
-        place: Chebyshev coefficients of the position, ITRS, (K, 3), metres.
-        turn: of rotation vectors from `middle`, (K, 3), radians.
-        middle: rotation of the body against the orbital frame, (3, 3).
-        law: orbital axes.
+    Attributes
+    ----------
+    span : tuple[float, float]
+        Of the readings that they go through.
+    place : np.ndarray
+        Chebyshev coefficients of the position, ITRS, (K, 3), metres.
+    turn : np.ndarray
+        Of rotation vectors from `middle`, (K, 3), radians.
+    middle : np.ndarray
+        Rotation of the body against the orbital frame, (3, 3).
+    law : Attitude
+        Orbital axes.
     """
 
     span: tuple[float, float]
@@ -63,8 +69,10 @@ class SteadyPlatform:
     def of(cls, path: TabulatedTrajectory, first: float, last: float) -> SteadyPlatform:
         """Through the readings between two times and, to each side, as long again where there are any.
 
-        Raises:
-            ValueError: the readings do not cover the times.
+        Raises
+        ------
+        ValueError
+            The readings do not cover the times.
         """
         path.position(np.array([first, last]))
         reach = last - first
@@ -143,16 +151,23 @@ class SightsError(PhysicalError, ValueError):
 class Sights:
     """What lines saw of the same points.
 
-    Attributes:
-        observations: of the attitude about the axes that are sought, whitened.
-        lines: that are used, in the order in which they see a place.
-        gaps: (first line, second line) -> seconds between their sights of the same points: the median, and
-            before and after it the ends of nine tenths of them.
-        pixel: angle of a pixel along the line, radians.
-        points: how many are seen by two lines or more.
-        pairs: (first line, second line) -> moments (n,) of the first sight, and what the second line sees the points by
-            farther across (pixels to the right) and along (lines later) than the first, as far as neither ground nor
-            interior orientation explain it, (n, 2): to look at.
+    Attributes
+    ----------
+    observations : Observations
+        Of the attitude about the axes that are sought, whitened.
+    lines : tuple[str, ...]
+        That are used, in the order in which they see a place.
+    gaps : Mapping[tuple[str, str], tuple[float, float, float]]
+        (first line, second line) -> seconds between their sights of the same points: the median, and before and after
+        it the ends of nine tenths of them.
+    pixel : float
+        Angle of a pixel along the line, radians.
+    points : int
+        How many are seen by two lines or more.
+    pairs : Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
+        (first line, second line) -> moments (n,) of the first sight, and what the second line sees the points by
+        farther across (pixels to the right) and along (lines later) than the first, as far as neither ground nor
+        interior orientation explain it, (n, 2): to look at.
     """
 
     observations: Observations
@@ -184,16 +199,25 @@ def sights_of(
 ) -> Sights:
     """Of a pass.
 
-    Args:
-        one: what was measured.
-        cameras: as the laboratory knows them.
-        chosen: lines that are used; None for all that have points.
-        search: axes, trends and what is known of heights.
-        effects: on the light, that are in the image points.
+    Parameters
+    ----------
+    one : PassMeasurements
+        What was measured.
+    cameras : Mapping[str, LineCamera]
+        As the laboratory knows them.
+    chosen : tuple[str, ...] | None
+        Lines that are used; None for all that have points.
+    search : JitterSearchSpec
+        Axes, trends and what is known of heights.
+    effects : LightEffects
+        On the light, that are in the image points.
 
-    Raises:
-        SightsError: lines without points, or fewer than two lines that see the same ones.
-        ValueError: readings that do not cover the points' moments.
+    Raises
+    ------
+    SightsError
+        Lines without points, or fewer than two lines that see the same ones.
+    ValueError
+        Readings that do not cover the points' moments.
     """
     names = [name for name in cameras if name in one.images and name in (chosen or cameras)]
     if missing := [name for name in chosen or () if name not in one.images]:
@@ -262,10 +286,14 @@ def _moment(line: _Line, lines: Mapping[str, _Line]) -> float:
 class _Prior:
     """What is known of places before they are seen.
 
-    Attributes:
-        tie: (n,) whether only the height is known.
-        place: (n, 3), ITRS, metres.
-        root: (n, 3, 3) by which differences in place become white; of ties the first row alone, for the height.
+    Attributes
+    ----------
+    tie : np.ndarray
+        (n,) whether only the height is known.
+    place : np.ndarray
+        (n, 3), ITRS, metres.
+    root : np.ndarray
+        (n, 3, 3) by which differences in place become white; of ties the first row alone, for the height.
     """
 
     tie: np.ndarray
@@ -402,10 +430,14 @@ def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
     A measured line is wrong by the same noise as what is observed, so that a time that follows from it goes with the
     observation; where points lie on rows, all of the scatter of their times is this noise.
 
-    Args:
-        line: with the measured places.
-        off: measured less expected lines (n,), of which noise is what is smooth no more, as far as its sigma allows.
-        basis: (n, width) smooth functions of the points.
+    Parameters
+    ----------
+    line : _Line
+        With the measured places.
+    off : np.ndarray
+        Measured less expected lines (n,), of which noise is what is smooth no more, as far as its sigma allows.
+    basis : np.ndarray
+        (n, width) smooth functions of the points.
     """
     sigma = np.sqrt(line.covariance[:, 0, 0])
     kept = np.isfinite(off)

@@ -73,12 +73,18 @@ class UserGround(ImagedGround):
 class Match:
     """What was measured.
 
-    Attributes:
-        setup: what the file says.
-        ground: images and maps.
-        points: measured in the images.
-        measurements: the same with orbit, attitude and line times, as a calibration takes them.
-        accuracy: of the maps' way to WGS 84 as its authority states it, metres; None where it is not stated.
+    Attributes
+    ----------
+    setup : MatchSetup
+        What the file says.
+    ground : UserGround
+        Images and maps.
+    points : PatchPoints
+        Measured in the images.
+    measurements : PassMeasurements
+        The same with orbit, attitude and line times, as a calibration takes them.
+    accuracy : float | None
+        Of the maps' way to WGS 84 as its authority states it, metres; None where it is not stated.
     """
 
     setup: MatchSetup
@@ -91,9 +97,12 @@ class Match:
 def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Match:
     """Measure points; nothing is traced or drawn.
 
-    Raises:
-        InputError: files that cannot be read, or do not fit together.
-        BenchError: points that cannot be measured.
+    Raises
+    ------
+    InputError
+        Files that cannot be read, or do not fit together.
+    BenchError
+        Points that cannot be measured.
     """
     advance("points", 0, 3)
     spec, folder = setup.test, Path()

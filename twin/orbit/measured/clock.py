@@ -36,9 +36,12 @@ _FORM = "a date and time such as 2011-03-05T03:05:00.25 or 2011-064T03:05:00.25,
 class Readings:
     """What a clock showed.
 
-    Attributes:
-        day: (N,) modified Julian days, whole.
-        second: (N,) seconds of the day, from 0 to 86400, within a leap second up to 86401.
+    Attributes
+    ----------
+    day : np.ndarray
+        (N,) modified Julian days, whole.
+    second : np.ndarray
+        (N,) seconds of the day, from 0 to 86400, within a leap second up to 86401.
     """
 
     day: np.ndarray
@@ -51,12 +54,17 @@ class Readings:
     def after(cls, epoch: str, seconds: np.ndarray) -> Readings:
         """Readings of a clock whose days all have 86400 s.
 
-        Args:
-            epoch: what it read at 0 s, ISO 8601 text.
-            seconds: (N,) since then.
+        Parameters
+        ----------
+        epoch : str
+            What it read at 0 s, ISO 8601 text.
+        seconds : np.ndarray
+            (N,) since then.
 
-        Raises:
-            Problem: not such a text.
+        Raises
+        ------
+        Problem
+            Not such a text.
         """
         day, second = calendar_reading(epoch)
         whole = np.floor((second + seconds) / DAY)
@@ -66,11 +74,15 @@ class Readings:
     def of_texts(cls, texts: Sequence[str]) -> Readings:
         """From calendar texts.
 
-        Args:
-            texts: N of them.
+        Parameters
+        ----------
+        texts : Sequence[str]
+            N of them.
 
-        Raises:
-            Problem: not such a text; ``within`` holds its index.
+        Raises
+        ------
+        Problem
+            Not such a text; ``within`` holds its index.
         """
         day, second = np.empty(len(texts), np.int64), np.empty(len(texts))
         known: dict[str, int] = {}
@@ -98,8 +110,10 @@ class Readings:
     def instants(self, scale: str) -> Instants:
         """The instants, if the clock shows this scale.
 
-        Raises:
-            Problem: a leap second on a day that has none, or of a scale that has none.
+        Raises
+        ------
+        Problem
+            a leap second on a day that has none, or of a scale that has none.
         """
         late = self.second >= DAY
         if scale != "UTC":
@@ -121,9 +135,12 @@ class Readings:
 class Instants:
     """Instants of TAI.
 
-    Attributes:
-        day: (N,) whole days since MJD 0.
-        second: (N,) SI seconds after them.
+    Attributes
+    ----------
+    day : np.ndarray
+        (N,) whole days since MJD 0.
+    second : np.ndarray
+        (N,) SI seconds after them.
     """
 
     day: np.ndarray
@@ -154,8 +171,10 @@ def epoch_before(instants: Instants) -> str:
 def tai_minus_utc(day: int) -> float:
     """TAI - UTC on a modified Julian day, seconds.
 
-    Raises:
-        Problem: before 1972 or after 2099.
+    Raises
+    ------
+    Problem
+        Before 1972 or after 2099.
     """
     if not FIRST_DAY <= day <= LAST_DAY:
         raise Problem("outside the years of this time scale", f"MJD {day}", _FORM)
@@ -172,8 +191,10 @@ def calendar(day: int) -> str:
 def calendar_reading(text: str) -> tuple[int, float]:
     """Modified Julian day and second of the day that a text shows.
 
-    Raises:
-        Problem: not such a text.
+    Raises
+    ------
+    Problem
+        Not such a text.
     """
     one = single_reading(text)
     return int(one.day[0]), float(one.second[0])
@@ -182,8 +203,10 @@ def calendar_reading(text: str) -> tuple[int, float]:
 def single_reading(text: str) -> Readings:
     """What one text shows.
 
-    Raises:
-        Problem: not a text of a date and a time.
+    Raises
+    ------
+    Problem
+        Not a text of a date and a time.
     """
     try:
         return Readings.of_texts([text.strip()])
@@ -194,8 +217,10 @@ def single_reading(text: str) -> Readings:
 def known_scale(name: str) -> str:
     """The scale of this name, as files of others spell it: GPST for GPS, GLO and GLONASS for UTC.
 
-    Raises:
-        Problem: another one.
+    Raises
+    ------
+    Problem
+        Another one.
     """
     upper = name.strip().upper()
     found = {"GPST": "GPS", "GLO": "UTC", "GLONASS": "UTC", "BDS": "BDT", "TDT": "TT"}.get(upper, upper)

@@ -68,11 +68,16 @@ _LINES_OFF = 3.0
 class AttitudePolynomial:
     """Quaternions as polynomials of time.
 
-    Attributes:
-        day: modified Julian day whose seconds count.
-        offset: second of the day at which the polynomials' variable is 0.
-        scale: seconds by which it grows by 1.
-        coefficients: (4, K) of Q0, the scalar, to Q3, ascending powers.
+    Attributes
+    ----------
+    day : int
+        Modified Julian day whose seconds count.
+    offset : float
+        Second of the day at which the polynomials' variable is 0.
+    scale : float
+        Seconds by which it grows by 1.
+    coefficients : Array
+        (4, K) of Q0, the scalar, to Q3, ascending powers.
     """
 
     day: int
@@ -90,22 +95,38 @@ class AttitudePolynomial:
 class DimapPass:
     """What a DIMAP file says of a pass.
 
-    Attributes:
-        file: where it is from.
-        profile: of the product, one of `PROFILES`.
-        version: of the format.
-        name: of the data set.
-        lines, pixels: of the image.
-        first_line: when the first line was exposed, UTC, one reading.
-        line_time: from one line to the next, seconds.
-        orbit: its readings, ITRS and UTC.
-        attitude: its samples, or polynomials.
-        forward, right: coefficients (K,) of the tangents of a pixel's look, ascending powers of the pixel from 0.
-        pitch: of the detector's pixels, metres; None where the file does not say.
-        refracted: whether its geometry knows refraction.
-        inertial_velocity: whether its velocities were those against the stars.
-        light_speed: whether it says that the speed of light was taken into account, of which nothing is known here.
-        rpc: names of files with its rational polynomials.
+    Attributes
+    ----------
+    file : str
+        Where it is from.
+    profile : str
+        Of the product, one of `PROFILES`.
+    version : str
+        Of the format.
+    name : str
+        Of the data set.
+    lines, pixels : int
+        Of the image.
+    first_line : Readings
+        When the first line was exposed, UTC, one reading.
+    line_time : float
+        From one line to the next, seconds.
+    orbit : OrbitReadings
+        Its readings, ITRS and UTC.
+    attitude : AttitudeReadings | AttitudePolynomial
+        Its samples, or polynomials.
+    forward, right : Array
+        Coefficients (K,) of the tangents of a pixel's look, ascending powers of the pixel from 0.
+    pitch : float | None
+        Of the detector's pixels, metres; None where the file does not say.
+    refracted : bool
+        Whether its geometry knows refraction.
+    inertial_velocity : bool
+        Whether its velocities were those against the stars.
+    light_speed : bool
+        Whether it says that the speed of light was taken into account, of which nothing is known here.
+    rpc : tuple[str, ...]
+        Names of files with its rational polynomials.
     """
 
     file: str
@@ -151,8 +172,10 @@ class DimapPass:
     def spanning_orbit(self) -> OrbitReadings:
         """The orbit's readings, with one more at either end where the image begins or ends a moment beyond them.
 
-        Raises:
-            InputError: it does by more than that.
+        Raises
+        ------
+        InputError
+            It does by more than that.
         """
         time = self._since(self.orbit.clock)
         assert self.orbit.velocity is not None
@@ -220,12 +243,17 @@ def is_dimap(lines: list[str]) -> bool:
 def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
     """The rigorous model of a product.
 
-    Args:
-        path: of its file DIM_*.XML.
-        band: whose looks are taken; may be left out where all bands have the same.
+    Parameters
+    ----------
+    path : str | Path
+        Of its file DIM_*.XML.
+    band : str | None
+        Whose looks are taken; may be left out where all bands have the same.
 
-    Raises:
-        InputError: it cannot be read, or is another product; with file, line and element.
+    Raises
+    ------
+    InputError
+        It cannot be read, or is another product; with file, line and element.
     """
     root = read_xml(path, _WHAT)
     version, profile = _identified(root)

@@ -40,12 +40,18 @@ _COLUMNS = (
 class EarthOrientation:
     """A table of Earth orientation; made by `read_earth_orientation`.
 
-    Attributes:
-        file: where it is from.
-        mjd: (K,) modified Julian dates in UTC, rising, four or more.
-        ut1_tai: (K,) UT1 - TAI, seconds.
-        pole: (K, 2) x and y of the pole, radians.
-        offsets: (K, 2) dX and dY of the celestial pole against IAU 2006/2000A, radians.
+    Attributes
+    ----------
+    file : str
+        Where it is from.
+    mjd : np.ndarray
+        (K,) modified Julian dates in UTC, rising, four or more.
+    ut1_tai : np.ndarray
+        (K,) UT1 - TAI, seconds.
+    pole : np.ndarray
+        (K, 2) x and y of the pole, radians.
+    offsets : np.ndarray
+        (K, 2) dX and dY of the celestial pole against IAU 2006/2000A, radians.
     """
 
     file: str
@@ -57,8 +63,10 @@ class EarthOrientation:
     def rotation(self, epoch: str, first: float, last: float) -> TableRotation:
         """The Earth's rotation from `first` to `last`, seconds from an epoch in UTC.
 
-        Raises:
-            InputError: the table does not reach over the span.
+        Raises
+        ------
+        InputError
+            The table does not reach over the span.
         """
         day, second = calendar_reading(epoch)
         begin, end = (day + (second + t) / DAY for t in (first, last))
@@ -90,10 +98,14 @@ class EarthOrientation:
 class TableRotation:
     """Rotation GCRS -> ITRS by a table; as `twin.orbit.flight.earth.EarthRotation`.
 
-    Attributes:
-        table: of Earth orientation.
-        epoch: UTC, ISO 8601 text; times are SI seconds from it.
-        celestial_pole: spline of the pole's X and Y and of the locator s by IAU 2006/2000A, radians.
+    Attributes
+    ----------
+    table : EarthOrientation
+        Of Earth orientation.
+    epoch : str
+        UTC, ISO 8601 text; times are SI seconds from it.
+    celestial_pole : Any
+        Spline of the pole's X and Y and of the locator s by IAU 2006/2000A, radians.
     """
 
     table: EarthOrientation
@@ -136,9 +148,12 @@ class TableRotation:
 def rate_of(matrix: Any, seconds: np.ndarray) -> np.ndarray:
     """Angular velocity (N, 3), rad/s, of the axes to which a rotation of time leads, in these axes.
 
-    Args:
-        matrix: seconds (N,) -> (N, 3, 3).
-        seconds: (N,).
+    Parameters
+    ----------
+    matrix : Any
+        Seconds (N,) -> (N, 3, 3).
+    seconds : np.ndarray
+        (N,).
     """
     turn = matrix(seconds + _RATE_STEP) @ np.swapaxes(matrix(seconds - _RATE_STEP), -1, -2)
     # of a rotation by a small angle, whose sine and angle differ by 1e-12 of it
@@ -153,10 +168,14 @@ def rate_of(matrix: Any, seconds: np.ndarray) -> np.ndarray:
 def constant_orientation(epoch: str, ut1_utc: float, pole: tuple[float, float]) -> EarthOrientation:
     """A table of a week that holds the same everywhere.
 
-    Args:
-        epoch: UTC, ISO 8601 text.
-        ut1_utc: UT1 - UTC at the epoch, seconds; UT1 runs on evenly from there, also over a leap second.
-        pole: x and y of the pole, radians.
+    Parameters
+    ----------
+    epoch : str
+        UTC, ISO 8601 text.
+    ut1_utc : float
+        UT1 - UTC at the epoch, seconds; UT1 runs on evenly from there, also over a leap second.
+    pole : tuple[float, float]
+        x and y of the pole, radians.
     """
     day, _ = calendar_reading(epoch)
     mjd = day + np.arange(-3.0, 5.0)
@@ -169,12 +188,16 @@ def constant_orientation(epoch: str, ut1_utc: float, pole: tuple[float, float]) 
 def read_earth_orientation(path: str | Path) -> EarthOrientation:
     """A table of Earth orientation.
 
-    Args:
-        path: of a file finals2000A (all, data or daily), C04 (14 or 20), or CSV with columns mjd, ut1_utc [s], x_pole
-            [arcsec], y_pole [arcsec] and perhaps dx [mas] and dy [mas].
+    Parameters
+    ----------
+    path : str | Path
+        Of a file finals2000A (all, data or daily), C04 (14 or 20), or CSV with columns mjd, ut1_utc [s], x_pole
+        [arcsec], y_pole [arcsec] and perhaps dx [mas] and dy [mas].
 
-    Raises:
-        InputError: it cannot be read, or holds fewer than four days.
+    Raises
+    ------
+    InputError
+        It cannot be read, or holds fewer than four days.
     """
     file, start = str(path), list(first_lines(path, WHAT, 400))
     if any("mjd" in line.lower() and not line.startswith("#") and "," in line for line in start):

@@ -38,10 +38,14 @@ _GEOGRAPHIC = "EPSG:4979"
 class GroundFile:
     """What a file of ground points holds.
 
-    Attributes:
-        points: in the ITRS.
-        accuracy: of the way there, as the systems' authority states it, metres; None where it is not stated.
-        images: image file -> (n, 5) row of `points`, line, pixel and their sigmas, where the file has some.
+    Attributes
+    ----------
+    points : GroundPoints
+        In the ITRS.
+    accuracy : float | None
+        Of the way there, as the systems' authority states it, metres; None where it is not stated.
+    images : Mapping[str, np.ndarray]
+        Image file -> (n, 5) row of `points`, line, pixel and their sigmas, where the file has some.
     """
 
     points: GroundPoints
@@ -63,12 +67,17 @@ class _Rows:
 def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
     """The points of a file.
 
-    Args:
-        spec: the file, and what it does not say itself.
-        folder: that relative paths start from.
+    Parameters
+    ----------
+    spec : GroundFileSpec
+        The file, and what it does not say itself.
+    folder : Path
+        That relative paths start from.
 
-    Raises:
-        InputError: it cannot be read; with file and line, or the feature of a GeoJSON file.
+    Raises
+    ------
+    InputError
+        It cannot be read; with file and line, or the feature of a GeoJSON file.
     """
     path = folder / spec.file
     images: dict[str, np.ndarray] = {}

@@ -42,14 +42,21 @@ _DRIVERS = ("GTiff", "GTX", "COG")
 class GeoRaster:
     """A raster whose places are known; made by `open_raster`. Nothing is held in memory.
 
-    Attributes:
-        file: its path.
-        crs: of its coordinates.
-        transform: (a, b, c, d, e, f): x = a column + b row + c and y = d column + e row + f, (0, 0) being the middle of
-            the first pixel.
-        shape: rows and columns.
-        band: that is read, counted from 1.
-        dtype: of its values.
+    Attributes
+    ----------
+    file : str
+        Its path.
+    crs : pyproj.CRS
+        Of its coordinates.
+    transform : tuple[float, float, float, float, float, float]
+        (a, b, c, d, e, f): x = a column + b row + c and y = d column + e row + f, (0, 0) being the middle of the first
+        pixel.
+    shape : tuple[int, int]
+        Rows and columns.
+    band : int
+        That is read, counted from 1.
+    dtype : str
+        Of its values.
     """
 
     file: str
@@ -74,12 +81,17 @@ class GeoRaster:
     def read(self, rows: slice | None = None, columns: slice | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Values (r, c) of a part, of the raster's own type, and which of them hold something (bool).
 
-        Args:
-            rows: of the part, within the raster; None for all.
-            columns: likewise.
+        Parameters
+        ----------
+        rows : slice | None
+            Of the part, within the raster; None for all.
+        columns : slice | None
+            likewise.
 
-        Raises:
-            InputError: too large a part, or a file that is damaged.
+        Raises
+        ------
+        InputError
+            Too large a part, or a file that is damaged.
         """
         part = rows or slice(0, self.shape[0]), columns or slice(0, self.shape[1])
         size = [s.stop - s.start for s in part]
@@ -101,13 +113,19 @@ class GeoRaster:
 def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoRaster:
     """A raster's place and size.
 
-    Args:
-        path: of the file.
-        band: that is to be read, counted from 1.
-        crs: of a file that does not say it.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file.
+    band : int
+        That is to be read, counted from 1.
+    crs : str | None
+        Of a file that does not say it.
 
-    Raises:
-        InputError: no such file, none that GDAL reads as a plain grid, without a place, with complex or no values.
+    Raises
+    ------
+    InputError
+        No such file, none that GDAL reads as a plain grid, without a place, with complex or no values.
     """
     file = str(path)
     with opened(file) as source:
@@ -172,8 +190,10 @@ CGCS2000 = "China 2000"
 class Geoid:
     """Heights of a geoid above the ellipsoid on a grid of longitude and latitude, bilinear between its nodes.
 
-    Attributes:
-        raster: the grid.
+    Attributes
+    ----------
+    raster : GeoRaster
+        The grid.
     """
 
     raster: GeoRaster
@@ -205,12 +225,17 @@ class Geoid:
     def __call__(self, longitude: Any, latitude: Any) -> np.ndarray:
         """Height of the geoid, metres, (...).
 
-        Args:
-            longitude: degrees, any turn, (...).
-            latitude: degrees, (...).
+        Parameters
+        ----------
+        longitude : Any
+            Degrees, any turn, (...).
+        latitude : Any
+            Degrees, (...).
 
-        Raises:
-            Problem: a place beyond the grid.
+        Raises
+        ------
+        Problem
+            a place beyond the grid.
         """
         lon, lat = np.broadcast_arrays(np.asarray(longitude, float), np.asarray(latitude, float))
         rows, columns = self.raster.shape
@@ -235,11 +260,16 @@ class Geoid:
 class Datum:
     """A coordinate reference system with what its heights are counted from; made by `Datum.of`.
 
-    Attributes:
-        crs: as given: two coordinates or three.
-        geoid: that heights are above; None for the ellipsoid.
-        forward: to geocentric coordinates of the ITRS.
-        geographic: to longitude and latitude, degrees, of the same system.
+    Attributes
+    ----------
+    crs : pyproj.CRS
+        As given: two coordinates or three.
+    geoid : Geoid | None
+        That heights are above; None for the ellipsoid.
+    forward : pyproj.Transformer
+        To geocentric coordinates of the ITRS.
+    geographic : pyproj.Transformer
+        To longitude and latitude, degrees, of the same system.
     """
 
     crs: pyproj.CRS
@@ -251,13 +281,19 @@ class Datum:
     def of(cls, text: str, heights: str | None, geoid: Geoid | None) -> Datum:
         """The system of this name.
 
-        Args:
-            text: of the system, for PROJ.
-            heights: ``ellipsoid`` or ``geoid``; None where the system itself says it.
-            geoid: for heights above it.
+        Parameters
+        ----------
+        text : str
+            Of the system, for PROJ.
+        heights : str | None
+            ``ellipsoid`` or ``geoid``; None where the system itself says it.
+        geoid : Geoid | None
+            For heights above it.
 
-        Raises:
-            Problem: no such system, heights that are not said or said twice, no way to the ITRS without a guess.
+        Raises
+        ------
+        Problem
+            No such system, heights that are not said or said twice, no way to the ITRS without a guess.
         """
         try:
             crs = pyproj.CRS(text)
@@ -289,13 +325,19 @@ class Datum:
     def itrs(self, x: Any, y: Any, z: Any) -> np.ndarray:
         """Places (..., 3) in the ITRS, metres.
 
-        Args:
-            x: longitude in degrees, easting, or geocentric, (...).
-            y: latitude in degrees, northing, or geocentric, (...).
-            z: height, or geocentric, metres, (...).
+        Parameters
+        ----------
+        x : Any
+            Longitude in degrees, easting, or geocentric, (...).
+        y : Any
+            Latitude in degrees, northing, or geocentric, (...).
+        z : Any
+            Height, or geocentric, metres, (...).
 
-        Raises:
-            Problem: a place where the system has none, or beyond the geoid's grid.
+        Raises
+        ------
+        Problem
+            a place where the system has none, or beyond the geoid's grid.
         """
         x, y, z = (np.asarray(v, np.float64) for v in np.broadcast_arrays(x, y, z))
         if self.crs.is_geographic and (np.any(np.abs(y) > 90.0) or np.any(np.abs(x) > 540.0)):
@@ -343,14 +385,22 @@ _WGS84 = "EPSG:4326"
 class MapPart:
     """A part of a map; see `twin.orbit.ground.orthophoto.Map`.
 
-    Attributes:
-        values: (rows, columns); grey values float32 with NaN where there are none, or heights above the ellipsoid.
-        valid: (rows, columns) bool; None for all.
-        raster: that it is cut from.
-        first: row and column of its first value there.
-        frame: plane coordinates of the ground.
-        way: from the raster's system to longitude and latitude, degrees.
-        spacing: of rows and columns on the ground, metres, their geometric mean.
+    Attributes
+    ----------
+    values : np.ndarray
+        (rows, columns); grey values float32 with NaN where there are none, or heights above the ellipsoid.
+    valid : np.ndarray | None
+        (rows, columns) bool; None for all.
+    raster : GeoRaster
+        That it is cut from.
+    first : tuple[int, int]
+        Row and column of its first value there.
+    frame : GroundFrame
+        Plane coordinates of the ground.
+    way : pyproj.Transformer
+        From the raster's system to longitude and latitude, degrees.
+    spacing : float
+        Of rows and columns on the ground, metres, their geometric mean.
     """
 
     values: np.ndarray
@@ -384,10 +434,14 @@ class MapPart:
 class UserMap:
     """A map in a file, of which parts are read; made by `UserMap.open`.
 
-    Attributes:
-        raster: the file.
-        way: from its system to longitude and latitude, degrees.
-        geoid: that its values are heights above; None for the ellipsoid, or for grey values.
+    Attributes
+    ----------
+    raster : GeoRaster
+        The file.
+    way : pyproj.Transformer
+        From its system to longitude and latitude, degrees.
+    geoid : Geoid | None
+        That its values are heights above; None for the ellipsoid, or for grey values.
     """
 
     raster: GeoRaster
@@ -398,13 +452,19 @@ class UserMap:
     def open(cls, spec: RasterFileSpec, folder: Path, heights: bool = False) -> UserMap:
         """A map of a file.
 
-        Args:
-            spec: the file, and what it does not say itself.
-            folder: that relative paths start from.
-            heights: whether it is an elevation model, whose heights must be said to be above something.
+        Parameters
+        ----------
+        spec : RasterFileSpec
+            The file, and what it does not say itself.
+        folder : Path
+            That relative paths start from.
+        heights : bool
+            Whether it is an elevation model, whose heights must be said to be above something.
 
-        Raises:
-            InputError: it cannot be read, no way from its system without a guess, heights above nothing.
+        Raises
+        ------
+        InputError
+            It cannot be read, no way from its system without a guess, heights above nothing.
         """
         raster = open_raster(folder / spec.file, spec.band, spec.crs)
         flat = raster.crs.sub_crs_list[0] if raster.crs.is_compound else raster.crs
@@ -428,8 +488,10 @@ class UserMap:
     def limits(self) -> tuple[float, float]:
         """Least and largest height of some thousand places over the whole elevation model.
 
-        Raises:
-            InputError: there are none, or they are no heights of ground.
+        Raises
+        ------
+        InputError
+            There are none, or they are no heights of ground.
         """
         shape = tuple(min(n, _SAMPLED) for n in self.raster.shape)
         with opened(self.raster.file) as source:
@@ -448,13 +510,19 @@ class UserMap:
     def part(self, frame: GroundFrame, ends: tuple[float, float, float, float], heights: bool = False) -> MapPart:
         """What lies within some ends.
 
-        Args:
-            frame: plane coordinates of the ground.
-            ends: west, east, south and north, metres.
-            heights: whether its values are heights.
+        Parameters
+        ----------
+        frame : GroundFrame
+            Plane coordinates of the ground.
+        ends : tuple[float, float, float, float]
+            West, east, south and north, metres.
+        heights : bool
+            Whether its values are heights.
 
-        Raises:
-            InputError: nothing does, or too much for the memory; a place without a geoid.
+        Raises
+        ------
+        InputError
+            Nothing does, or too much for the memory; a place without a geoid.
         """
         side = np.linspace(0.0, 1.0, 21)
         east = ends[0] + (ends[1] - ends[0]) * np.concatenate([side, side, 0.0 * side, 0.0 * side + 1.0])

@@ -85,16 +85,23 @@ def read_pass(
 ) -> PassMeasurements:
     """What the tables of a pass say.
 
-    Args:
-        name: of the pass.
-        spec: its epoch and files, with paths that hold from here.
-        conventions: of all tables.
-        camera: whose lines they name.
-        needed: role -> in how many line cameras one of its points must be seen.
+    Parameters
+    ----------
+    name : str
+        Of the pass.
+    spec : PassFilesSpec
+        Its epoch and files, with paths that hold from here.
+    conventions : ConventionsSpec
+        Of all tables.
+    camera : ThreeLineCameraSpec
+        Whose lines they name.
+    needed : Mapping[str, int]
+        Role -> in how many line cameras one of its points must be seen.
 
-    Raises:
-        InputError: a table cannot be read or is not as `COLUMNS` says, or what it says cannot be, with file, line and
-            column.
+    Raises
+    ------
+    InputError
+        a table cannot be read or is not as `COLUMNS` says, or what it says cannot be, with file, line and column.
     """
     files = spec.files
     platform = _platform(spec, conventions)
@@ -152,14 +159,21 @@ def read_measurements(
 ) -> tuple[PassMeasurements, ...]:
     """All passes of a test.
 
-    Args:
-        data: conventions and files.
-        camera: whose lines they name.
-        advance: how far it is.
-        needed: role -> in how many line cameras one of its points must be seen.
+    Parameters
+    ----------
+    data : OrbitDataSpec
+        Conventions and files.
+    camera : ThreeLineCameraSpec
+        Whose lines they name.
+    advance : Advance
+        How far it is.
+    needed : Mapping[str, int]
+        Role -> in how many line cameras one of its points must be seen.
 
-    Raises:
-        InputError: a table cannot be read, or what it says cannot be, with file, line and column.
+    Raises
+    ------
+    InputError
+        a table cannot be read, or what it says cannot be, with file, line and column.
     """
     found = []
     for name, files in data.passes.items():
@@ -173,14 +187,21 @@ def _line_times_of(
 ) -> tuple[dict[str, LineTimes], dict[str, float]]:
     """Line camera -> its line times with the first line as 0, and the number of that line in the file.
 
-    Args:
-        table: of the lines of all cameras.
-        conventions: which moment of an exposure its times are.
-        camera: whose lines they are.
-        platform: whose readings must cover them.
+    Parameters
+    ----------
+    table : Table
+        Of the lines of all cameras.
+    conventions : ConventionsSpec
+        Which moment of an exposure its times are.
+    camera : ThreeLineCameraSpec
+        Whose lines they are.
+    platform : PlatformTable
+        Whose readings must cover them.
 
-    Raises:
-        InputError: a camera that is none, a line twice, times that do not rise, lines outside the readings.
+    Raises
+    ------
+    InputError
+        a camera that is none, a line twice, times that do not rise, lines outside the readings.
     """
     require_known(table, "camera", tuple(camera.lines))
     path = TabulatedTrajectory(platform)
@@ -211,12 +232,16 @@ def _line_times_of(
 def ground_of(table: Table) -> GroundPoints:
     """Points with coordinates.
 
-    Args:
-        table: of them.
+    Parameters
+    ----------
+    table : Table
+        Of them.
 
-    Raises:
-        InputError: a name twice, another role, a point far from the Earth's surface, sigmas that are missing, given in
-            two ways, or no covariance.
+    Raises
+    ------
+    InputError
+        a name twice, another role, a point far from the Earth's surface, sigmas that are missing, given in two ways, or
+        no covariance.
     """
     _once(table, "point")
     require_known(table, "role", ("control", "check"))
@@ -275,18 +300,28 @@ def _image_points_of(
 ) -> dict[str, ImagePoints]:
     """Line camera -> its image points, by number of the point.
 
-    Args:
-        table: of all cameras.
-        names: point -> its number.
-        times: line camera -> line times.
-        origins: line camera -> number of its first line.
-        conventions: of pixels.
-        camera: its lines.
-        trajectory: must be known when the points were exposed.
+    Parameters
+    ----------
+    table : Table
+        Of all cameras.
+    names : Mapping[str, int]
+        Point -> its number.
+    times : Mapping[str, LineTimes]
+        Line camera -> line times.
+    origins : Mapping[str, float]
+        Line camera -> number of its first line.
+    conventions : ConventionsSpec
+        Of pixels.
+    camera : ThreeLineCameraSpec
+        Its lines.
+    trajectory : TabulatedTrajectory
+        Must be known when the points were exposed.
 
-    Raises:
-        InputError: a point or camera that is none, a point twice in a camera, a place outside the image or exposed
-            where orbit or attitude are not known.
+    Raises
+    ------
+    InputError
+        a point or camera that is none, a point twice in a camera, a place outside the image or exposed where orbit or
+        attitude are not known.
     """
     require_known(table, "camera", tuple(times))
     number = np.array([names.get(name, -1) for name in table["point"].tolist()])
@@ -366,9 +401,12 @@ TEST_FILE = "calibrate.yaml"
 def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]) -> dict[str, str]:
     """Path -> text of a folder of measurements: ``data.yaml``, the tables of each pass, the camera.
 
-    Args:
-        passes: with different names.
-        camera: of the payload's file, plain data.
+    Parameters
+    ----------
+    passes : Sequence[PassMeasurements]
+        With different names.
+    camera : Mapping[str, Any]
+        Of the payload's file, plain data.
     """
     files, listed = {CAMERA_FILE: dump_yaml(camera)}, {}
     for one in passes:
@@ -466,15 +504,22 @@ _LEAST_TURN, _FASTEST_TURN = np.radians(2.0), np.radians(10.0)
 def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: ConventionsSpec) -> PlatformTable:
     """Orbit and attitude.
 
-    Args:
-        epoch: UTC.
-        orbit: its table.
-        attitude: its table, which may be the same.
-        conventions: of both.
+    Parameters
+    ----------
+    epoch : str
+        UTC.
+    orbit : Table
+        Its table.
+    attitude : Table
+        Its table, which may be the same.
+    conventions : ConventionsSpec
+        Of both.
 
-    Raises:
-        InputError: a time twice, a place where no satellite is, a velocity that is not that of the places, a
-            quaternion that is not of unit length.
+    Raises
+    ------
+    InputError
+        a time twice, a place where no satellite is, a velocity that is not that of the places, a quaternion that is not
+        of unit length.
     """
     order, looks = _rising(orbit), _rising(attitude)
     time, place = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
@@ -508,9 +553,12 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
 def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
     """Quaternions x, y, z, w that turn the project's body axes into those of the frame.
 
-    Args:
-        numbers: (n, 4) q1 to q4 as the file has them.
-        conventions: what they mean.
+    Parameters
+    ----------
+    numbers : Array
+        (n, 4) q1 to q4 as the file has them.
+    conventions : ConventionsSpec
+        What they mean.
     """
     said = conventions.quaternion
     assert said is not None

@@ -34,9 +34,12 @@ FRAMES: tuple[str, ...] = get_args(Frame)
 class Segment:
     """Part of an orbit that is joined by itself, as between two manoeuvres.
 
-    Attributes:
-        first, last: of its readings, counted from 0.
-        usable: two clock readings between which the file says that it may be used; None for all of it.
+    Attributes
+    ----------
+    first, last : int
+        Of its readings, counted from 0.
+    usable : Readings | None
+        Two clock readings between which the file says that it may be used; None for all of it.
     """
 
     first: int
@@ -48,14 +51,22 @@ class Segment:
 class OrbitReadings:
     """An orbit as a file holds it.
 
-    Attributes:
-        file: where it is from.
-        clock: N readings, rising.
-        position: (N, 3) metres.
-        velocity: (N, 3) m/s in axes and against axes of the same frame; None where the file has none.
-        frame: in which; None where the file does not say.
-        scale: of the clock; None where the file does not say.
-        segments: parts that no interpolation may join; empty for one.
+    Attributes
+    ----------
+    file : str
+        Where it is from.
+    clock : Readings
+        N readings, rising.
+    position : np.ndarray
+        (N, 3) metres.
+    velocity : np.ndarray | None
+        (N, 3) m/s in axes and against axes of the same frame; None where the file has none.
+    frame : str | None
+        In which; None where the file does not say.
+    scale : str | None
+        Of the clock; None where the file does not say.
+    segments : tuple[Segment, ...]
+        Parts that no interpolation may join; empty for one.
     """
 
     file: str
@@ -79,15 +90,24 @@ class OrbitReadings:
 class AttitudeReadings:
     """An attitude as a file holds it.
 
-    Attributes:
-        file: where it is from.
-        clock: M readings, rising.
-        quaternion: (M, 4) components as they stand in the file; None for angles.
-        angles: (M, 3) roll, pitch, yaw, radians; None for quaternions.
-        frame: that the body is turned against; None where the file does not say.
-        scale: of the clock; None where the file does not say.
-        scalar: where the scalar part stands; None where the file does not say.
-        turns: what the quaternion turns into what; None where the file does not say.
+    Attributes
+    ----------
+    file : str
+        Where it is from.
+    clock : Readings
+        M readings, rising.
+    quaternion : np.ndarray | None
+        (M, 4) components as they stand in the file; None for angles.
+    angles : np.ndarray | None
+        (M, 3) roll, pitch, yaw, radians; None for quaternions.
+    frame : str | None
+        That the body is turned against; None where the file does not say.
+    scale : str | None
+        Of the clock; None where the file does not say.
+    scalar : Scalar | None
+        Where the scalar part stands; None where the file does not say.
+    turns : Turns | None
+        What the quaternion turns into what; None where the file does not say.
     """
 
     file: str
@@ -111,8 +131,10 @@ def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_F
     Every ITRF and WGS 84 counts as ITRS: realisations since 1992 agree to some centimetres. GCRF and ICRF are GCRS, and
     J2000 is EME2000, which is turned against it by 0.02 arcsec.
 
-    Raises:
-        InputError: another one.
+    Raises
+    ------
+    InputError
+        Another one.
     """
     word = name.strip().upper().replace("-", "").replace("_", "")
     # SP3 has five letters: ITR97, IER97 of the IERS, IGS14, IGb08, and ECF where a realisation is not said
@@ -152,12 +174,18 @@ def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, boo
     """Return by how much velocities differ from the change of Earth-fixed places, and whether they are recognised as
     those against the stars, which are larger by omega x P.
 
-    Args:
-        time: (N,), seconds.
-        place: (N, 3), ITRS, metres.
-        speed: (N, 3), in axes of the ITRS, m/s.
+    Parameters
+    ----------
+    time : Array
+        (N,), seconds.
+    place : Array
+        (N, 3), ITRS, metres.
+    speed : Array
+        (N, 3), in axes of the ITRS, m/s.
 
-    Returns:
+    Returns
+    -------
+    tuple[Array, bool]
         Relative differences (N - 1,), and whether the velocities less omega x P fit while they themselves do not.
     """
     rate = np.diff(place, axis=0) / np.diff(time)[:, None]
@@ -204,12 +232,17 @@ def message_kind(lines: list[str]) -> str | None:
 def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     """The orbit of an OEM.
 
-    Args:
-        path: of the file.
-        satellite: its OBJECT_ID or OBJECT_NAME; may be left out where there is one only.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file.
+    satellite : str | None
+        Its OBJECT_ID or OBJECT_NAME; may be left out where there is one only.
 
-    Raises:
-        InputError: it cannot be read, about another body than the Earth, or its segments do not fit together.
+    Raises
+    ------
+    InputError
+        It cannot be read, about another body than the Earth, or its segments do not fit together.
     """
     file = str(path)
     segments = _chosen(file, _segments(path, "OEM"), satellite)
@@ -420,12 +453,17 @@ def is_sp3(first: str) -> bool:
 def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     """The orbit of a satellite.
 
-    Args:
-        path: of the file.
-        satellite: its number as the file has it, L51; may be left out where there is one only.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file.
+    satellite : str | None
+        Its number as the file has it, L51; may be left out where there is one only.
 
-    Raises:
-        InputError: no such satellite, fewer than two places, a line that cannot be read, a file that ends early.
+    Raises
+    ------
+    InputError
+        No such satellite, fewer than two places, a line that cannot be read, a file that ends early.
     """
     file, lines = str(path), text_lines(path, WHAT)
     head = lines[0]

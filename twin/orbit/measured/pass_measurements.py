@@ -24,11 +24,16 @@ ROLES = ("control", "check", "tie")
 class GroundPoints:
     """Points on the ground.
 
-    Attributes:
-        ids: (n,) names, each once.
-        itrs: (n, 3) metres; NaN where the role is tie and nothing is known.
-        covariance: (n, 3, 3) of the coordinates, ITRS axes, m^2; zero for exact ones, and for ties.
-        role: (n,) one of `ROLES`.
+    Attributes
+    ----------
+    ids : NDArray[np.object_]
+        (n,) names, each once.
+    itrs : Array
+        (n, 3) metres; NaN where the role is tie and nothing is known.
+    covariance : Array
+        (n, 3, 3) of the coordinates, ITRS axes, m^2; zero for exact ones, and for ties.
+    role : NDArray[np.object_]
+        (n,) one of `ROLES`.
     """
 
     ids: NDArray[np.object_]
@@ -40,15 +45,22 @@ class GroundPoints:
     def of(cls, ids: ArrayLike, itrs: ArrayLike, covariance: ArrayLike, role: ArrayLike) -> GroundPoints:
         """The points, checked.
 
-        Args:
-            ids: (n,) names.
-            itrs: (n, 3), metres.
-            covariance: (n, 3, 3), or one (3, 3) for all, m^2.
-            role: (n,), or one for all.
+        Parameters
+        ----------
+        ids : ArrayLike
+            (n,) names.
+        itrs : ArrayLike
+            (n, 3), metres.
+        covariance : ArrayLike
+            (n, 3, 3), or one (3, 3) for all, m^2.
+        role : ArrayLike
+            (n,), or one for all.
 
-        Raises:
-            ValueError: shapes that do not match, a name twice, a role that is none, control or check points whose
-                coordinates are not finite, a covariance that is none.
+        Raises
+        ------
+        ValueError
+            Shapes that do not match, a name twice, a role that is none, control or check points whose coordinates are
+            not finite, a covariance that is none.
         """
         names, places = np.array(ids, dtype=object), np.array(itrs, np.float64)
         n = len(names)
@@ -86,10 +98,14 @@ class GroundPoints:
 class ImagePoints:
     """Image points of one line camera.
 
-    Attributes:
-        point: (n,) which ground point each of them shows.
-        line, pixel: (n,) image coordinates; the centre of the first line's first pixel is (0, 0).
-        covariance: (n, 2, 2) of line and pixel, pixels squared.
+    Attributes
+    ----------
+    point : NDArray[np.intp]
+        (n,) which ground point each of them shows.
+    line, pixel : Array
+        (n,) image coordinates; the centre of the first line's first pixel is (0, 0).
+    covariance : Array
+        (n, 2, 2) of line and pixel, pixels squared.
     """
 
     point: NDArray[np.intp]
@@ -101,14 +117,21 @@ class ImagePoints:
     def of(cls, point: ArrayLike, line: ArrayLike, pixel: ArrayLike, covariance: ArrayLike) -> ImagePoints:
         """The points, checked.
 
-        Args:
-            point: (n,) whole numbers.
-            line: (n,).
-            pixel: (n,).
-            covariance: (n, 2, 2), or one (2, 2) for all, pixels squared.
+        Parameters
+        ----------
+        point : ArrayLike
+            (n,) whole numbers.
+        line : ArrayLike
+            (n,).
+        pixel : ArrayLike
+            (n,).
+        covariance : ArrayLike
+            (n, 2, 2), or one (2, 2) for all, pixels squared.
 
-        Raises:
-            ValueError: shapes that do not match, values that are not finite.
+        Raises
+        ------
+        ValueError
+            Shapes that do not match, values that are not finite.
         """
         which, at, along = np.array(point, np.intp), np.array(line, np.float64), np.array(pixel, np.float64)
         if which.ndim != 1 or at.shape != which.shape or along.shape != which.shape:
@@ -146,9 +169,12 @@ _APART = 0.01
 def duplicates(ids: NDArray[np.object_], places: Array) -> str:
     """Return a warning that names points which are one point under two names; empty where there are none.
 
-    Args:
-        ids: (n,) names.
-        places: (n, 3), ITRS, metres; NaN where unknown.
+    Parameters
+    ----------
+    ids : NDArray[np.object_]
+        (n,) names.
+    places : Array
+        (n, 3), ITRS, metres; NaN where unknown.
     """
     known = np.flatnonzero(np.all(np.isfinite(places), axis=1))
     pairs = sorted(cKDTree(places[known]).query_pairs(_APART))
@@ -171,12 +197,18 @@ def listed(names: Sequence[str]) -> str:
 class PassMeasurements:
     """One pass as it was measured.
 
-    Attributes:
-        name: of the pass, or of the field that it passes.
-        platform: readings of orbit and attitude.
-        line_times: line camera -> when its lines were exposed.
-        ground: control, check and tie points.
-        images: line camera -> image points; `point` counts the rows of `ground`.
+    Attributes
+    ----------
+    name : str
+        Of the pass, or of the field that it passes.
+    platform : PlatformTable
+        Readings of orbit and attitude.
+    line_times : Mapping[str, LineTimes]
+        Line camera -> when its lines were exposed.
+    ground : GroundPoints
+        Control, check and tie points.
+    images : Mapping[str, ImagePoints]
+        Line camera -> image points; `point` counts the rows of `ground`.
     """
 
     name: str

@@ -62,15 +62,24 @@ _EME2000_FROM_GCRS = np.asarray(erfa.bp06(2451545.0, 0.0)[0])
 class Conventions:
     """What the numbers of orbit and attitude files mean; names as in `scenes.specs.orbit.measurements`.
 
-    Attributes:
-        orbit_frame, attitude_frame: axes.
-        orbit_scale, attitude_scale: time scales.
-        orbit_offset, attitude_offset: seconds to be added to the times.
-        scalar: where a quaternion's scalar part stands.
-        turns: what a quaternion turns into what.
-        body_axes: of the attitude's body.
-        sequence: of angles.
-        law: of the orbital frame.
+    Attributes
+    ----------
+    orbit_frame, attitude_frame : str
+        axes.
+    orbit_scale, attitude_scale : str
+        Time scales.
+    orbit_offset, attitude_offset : float
+        Seconds to be added to the times.
+    scalar : str
+        Where a quaternion's scalar part stands.
+    turns : str
+        What a quaternion turns into what.
+    body_axes : tuple[str, str, str]
+        Of the attitude's body.
+    sequence : str
+        Of angles.
+    law : Attitude
+        Of the orbital frame.
     """
 
     orbit_frame: str
@@ -90,10 +99,14 @@ class Conventions:
 class PlatformReadings:
     """Orbit and attitude as their files hold them.
 
-    Attributes:
-        orbit: of one file.
-        attitude: of another.
-        earth: table of Earth orientation; None where there is none.
+    Attributes
+    ----------
+    orbit : OrbitReadings
+        Of one file.
+    attitude : AttitudeReadings
+        Of another.
+    earth : EarthOrientation | None
+        Table of Earth orientation; None where there is none.
     """
 
     orbit: OrbitReadings
@@ -104,12 +117,17 @@ class PlatformReadings:
 def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadings, Conventions]:
     """What the files of a platform hold, and what it means.
 
-    Args:
-        spec: the files, and what they do not say themselves.
-        folder: that relative paths start from.
+    Parameters
+    ----------
+    spec : PlatformFilesSpec
+        The files, and what they do not say themselves.
+    folder : Path
+        That relative paths start from.
 
-    Raises:
-        InputError: a file that cannot be read, something that neither file nor spec says, or that they say differently.
+    Raises
+    ------
+    InputError
+        a file that cannot be read, something that neither file nor spec says, or that they say differently.
     """
     orbit, attitude = _orbit(spec.orbit, folder), _attitude(spec.attitude, folder)
     turned = attitude.quaternion is not None
@@ -139,14 +157,20 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
 def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | None = None) -> PlatformTable:
     """The readings understood in one way.
 
-    Args:
-        readings: of the files.
-        meant: what they mean.
-        epoch: from which times count, UTC, ISO 8601; None for the first second of the orbit.
+    Parameters
+    ----------
+    readings : PlatformReadings
+        Of the files.
+    meant : Conventions
+        What they mean.
+    epoch : str | None
+        From which times count, UTC, ISO 8601; None for the first second of the orbit.
 
-    Raises:
-        InputError: a leap second that is none, no Earth orientation for an inertial frame, attitude by an orbital frame
-            at times without orbit.
+    Raises
+    ------
+    InputError
+        a leap second that is none, no Earth orientation for an inertial frame, attitude by an orbital frame at times
+        without orbit.
     """
     orbit, attitude = readings.orbit, readings.attitude
     usable: Instants | None = None
@@ -329,8 +353,10 @@ def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
 def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFileSpec) -> Readings:
     """What the clock read in each row of a table, by its column time or date_time.
 
-    Raises:
-        InputError: times that are not said once, a text that is no date and time, seconds without their epoch.
+    Raises
+    ------
+    InputError
+        Times that are not said once, a text that is no date and time, seconds without their epoch.
     """
     if ("time" in table) == ("date_time" in table):
         found, allowed = ", ".join(table.columns), "time [s] with `epoch:`, or date_time"
@@ -385,10 +411,14 @@ _ITRS = Conventions("ITRS", "UTC", "ITRS", "UTC", scalar="first", turns="body_to
 class DimapScene:
     """A scene.
 
-    Attributes:
-        read: what its file says.
-        sensor: the rigorous model; line 0 and pixel 0 are the format's row 1 and column 1.
-        epoch: UTC from which the sensor's times count.
+    Attributes
+    ----------
+    read : DimapPass
+        What its file says.
+    sensor : Sensor
+        The rigorous model; line 0 and pixel 0 are the format's row 1 and column 1.
+    epoch : str
+        UTC from which the sensor's times count.
     """
 
     read: DimapPass
@@ -399,13 +429,19 @@ class DimapScene:
 def read_scene(path: str | Path, band: str | None = None, effects: LightEffects | None = None) -> DimapScene:
     """The scene of a DIMAP file.
 
-    Args:
-        path: of its file DIM_*.XML.
-        band: whose looks are taken; may be left out where all bands have the same.
-        effects: what happens to the light; None for refraction where the file says so, and nothing else.
+    Parameters
+    ----------
+    path : str | Path
+        Of its file DIM_*.XML.
+    band : str | None
+        Whose looks are taken; may be left out where all bands have the same.
+    effects : LightEffects | None
+        What happens to the light; None for refraction where the file says so, and nothing else.
 
-    Raises:
-        InputError: it cannot be read, or its orbit or attitude do not reach over the image.
+    Raises
+    ------
+    InputError
+        It cannot be read, or its orbit or attitude do not reach over the image.
     """
     read = read_dimap(path, band)
     readings = PlatformReadings(read.spanning_orbit(), read.samples(), None)

@@ -40,14 +40,21 @@ def first_lines(path: str | Path, what: str, count: int = 20) -> Iterator[str]:
 def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], heads: Sequence[str]) -> np.ndarray:
     """(N, K) floats of N rows of K texts.
 
-    Args:
-        file: for messages.
-        cells: the rows.
-        lines: (N,) of the rows in the file.
-        heads: (K,) what the columns are, for messages.
+    Parameters
+    ----------
+    file : str
+        For messages.
+    cells : Sequence[Sequence[str]]
+        The rows.
+    lines : Sequence[int]
+        (N,) of the rows in the file.
+    heads : Sequence[str]
+        (K,) what the columns are, for messages.
 
-    Raises:
-        InputError: a row with another number of texts, one that is no number, not finite, or beyond LARGEST_NUMBER.
+    Raises
+    ------
+    InputError
+        a row with another number of texts, one that is no number, not finite, or beyond LARGEST_NUMBER.
     """
     width = len(heads)
     uneven = next((k for k, row in enumerate(cells) if len(row) != width), None)
@@ -108,14 +115,22 @@ _NONE: Mapping[str, str] = FrozenMap()
 class Element:
     """An element.
 
-    Attributes:
-        tag: its name.
-        file: where it stands.
-        line: of its start, counted from 1.
-        attributes: by name.
-        path: tags from the document's root to it.
-        children: in order.
-        text: between its tags, without spaces at the ends; that of its children left out.
+    Attributes
+    ----------
+    tag : str
+        Its name.
+    file : str
+        Where it stands.
+    line : int
+        Of its start, counted from 1.
+    attributes : Mapping[str, str]
+        By name.
+    path : tuple[str, ...]
+        Tags from the document's root to it.
+    children : list[Element]
+        In order.
+    text : str
+        Between its tags, without spaces at the ends; that of its children left out.
     """
 
     tag: str
@@ -148,8 +163,10 @@ class Element:
     def maybe(self, *tags: str) -> Element | None:
         """The element at a path below this one; None where there is none.
 
-        Raises:
-            InputError: there are several.
+        Raises
+        ------
+        InputError
+            There are several.
         """
         found = self.all(*tags)
         if len(found) > 1:
@@ -159,8 +176,10 @@ class Element:
     def one(self, *tags: str) -> Element:
         """The element at a path below this one.
 
-        Raises:
-            InputError: there is none, or there are several.
+        Raises
+        ------
+        InputError
+            There is none, or there are several.
         """
         found = self.maybe(*tags)
         if found is not None:
@@ -184,8 +203,10 @@ class Element:
     def floats(self, count: int | None = None) -> np.ndarray:
         """Its numbers, (count,), parted by spaces or commas; any number of them where count is None.
 
-        Raises:
-            InputError: another number of them, something that is none, or not finite.
+        Raises
+        ------
+        InputError
+            Another number of them, something that is none, or not finite.
         """
         cells = self.text.replace(",", " ").split()
         if not cells or (count is not None and len(cells) != count):
@@ -200,14 +221,21 @@ class Element:
     ) -> float:
         """The number at a path below this one.
 
-        Args:
-            tags: of the path.
-            least: it may be.
-            most: it may be.
-            unit: what its attribute ``unit`` may be -> by what the number is multiplied; the first where it has none.
+        Parameters
+        ----------
+        tags : str
+            Of the path.
+        least : float
+            It may be.
+        most : float
+            It may be.
+        unit : Mapping[str, float] | None
+            What its attribute ``unit`` may be -> by what the number is multiplied; the first where it has none.
 
-        Raises:
-            InputError: none, no number, beyond the bounds, another unit.
+        Raises
+        ------
+        InputError
+            None, no number, beyond the bounds, another unit.
         """
         found = self.one(*tags) if tags else self
         value = float(found.floats(1)[0])
@@ -286,12 +314,17 @@ class _Builder:
 def read_xml(path: str | Path, what: str) -> Element:
     """The root of a file.
 
-    Args:
-        path: of the file, UTF-8.
-        what: it should be, for messages.
+    Parameters
+    ----------
+    path : str | Path
+        Of the file, UTF-8.
+    what : str
+        It should be, for messages.
 
-    Raises:
-        InputError: there is none, it is too large, not XML, or has a document type or entities.
+    Raises
+    ------
+    InputError
+        There is none, it is too large, not XML, or has a document type or entities.
     """
     return parsed_xml(table_text(path, what, _MOST_BYTES), str(path))
 
@@ -299,9 +332,12 @@ def read_xml(path: str | Path, what: str) -> Element:
 def parsed_xml(text: str, file: str) -> Element:
     """The root of a document that was read; raises as `read_xml`.
 
-    Args:
-        text: of it.
-        file: for messages.
+    Parameters
+    ----------
+    text : str
+        Of it.
+    file : str
+        For messages.
     """
     builder = _Builder(file)
     try:

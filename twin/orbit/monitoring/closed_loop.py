@@ -67,12 +67,18 @@ _DRAWN = 20
 class Corrector:
     """One correction on its instrument.
 
-    Attributes:
-        name: of it.
-        spec: what the file says.
-        motion: of its mechanism; None for a correction on the ground.
-        row: number of its quantity, of P.
-        effect: (P,) what 1 rad or 1 m of it does to the quantities; spots: (D,) to the spots, px.
+    Attributes
+    ----------
+    name : str
+        Of it.
+    spec : CorrectionSpec
+        What the file says.
+    motion : ElementaryMotion | None
+        Of its mechanism; None for a correction on the ground.
+    row : int
+        Number of its quantity, of P.
+    effect : np.ndarray
+        (P,) what 1 rad or 1 m of it does to the quantities; spots: (D,) to the spots, px.
     """
 
     name: str
@@ -98,10 +104,14 @@ class Corrector:
 class LoopModel:
     """A loop on its instrument.
 
-    Attributes:
-        experiment: the instrument.
-        stated: what moves, with all P quantities in place of the parameters.
-        correctors: by name, in the order of the names, so that their order in the file does not matter.
+    Attributes
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    stated : Disturbances
+        What moves, with all P quantities in place of the parameters.
+    correctors : tuple[Corrector, ...]
+        By name, in the order of the names, so that their order in the file does not matter.
     """
 
     experiment: MonitorExperiment
@@ -124,9 +134,12 @@ class LoopModel:
     def moved(self, state: State, positions: np.ndarray) -> State:
         """A state with the mechanisms at positions, which do what they really do.
 
-        Args:
-            state: without them.
-            positions: (n,) of the correctors, rad or m.
+        Parameters
+        ----------
+        state : State
+            Without them.
+        positions : np.ndarray
+            (n,) of the correctors, rad or m.
         """
         bodies = {body.path: body for body in self.experiment.instrument.assembly.tree.bodies}
         for one, position in zip(self.correctors, positions.tolist(), strict=True):
@@ -174,10 +187,13 @@ def _row(cameras: Sequence[str], camera: str, quantity: str) -> int:
 def loop_model(setup: MonitorSetup, experiment: MonitorExperiment) -> LoopModel:
     """Trace what moves and what the mechanisms do.
 
-    Raises:
-        InputError: a mechanism that the instrument does not have, or that does nothing to its quantity; a node that
-            does not exist or does not move so.
-        AimError, BeamMissedError: light is lost.
+    Raises
+    ------
+    InputError
+        a mechanism that the instrument does not have, or that does nothing to its quantity; a node that does not exist
+        or does not move so.
+    AimError, BeamMissedError
+        Light is lost.
     """
     stated, motions = experiment.disturbances, experiment.stated
     assert stated is not None  # the set-up states them
@@ -244,17 +260,28 @@ def _mechanism(
 class LoopCourse:
     """One way through the moments: with the loop closed or open.
 
-    Attributes:
-        model: of the loop.
-        times: (T,) seconds from the orbit's epoch.
-        positions: (T, n) where the mechanisms are told to stand when images are taken, rad or m.
-        held: (T, n) whether a command was held by the end of a range.
-        expected: (T, P) what the posterior says of the quantities when images are taken.
-        covariance: (T, P, P) of its error.
-        chi_square: (T,) of the readings against what was expected of them before they came.
-        jumps: that the filter told.
-        states: of the moments, when images are taken.
-        evidence: what the fits of the spots say of their sigmas; None where nobody judged them.
+    Attributes
+    ----------
+    model : LoopModel
+        Of the loop.
+    times : np.ndarray
+        (T,) seconds from the orbit's epoch.
+    positions : np.ndarray
+        (T, n) where the mechanisms are told to stand when images are taken, rad or m.
+    held : np.ndarray
+        (T, n) whether a command was held by the end of a range.
+    expected : np.ndarray
+        (T, P) what the posterior says of the quantities when images are taken.
+    covariance : np.ndarray
+        (T, P, P) of its error.
+    chi_square : np.ndarray
+        (T,) of the readings against what was expected of them before they came.
+    jumps : tuple[Jump, ...]
+        That the filter told.
+    states : tuple[State, ...]
+        Of the moments, when images are taken.
+    evidence : SpotEvidence | None
+        What the fits of the spots say of their sigmas; None where nobody judged them.
     """
 
     model: LoopModel
@@ -300,8 +327,10 @@ def drifting_states(spec: OrbitMonitorSpec, experiment: MonitorExperiment, seed:
     """States of the moments without any mechanism: by the file's course, or by amounts that are drawn by their laws;
     with the motions of the file.
 
-    Raises:
-        InputError: a node that does not exist or does not move so.
+    Raises
+    ------
+    InputError
+        a node that does not exist or does not move so.
     """
     spec.check_nodes(experiment.instrument.nodes)
     if spec.course is not None:
@@ -325,10 +354,14 @@ def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:
 
     It raises BenchError where light is lost or a spot cannot be measured.
 
-    Args:
-        model: of the loop.
-        spec: the test.
-        seed: of the detectors.
+    Parameters
+    ----------
+    model : LoopModel
+        Of the loop.
+    spec : OrbitMonitorSpec
+        The test.
+    seed : int
+        Of the detectors.
     """
     experiment, errors = model.experiment, spec.errors
     frames = spec.frames or experiment.instrument.spec.autocollimator.frames
@@ -368,13 +401,20 @@ def gone_through(
 ) -> LoopCourse:
     """Go through the moments.
 
-    Args:
-        model: of the loop.
-        spec: the test.
-        states: of its T moments without mechanisms.
-        read: as of `reader`.
-        open_loop: leave all mechanisms where they are.
-        advance: told of the number of moments that are done.
+    Parameters
+    ----------
+    model : LoopModel
+        Of the loop.
+    spec : OrbitMonitorSpec
+        The test.
+    states : Sequence[State]
+        Of its T moments without mechanisms.
+    read : Read
+        As of `reader`.
+    open_loop : bool
+        Leave all mechanisms where they are.
+    advance : Callable[[int], None]
+        Told of the number of moments that are done.
     """
     commands = Commands.none(model, open_loop)
     rows: list[tuple[np.ndarray, ...]] = []
@@ -419,11 +459,16 @@ def gone_through(
 class Commands:
     """Commands to n mechanisms.
 
-    Attributes:
-        model: of the loop.
-        idle: whether none is given.
-        given_before: (n,) rad or m, the newest first; empty before any reading.
-        held: (n,) whether the newest was held by the end of a range.
+    Attributes
+    ----------
+    model : LoopModel
+        Of the loop.
+    idle : bool
+        Whether none is given.
+    given_before : tuple[np.ndarray, ...]
+        (n,) rad or m, the newest first; empty before any reading.
+    held : np.ndarray
+        (n,) whether the newest was held by the end of a range.
     """
 
     model: LoopModel
@@ -449,8 +494,10 @@ class Commands:
     def given(self, mean: np.ndarray) -> Commands:
         """Commands after a reading.
 
-        Args:
-            mean: (P,) what the posterior says would be there without mechanisms.
+        Parameters
+        ----------
+        mean : np.ndarray
+            (P,) what the posterior says would be there without mechanisms.
         """
         left = mean + self.model.effects @ self.standing
         count = len(self.model.correctors)

@@ -65,12 +65,18 @@ if TYPE_CHECKING:
 class ImagedPair:
     """Points that were matched in one pair of images, and intersected.
 
-    Attributes:
-        moment: number of the reading after which they are taken.
-        errors: (n, 3) of the points that were matched: found minus true, east, north, up, metres.
-        misplaced: (n, 2) found minus true place in the first camera's image, lines and pixels.
-        sigma: (2,) that matching states of it, median, lines and pixels.
-        sought: points that were sought.
+    Attributes
+    ----------
+    moment : int
+        Number of the reading after which they are taken.
+    errors : np.ndarray
+        (n, 3) of the points that were matched: found minus true, east, north, up, metres.
+    misplaced : np.ndarray
+        (n, 2) found minus true place in the first camera's image, lines and pixels.
+    sigma : np.ndarray
+        (2,) that matching states of it, median, lines and pixels.
+    sought : int
+        Points that were sought.
     """
 
     moment: int
@@ -103,18 +109,29 @@ def imaged_pair(
 ) -> ImagedPair:
     """Render, match and intersect.
 
-    Args:
-        setup: the loop.
-        flight: lines as they truly are, and as calibrated in the analysis's form.
-        moment: number of the reading.
-        nominal: camera -> its line as it was calibrated.
-        changes: camera -> (4,) what the processing takes for its change.
-        foci: camera -> its defocus, metres.
-        flown: orbit and attitude.
-        seed: of ground and frames.
+    Parameters
+    ----------
+    setup : MonitorSetup
+        The loop.
+    flight : PairFlight
+        Lines as they truly are, and as calibrated in the analysis's form.
+    moment : int
+        Number of the reading.
+    nominal : Mapping[str, LineCamera]
+        Camera -> its line as it was calibrated.
+    changes : Mapping[str, np.ndarray]
+        Camera -> (4,) what the processing takes for its change.
+    foci : Mapping[str, float]
+        Camera -> its defocus, metres.
+    flown : Flown
+        Orbit and attitude.
+    seed : np.random.SeedSequence
+        Of ground and frames.
 
-    Raises:
-        BenchError: a patch that a line cannot image, or too few points in it.
+    Raises
+    ------
+    BenchError
+        a patch that a line cannot image, or too few points in it.
     """
     spec, pair, images = setup.test, setup.pair, setup.test.loop.images
     assert images is not None
@@ -201,15 +218,24 @@ FOCUS_SCALE = 10e-6
 class LoopPass:
     """One course with what it truly leaves.
 
-    Attributes:
-        course: of it.
-        flight: its lines and check points.
-        truth: (T, P) true quantities when images are taken, less what the processing corrects.
-        heights: errors at the check points.
-        slopes: (T, P) of the mean height error by the quantities, m/rad and m/m.
-        angle: (P,) row of the angle between the pair's lines of sight, opening positive.
-        mtf: camera -> (T, 2) at Nyquist along the line and along the track, mean over the fields.
-        images: pairs of line images, at the moments that the file names.
+    Attributes
+    ----------
+    course : LoopCourse
+        Of it.
+    flight : PairFlight
+        Its lines and check points.
+    truth : np.ndarray
+        (T, P) true quantities when images are taken, less what the processing corrects.
+    heights : CaseErrors
+        Errors at the check points.
+    slopes : np.ndarray
+        (T, P) of the mean height error by the quantities, m/rad and m/m.
+    angle : np.ndarray
+        (P,) row of the angle between the pair's lines of sight, opening positive.
+    mtf : Mapping[str, np.ndarray]
+        Camera -> (T, 2) at Nyquist along the line and along the track, mean over the fields.
+    images : tuple[ImagedPair, ...]
+        Pairs of line images, at the moments that the file names.
     """
 
     course: LoopCourse
@@ -224,8 +250,10 @@ class LoopPass:
     def posterior(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(T,) what the posterior says of a quantity, and its sigma.
 
-        Args:
-            rows: (P,) or (T, P) of it on the quantities.
+        Parameters
+        ----------
+        rows : np.ndarray
+            (P,) or (T, P) of it on the quantities.
         """
         each = np.broadcast_to(rows, self.truth.shape)
         value = np.einsum("tp,tp->t", each, self.course.expected)
@@ -247,12 +275,18 @@ class LoopPass:
 class LoopFacts:
     """One correction as a loop.
 
-    Attributes:
-        corrector: of it.
-        loop_gain: gain, times what the spots tell of what the mechanism does beyond what is known.
-        margins: of this gain with the delay.
-        cycle: of a mechanism of whole steps; None for another one.
-        ends: numbers of the moments at which the end of the range held it.
+    Attributes
+    ----------
+    corrector : Corrector
+        Of it.
+    loop_gain : float
+        Gain, times what the spots tell of what the mechanism does beyond what is known.
+    margins : Margins
+        Of this gain with the delay.
+    cycle : LimitCycle | None
+        Of a mechanism of whole steps; None for another one.
+    ends : tuple[int, ...]
+        Numbers of the moments at which the end of the range held it.
     """
 
     corrector: Corrector
@@ -266,16 +300,26 @@ class LoopFacts:
 class LoopRun:
     """A finished loop.
 
-    Attributes:
-        setup: what its file says.
-        seed: of all random numbers.
-        model: of the loop.
-        closed: with the corrections; open: without.
-        loops: of the corrections, by name.
-        radius: largest size of the eigenvalues of all loops together.
-        margin: by how much all gains together may be larger.
-        modes: what no spot shows; quantities are height (m) and the defocus (m) of the pair.
-        unseen: (3, T) standard deviations of the same that no estimate from the spots can have less of.
+    Attributes
+    ----------
+    setup : MonitorSetup
+        What its file says.
+    seed : int
+        Of all random numbers.
+    model : LoopModel
+        Of the loop.
+    closed : LoopPass
+        With the corrections; open: without.
+    loops : Mapping[str, LoopFacts]
+        Of the corrections, by name.
+    radius : float
+        Largest size of the eigenvalues of all loops together.
+    margin : float
+        By how much all gains together may be larger.
+    modes : tuple[UnseenMode, ...]
+        What no spot shows; quantities are height (m) and the defocus (m) of the pair.
+    unseen : np.ndarray
+        (3, T) standard deviations of the same that no estimate from the spots can have less of.
     """
 
     setup: MonitorSetup
@@ -344,11 +388,16 @@ _SCALE = np.array([1.0, FOCUS_SCALE, FOCUS_SCALE])
 def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> LoopRun:
     """Draw, render, read, correct, look down: `run_monitor` of a test with mechanisms.
 
-    Raises:
-        InputError: a mechanism or a node that the instrument does not have, or that does not move so.
-        BenchError: the loop cannot be run as its file says.
-        AimError, BeamMissedError: light is lost.
-        IntersectionError: rays that are parallel.
+    Raises
+    ------
+    InputError
+        a mechanism or a node that the instrument does not have, or that does not move so.
+    BenchError
+        The loop cannot be run as its file says.
+    AimError, BeamMissedError
+        Light is lost.
+    IntersectionError
+        Rays that are parallel.
     """
     spec, pair = setup.test, setup.pair
     ground_seed, monitor_seed = np.random.SeedSequence(seed).spawn(2)

@@ -45,15 +45,22 @@ def states_of(
 ) -> list[State]:
     """States at times of the course.
 
-    Args:
-        experiment: the instrument.
-        spec: the test.
-        numbers: of the times, all by default.
-        only: "temperature" or "motion", and the node of the course that alone has one; the others of the course have
-            temperatures of 0 K, so that nothing is inherited. What `perturb` says stays.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    spec : OrbitMonitorSpec
+        The test.
+    numbers : Sequence[int] | None
+        Of the times, all by default.
+    only : tuple[str, str] | None
+        "temperature" or "motion", and the node of the course that alone has one; the others of the course have
+        temperatures of 0 K, so that nothing is inherited. What `perturb` says stays.
 
-    Raises:
-        InputError: a temperature at or below 0 K at some time, or one at which a glass's index is not known.
+    Raises
+    ------
+    InputError
+        a temperature at or below 0 K at some time, or one at which a glass's index is not known.
     """
     job, bodies = spec.job, {body.path: body for body in experiment.instrument.assembly.tree.bodies}
     course, out = spec.course, []
@@ -78,11 +85,16 @@ def states_of(
 class Readings:
     """Changes of two cameras since the reference at T times.
 
-    Attributes:
-        cameras: names of the two.
-        values: (T, 8) d_alpha, d_beta, d_gamma (rad), d_f (m) of the first, then of the second.
-        noise: (T, 8, 8) covariance of their errors by the noise of the images.
-        total: likewise of the whole error; None where nothing is stated to move.
+    Attributes
+    ----------
+    cameras : tuple[str, str]
+        Names of the two.
+    values : np.ndarray
+        (T, 8) d_alpha, d_beta, d_gamma (rad), d_f (m) of the first, then of the second.
+    noise : np.ndarray
+        (T, 8, 8) covariance of their errors by the noise of the images.
+    total : np.ndarray | None
+        Likewise of the whole error; None where nothing is stated to move.
     """
 
     cameras: tuple[str, str]
@@ -110,10 +122,14 @@ class Readings:
 class SmoothedReadings:
     """All measurements at one interval together.
 
-    Attributes:
-        readings: at all times of the course.
-        consistency: chi-square of the measurements.
-        jumps: that were found; None where nothing is stated to jump.
+    Attributes
+    ----------
+    readings : Readings
+        At all times of the course.
+    consistency : Consistency
+        Chi-square of the measurements.
+    jumps : tuple[Jump, ...] | None
+        That were found; None where nothing is stated to jump.
     """
 
     readings: Readings
@@ -125,12 +141,18 @@ class SmoothedReadings:
 class Measured:
     """Shifts of all spots since the reference images, of S states.
 
-    Attributes:
-        positions: (2, S, C, 2) before and after, px.
-        covariance: (S, 2 C, 2 C) px^2 of each state's shifts.
-        noise: of the shifts of all states together; None where they are not of one series.
-        evidence: what the fits of the spots say of their sigmas.
-        truth: of the states.
+    Attributes
+    ----------
+    positions : np.ndarray
+        (2, S, C, 2) before and after, px.
+    covariance : np.ndarray
+        (S, 2 C, 2 C) px^2 of each state's shifts.
+    noise : SeriesNoise | None
+        Of the shifts of all states together; None where they are not of one series.
+    evidence : SpotEvidence
+        What the fits of the spots say of their sigmas.
+    truth : tuple[Truth, ...]
+        Of the states.
     """
 
     positions: np.ndarray
@@ -150,9 +172,12 @@ class Measured:
     def doubts(self, times: Sequence[float], spots: Sequence[str]) -> tuple[str, ...]:
         """A warning where sigma does not hold: at the worst of the states.
 
-        Args:
-            times: of the states, seconds.
-            spots: their names.
+        Parameters
+        ----------
+        times : Sequence[float]
+            Of the states, seconds.
+        spots : Sequence[str]
+            Their names.
         """
         doubt = self.evidence.course_doubt([moment(time) for time in times], spots)
         return () if doubt is None else (doubt,)
@@ -178,11 +203,16 @@ class MonitorSeries:
     """A monitor with its reference images. Where disturbances are stated each state is read by `posterior`, with what
     they are expected to change since the reference; else by `model`.
 
-    Args:
-        experiment: the instrument with its calibration on the ground.
-        spec: the test.
-        reference: state at the reference time.
-        pair: the two cameras.
+    Parameters
+    ----------
+    experiment
+        The instrument with its calibration on the ground.
+    spec
+        The test.
+    reference
+        State at the reference time.
+    pair
+        The two cameras.
     """
 
     def __init__(
@@ -203,9 +233,12 @@ class MonitorSeries:
     def measured(self, states: Sequence[State], seed: int) -> tuple[Measured, Measured]:
         """From exposed frames, and from expected images without noise.
 
-        Raises:
-            BenchError: a spot cannot be measured.
-            AimError, BeamMissedError: light is lost.
+        Raises
+        ------
+        BenchError
+            a spot cannot be measured.
+        AimError, BeamMissedError
+            Light is lost.
         """
         # a stream of its own: states are numbered from 0
         first = self._reference_spots(self._exposed(self.reference, seed, len(states)))
@@ -248,9 +281,12 @@ class MonitorSeries:
     def gains(self, measured: Measured, numbers: Sequence[int]) -> np.ndarray:
         """(S, 8, 2 C) of the estimator, parameters of the pair per pixel.
 
-        Args:
-            measured: S states.
-            numbers: of their times.
+        Parameters
+        ----------
+        measured : Measured
+            S states.
+        numbers : Sequence[int]
+            Of their times.
         """
         stated, spec = self.experiment.disturbances, self.spec
         cameras, (before, after) = self.experiment.cameras, measured.positions
@@ -267,9 +303,12 @@ class MonitorSeries:
     def readings(self, measured: Measured, numbers: Sequence[int]) -> Readings:
         """Return what the shifts of each state say alone.
 
-        Args:
-            measured: S states.
-            numbers: of their times.
+        Parameters
+        ----------
+        measured : Measured
+            S states.
+        numbers : Sequence[int]
+            Of their times.
         """
         gains = self.gains(measured, numbers)
         noise = gains @ measured.covariance @ np.swapaxes(gains, 1, 2)
@@ -287,9 +326,12 @@ class MonitorSeries:
     def smoothed(self, measured: Measured, interval: float) -> SmoothedReadings:
         """From the measurements at one interval, at all times.
 
-        Args:
-            measured: all times of the course.
-            interval: seconds.
+        Parameters
+        ----------
+        measured : Measured
+            All times of the course.
+        interval : float
+            seconds.
         """
         stated, noise = self.experiment.disturbances, measured.noise
         if stated is None or noise is None:
@@ -311,9 +353,12 @@ class MonitorSeries:
     def by_camera(self, gains: np.ndarray, shifts: np.ndarray) -> Mapping[str, np.ndarray]:
         """Camera -> (S, 4) what an estimator makes of shifts.
 
-        Args:
-            gains: (S, 8, 2 C) or (8, 2 C).
-            shifts: (S, 2 C).
+        Parameters
+        ----------
+        gains : np.ndarray
+            (S, 8, 2 C) or (8, 2 C).
+        shifts : np.ndarray
+            (S, 2 C).
         """
         values = np.einsum("...pd,...d->...p", gains, shifts)
         return {name: values[:, 4 * k : 4 * k + 4] for k, name in enumerate(self.pair)}
@@ -336,11 +381,16 @@ class MonitorSeries:
     ) -> list[tuple[list[Recovery], SeriesNoise | None, list[Truth]]]:
         """Observe the same states by several ways to record images, piece by piece, as `Measured.of` takes it.
 
-        Args:
-            states: to be observed.
-            records: ways to record.
-            numbers: of the states' times; those of the course if not given.
-            series: whether the states are those of the course, whose noise is wanted together.
+        Parameters
+        ----------
+        states : Sequence[State]
+            To be observed.
+        records : Sequence[Record]
+            Ways to record.
+        numbers : Sequence[int]
+            Of the states' times; those of the course if not given.
+        series : bool
+            Whether the states are those of the course, whose noise is wanted together.
         """
         experiment, spots = self.experiment, self.experiment.calibration.spots
         series = series and experiment.disturbances is not None

@@ -54,11 +54,16 @@ FALSE_ALARM = 1e-4
 class Cause:
     """One entry of the file alone, all others without effect.
 
-    Attributes:
-        what: temperature or motion.
-        path: of the node.
-        truth: camera -> (4,) true changes since the reference.
-        error: camera -> (4,) what the monitor says, without noise, minus the truth.
+    Attributes
+    ----------
+    what : str
+        Temperature or motion.
+    path : str
+        Of the node.
+    truth : Mapping[str, np.ndarray]
+        Camera -> (4,) true changes since the reference.
+    error : Mapping[str, np.ndarray]
+        Camera -> (4,) what the monitor says, without noise, minus the truth.
     """
 
     what: str
@@ -71,11 +76,15 @@ class Cause:
 class Conversion:
     """Metres of height for one arcsecond, at the reference time.
 
-    Attributes:
-        traced: camera -> height change when this camera alone is turned by 1 arcsec about its Y, by the trace, m.
-        theory: camera -> the same by base to height: slant range x 1 arcsec / cos(incidence) over the difference of the
-            tangents of both incidences, m.
-        base_to_height: that difference.
+    Attributes
+    ----------
+    traced : Mapping[str, float]
+        Camera -> height change when this camera alone is turned by 1 arcsec about its Y, by the trace, m.
+    theory : Mapping[str, float]
+        Camera -> the same by base to height: slant range x 1 arcsec / cos(incidence) over the difference of the
+        tangents of both incidences, m.
+    base_to_height : float
+        That difference.
     """
 
     traced: Mapping[str, float]
@@ -98,9 +107,12 @@ class Conversion:
 class Scatter:
     """Height errors of one time's points when the monitor measures again and again.
 
-    Attributes:
-        heights: (R,) mean height error from the monitor's values alone, metres.
-        sigma: by propagation of the claimed covariance, metres, mean over the repeats.
+    Attributes
+    ----------
+    heights : np.ndarray
+        (R,) mean height error from the monitor's values alone, metres.
+    sigma : float
+        By propagation of the claimed covariance, metres, mean over the repeats.
     """
 
     heights: np.ndarray
@@ -129,12 +141,18 @@ class Scatter:
 class Smoothing:
     """Heights by values smoothed from the measurements at one interval.
 
-    Attributes:
-        case: errors.
-        interpolated: errors with values interpolated between the same measurements.
-        error: (T,) mean height error by what the smoothed values are wrong, to first order, metres.
-        sigma: (T,) of the same as the smoother states it, metres; 0 at the reference.
-        consistency: chi-square of the measured shifts under the stated disturbances.
+    Attributes
+    ----------
+    case : CaseErrors
+        errors.
+    interpolated : CaseErrors
+        Errors with values interpolated between the same measurements.
+    error : np.ndarray
+        (T,) mean height error by what the smoothed values are wrong, to first order, metres.
+    sigma : np.ndarray
+        (T,) of the same as the smoother states it, metres; 0 at the reference.
+    consistency : Consistency
+        Chi-square of the measured shifts under the stated disturbances.
     """
 
     case: CaseErrors
@@ -175,23 +193,38 @@ class MonitorRun(PairFlight):
     """A finished test: truth and measurements at T times, counted from the reference, at which the lines were
     calibrated, and what follows from them for heights.
 
-    Attributes:
-        setup: what its file says.
-        seed: of all random numbers.
-        looks: nominal look angles of the two cameras, radians.
-        truth: camera -> (T, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) since the reference.
-        true_angle: (T,) true angle between the lines of sight, radians.
-        estimator: by which the monitor's shifts are read.
-        monitored: what the monitor says of the cameras' changes since the reference.
-        together: seconds -> what all its measurements at this interval say together; empty where nothing is stated to
-            move.
-        clean: camera -> (T, 4) as monitored, from expected images without noise.
-        prisms: camera -> (T, 4) what temperatures that the file gives to prisms alone make it say, without noise.
-        repeated: what the monitor says at time `worst`, measured again and again.
-        worst: number of the time with the largest change of the angle.
-        causes: what each temperature and motion of the file does alone at time `worst`, without noise.
-        turned: camera -> its line at the reference when the whole camera is turned by 1 arcsec about its Y.
-        doubts: where the monitor's sigmas do not hold, for its spots are not as calibrated.
+    Attributes
+    ----------
+    setup : MonitorSetup
+        What its file says.
+    seed : int
+        Of all random numbers.
+    looks : tuple[float, float]
+        Nominal look angles of the two cameras, radians.
+    truth : Mapping[str, np.ndarray]
+        Camera -> (T, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) since the reference.
+    true_angle : np.ndarray
+        (T,) true angle between the lines of sight, radians.
+    estimator : str
+        By which the monitor's shifts are read.
+    monitored : Readings
+        What the monitor says of the cameras' changes since the reference.
+    together : Mapping[float, SmoothedReadings]
+        Seconds -> what all its measurements at this interval say together; empty where nothing is stated to move.
+    clean : Mapping[str, np.ndarray]
+        Camera -> (T, 4) as monitored, from expected images without noise.
+    prisms : Mapping[str, np.ndarray]
+        Camera -> (T, 4) what temperatures that the file gives to prisms alone make it say, without noise.
+    repeated : Readings
+        What the monitor says at time `worst`, measured again and again.
+    worst : int
+        Number of the time with the largest change of the angle.
+    causes : tuple[Cause, ...]
+        What each temperature and motion of the file does alone at time `worst`, without noise.
+    turned : Mapping[str, LineCamera]
+        Camera -> its line at the reference when the whole camera is turned by 1 arcsec about its Y.
+    doubts : tuple[str, ...]
+        Where the monitor's sigmas do not hold, for its spots are not as calibrated.
     """
 
     setup: MonitorSetup
@@ -228,9 +261,12 @@ class MonitorRun(PairFlight):
     def variance(self, covariance: np.ndarray, at: int | None = None) -> np.ndarray:
         """Variance (S,) of the mean height by the pair's values, m^2.
 
-        Args:
-            covariance: (S, 8, 8) of the pair's values.
-            at: number of the time to which all of them belong; None for one of each time.
+        Parameters
+        ----------
+        covariance : np.ndarray
+            (S, 8, 8) of the pair's values.
+        at : int | None
+            Number of the time to which all of them belong; None for one of each time.
         """
         both = np.concatenate([self.slopes[n] * self.mask for n in self.pair], axis=1)
         slope = both if at is None else both[at]
@@ -390,9 +426,12 @@ class MonitorRun(PairFlight):
 def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance = silent) -> MonitorRun | LoopRun:
     """Fly, measure, intersect: ``python -m twin.orbit monitor``; with mechanisms the loop is closed.
 
-    Raises:
-        InputError: an unknown node, a mechanism that the instrument does not have, or an impossible temperature.
-        BenchError: the test cannot be carried out as its file says.
+    Raises
+    ------
+    InputError
+        An unknown node, a mechanism that the instrument does not have, or an impossible temperature.
+    BenchError
+        The test cannot be carried out as its file says.
     """
     spec = setup.test
     try:
@@ -411,10 +450,14 @@ def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advan
 def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorRun:
     """Trace, render, measure, look down.
 
-    Raises:
-        InputError: an unknown node or an impossible temperature.
-        BenchError: the test cannot be carried out as its file says.
-        AimError, BeamMissedError: light is lost.
+    Raises
+    ------
+    InputError
+        An unknown node or an impossible temperature.
+    BenchError
+        The test cannot be carried out as its file says.
+    AimError, BeamMissedError
+        Light is lost.
     """
     spec, pair = setup.test, setup.pair
     ground_seed, monitor_seed = np.random.SeedSequence(seed).spawn(2)

@@ -54,10 +54,14 @@ def rms(values: np.ndarray) -> float:
 def moves_at(spec: OrbitMonitorSpec, time: float, only: str | None = None) -> State:
     """Motions of the file at a time.
 
-    Args:
-        spec: the test.
-        time: seconds.
-        only: node that alone moves; all by default.
+    Parameters
+    ----------
+    spec : OrbitMonitorSpec
+        The test.
+    time : float
+        seconds.
+    only : str | None
+        Node that alone moves; all by default.
     """
     moves = {}
     for path, motion in spec.motion.items():
@@ -72,10 +76,14 @@ def moves_at(spec: OrbitMonitorSpec, time: float, only: str | None = None) -> St
 class View:
     """Check points at one time.
 
-    Attributes:
-        ground: (n, 3) true, ITRS, metres.
-        exact: of each camera of the pair, as it truly is, with the true orbit and attitude.
-        seen: as measured.
+    Attributes
+    ----------
+    ground : np.ndarray
+        (n, 3) true, ITRS, metres.
+    exact : tuple[Sightings, Sightings]
+        Of each camera of the pair, as it truly is, with the true orbit and attitude.
+    seen : tuple[Sightings, Sightings]
+        As measured.
     """
 
     ground: np.ndarray
@@ -87,12 +95,17 @@ class View:
 class CaseErrors:
     """Errors at the check points over T times.
 
-    Attributes:
-        plan: (T,) RMS, both axes, metres; height: (T,) likewise.
-        bias: (T,) mean of the height errors, found minus true.
-        camera: (T,) the same less that of the true cameras at the same image points, orbit and attitude: what the
-            cameras alone do.
-        camera_plan: (T,) RMS over the points of what the cameras alone do in plan; camera_height: likewise in height.
+    Attributes
+    ----------
+    plan : np.ndarray
+        (T,) RMS, both axes, metres; height: (T,) likewise.
+    bias : np.ndarray
+        (T,) mean of the height errors, found minus true.
+    camera : np.ndarray
+        (T,) the same less that of the true cameras at the same image points, orbit and attitude: what the cameras alone
+        do.
+    camera_plan : np.ndarray
+        (T,) RMS over the points of what the cameras alone do in plan; camera_height: likewise in height.
     """
 
     plan: np.ndarray
@@ -127,12 +140,18 @@ class CaseErrors:
 class PairFlight:
     """A stereo pair at T times of its orbit.
 
-    Attributes:
-        pair: names of the two cameras.
-        times: (T,) seconds from the orbit's epoch.
-        lines: of each time: camera -> its line as it truly is.
-        calibrated: camera -> its line as calibrated, which the ground knows.
-        views: check points of each time.
+    Attributes
+    ----------
+    pair : tuple[str, str]
+        Names of the two cameras.
+    times : np.ndarray
+        (T,) seconds from the orbit's epoch.
+    lines : tuple[Mapping[str, LineCamera], ...]
+        Of each time: camera -> its line as it truly is.
+    calibrated : Mapping[str, CalibratedLine]
+        Camera -> its line as calibrated, which the ground knows.
+    views : tuple[View, ...]
+        Check points of each time.
     """
 
     pair: tuple[str, str]
@@ -203,13 +222,19 @@ def traced_pair(experiment: MonitorExperiment, state: State, pair: tuple[str, st
 def point_errors(cameras: Sequence[CalibratedLine], view: View, exact_data: bool = False) -> np.ndarray:
     """Errors (n, 3) east, north, up of points that two cameras intersect, metres.
 
-    Args:
-        cameras: the two, as the analysis takes them.
-        view: the points.
-        exact_data: with exact image points, orbit and attitude.
+    Parameters
+    ----------
+    cameras : Sequence[CalibratedLine]
+        The two, as the analysis takes them.
+    view : View
+        The points.
+    exact_data : bool
+        With exact image points, orbit and attitude.
 
-    Raises:
-        IntersectionError: rays that are parallel.
+    Raises
+    ------
+    IntersectionError
+        Rays that are parallel.
     """
     seen = view.exact if exact_data else view.seen
     return check_errors(intersect_pair(cameras[0], cameras[1], *seen).ground, view.ground).error
@@ -218,9 +243,12 @@ def point_errors(cameras: Sequence[CalibratedLine], view: View, exact_data: bool
 def case_errors(found: np.ndarray, true: np.ndarray) -> CaseErrors:
     """Errors of a case.
 
-    Args:
-        found: (T, n, 3) errors east, north, up of the points, metres.
-        true: (T, n, 3) those by the true cameras with the same image points, orbit and attitude.
+    Parameters
+    ----------
+    found : np.ndarray
+        (T, n, 3) errors east, north, up of the points, metres.
+    true : np.ndarray
+        (T, n, 3) those by the true cameras with the same image points, orbit and attitude.
     """
     alone = found - true
     return CaseErrors(
@@ -242,15 +270,23 @@ def look_down(
 ) -> tuple[View, ...]:
     """Check points at every time, as both lines see them.
 
-    Args:
-        spec: of orbit, attitude, ground and errors.
-        pair: the two cameras.
-        lines: of each of the T times: camera -> its line as it truly is.
-        seed: of places and errors.
-        advance: told of the progress.
+    Parameters
+    ----------
+    spec : OrbitMonitorSpec
+        Of orbit, attitude, ground and errors.
+    pair : tuple[str, str]
+        The two cameras.
+    lines : Sequence[Mapping[str, LineCamera]]
+        Of each of the T times: camera -> its line as it truly is.
+    seed : np.random.SeedSequence
+        Of places and errors.
+    advance : Advance
+        Told of the progress.
 
-    Raises:
-        BenchError: no such orbit, or not enough points that both lines see.
+    Raises
+    ------
+    BenchError
+        No such orbit, or not enough points that both lines see.
     """
     flown, out = fly(spec, seed), []
     for k, line in enumerate(lines):
@@ -263,9 +299,12 @@ def look_down(
 class Flown:
     """Orbit and attitude.
 
-    Attributes:
-        earth: below them.
-        true: as they are; measured: as the satellite says.
+    Attributes
+    ----------
+    earth : Earth
+        Below them.
+    true : Trajectory
+        As they are; measured: as the satellite says.
     """
 
     earth: Earth
@@ -276,8 +315,10 @@ class Flown:
 def fly(spec: OrbitMonitorSpec, seed: np.random.SeedSequence) -> Flown:
     """Orbit and attitude of a test, the same for the same seed.
 
-    Raises:
-        BenchError: no such orbit.
+    Raises
+    ------
+    BenchError
+        No such orbit.
     """
     earth = Earth.from_spec(spec.earth)
     try:
@@ -332,14 +373,21 @@ def _view(
 def second_view(sensors: Sequence[Sensor], time: float, pixel: float, height: float) -> float:
     """When the second line sees a point that the first sees as long before ``time`` (or after it), seconds.
 
-    Args:
-        sensors: of the two lines.
-        time: between their views, seconds.
-        pixel: of the second line.
-        height: of the point, metres.
+    Parameters
+    ----------
+    sensors : Sequence[Sensor]
+        Of the two lines.
+    time : float
+        Between their views, seconds.
+    pixel : float
+        Of the second line.
+    height : float
+        Of the point, metres.
 
-    Raises:
-        BenchError: the first line does not see what the second sees.
+    Raises
+    ------
+    BenchError
+        The first line does not see what the second sees.
     """
     at = time
     for _ in range(20):

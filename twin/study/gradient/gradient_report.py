@@ -36,11 +36,16 @@ DOUBTFUL_TEXT = (
 def _write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings: Sequence[str] = ()) -> None:
     """Write report.html, its figures and tables into an open run folder.
 
-    Args:
-        setup: the study.
-        found: its Jacobian.
-        folder: where.
-        warnings: what the user should know.
+    Parameters
+    ----------
+    setup : StudySetup
+        The study.
+    found : Gradient
+        Its Jacobian.
+    folder : RunFolder
+        where.
+    warnings : Sequence[str]
+        What the user should know.
     """
     with svg.look("gradient"):
         figures = (
@@ -310,12 +315,17 @@ def _doubtful(found: Gradient) -> list[str]:
 def run_gradient(file: Path, options: cli.Options) -> None:
     """Read a study, differentiate it at its base, write gradient.json, gradient.csv and a report, print what they say.
 
-    Args:
-        file: of the study, or a config.yaml.
-        options: what the user chose.
+    Parameters
+    ----------
+    file : Path
+        Of the study, or a config.yaml.
+    options : cli.Options
+        What the user chose.
 
-    Raises:
-        typer.Exit: with the exit code of a failure, which has been told.
+    Raises
+    ------
+    typer.Exit
+        With the exit code of a failure, which has been told.
     """
     command.run_command(f"{file.stem}-gradient", options, lambda: read_for(PROGRAM, file, resolve_study), _work)
 

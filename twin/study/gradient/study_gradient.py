@@ -59,10 +59,14 @@ Slopes = Mapping[ElementaryMotion, float]
 def motion_slopes(about: State, state: Callable[[float], State], step: float) -> Slopes | None:
     """Derivative of a state's motions by a factor; None if the factor changes more than motions, figures and scales.
 
-    Args:
-        about: the state of the base.
-        state: change of the factor -> the state.
-        step: a change of the factor. Motions are linear in it, or nearly so where temperatures add to them.
+    Parameters
+    ----------
+    about : State
+        The state of the base.
+    state : Callable[[float], State]
+        Change of the factor -> the state.
+    step : float
+        a change of the factor. Motions are linear in it, or nearly so where temperatures add to them.
     """
     at = [state(share * step) for share in SHARES]
     slopes: dict[ElementaryMotion, float] = {}
@@ -103,9 +107,12 @@ class Chain:
     Spots are means of rays, which are the energy centroids of the images. An instrument without a monitor has none, and
     lines of sight alone.
 
-    Attributes:
-        resolved: the job.
-        experiment: its instrument.
+    Attributes
+    ----------
+    resolved : ResolvedJob
+        The job.
+    experiment : MonitorExperiment
+        Its instrument.
     """
 
     resolved: ResolvedJob
@@ -169,9 +176,12 @@ SHARES = (1.0, -1.0, 0.5, -0.5)
 def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Central differences with a step and its half, extrapolated after Richardson, and how far that went.
 
-    Args:
-        values: (4, ...) at the base plus ``SHARES`` times the step.
-        step: of the whole step.
+    Parameters
+    ----------
+    values : np.ndarray
+        (4, ...) at the base plus ``SHARES`` times the step.
+    step : float
+        Of the whole step.
     """
     wide, narrow = (values[0] - values[1]) / (2.0 * step), (values[2] - values[3]) / step
     return narrow + (narrow - wide) / 3.0, np.abs(narrow - wide) / 3.0
@@ -182,17 +192,26 @@ def sight_gradient(
 ) -> np.ndarray:
     """Derivative of the directions of ``twin.monitor.truth.LineSight.trace``.
 
-    Args:
-        instrument: the instrument.
-        backend: where to trace.
-        motions: M elementary motions, with the pivots that the bodies have in ``about``.
-        about: the state at which to differentiate.
+    Parameters
+    ----------
+    instrument : Instrument
+        The instrument.
+    backend : Backend
+        Where to trace.
+    motions : Sequence[ElementaryMotion]
+        M elementary motions, with the pivots that the bodies have in ``about``.
+    about : State
+        The state at which to differentiate.
 
-    Returns:
+    Returns
+    -------
+    np.ndarray
         (cameras, M, LINE_POINTS, 3), world, per radian, metre or unit.
 
-    Raises:
-        AimError, BeamMissedError: the state moves the image off the mirrors.
+    Raises
+    ------
+    AimError, BeamMissedError
+        The state moves the image off the mirrors.
     """
     assembly, names, m = instrument.assembly, list(instrument.cameras), len(motions)
     states = [_named(motion, about) for motion in motions]
@@ -235,13 +254,20 @@ def _named(motion: ElementaryMotion, about: State) -> State:
 class GradientFactor:
     """One factor.
 
-    Attributes:
-        setup: the study.
-        name: of the factor.
-        unit: of its numbers, empty for pure ones.
-        value: in the base.
-        spread: sigma of a normal distribution, else half of the range of its values; in its unit.
-        spread_of: which of the two, in words.
+    Attributes
+    ----------
+    setup : StudySetup
+        The study.
+    name : str
+        Of the factor.
+    unit : str
+        Of its numbers, empty for pure ones.
+    value : float
+        In the base.
+    spread : float
+        Sigma of a normal distribution, else half of the range of its values; in its unit.
+    spread_of : str
+        Which of the two, in words.
     """
 
     setup: StudySetup
@@ -255,8 +281,10 @@ class GradientFactor:
     def of(cls, setup: StudySetup, name: str) -> GradientFactor:
         """The factor of that name.
 
-        Raises:
-            InputError: it has no numbers, or the base has none where it acts.
+        Raises
+        ------
+        InputError
+            It has no numbers, or the base has none where it acts.
         """
         factor = setup.study.factors[name]
         numbers = factor.numbers()
@@ -284,8 +312,10 @@ class GradientFactor:
     def values(self, value: float) -> tuple[tuple[KeyPath, Any], ...]:
         """(place, what stands there) of all that the factor changes when it has this value; others are as in the base.
 
-        Raises:
-            InputError: a value that follows the factor cannot be worked out.
+        Raises
+        ------
+        InputError
+            a value that follows the factor cannot be worked out.
         """
         cell = with_unit(value, self.unit) if self.unit else value
         out: dict[KeyPath, Any] = dict.fromkeys(self.spec.places, cell)
@@ -338,16 +368,26 @@ AD_PART = "automatic differentiation"
 class Gradient:
     """Jacobian of R responses by F factors, per unit of the factor.
 
-    Attributes:
-        factors: what was differentiated by.
-        responses: names.
-        units: of the responses, empty for pure numbers.
-        ad: (R, F) by automatic differentiation; NaN where there is none.
-        differences: (R, F) by central differences.
-        error: (R, F) how far Richardson's extrapolation took the differences.
-        scale: (R, F) size of the terms that an entry is the difference of; the entry's own where there is one term.
-        step: (R, F) of the differences, in the factor's unit.
-        method: (R, F) names: how the best value was found.
+    Attributes
+    ----------
+    factors : tuple[GradientFactor, ...]
+        What was differentiated by.
+    responses : tuple[str, ...]
+        names.
+    units : tuple[str, ...]
+        Of the responses, empty for pure numbers.
+    ad : np.ndarray
+        (R, F) by automatic differentiation; NaN where there is none.
+    differences : np.ndarray
+        (R, F) by central differences.
+    error : np.ndarray
+        (R, F) how far Richardson's extrapolation took the differences.
+    scale : np.ndarray
+        (R, F) size of the terms that an entry is the difference of; the entry's own where there is one term.
+    step : np.ndarray
+        (R, F) of the differences, in the factor's unit.
+    method : np.ndarray
+        (R, F) names: how the best value was found.
     """
 
     factors: tuple[GradientFactor, ...]
@@ -404,9 +444,12 @@ class Gradient:
 class _Asked:
     """A response: where its number stands, and what is subtracted.
 
-    Attributes:
-        name: of the response.
-        spec: its keys.
+    Attributes
+    ----------
+    name : str
+        Of the response.
+    spec : ResponseSpec
+        Its keys.
     """
 
     name: str
@@ -447,15 +490,22 @@ class _Asked:
 def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silent) -> Gradient:
     """Differentiate a study at its base.
 
-    Args:
-        setup: the study; its design plays no part.
-        backend: where to trace.
-        advance: told of each kind of derivative by how many of how many factors it is done.
+    Parameters
+    ----------
+    setup : StudySetup
+        The study; its design plays no part.
+    backend : Backend
+        Where to trace.
+    advance : Advance
+        Told of each kind of derivative by how many of how many factors it is done.
 
-    Raises:
-        InputError: a factor or response has no number, the base's schema refuses a value beside the base's, or a
-            factor's step loses the light.
-        InputErrorText: the base itself cannot be run.
+    Raises
+    ------
+    InputError
+        a factor or response has no number, the base's schema refuses a value beside the base's, or a factor's step
+        loses the light.
+    InputErrorText
+        The base itself cannot be run.
     """
     factors = tuple(GradientFactor.of(setup, name) for name in setup.study.factors)
     asked = [_Asked(name, spec) for name, spec in setup.study.responses.items()]

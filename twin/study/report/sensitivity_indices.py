@@ -30,13 +30,19 @@ def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> t
     factor Legendre's polynomials, of a normal one Hermite's, of others, lists and texts those that Gram and Schmidt's
     method makes on the distribution itself. All functions of a text have degree 1.
 
-    Args:
-        axis: factors that vary together.
-        good: (runs,) which runs are used.
-        degree: the highest.
+    Parameters
+    ----------
+    axis : tuple[Factor, ...]
+        Factors that vary together.
+    good : np.ndarray
+        (runs,) which runs are used.
+    degree : int
+        The highest.
 
-    Raises:
-        _NoBasis: the axis has too many different texts.
+    Raises
+    ------
+    _NoBasis
+        The axis has too many different texts.
     """
     if len(axis) == 1 and axis[0].numeric:
         return _of_number(axis[0], axis[0].values[good], degree)
@@ -175,12 +181,18 @@ disagree, five standard deviations of the former for smooth responses of 100 to 
 class Index:
     """Sensitivity to an axis.
 
-    Attributes:
-        factors: names of the factors that vary together, mostly one.
-        first: share of the variance that the axis explains alone.
-        total: share that is gone when the axis is fixed.
-        check: first order by RBD-FAST, which needs no model; None where it cannot be used.
-        agrees: whether that lies within the interval of ``first``, but for its noise; None without it.
+    Attributes
+    ----------
+    factors : tuple[str, ...]
+        Names of the factors that vary together, mostly one.
+    first : Estimate
+        Share of the variance that the axis explains alone.
+    total : Estimate
+        Share that is gone when the axis is fixed.
+    check : float | None
+        First order by RBD-FAST, which needs no model; None where it cannot be used.
+    agrees : bool | None
+        Whether that lies within the interval of ``first``, but for its noise; None without it.
     """
 
     factors: tuple[str, ...]
@@ -199,15 +211,23 @@ class Index:
 class Indices:
     """Sensitivity indices of a response.
 
-    Attributes:
-        method: ``chaos``, polynomial chaos fitted to the runs, or ``grid``, the exact parts of a complete grid.
-        axes: the largest total first.
-        degree: of the polynomials; 0 for a grid.
-        terms: of them; 0 for a grid.
-        held_out: R2 of runs that the model was not fitted to, by leaving each out in turn; None for a grid.
-        rest: share of the variance that the model does not explain; 0 for a grid.
-        noise: share of the variance that the runs state as noise, as `noise_share`; None without. By chance above 1
-            where nothing else varies.
+    Attributes
+    ----------
+    method : str
+        ``chaos``, polynomial chaos fitted to the runs, or ``grid``, the exact parts of a complete grid.
+    axes : tuple[Index, ...]
+        The largest total first.
+    degree : int
+        Of the polynomials; 0 for a grid.
+    terms : int
+        Of them; 0 for a grid.
+    held_out : float | None
+        R2 of runs that the model was not fitted to, by leaving each out in turn; None for a grid.
+    rest : float
+        Share of the variance that the model does not explain; 0 for a grid.
+    noise : float | None
+        Share of the variance that the runs state as noise, as `noise_share`; None without. By chance above 1 where
+        nothing else varies.
     """
 
     method: str
@@ -238,9 +258,12 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
     intervals reach as far as any numbers within the range of the others would move them; where many have none, the
     others have another distribution than the factors, and there are no indices.
 
-    Args:
-        runs: of the study.
-        response: one of its responses or stated sigmas.
+    Parameters
+    ----------
+    runs : StudyRuns
+        Of the study.
+    response : Response
+        One of its responses or stated sigmas.
     """
     axes = [axis for axis in runs.axes if any(len(np.unique(f.values[response.good])) > 1 for f in axis)]
     if response.constant:
@@ -310,12 +333,18 @@ def _between(cells: np.ndarray, values: np.ndarray) -> float:
 class _Chaos:
     """Polynomials fitted to the runs.
 
-    Attributes:
-        terms: per coefficient but the constant: which function of each axis, (m, axes), 0 for none.
-        coefficients: (m,) of them.
-        q: (n, m + 1) orthonormal columns of the fit, r its triangle.
-        rest_values: (n,) what is left, each as if its run had been left out.
-        rest: share of the variance that is left.
+    Attributes
+    ----------
+    terms : np.ndarray
+        Per coefficient but the constant: which function of each axis, (m, axes), 0 for none.
+    coefficients : np.ndarray
+        (m,) of them.
+    q : np.ndarray
+        (n, m + 1) orthonormal columns of the fit, r its triangle.
+    rest_values
+        (n,) what is left, each as if its run had been left out.
+    rest : float
+        Share of the variance that is left.
     """
 
     axes: Sequence[tuple[Factor, ...]]
@@ -378,10 +407,14 @@ class _Chaos:
     def indices(self, noise: float, seed: int, missing: np.ndarray) -> tuple[Index, ...]:
         """Indices of every axis, the largest total first.
 
-        Args:
-            noise: variance of the noise that the runs state, 0 where they state none.
-            seed: of the resamples.
-            missing: (runs,) which runs have no number.
+        Parameters
+        ----------
+        noise : float
+            Variance of the noise that the runs state, 0 where they state none.
+        seed : int
+            Of the resamples.
+        missing : np.ndarray
+            (runs,) which runs have no number.
         """
         shares = self._shares()
         ends = [

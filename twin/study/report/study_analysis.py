@@ -22,13 +22,20 @@ from twin.study.report.study_statistics import Estimate, Response, StudyRuns
 class ParetoFront:
     """Non-dominated runs of a pair.
 
-    Attributes:
-        spec: the pair, and which way each is better.
-        runs: (m,) numbers of the runs on the front, from the best x to the best y.
-        x: (m,) their x.
-        y: (m,) their y.
-        ranks: (n,) of all runs: 0 on the front, 1 when the front is taken away, ...; -1 without numbers.
-        knee: index into ``runs`` of the strongest bulge; None where the front has none.
+    Attributes
+    ----------
+    spec : ParetoSpec
+        The pair, and which way each is better.
+    runs : np.ndarray
+        (m,) numbers of the runs on the front, from the best x to the best y.
+    x : np.ndarray
+        (m,) their x.
+    y : np.ndarray
+        (m,) their y.
+    ranks : np.ndarray
+        (n,) of all runs: 0 on the front, 1 when the front is taken away, ...; -1 without numbers.
+    knee : int | None
+        Index into ``runs`` of the strongest bulge; None where the front has none.
     """
 
     spec: ParetoSpec
@@ -42,10 +49,14 @@ class ParetoFront:
 def pareto_front(spec: ParetoSpec, x: np.ndarray, y: np.ndarray) -> ParetoFront:
     """The front of (n,) ``x`` and ``y``.
 
-    Args:
-        spec: the pair, and which way each is better.
-        x: (n,) of all runs.
-        y: (n,) of all runs.
+    Parameters
+    ----------
+    spec : ParetoSpec
+        The pair, and which way each is better.
+    x : np.ndarray
+        (n,) of all runs.
+    y : np.ndarray
+        (n,) of all runs.
     """
     good = np.isfinite(x) & np.isfinite(y)
     signs = {"min": 1.0, "max": -1.0}
@@ -101,15 +112,24 @@ def knee(costs: np.ndarray) -> int | None:
 class Requirement:
     """What became of a requirement.
 
-    Attributes:
-        name: of the requirement; empty for all of them together.
-        text: in words.
-        met: runs that meet it.
-        count: runs that have a number.
-        runs: all runs, those without a number too.
-        interval: of the share of those that have a number, in a drawn design; None in a grid.
-        judged: statistics of what is judged: the response, or its size; None for all together.
-        unit: of it.
+    Attributes
+    ----------
+    name : str
+        Of the requirement; empty for all of them together.
+    text : str
+        In words.
+    met : int
+        Runs that meet it.
+    count : int
+        Runs that have a number.
+    runs : int
+        All runs, those without a number too.
+    interval : tuple[float, float] | None
+        Of the share of those that have a number, in a drawn design; None in a grid.
+    judged : statistics.Description | None
+        Statistics of what is judged: the response, or its size; None for all together.
+    unit : str
+        Of it.
     """
 
     name: str
@@ -213,15 +233,24 @@ POINTS = 40
 class Convergence:
     """A statistic of the first n runs.
 
-    Attributes:
-        name: mean, sigma, p95 or p99.7.
-        counts: (m,) numbers of runs.
-        values: (m,) the statistic.
-        low: (m,) lower end of its interval, NaN where there is none.
-        high: (m,) upper end.
-        relative: half the interval at the end, in units of sigma; None where it is open.
-        enough: whether that is below the goal.
-        needed: about how many runs would reach it; None where it cannot be told.
+    Attributes
+    ----------
+    name : str
+        Mean, sigma, p95 or p99.7.
+    counts : np.ndarray
+        (m,) numbers of runs.
+    values : np.ndarray
+        (m,) the statistic.
+    low : np.ndarray
+        (m,) lower end of its interval, NaN where there is none.
+    high : np.ndarray
+        (m,) upper end.
+    relative : float | None
+        Half the interval at the end, in units of sigma; None where it is open.
+    enough : bool
+        Whether that is below the goal.
+    needed : int | None
+        About how many runs would reach it; None where it cannot be told.
     """
 
     name: str
@@ -271,17 +300,28 @@ def _convergence(
 class StudyAnalysis:
     """What was found; mappings go by the name of the response.
 
-    Attributes:
-        runs: the study's.
-        descriptions: statistics of responses and of stated sigmas.
-        linear: None where no model can be fitted.
-        effects: main effects of a grid; empty in drawn designs.
-        noise: of the responses whose noise the runs state.
-        indices: empty when the study does not ask for them.
-        convergences: how the statistics settle; empty for grids.
-        requirements: in the study's order, then all together.
-        fronts: of the pairs that the study asks for and that are numbers.
-        not_numbers: pairs that are not.
+    Attributes
+    ----------
+    runs : StudyRuns
+        The study's.
+    descriptions : Mapping[str, statistics.Description]
+        Statistics of responses and of stated sigmas.
+    linear : Mapping[str, statistics.LinearModel | None]
+        None where no model can be fitted.
+    effects : Mapping[str, tuple[statistics.MainEffect, ...]]
+        Main effects of a grid; empty in drawn designs.
+    noise : Mapping[str, statistics.NoiseShare]
+        Of the responses whose noise the runs state.
+    indices : Mapping[str, Indices | NoIndices]
+        Empty when the study does not ask for them.
+    convergences : Mapping[str, tuple[Convergence, ...]]
+        How the statistics settle; empty for grids.
+    requirements : tuple[Requirement, ...]
+        In the study's order, then all together.
+    fronts : tuple[ParetoFront, ...]
+        Of the pairs that the study asks for and that are numbers.
+    not_numbers : tuple[str, ...]
+        Pairs that are not.
     """
 
     runs: StudyRuns

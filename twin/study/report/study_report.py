@@ -32,11 +32,16 @@ from twin.study.runs.setup import PROGRAM
 class StudyReport:
     """A report.
 
-    Attributes:
-        verdict: that it begins with.
-        contents: of its files, by their paths in the study's folder.
-        undrawn: what could not be drawn, a sentence each.
-        warnings: what the user should know.
+    Attributes
+    ----------
+    verdict : str
+        That it begins with.
+    contents : dict[str, bytes]
+        Of its files, by their paths in the study's folder.
+    undrawn : tuple[str, ...]
+        What could not be drawn, a sentence each.
+    warnings : tuple[str, ...]
+        What the user should know.
     """
 
     verdict: str
@@ -50,14 +55,22 @@ def write_report(
 ) -> StudyReport:
     """Write ``report.html``, ``statistics.json`` and the folder ``artefacts`` into the study's folder.
 
-    Args:
-        data: as ``twin.study.study_files.make_dataset`` makes it.
-        plan: the study; ``plan.setup.study.report`` says what is asked for.
-        folder: of the study; it is complete but for the manifest, which is written afterwards.
-        files: of the data set, in that folder.
-        given: what is wrong with what the study is given, to be told before all else.
+    Parameters
+    ----------
+    data : xr.Dataset
+        As ``twin.study.study_files.make_dataset`` makes it.
+    plan : Plan
+        The study; ``plan.setup.study.report`` says what is asked for.
+    folder : RunFolder
+        Of the study; it is complete but for the manifest, which is written afterwards.
+    files : Sequence[str]
+        Of the data set, in that folder.
+    given : Sequence[str]
+        What is wrong with what the study is given, to be told before all else.
 
-    Returns:
+    Returns
+    -------
+    StudyReport
         The verdict that it begins with, and what could not be drawn.
     """
     made = report_files(data, plan.setup.study, files, given)

@@ -31,10 +31,14 @@ def typeset(unit: str) -> str:
 class Series:
     """Values of a factor or of a response, run by run.
 
-    Attributes:
-        name: of it.
-        unit: of the numbers, empty for pure numbers and texts.
-        values: (runs,) float64, NaN where there is none; of some factors text.
+    Attributes
+    ----------
+    name : str
+        Of it.
+    unit : str
+        Of the numbers, empty for pure numbers and texts.
+    values : np.ndarray
+        (runs,) float64, NaN where there is none; of some factors text.
     """
 
     name: str
@@ -65,9 +69,12 @@ class Series:
 class Factor(Series):
     """What was varied.
 
-    Attributes:
-        spec: where the values come from.
-        drawn: whether the runs are drawn from it; those of a grid are not.
+    Attributes
+    ----------
+    spec : FactorSpec
+        Where the values come from.
+    drawn : bool
+        Whether the runs are drawn from it; those of a grid are not.
     """
 
     spec: FactorSpec
@@ -78,9 +85,12 @@ class Factor(Series):
 class Response(Series):
     """What came out.
 
-    Attributes:
-        noise: (runs,) the standard deviation by noise alone that each run states for it; None without.
-        of: of a standard deviation that is looked at like a response: what it belongs to; empty for responses.
+    Attributes
+    ----------
+    noise : np.ndarray | None
+        (runs,) the standard deviation by noise alone that each run states for it; None without.
+    of : str
+        Of a standard deviation that is looked at like a response: what it belongs to; empty for responses.
     """
 
     noise: np.ndarray | None = None
@@ -109,14 +119,22 @@ class Response(Series):
 class StudyRuns:
     """All runs of a study.
 
-    Attributes:
-        study: as the user wrote it.
-        factors: what was varied, in the study's order.
-        responses: what came out, in the study's order.
-        sigmas: the standard deviations that the runs state for responses, where they are not all the same.
-        failed: (runs,) bool.
-        messages: (runs,) why a run failed.
-        doubts: (runs,) why sigma does not hold in a run, empty where it does; none of commands that do not say so.
+    Attributes
+    ----------
+    study : StudySpec
+        As the user wrote it.
+    factors : tuple[Factor, ...]
+        What was varied, in the study's order.
+    responses : tuple[Response, ...]
+        What came out, in the study's order.
+    sigmas : tuple[Response, ...]
+        The standard deviations that the runs state for responses, where they are not all the same.
+    failed : np.ndarray
+        (runs,) bool.
+    messages : tuple[str, ...]
+        (runs,) why a run failed.
+    doubts : tuple[str, ...]
+        (runs,) why sigma does not hold in a run, empty where it does; none of commands that do not say so.
     """
 
     study: StudySpec
@@ -218,10 +236,14 @@ class Estimate:
 class Normality:
     """D'Agostino and Pearson's test of skewness and kurtosis.
 
-    Attributes:
-        skewness: 0 for a normal distribution; + has its long tail above.
-        kurtosis: excess, 0 for a normal distribution; + has heavy tails.
-        p: how often a normal distribution gives a sample that is as far from it.
+    Attributes
+    ----------
+    skewness : float
+        0 for a normal distribution; + has its long tail above.
+    kurtosis : float
+        Excess, 0 for a normal distribution; + has heavy tails.
+    p : float
+        How often a normal distribution gives a sample that is as far from it.
     """
 
     skewness: float
@@ -238,13 +260,20 @@ class Normality:
 class Description:
     """Statistics of a response.
 
-    Attributes:
-        count: runs that have a number.
-        mean, std, median, p95, p997: with intervals where the runs were drawn; std with n - 1; None without runs.
-        low: smallest value.
-        high: largest value.
-        normality: None where it is not judged.
-        tails: quantiles at `TAILS`, None where too few runs reach there.
+    Attributes
+    ----------
+    count : int
+        Runs that have a number.
+    mean, std, median, p95, p997 : Estimate | None
+        With intervals where the runs were drawn; std with n - 1; None without runs.
+    low : float | None
+        Smallest value.
+    high : float | None
+        Largest value.
+    normality : Normality | None
+        None where it is not judged.
+    tails : tuple[float, float] | None
+        Quantiles at `TAILS`, None where too few runs reach there.
     """
 
     count: int
@@ -265,9 +294,12 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
     The intervals take the runs as independent. Evenly spread designs (Latin hypercube, Sobol) know the mean better, so
     that theirs are on the safe side.
 
-    Args:
-        values: (n,) of a response.
-        sampled: whether the runs are drawn from distributions; those of a grid are not.
+    Parameters
+    ----------
+    values : np.ndarray
+        (n,) of a response.
+    sampled : bool
+        Whether the runs are drawn from distributions; those of a grid are not.
     """
     good = values[np.isfinite(values)]
     n = len(good)
@@ -329,9 +361,12 @@ def quantile_interval(values: np.ndarray, q: float) -> Interval:
 
     Each end is passed with a chance of (1 - CONFIDENCE)/2 at most; an end that n values do not reach is None.
 
-    Args:
-        values: (n,) of a response.
-        q: share of the runs that lie below the quantile.
+    Parameters
+    ----------
+    values : np.ndarray
+        (n,) of a response.
+    q : float
+        Share of the runs that lie below the quantile.
     """
     found = stats.quantile_test(values, p=q).confidence_interval(CONFIDENCE)
     return (None if math.isnan(found.low) else float(found.low)), (
@@ -362,11 +397,15 @@ FALSE_ALARM = 1e-6
 class NoiseShare:
     """Noise against all that varies in a response.
 
-    Attributes:
-        response: its name.
-        share: mean of the stated variances over the variance of the runs. By chance somewhat above 1 where nothing
-            but noise varies.
-        chance: how often runs vary as little or less where the stated noise is all there is.
+    Attributes
+    ----------
+    response : str
+        Its name.
+    share : float
+        Mean of the stated variances over the variance of the runs. By chance somewhat above 1 where nothing but noise
+        varies.
+    chance : float
+        How often runs vary as little or less where the stated noise is all there is.
     """
 
     response: str
@@ -385,9 +424,12 @@ def noise_share(response: Response, study: StudySpec) -> NoiseShare | None:
     Of independent normal noise the sum of squares is chi-square; where the runs differ in noise its degrees of freedom
     are those of Satterthwaite, Biometrics Bulletin 2, 110 (1946).
 
-    Args:
-        response: whose noise the runs state.
-        study: which says whether runs share their noise.
+    Parameters
+    ----------
+    response : Response
+        Whose noise the runs state.
+    study : StudySpec
+        Which says whether runs share their noise.
     """
     # noise that all runs have in common is a part of what they do not differ by
     if response.noise is None or study.noise == "shared" or response.constant:
@@ -423,15 +465,20 @@ def impossible(runs: StudyRuns) -> InputError | None:
 class Effect:
     """What a factor does to a response, by the linear model and by ranks.
 
-    Attributes:
-        factor: its name.
-        swing: change of the response from the factor's 5% to its 95% quantile, in the response's unit; of a text the
-            largest minus the smallest mean of its values, the other factors equal. The quantiles are those of the
-            factor's distribution where runs are drawn from it.
-        coefficient: standardised regression coefficient, sigmas of the response per sigma of the factor; None for
-            texts.
-        rank: Spearman's rank correlation; None for texts.
-        span: the factor's quantiles, or for a text its values with the smallest and the largest mean.
+    Attributes
+    ----------
+    factor : str
+        Its name.
+    swing : Estimate
+        Change of the response from the factor's 5% to its 95% quantile, in the response's unit; of a text the largest
+        minus the smallest mean of its values, the other factors equal. The quantiles are those of the factor's
+        distribution where runs are drawn from it.
+    coefficient : Estimate | None
+        Standardised regression coefficient, sigmas of the response per sigma of the factor; None for texts.
+    rank : Estimate | None
+        Spearman's rank correlation; None for texts.
+    span : tuple[float | str, float | str]
+        The factor's quantiles, or for a text its values with the smallest and the largest mean.
     """
 
     factor: str
@@ -445,12 +492,18 @@ class Effect:
 class LinearModel:
     """Least squares fit of a response by all factors together, each by itself, without products.
 
-    Attributes:
-        r2: share of the variance that it explains, 1 for a straight line without noise.
-        adjusted: the same, corrected for the number of terms.
-        terms: number of coefficients, the constant included.
-        effects: of each factor that varies, the largest swing first.
-        cannot: names of factors whose effects the runs do not separate.
+    Attributes
+    ----------
+    r2 : float
+        Share of the variance that it explains, 1 for a straight line without noise.
+    adjusted : float
+        The same, corrected for the number of terms.
+    terms : int
+        Number of coefficients, the constant included.
+    effects : tuple[Effect, ...]
+        Of each factor that varies, the largest swing first.
+    cannot : tuple[str, ...]
+        Names of factors whose effects the runs do not separate.
     """
 
     r2: float
@@ -468,9 +521,12 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
     scatter by, too: sum over the runs of what each does to the coefficient. Columns of the matrix that follow from
     others are left out.
 
-    Args:
-        factors: of the study.
-        response: to be fitted.
+    Parameters
+    ----------
+    factors : Sequence[Factor]
+        Of the study.
+    response : Response
+        To be fitted.
     """
     good = response.good
     y = response.values[good]
@@ -595,11 +651,16 @@ def _rank_interval(rank: float, n: int) -> Interval:
 class MainEffect:
     """Means of a response over the runs of a grid, for each value of a factor.
 
-    Attributes:
-        factor: its name.
-        levels: (m,) its values.
-        means: (m,) mean of the response there.
-        swing: largest minus smallest.
+    Attributes
+    ----------
+    factor : str
+        Its name.
+    levels : np.ndarray
+        (m,) its values.
+    means : np.ndarray
+        (m,) mean of the response there.
+    swing : float
+        Largest minus smallest.
     """
 
     factor: str
@@ -611,9 +672,12 @@ class MainEffect:
 def main_effects(factors: Sequence[Factor], response: Response) -> tuple[MainEffect, ...]:
     """Main effects of the factors that take several values with numbers, the largest swing first.
 
-    Args:
-        factors: of the study.
-        response: of a grid.
+    Parameters
+    ----------
+    factors : Sequence[Factor]
+        Of the study.
+    response : Response
+        Of a grid.
     """
     out = []
     for factor in factors:

@@ -29,10 +29,14 @@ from twin.framework.procedure import silent
 class Run:
     """One run of a study.
 
-    Attributes:
-        number: from 0.
-        values: (place, value) of everything the factors change in the base's tree.
-        seed: of its noise; None for the base's own.
+    Attributes
+    ----------
+    number : int
+        From 0.
+    values : tuple[tuple[KeyPath, Any], ...]
+        (place, value) of everything the factors change in the base's tree.
+    seed : int | None
+        Of its noise; None for the base's own.
     """
 
     number: int
@@ -44,8 +48,10 @@ class Run:
 class Failure:
     """A run that cannot be: light is lost, or its values do not go together.
 
-    Attributes:
-        message: why, one line.
+    Attributes
+    ----------
+    message : str
+        Why, one line.
     """
 
     message: str
@@ -86,8 +92,10 @@ a fault of the program and stops the study.
 class ProcedureBase:
     """A test, one run after the other; only its numbers are made.
 
-    Attributes:
-        procedure: the test.
+    Attributes
+    ----------
+    procedure : Procedure
+        The test.
     """
 
     procedure: Procedure
@@ -140,14 +148,21 @@ Tree = dict[str, Any]
 def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = False) -> Tree:
     """The tree in which ``key`` leads to a single value; what is missing but may be there is made with its defaults.
 
-    Args:
-        tree: plain data of a ``model``; not changed.
-        model: what the tree describes.
-        key: keys and list indices from the root.
-        neutral: whether a number without a default, which would be None, is zero where zero has the same effect.
+    Parameters
+    ----------
+    tree : Tree
+        Plain data of a ``model``; not changed.
+    model : type[Spec]
+        What the tree describes.
+    key : KeyPath
+        Keys and list indices from the root.
+    neutral : bool
+        Whether a number without a default, which would be None, is zero where zero has the same effect.
 
-    Raises:
-        Problem: it leads nowhere; ``within`` is the part that does not fit.
+    Raises
+    ------
+    Problem
+        It leads nowhere; ``within`` is the part that does not fit.
     """
     out = copy.deepcopy(tree)
     node: Any = out
@@ -173,10 +188,14 @@ def with_place(tree: Tree, model: type[Spec], key: KeyPath, neutral: bool = Fals
 def says_nothing(tree: Tree, model: type[Spec], key: KeyPath) -> bool:
     """Return whether all that ``with_place`` adds for ``key`` has the same effect as its absence.
 
-    Args:
-        tree: plain data of a ``model``.
-        model: what the tree describes.
-        key: keys and list indices from the root, which lead somewhere.
+    Parameters
+    ----------
+    tree : Tree
+        Plain data of a ``model``.
+    model : type[Spec]
+        What the tree describes.
+    key : KeyPath
+        Keys and list indices from the root, which lead somewhere.
     """
     node: Any = tree
     for k, part in enumerate(key):
@@ -231,9 +250,12 @@ def _is_model(annotation: Any) -> bool:
 def with_values(tree: Tree, values: Iterable[tuple[KeyPath, Any]]) -> Tree:
     """The tree with other values at places that are there; what is not changed is shared with ``tree``.
 
-    Args:
-        tree: plain data; not changed.
-        values: (place, value) of all that changes.
+    Parameters
+    ----------
+    tree : Tree
+        Plain data; not changed.
+    values : Iterable[tuple[KeyPath, Any]]
+        (place, value) of all that changes.
     """
     out = dict(tree)
     own = {id(out)}
@@ -253,12 +275,17 @@ def with_values(tree: Tree, values: Iterable[tuple[KeyPath, Any]]) -> Tree:
 def leaf(tree: Any, key: KeyPath) -> Any:
     """What stands at ``key`` of results.
 
-    Args:
-        tree: plain data.
-        key: keys and list indices from its root.
+    Parameters
+    ----------
+    tree : Any
+        Plain data.
+    key : KeyPath
+        Keys and list indices from its root.
 
-    Raises:
-        Problem: nothing does; ``within`` is the part that does not fit.
+    Raises
+    ------
+    Problem
+        Nothing does; ``within`` is the part that does not fit.
     """
     node = tree
     for k, part in enumerate(key):
@@ -278,13 +305,20 @@ def leaf(tree: Any, key: KeyPath) -> Any:
 class BlockResult:
     """Responses of n consecutive runs.
 
-    Attributes:
-        values: (n, R) in the order of the study's responses, NaN in runs that failed and where there is no number.
-        sigmas: (n, R) their standard deviations, NaN where none is asked for.
-        noises: (n, R) those by noise alone, likewise.
-        messages: (n,) why a run failed, empty for one that did not.
-        seconds: that a worker took for them.
-        doubts: (n,) why sigma does not hold in a run that did not fail, empty where it does.
+    Attributes
+    ----------
+    values : np.ndarray
+        (n, R) in the order of the study's responses, NaN in runs that failed and where there is no number.
+    sigmas : np.ndarray
+        (n, R) their standard deviations, NaN where none is asked for.
+    noises : np.ndarray
+        (n, R) those by noise alone, likewise.
+    messages : tuple[str, ...]
+        (n,) why a run failed, empty for one that did not.
+    seconds : float
+        That a worker took for them.
+    doubts : tuple[str, ...]
+        (n,) why sigma does not hold in a run that did not fail, empty where it does.
     """
 
     values: np.ndarray
@@ -382,8 +416,10 @@ def _number(outcome: Mapping[str, Any], key: Any, name: str) -> float:
 def check_response(sample: Mapping[str, Any], key: Any) -> None:
     """Check that results like ``sample`` have a number at ``key``.
 
-    Raises:
-        Problem: they do not; ``within`` is the part that does not fit, ``allowed`` what there is.
+    Raises
+    ------
+    Problem
+        They do not; ``within`` is the part that does not fit, ``allowed`` what there is.
     """
     value = leaf(sample, key)
     if isinstance(value, Mapping):

@@ -44,11 +44,16 @@ class OtherProgramError(Exception):
 class Task:
     """A block of a study with all that a worker needs for it.
 
-    Attributes:
-        config: text of the study's config.yaml.
-        source: checksum of the program's source files, which the worker's must have too.
-        backend: where to trace.
-        runs: of the block.
+    Attributes
+    ----------
+    config : str
+        Text of the study's config.yaml.
+    source : str
+        Checksum of the program's source files, which the worker's must have too.
+    backend : str
+        Where to trace.
+    runs : tuple[Run, ...]
+        Of the block.
     """
 
     config: str
@@ -61,12 +66,18 @@ class Task:
 class Pilot:
     """The first block of a study.
 
-    Attributes:
-        result: of the block; its seconds are those of a second evaluation, with everything compiled and calibrated.
-        sample: all results of the first run that did not fail, None if all did.
-        start_seconds: what the first evaluation took longer.
-        memory: largest that the worker's process has been, bytes.
-        refusal: why the study cannot be run at all.
+    Attributes
+    ----------
+    result : BlockResult
+        Of the block; its seconds are those of a second evaluation, with everything compiled and calibrated.
+    sample : Mapping[str, Any] | None
+        All results of the first run that did not fail, None if all did.
+    start_seconds : float
+        What the first evaluation took longer.
+    memory : float
+        Largest that the worker's process has been, bytes.
+    refusal : InputError | None
+        Why the study cannot be run at all.
     """
 
     result: BlockResult
@@ -147,10 +158,14 @@ def _one_thread() -> None:
 def journal_of(setup: StudySetup, file: Path | None, noun: str = "study") -> Journal:
     """The journal of a study's blocks.
 
-    Args:
-        setup: the study.
-        file: of the journal, None to keep nothing.
-        noun: what the study is, for messages.
+    Parameters
+    ----------
+    setup : StudySetup
+        The study.
+    file : Path | None
+        Of the journal, None to keep nothing.
+    noun : str
+        What the study is, for messages.
     """
     return Journal(file, setup.content, noun, (BlockResult,))
 
@@ -159,15 +174,24 @@ def journal_of(setup: StudySetup, file: Path | None, noun: str = "study") -> Jou
 class Engine:
     """Computes the blocks of a study that are not in its journal.
 
-    Attributes:
-        plan: all runs.
-        journal: of the study's blocks, open.
-        backend: where to trace.
-        advance: told the number of runs that are there, and of all.
-        say: told how long it will take, once the first block is there.
-        warn: told what the user should know.
-        computed: number of runs that this engine has computed.
-        seconds: that it took for them.
+    Attributes
+    ----------
+    plan : Plan
+        All runs.
+    journal : Journal
+        Of the study's blocks, open.
+    backend : str
+        Where to trace.
+    advance : Callable[[int, int], None]
+        Told the number of runs that are there, and of all.
+    say : Callable[[str], None]
+        Told how long it will take, once the first block is there.
+    warn : Callable[[str], None]
+        Told what the user should know.
+    computed : int
+        Number of runs that this engine has computed.
+    seconds : float
+        That it took for them.
     """
 
     plan: Plan
@@ -203,16 +227,24 @@ class Engine:
     def run(self, workers: cluster.Workers, own_memory: float = 0.0) -> None:
         """Compute whatever is missing.
 
-        Args:
-            workers: who computes.
-            own_memory: of this process, bytes, for the estimate.
+        Parameters
+        ----------
+        workers : cluster.Workers
+            Who computes.
+        own_memory : float
+            Of this process, bytes, for the estimate.
 
-        Raises:
-            InputError: the base cannot be run as it is, or a response's key leads nowhere in its results.
-            Incomplete: workers died again and again in some runs; or any error but those that say that a run cannot
-                be. What is done is kept.
-            ClusterError: the scheduler is gone.
-            RunFolderError: a block cannot be kept.
+        Raises
+        ------
+        InputError
+            The base cannot be run as it is, or a response's key leads nowhere in its results.
+        Incomplete
+            Workers died again and again in some runs; or any error but those that say that a run cannot be. What is
+            done is kept.
+        ClusterError
+            The scheduler is gone.
+        RunFolderError
+            a block cannot be kept.
         """
         started = time.monotonic()
         missing = self.missing
@@ -304,12 +336,17 @@ def _fault(future: Any) -> Incomplete:
 def check_responses(setup: StudySetup, sample: Any) -> None:
     """Check that the results hold every response of a study.
 
-    Args:
-        setup: the study.
-        sample: results of one run, by file.
+    Parameters
+    ----------
+    setup : StudySetup
+        The study.
+    sample : Any
+        Results of one run, by file.
 
-    Raises:
-        InputError: one that they do not, with what there is.
+    Raises
+    ------
+    InputError
+        One that they do not, with what there is.
     """
     for name, response in setup.study.responses.items():
         asked = {"key": response.key, "sigma": response.sigma, "noise": response.noise, "minus": response.minus}
@@ -330,8 +367,10 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
 def _check_noise(setup: StudySetup, sample: Any, name: str, path: KeyPath) -> None:
     """Check that the noise of a response is not a total standard deviation beside which that of noise stands.
 
-    Raises:
-        InputError: it is.
+    Raises
+    ------
+    InputError
+        It is.
     """
     place = max((k for k, part in enumerate(path) if isinstance(part, str)), default=0)
     named = str(path[place])

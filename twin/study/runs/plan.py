@@ -119,9 +119,12 @@ def quantiles(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
     """Where the distribution function of a factor of numbers is ``u``; of a list the least of its values where that is
     reached.
 
-    Args:
-        factor: whose values are numbers.
-        u: shares between 0 and 1.
+    Parameters
+    ----------
+    factor : FactorSpec
+        Whose values are numbers.
+    u : np.ndarray
+        Shares between 0 and 1.
     """
     if factor.kind in _LISTS:
         return np.quantile(np.array(factor.numbers().values, np.float64), u, method="inverted_cdf")
@@ -138,9 +141,12 @@ def extremes(factor: FactorSpec) -> list[float]:
 class Scaling:
     """All values of a study that are scaled; several factors may scale one of them.
 
-    Attributes:
-        base: place -> number and unit as the base has them; the number is whole where the base's is.
-        ratio: place -> (runs,) what the number is multiplied by.
+    Attributes
+    ----------
+    base : Mapping[KeyPath, tuple[float | int, str]]
+        Place -> number and unit as the base has them; the number is whole where the base's is.
+    ratio : Mapping[KeyPath, np.ndarray]
+        Place -> (runs,) what the number is multiplied by.
     """
 
     base: Mapping[KeyPath, tuple[float | int, str]]
@@ -156,9 +162,12 @@ class Scaling:
 def scaled(number: tuple[float | int, str], ratio: float) -> Any:
     """Number and unit, times a ratio, as they stand in a tree.
 
-    Args:
-        number: number and unit, the unit empty for a pure number.
-        ratio: that the number is multiplied by.
+    Parameters
+    ----------
+    number : tuple[float | int, str]
+        Number and unit, the unit empty for a pure number.
+    ratio : float
+        That the number is multiplied by.
     """
     value = number[0] * ratio
     if number[1]:
@@ -170,14 +179,21 @@ def scaled(number: tuple[float | int, str], ratio: float) -> Any:
 def ratios(factor: FactorSpec, tree: Tree, values: np.ndarray, unit: str) -> dict[KeyPath, np.ndarray]:
     """What the values that follow a factor are multiplied by: place -> array like ``values``.
 
-    Args:
-        factor: with its ``scales``.
-        tree: of the base.
-        values: of the factor.
-        unit: of them, empty for pure numbers.
+    Parameters
+    ----------
+    factor : FactorSpec
+        With its ``scales``.
+    tree : Tree
+        Of the base.
+    values : np.ndarray
+        Of the factor.
+    unit : str
+        Of them, empty for pure numbers.
 
-    Raises:
-        Problem: the factor's value in the base is none that anything can be compared with, or a power does not exist.
+    Raises
+    ------
+    Problem
+        The factor's value in the base is none that anything can be compared with, or a power does not exist.
     """
     out = {}
     for k, scale in enumerate(factor.scales):
@@ -203,13 +219,19 @@ def _nominal(factor: FactorSpec, tree: Tree, unit: str) -> float:
 def number_at(base: Tree, place: KeyPath, unit: str) -> float:
     """Return the number that the base has at the place of a factor, in a unit.
 
-    Args:
-        base: the base's own tree, without values of factors.
-        place: of the factor.
-        unit: of the factor's numbers, empty for pure numbers.
+    Parameters
+    ----------
+    base : Tree
+        The base's own tree, without values of factors.
+    place : KeyPath
+        Of the factor.
+    unit : str
+        Of the factor's numbers, empty for pure numbers.
 
-    Raises:
-        Problem: the base has no value there, or none of that kind.
+    Raises
+    ------
+    Problem
+        The base has no value there, or none of that kind.
     """
     try:
         value = leaf(base, place)
@@ -226,9 +248,12 @@ def number_at(base: Tree, place: KeyPath, unit: str) -> float:
 def number_in(value: Any, unit: str) -> float | None:
     """The number of a value in a unit; None where it is no number of that kind.
 
-    Args:
-        value: as it stands in a tree.
-        unit: of the same dimension, empty for pure numbers.
+    Parameters
+    ----------
+    value : Any
+        As it stands in a tree.
+    unit : str
+        Of the same dimension, empty for pure numbers.
     """
     parts = split_quantity(value)
     if parts is not None:
@@ -239,8 +264,10 @@ def number_in(value: Any, unit: str) -> float | None:
 def number_of(value: Any) -> tuple[float | int, str]:
     """Number and unit of a value of the tree, the unit empty for a pure number.
 
-    Raises:
-        Problem: it has none.
+    Raises
+    ------
+    Problem
+        It has none.
     """
     parts = split_quantity(value)
     if parts is not None:
@@ -254,10 +281,14 @@ def number_of(value: Any) -> tuple[float | int, str]:
 class Column:
     """Values of one factor.
 
-    Attributes:
-        name: of the factor.
-        unit: of the numbers; empty for pure numbers and for texts.
-        values: (runs,) float64, int64, bool or text.
+    Attributes
+    ----------
+    name : str
+        Of the factor.
+    unit : str
+        Of the numbers; empty for pure numbers and for texts.
+    values : np.ndarray
+        (runs,) float64, int64, bool or text.
     """
 
     name: str
@@ -274,9 +305,12 @@ class Column:
 class Plan:
     """All runs of a study.
 
-    Attributes:
-        setup: the study.
-        columns: values of every factor, in the study's order.
+    Attributes
+    ----------
+    setup : StudySetup
+        The study.
+    columns : tuple[Column, ...]
+        Values of every factor, in the study's order.
     """
 
     setup: StudySetup
@@ -286,8 +320,10 @@ class Plan:
     def of(cls, setup: StudySetup) -> Plan:
         """The plan of a study.
 
-        Raises:
-            InputError: a factor takes a value that the base's schema does not allow.
+        Raises
+        ------
+        InputError
+            a factor takes a value that the base's schema does not allow.
         """
         sampled = draw(setup.study)
         plan = cls(setup, tuple(_column(setup, name, values) for name, values in sampled.items()))
@@ -318,8 +354,10 @@ class Plan:
     def scaling(self) -> Scaling:
         """Values of the base that follow factors.
 
-        Raises:
-            InputError: a value that is no number, or a power that does not exist.
+        Raises
+        ------
+        InputError
+            a value that is no number, or a power that does not exist.
         """
         base: dict[KeyPath, tuple[float | int, str]] = {}
         ratio: dict[KeyPath, np.ndarray] = {}
@@ -363,8 +401,10 @@ class Plan:
         The schema's limits are intervals, so that what lies between two good values is good. Values that only together
         cannot be are found when they are run, and fail alone.
 
-        Raises:
-            InputError: at the factor's line.
+        Raises
+        ------
+        InputError
+            At the factor's line.
         """
         for column in self.columns:
             factor = self.setup.study.factors[column.name]
@@ -435,9 +475,12 @@ _KEPT = 5
 def study_bytes(setup: StudySetup, runs: int) -> float:
     """Memory of the process that keeps the results, beside the imported program, bytes.
 
-    Args:
-        setup: the study.
-        runs: of it.
+    Parameters
+    ----------
+    setup : StudySetup
+        The study.
+    runs : int
+        Of it.
     """
     responses = setup.study.responses.values()
     columns = _KEPT + len(setup.study.factors) + sum(1 + len(one.stated) for one in responses)
@@ -448,11 +491,15 @@ def require_study_memory(setup: StudySetup) -> None:
     """See whether the results of all runs fit into the memory that is free and that the study may use. How long they
     take a first block of runs tells before the others begin (`twin.study.runs.blocks`).
 
-    Args:
-        setup: the study.
+    Parameters
+    ----------
+    setup : StudySetup
+        The study.
 
-    Raises:
-        InputError: they do not; with the number of runs that would.
+    Raises
+    ------
+    InputError
+        They do not; with the number of runs that would.
     """
     study, runs = setup.study, run_count(setup.study)
     key: KeyPath = ("factors",) if study.design.kind == GRID else ("design", "runs")

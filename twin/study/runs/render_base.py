@@ -40,12 +40,18 @@ def run_results(
     """``truth`` and, with a monitor, ``recovered``: contents of truth.json and recovered.json, made by the code that
     makes the files.
 
-    Args:
-        resolved: the job.
-        experiment: its instrument.
-        state: what the job perturbs.
-        truth: of this one state.
-        recovery: what its images or spots say, None without a monitor.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The job.
+    experiment : MonitorExperiment
+        Its instrument.
+    state : State
+        What the job perturbs.
+    truth : Truth
+        Of this one state.
+    recovery : Recovery | None
+        What its images or spots say, None without a monitor.
     """
     known: dict[str, Any] = {"resolved": resolved, "experiment": experiment, "state": state, "truth": truth}
     known |= {"frames": resolved.frames, "seed": resolved.job.render.seed, "warnings": ()}
@@ -65,12 +71,18 @@ def _run_together(
 ) -> list[Outcome]:
     """Results of runs of one instrument with one number of frames, as truth.json and recovered.json hold them.
 
-    Args:
-        experiment: the instrument.
-        runs: to be done at once.
-        before: number of frames and seed -> frames of the nominal state, (C, frames, rows, columns).
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        The instrument.
+    runs : Sequence[MonitorRun]
+        To be done at once.
+    before : Callable[[int, int], np.ndarray]
+        Number of frames and seed -> frames of the nominal state, (C, frames, rows, columns).
 
-    Returns:
+    Returns
+    -------
+    list[Outcome]
         For each run its results, or why it has none. When one run's light is lost, all runs of the group are tried
         alone, and those that are good are done together without it.
     """
@@ -264,8 +276,10 @@ class JobMaker:
     without their tables of displaced nodes, which a study does not vary; of any other the whole job, which takes some
     ten times as long.
 
-    Args:
-        tree: plain data of a ResolvedJob; whatever is changed is there.
+    Parameters
+    ----------
+    tree
+        Plain data of a ResolvedJob; whatever is changed is there.
     """
 
     def __init__(self, tree: Tree) -> None:
@@ -274,8 +288,10 @@ class JobMaker:
     def job(self, values: tuple[tuple[KeyPath, Any], ...]) -> ResolvedJob:
         """The job with these values.
 
-        Raises:
-            InputError: a value that the schema does not allow.
+        Raises
+        ------
+        InputError
+            a value that the schema does not allow.
         """
         if not values:
             return self.base

@@ -41,12 +41,16 @@ responses.
 class StudySetup:
     """A study with all it refers to.
 
-    Attributes:
-        study: as the user wrote it, with the tables' values.
-        tree: plain data of the resolved base with a place for every factor; where the base has no value, and none has
-            the same effect, one of the factor's.
-        base: the same without any value of a factor: a place is there only if the base has a value at it, or one
-            that has the same effect as none.
+    Attributes
+    ----------
+    study : StudySpec
+        As the user wrote it, with the tables' values.
+    tree : Tree
+        Plain data of the resolved base with a place for every factor; where the base has no value, and none has the
+        same effect, one of the factor's.
+    base : Tree
+        The same without any value of a factor: a place is there only if the base has a value at it, or one that has the
+        same effect as none.
     """
 
     study: StudySpec
@@ -117,8 +121,10 @@ class StudySetup:
 def resolve_study(path: str | Path) -> StudySetup:
     """Read a study and all it refers to. The config.yaml of an earlier one can be given in its place.
 
-    Raises:
-        InputError: any of the files cannot be read or is not valid, or a factor's key leads nowhere in the base.
+    Raises
+    ------
+    InputError
+        Any of the files cannot be read or is not valid, or a factor's key leads nowhere in the base.
     """
     return _resolved(yaml_file.read_yaml(path))
 
@@ -126,8 +132,10 @@ def resolve_study(path: str | Path) -> StudySetup:
 def base_of(setup: StudySetup) -> Spec:
     """The study's base as its own file has it, without what the factors do to it.
 
-    Raises:
-        InputError: the file has changed meanwhile.
+    Raises
+    ------
+    InputError
+        The file has changed meanwhile.
     """
     source = setup.study.source
     if source.prefix:  # a study's config.yaml holds it
@@ -346,8 +354,10 @@ def _cell(text: str) -> Any:
 def _job(command: str) -> BaseJob:
     """The job of that name: one of `BASES`, or a test of `PROCEDURES` that can be varied.
 
-    Raises:
-        InputError: this version of the twin does not have it.
+    Raises
+    ------
+    InputError
+        This version of the twin does not have it.
     """
     if command in BASES:
         job: BaseJob = BASES[command]()

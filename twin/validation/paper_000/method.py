@@ -48,9 +48,12 @@ PAIRS = (("forward", "nadir"), ("nadir", "backward"))
 class Passes:
     """One pass and its repeated measurements.
 
-    Attributes:
-        flight: the truth.
-        measured: with errors drawn anew each time; the light's effects are in the points and taken out again.
+    Attributes
+    ----------
+    flight : AnglePass
+        The truth.
+    measured : tuple[Measurement, ...]
+        With errors drawn anew each time; the light's effects are in the points and taken out again.
     """
 
     flight: AnglePass
@@ -126,13 +129,20 @@ def repeated(
 ) -> Passes:
     """Fly and measure `count` times.
 
-    Args:
-        setup: the test.
-        seed: of terrain and errors.
-        count: of measurements.
-        backend: to trace an instrument's lines.
-        turns: line -> further rotation vector in body axes since the laboratory, radians.
-        corrected: whether the analysis takes the light's effects out of the points.
+    Parameters
+    ----------
+    setup : AngleSetup
+        The test.
+    seed : np.random.SeedSequence
+        Of terrain and errors.
+    count : int
+        Of measurements.
+    backend : Backend | None
+        To trace an instrument's lines.
+    turns : Mapping[str, tuple[float, float, float]]
+        Line -> further rotation vector in body axes since the laboratory, radians.
+    corrected : bool
+        Whether the analysis takes the light's effects out of the points.
     """
     terrain, errors = seed.spawn(2)
     flight = fly(setup, _turned(angle_camera(setup, backend), turns), terrain)

@@ -86,10 +86,14 @@ def differences(planes: Passes, resection: Passes) -> Differences:
 class Data:
     """Measurements for the table.
 
-    Attributes:
-        same: of points of 1.5 m, light taken out.
-        own: of `POINT_SIGMA`, light taken out, with which the resection works.
-        light: others with the same stations and the light left in, with which the planes work.
+    Attributes
+    ----------
+    same : Passes
+        Of points of 1.5 m, light taken out.
+    own : Passes
+        Of `POINT_SIGMA`, light taken out, with which the resection works.
+    light : Passes
+        Others with the same stations and the light left in, with which the planes work.
     """
 
     same: Passes
@@ -232,13 +236,20 @@ PANELS = {
 class Sentence:
     """One statement of the text: how `angle` answers when `what` is moved.
 
-    Attributes:
-        name: of the row, without the paper.
-        kind: what is said.
-        what: "station", or the line whose points move.
-        angle: of which it is said.
-        axes: of which it is said; for signs those along which the angle rises.
-        others: with which they are compared; for signs those along which it falls.
+    Attributes
+    ----------
+    name : str
+        Of the row, without the paper.
+    kind : Kind
+        What is said.
+    what : str
+        "station", or the line whose points move.
+    angle : Angle
+        Of which it is said.
+    axes : tuple[str, ...]
+        Of which it is said; for signs those along which the angle rises.
+    others : tuple[str, ...]
+        With which they are compared; for signs those along which it falls.
     """
 
     name: str
@@ -352,9 +363,12 @@ def places_svg(figure: Figure, held: Mapping[Place, int], total: int, marked: Se
 class Answers:
     """Curves of one measurement, by planes fitted anew.
 
-    Attributes:
-        amount: (k,) metres.
-        change: (what is moved, angle, axis) -> (k,), arcsec.
+    Attributes
+    ----------
+    amount : Array
+        (k,) metres.
+    change : Mapping[tuple[str, str, str], Array]
+        (what is moved, angle, axis) -> (k,), arcsec.
     """
 
     amount: Array

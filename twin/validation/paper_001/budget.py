@@ -90,12 +90,18 @@ def root_sum_of_squares(lines: Mapping[str, BudgetLine]) -> tuple[float, float]:
 def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_single") -> dict[str, float]:
     """Table 5 from Table 4: errors of the parameters from that of one coordinate of one spot, all independent.
 
-    Args:
-        spot: as an angle, radians.
-        geometry: of the camera.
-        estimator: whose factors; (2), (3), (5), (7) or, as ``paper_joint``, Table 1's last column.
+    Parameters
+    ----------
+    spot : float
+        As an angle, radians.
+    geometry : MonitorGeometry
+        Of the camera.
+    estimator : str
+        Whose factors; (2), (3), (5), (7) or, as ``paper_joint``, Table 1's last column.
 
-    Returns:
+    Returns
+    -------
+    dict[str, float]
         d_alpha, d_beta, d_gamma in radians and d_f in metres.
     """
     pixels = spot * geometry.principal_distance_m / geometry.pitch_m
@@ -107,16 +113,26 @@ def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_s
 class BudgetImages:
     """What was simulated; what is not wanted is empty or None.
 
-    Attributes:
-        geometry: of the first camera; both are alike.
-        inputs: trials per line (twice as many for FEW_DRAWS), with all causes, and groups of frames.
-        lines: of Table 3.
-        focal_plane: true and read change of d_f by the focal plane's temperature, m.
-        halved: glass path of the 180-deg prism before and after halving, m, and the ratio of its errors.
-        together: all causes at once.
-        scatter: of the centroid in single frames and in means of FRAMES, radians, with standard deviations.
-        line_pixel: of the line CCD, metres.
-        roll_pixels: how far ROLL moves the line of sight of the line's end, pixels of the line CCD.
+    Attributes
+    ----------
+    geometry : MonitorGeometry
+        Of the first camera; both are alike.
+    inputs : tuple[int, int, int]
+        Trials per line (twice as many for FEW_DRAWS), with all causes, and groups of frames.
+    lines : dict[str, BudgetLine]
+        Of Table 3.
+    focal_plane : tuple[float, float] | None
+        True and read change of d_f by the focal plane's temperature, m.
+    halved : tuple[float, float, float] | None
+        Glass path of the 180-deg prism before and after halving, m, and the ratio of its errors.
+    together : Together | None
+        All causes at once.
+    scatter : tuple[tuple[float, float], tuple[float, float]] | None
+        Of the centroid in single frames and in means of FRAMES, radians, with standard deviations.
+    line_pixel : float
+        Of the line CCD, metres.
+    roll_pixels : float | None
+        How far ROLL moves the line of sight of the line's end, pixels of the line CCD.
     """
 
     geometry: MonitorGeometry

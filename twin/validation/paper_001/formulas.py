@@ -101,10 +101,14 @@ def focal_lengths(geometry: MonitorGeometry) -> tuple[float, float]:
 class Ratio:
     """A reading divided by what it should be.
 
-    Attributes:
-        value: mean of the cameras.
-        sigma: its standard deviation.
-        cameras: camera -> (value, sigma).
+    Attributes
+    ----------
+    value : float
+        Mean of the cameras.
+    sigma : float
+        Its standard deviation.
+    cameras : Mapping[str, Measured]
+        Camera -> (value, sigma).
     """
 
     value: float
@@ -126,10 +130,14 @@ def quotient(above: Measured, below: Measured) -> Measured:
 class MonitorImages:
     """Nine frames before and after every state, measured; what the formulas make of the spots is worked out on demand.
 
-    Args:
-        context: of the group, for the noise.
-        experiment: the instrument.
-        states: name -> state; both cameras' bodies may move in it.
+    Parameters
+    ----------
+    context
+        Of the group, for the noise.
+    experiment
+        The instrument.
+    states
+        Name -> state; both cameras' bodies may move in it.
     """
 
     def __init__(self, context: Context, experiment: MonitorExperiment, states: Mapping[str, State]) -> None:
@@ -489,7 +497,9 @@ class JointMotions(MonitorImages):
 
         Least squares of the readings of the mixtures on the traced changes and a constant, mean of the cameras.
 
-        Returns:
+        Returns
+        -------
+        tuple[np.ndarray, np.ndarray]
             (4, 4) readings by changes, in the order of PARAMETERS, arcsec and micrometres, twice.
         """
         parameters = self.estimates().parameters

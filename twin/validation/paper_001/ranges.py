@@ -51,11 +51,15 @@ Sample = Callable[[np.ndarray], Mapping[str, np.ndarray]]
 class Bench:
     """Spot positions, readings and truth of one instrument's monitor, without noise.
 
-    Args:
-        experiment: the instrument.
-        like: a bench on the same cameras: its geometry is taken over.
-        shapes: whether its spot shapes are taken over as well; needed for larger CCDs, of which only a window around
-            each spot is read out, as large as the CCDs of ``like``.
+    Parameters
+    ----------
+    experiment
+        The instrument.
+    like
+        a bench on the same cameras: its geometry is taken over.
+    shapes
+        Whether its spot shapes are taken over as well; needed for larger CCDs, of which only a window around each spot
+        is read out, as large as the CCDs of ``like``.
     """
 
     def __init__(self, experiment: MonitorExperiment, like: Bench | None = None, shapes: bool = False) -> None:
@@ -76,8 +80,10 @@ class Bench:
     def positions(self, states: Sequence[State]) -> np.ndarray:
         """Centres of the spots in rendered images, (S, C, 2) (row, column), px.
 
-        Raises:
-            SpotError, BeamMissedError: a spot is too near its CCD's edge or outside it, or its beam is lost.
+        Raises
+        ------
+        SpotError, BeamMissedError
+            a spot is too near its CCD's edge or outside it, or its beam is lost.
         """
         path = self.experiment.path
         rows, columns = path.shape
@@ -96,8 +102,10 @@ class Bench:
         """Means of the traced spots over the return face, (S, C, 2) (row, column) px from the CCD's middle, wherever
         they fall.
 
-        Raises:
-            BeamMissedError, AimError: a beam is lost, or a part of it.
+        Raises
+        ------
+        BeamMissedError, AimError
+            a beam is lost, or a part of it.
         """
         path = self.experiment.path
         known, scout = path.coarse_trace(states), path.scout
@@ -154,9 +162,12 @@ def _windows(images: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np
 class Curves:
     """Quantities over the size of a change.
 
-    Attributes:
-        size: (N,), ascending, > 0.
-        value: name -> (N,), as shares of what is allowed.
+    Attributes
+    ----------
+    size : np.ndarray
+        (N,), ascending, > 0.
+    value : Mapping[str, np.ndarray]
+        Name -> (N,), as shares of what is allowed.
     """
 
     size: np.ndarray
@@ -192,10 +203,14 @@ class Curves:
 class Domain:
     """How far something holds: followed in images as far as they go, traced on from there, until the beam is lost.
 
-    Attributes:
-        images, traced: curves over the size; both have the same names.
-        lost: size beyond which the beam is lost or not followed.
-        lost_why: which of the two.
+    Attributes
+    ----------
+    images, traced : Curves
+        Curves over the size; both have the same names.
+    lost : float
+        Size beyond which the beam is lost or not followed.
+    lost_why : str
+        Which of the two.
     """
 
     images: Curves
@@ -215,10 +230,14 @@ class Domain:
 def sampled(sample: Sample, sizes: Sequence[float], names: Sequence[str] | None = None) -> Curves:
     """Curves at given sizes, with points added where they pass the limit.
 
-    Args:
-        sample: what is sampled.
-        sizes: to begin with, ascending.
-        names: whose limits are refined; all by default.
+    Parameters
+    ----------
+    sample : Sample
+        What is sampled.
+    sizes : Sequence[float]
+        To begin with, ascending.
+    names : Sequence[str] | None
+        Whose limits are refined; all by default.
     """
     first = np.array(sizes, dtype=float)
     curves = Curves(first, sample(first))
@@ -272,12 +291,18 @@ class Range(Domain):
 
     The names of the curves are those of ``criterion`` and WINDOW.
 
-    Attributes:
-        parameter: of NAMES.
-        sign: +1 or -1.
-        raw: of the images, form -> error over the true change as (N, 2), for the figure.
-        raw_traced: the same traced.
-        trace_gap: largest difference of a traced spot shift to the rendered one, px.
+    Attributes
+    ----------
+    parameter : str
+        Of NAMES.
+    sign : int
+        +1 or -1.
+    raw : Mapping[str, np.ndarray]
+        Of the images, form -> error over the true change as (N, 2), for the figure.
+    raw_traced : Mapping[str, np.ndarray]
+        The same traced.
+    trace_gap : float
+        Largest difference of a traced spot shift to the rendered one, px.
     """
 
     parameter: str
@@ -308,12 +333,18 @@ def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[E
 def single_range(bench: Bench, wide: Bench, parameter: str, sign: int, count: int) -> Range:
     """Follow one parameter in one direction.
 
-    Args:
-        bench: with the instrument's own area CCDs, for the window's edge.
-        wide: with larger ones, same camera.
-        parameter: of NAMES.
-        sign: of the change.
-        count: number of sizes to begin with.
+    Parameters
+    ----------
+    bench : Bench
+        With the instrument's own area CCDs, for the window's edge.
+    wide : Bench
+        With larger ones, same camera.
+    parameter : str
+        Of NAMES.
+    sign : int
+        Of the change.
+    count : int
+        Number of sizes to begin with.
     """
     camera = bench.cameras[0]
     geometry = bench.geometry(camera)
@@ -468,11 +499,16 @@ def corners(bench: Bench, count: int) -> Corners:
 class Separation:
     """Readings of many random changes regressed on the true ones.
 
-    Attributes:
-        gain: form -> camera -> (4, 4): reading p per unit of true change q.
-        sigma: likewise, standard deviations.
-        scatter: form -> (4,) rms of what the regression leaves, table units, all cameras.
-        trials: number of states.
+    Attributes
+    ----------
+    gain : Mapping[str, Mapping[str, np.ndarray]]
+        Form -> camera -> (4, 4): reading p per unit of true change q.
+    sigma : Mapping[str, Mapping[str, np.ndarray]]
+        Likewise, standard deviations.
+    scatter : Mapping[str, np.ndarray]
+        Form -> (4,) rms of what the regression leaves, table units, all cameras.
+    trials : int
+        Number of states.
     """
 
     gain: Mapping[str, Mapping[str, np.ndarray]]
@@ -545,17 +581,27 @@ def variant(
 ) -> MonitorExperiment:
     """The experiment with one camera of an instrument, changed and built anew.
 
-    Args:
-        resolved: the instrument as its file gives it.
-        backend: where to trace.
-        camera: the camera that is kept.
-        pixels: rows and columns of the area CCDs.
-        pupil_offset: centre (X, Y) of the monitor's sub-aperture in the entrance pupil, metres.
-        field: of the area CCDs, radians.
-        ccd_offset: (X, Y) from the pinhole to the area CCD's centre, metres.
+    Parameters
+    ----------
+    resolved : ResolvedJob
+        The instrument as its file gives it.
+    backend : Backend
+        Where to trace.
+    camera : str
+        The camera that is kept.
+    pixels : int | None
+        Rows and columns of the area CCDs.
+    pupil_offset : tuple[float, float] | None
+        Centre (X, Y) of the monitor's sub-aperture in the entrance pupil, metres.
+    field : float | None
+        Of the area CCDs, radians.
+    ccd_offset : tuple[float, float] | None
+        (X, Y) from the pinhole to the area CCD's centre, metres.
 
-    Raises:
-        InputError: the prisms cannot stand so.
+    Raises
+    ------
+    InputError
+        The prisms cannot stand so.
     """
     spec = resolved.instrument
     site = spec.cameras[camera]
@@ -582,12 +628,17 @@ def with_return(experiment: MonitorExperiment, kind: str) -> MonitorExperiment:
     meet in its middle. Rays meet them in one order; the other orders give the same ray, as turns by half a turn do not
     depend on theirs.
 
-    Args:
-        experiment: with the plane return that was built.
-        kind: of RETURNS.
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        With the plane return that was built.
+    kind : str
+        Of RETURNS.
 
-    Raises:
-        ValueError: it is no such kind.
+    Raises
+    ------
+    ValueError
+        It is no such kind.
     """
     if kind not in RETURNS:
         raise ValueError(f"no return {kind!r}; there are {', '.join(RETURNS)}")
@@ -629,10 +680,14 @@ def _mirrors(kind: str) -> list[Pose]:
 class Response:
     """What a kind of return does.
 
-    Attributes:
-        kind: of RETURNS.
-        across, along: (2,) motion of the spots (left, right) over the motion of the line CCD across and along the line.
-        gain: (4,) corrected reading over truth, single changes.
+    Attributes
+    ----------
+    kind : str
+        Of RETURNS.
+    across, along : np.ndarray
+        (2,) motion of the spots (left, right) over the motion of the line CCD across and along the line.
+    gain : np.ndarray
+        (4,) corrected reading over truth, single changes.
     """
 
     kind: str
@@ -681,11 +736,16 @@ def false_slopes(bench: Bench, form: str, pistons: Sequence[float]) -> np.ndarra
 class PupilStudy:
     """False readings per piston over the place of the monitor's sub-aperture in the pupil.
 
-    Attributes:
-        offset: (N, 2) X, Y of the sub-aperture, metres.
-        slope: (N, 4) table units per metre of piston, corrected form.
-        gradient: (4, 2) change of the slope by X and Y, table units per m^2.
-        rest: (4,) rms of the slopes about that plane, table units per metre.
+    Attributes
+    ----------
+    offset : np.ndarray
+        (N, 2) X, Y of the sub-aperture, metres.
+    slope : np.ndarray
+        (N, 4) table units per metre of piston, corrected form.
+    gradient : np.ndarray
+        (4, 2) change of the slope by X and Y, table units per m^2.
+    rest : np.ndarray
+        (4,) rms of the slopes about that plane, table units per metre.
     """
 
     offset: np.ndarray
@@ -752,10 +812,14 @@ def gains(bench: Bench, constant: float = 0.0) -> dict[str, np.ndarray]:
 class FieldPoint:
     """The formulas with the area CCDs at another field.
 
-    Attributes:
-        field: radians. separation: of the area CCDs, metres.
-        gains: form -> (4,) reading over truth.
-        slope: (4,) false reading per metre of piston, corrected form, table units.
+    Attributes
+    ----------
+    field : float
+        radians. separation: of the area CCDs, metres.
+    gains : dict[str, np.ndarray]
+        Form -> (4,) reading over truth.
+    slope : np.ndarray
+        (4,) false reading per metre of piston, corrected form, table units.
     """
 
     field: float

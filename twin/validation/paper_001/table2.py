@@ -190,9 +190,12 @@ _TITLES = {
 def bench_png(reader: laboratory.Reader, tables: Sequence[laboratory.ReadingTable]) -> bytes:
     """The picture as PNG.
 
-    Args:
-        reader: of the experiment.
-        tables: rendered benches, each with the series of Table 2.
+    Parameters
+    ----------
+    reader : laboratory.Reader
+        Of the experiment.
+    tables : Sequence[laboratory.ReadingTable]
+        Rendered benches, each with the series of Table 2.
     """
     from matplotlib.figure import Figure
 

@@ -58,17 +58,27 @@ _CURVES = 40
 class Flights:
     """N campaigns over K fields, S schemes; the last scheme lets each field use its own parameters.
 
-    Attributes:
-        fields: names. latitude: (K,) radians.
-        bias, bias_sigma, true_bias: (N, K, 3) of each field calibrated by itself, radians; roll, pitch, yaw.
-        interior, interior_sigma: (N, K, 9) in the order of INNER, metres; sigma 0 where held.
-        plan, height: (N, S, K) RMS at check points without ground control, metres.
-        plan_before, height_before: (N, K) with the laboratory's camera.
-        plan_floor, height_floor: (N, K) with the true camera and the true bias: the check points' own noise.
-        expected: (N, S, K) RMS in plan that the true biases of fields and scheme imply.
-        fits: campaign -> roll, pitch, yaw against latitude, from the estimated biases.
-        true_amplitude, true_significance: (N, 3) amplitude from the true biases, by unweighted least squares, and how
-            many of its standard deviations it is.
+    Attributes
+    ----------
+    fields : tuple[str, ...]
+        names. latitude: (K,) radians.
+    bias, bias_sigma, true_bias : np.ndarray
+        (N, K, 3) of each field calibrated by itself, radians; roll, pitch, yaw.
+    interior, interior_sigma : np.ndarray
+        (N, K, 9) in the order of INNER, metres; sigma 0 where held.
+    plan, height : np.ndarray
+        (N, S, K) RMS at check points without ground control, metres.
+    plan_before, height_before : np.ndarray
+        (N, K) with the laboratory's camera.
+    plan_floor, height_floor : np.ndarray
+        (N, K) with the true camera and the true bias: the check points' own noise.
+    expected : np.ndarray
+        (N, S, K) RMS in plan that the true biases of fields and scheme imply.
+    fits : tuple[tuple[LatitudeFit, ...], ...]
+        Campaign -> roll, pitch, yaw against latitude, from the estimated biases.
+    true_amplitude, true_significance : np.ndarray
+        (N, 3) amplitude from the true biases, by unweighted least squares, and how many of its standard deviations it
+        is.
     """
 
     fields: tuple[str, ...]
@@ -183,11 +193,16 @@ class Quality:
     """Passes of all campaigns, (N, K, 3): metres for the orbit's x, y, z in the Earth-fixed frame, radians for roll,
     pitch, yaw of the attitude against the orbital frame.
 
-    Attributes:
-        orbit, attitude: RMS of the third differences of what is measured.
-        orbit_sigma, attitude_sigma: standard deviation of a reading that they imply.
-        orbit_error: RMS of measured minus true. attitude_error: of measured against true, less its mean over the pass.
-        attitude_jump: standard deviation of a reading's own error, from measured less true of neighbouring readings.
+    Attributes
+    ----------
+    orbit, attitude : np.ndarray
+        RMS of the third differences of what is measured.
+    orbit_sigma, attitude_sigma : np.ndarray
+        Standard deviation of a reading that they imply.
+    orbit_error : np.ndarray
+        RMS of measured minus true. attitude_error: of measured against true, less its mean over the pass.
+    attitude_jump : np.ndarray
+        Standard deviation of a reading's own error, from measured less true of neighbouring readings.
     """
 
     orbit: np.ndarray

@@ -118,11 +118,16 @@ def true_sensors(
 ) -> dict[str, Sensor]:
     """Line -> the camera as it is after launch, on the true trajectory of a pass or on another one.
 
-    Args:
-        setup: cameras.
-        one: the pass.
-        trajectory: another one, None for the true.
-        interior: line -> change of its f, x, y (3,), metres.
+    Parameters
+    ----------
+    setup : CalibrationSetup
+        cameras.
+    one : FieldPass
+        The pass.
+    trajectory : Platform | None
+        Another one, None for the true.
+    interior : Mapping[str, np.ndarray]
+        Line -> change of its f, x, y (3,), metres.
     """
     payload = changed_payload(setup.test, setup.camera)
     lines = dict(payload.lines)
@@ -141,9 +146,12 @@ def true_sensors(
 class Turned:
     """A platform with its body turned, attitude -> attitude Rx(roll) Ry(pitch) Rz(yaw).
 
-    Attributes:
-        base: the platform.
-        angles: (3,) roll, pitch, yaw, radians.
+    Attributes
+    ----------
+    base : Platform
+        The platform.
+    angles : np.ndarray
+        (3,) roll, pitch, yaw, radians.
     """
 
     base: Platform
@@ -176,12 +184,18 @@ def derivatives(setup: CalibrationSetup, one: FieldPass, bias: np.ndarray) -> tu
     """Coefficients of the error equations against image points of the rigorous sensor: each unknown of the sensor is
     changed a little; what the unchanged model then misses is minus its coefficient.
 
-    Args:
-        setup: cameras.
-        one: a pass; its check points are taken.
-        bias: (3,) from the measured to the true attitude, radians.
+    Parameters
+    ----------
+    setup : CalibrationSetup
+        cameras.
+    one : FieldPass
+        a pass; its check points are taken.
+    bias : np.ndarray
+        (3,) from the measured to the true attitude, radians.
 
-    Returns:
+    Returns
+    -------
+    tuple[str, str, float]
         Line and unknown that are farthest off, and their largest difference over the largest coefficient.
     """
     payload = changed_payload(setup.test, setup.camera)
@@ -248,10 +262,13 @@ def errors_of(campaign: Campaign, one: FieldPass, found: Adjustment | Stepwise) 
 class Rank:
     """What the twelve unknowns of a field leave open.
 
-    Attributes:
-        unknowns: how many. open: combinations. weak_sigma: of nadir y, metres, with nadir x held.
-        moved: RMS that the rigorous sensor's image points move by when the open combination is carried out, x of every
-            line 0.1 mm. alone: when only the x are. Pixels.
+    Attributes
+    ----------
+    unknowns : int
+        How many. open: combinations. weak_sigma: of nadir y, metres, with nadir x held.
+    moved : float
+        RMS that the rigorous sensor's image points move by when the open combination is carried out, x of every line
+        0.1 mm. alone: when only the x are. Pixels.
     """
 
     unknowns: int
@@ -292,9 +309,12 @@ def rank_of(setup: CalibrationSetup, campaign: Campaign) -> Rank:
 class Walk:
     """The stepwise solution of a field against the simultaneous one.
 
-    Attributes:
-        found: stepwise. together: simultaneous. distance: largest difference, sigmas.
-        after: rounds -> largest difference after so many, sigmas.
+    Attributes
+    ----------
+    found : Stepwise
+        stepwise. together: simultaneous. distance: largest difference, sigmas.
+    after : Mapping[int, float]
+        Rounds -> largest difference after so many, sigmas.
     """
 
     found: Stepwise
@@ -322,8 +342,10 @@ def walked(campaign: Campaign, one: FieldPass, rounds: tuple[int, ...] = (1, 10,
 class FoundMarks:
     """Marks of all windows of one line.
 
-    Attributes:
-        line, pixel: (n,) of their centroids. ground: (n, 3) true places, ITRS, metres.
+    Attributes
+    ----------
+    line, pixel : np.ndarray
+        (n,) of their centroids. ground: (n, 3) true places, ITRS, metres.
     """
 
     line: np.ndarray
@@ -425,13 +447,20 @@ def _matched(predicted: tuple[np.ndarray, np.ndarray], at: np.ndarray, ground: n
 class FromImages:
     """One field.
 
-    Attributes:
-        name: of it.
-        control, check: points that are left.
-        way: the stepwise solution. together: the simultaneous one, for sigmas.
-        error: unknown -> stepwise estimate minus truth, radians and metres; free ones only.
-        covariance: of these, in their order.
-        before, after: errors at check points with the laboratory's camera and with the field's parameters.
+    Attributes
+    ----------
+    name : str
+        Of it.
+    control, check : int
+        Points that are left.
+    way : Stepwise
+        The stepwise solution. together: the simultaneous one, for sigmas.
+    error : dict[str, float]
+        Unknown -> stepwise estimate minus truth, radians and metres; free ones only.
+    covariance : np.ndarray
+        Of these, in their order.
+    before, after : CheckErrors
+        Errors at check points with the laboratory's camera and with the field's parameters.
     """
 
     name: str

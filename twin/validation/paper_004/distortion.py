@@ -55,10 +55,14 @@ _PRINTED_ONLY = {f"004.table2.{name}" for name in ("reduction", "mean", "largest
 class Perspective:
     """The camera without distortion, L = f tan(W - w) + f tan w, that is nearest to chief rays.
 
-    Attributes:
-        f: principal distance, metres.
-        p: principal point f tan w, metres.
-        rest: distortion of the rays, (N,), metres.
+    Attributes
+    ----------
+    f : float
+        Principal distance, metres.
+    p : float
+        Principal point f tan w, metres.
+    rest : Array
+        Distortion of the rays, (N,), metres.
     """
 
     f: float
@@ -76,10 +80,14 @@ class Perspective:
     def nearest(cls, where: Array, turn: Array, tilted: bool = True) -> Perspective:
         """By nonlinear least squares, nothing expanded; with p = 0 unless ``tilted``.
 
-        Args:
-            where: of chief rays along the line, (N,), metres.
-            turn: W of their directions, (N,), radians.
-            tilted: whether p is sought.
+        Parameters
+        ----------
+        where : Array
+            Of chief rays along the line, (N,), metres.
+        turn : Array
+            W of their directions, (N,), radians.
+        tilted : bool
+            Whether p is sought.
         """
         start = (where[-1] - where[0]) / (np.tan(turn[-1]) - np.tan(turn[0]))
 

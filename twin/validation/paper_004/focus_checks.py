@@ -48,9 +48,12 @@ def effects(bench: FocusBench, inclined: float = 1.0) -> Array:
     Δα, Δβ and Δz are those of the plane through the traced defocus of all sites; Δγ is the line's turn, Δx and Δy where
     its middle goes.
 
-    Args:
-        bench: with the mount.
-        inclined: factor on the inclination of the mounting surface.
+    Parameters
+    ----------
+    bench : FocusBench
+        With the mount.
+    inclined : float
+        Factor on the inclination of the mounting surface.
     """
     test = bench.setup.test
     surface = test.mount.model_copy(update={"tilt": inclined * test.mount.tilt})

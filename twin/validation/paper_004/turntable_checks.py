@@ -43,9 +43,12 @@ CLOSED_FORMS = tuple(name for name in FITS if name != NETWORK)
 class FittedTable:
     """One turntable, fitted.
 
-    Attributes:
-        chosen: the closed form that cross-validation on the calibration points chooses.
-        held_out: RMS of each fit at readings that no fit has seen, radians; infinite where it failed.
+    Attributes
+    ----------
+    chosen : str
+        The closed form that cross-validation on the calibration points chooses.
+    held_out : Mapping[str, float]
+        RMS of each fit at readings that no fit has seen, radians; infinite where it failed.
     """
 
     chosen: str

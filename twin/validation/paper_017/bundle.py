@@ -40,9 +40,12 @@ _FIXED = CameraChangeSpec.model_validate({"lasting": {"angles": 3 * ["0.002 arcs
 def strip(image: float, attitude: float) -> AdjustSetup:
     """One pass of three lines without control.
 
-    Args:
-        image: standard deviation of an image point, pixels of 5 m.
-        attitude: of a reading of the attitude, twice a second, arcseconds.
+    Parameters
+    ----------
+    image : float
+        Standard deviation of an image point, pixels of 5 m.
+    attitude : float
+        Of a reading of the attitude, twice a second, arcseconds.
     """
     setup = AdjustSetup.read(SCENES / ORBIT / "adjust.yaml")
     test, lines = setup.test, ("forward", "nadir", "backward")
