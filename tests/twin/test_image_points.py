@@ -21,7 +21,7 @@ from twin.orbit.calibration.calibration_run import true_values
 from twin.orbit.calibration.campaign import Campaign, FieldImages
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
-from twin.orbit.calibration.screening import screened
+from twin.orbit.calibration.screening import screen_campaign
 from twin.orbit.images import image_points
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
 from twin.orbit.images.patch import judged, true_ground
@@ -79,15 +79,20 @@ def test_true_ground_is_the_map_less_its_errors(flown: Simulation, control: Matc
 
 
 def test_what_is_not_known_of_heights_adds_its_variance(flown: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three times the sigma of the reference's heights is nine times what it adds to a match's covariance."""
+    """Three times the sigma of the reference's heights is nine times what it adds to a match's covariance; without it
+    there are the match itself and the roughness."""
     agreed, seen = image_points.consensus, []
+    matching, matches = image_points.match, []
     monkeypatch.setattr(image_points, "consensus", lambda *a, **k: seen.append(k["covariance"]) or agreed(*a, **k))
+    monkeypatch.setattr(image_points, "match", lambda *a, **k: matches.append(matching(*a, **k)) or matches[-1])
     for sigma in (0.0, 1.0, 3.0):
         map_points(flown.patch, asked().model_copy(update={"control": 60, "check": 20, "height_sigma": sigma}))
     none, one, three = seen[:: len(flown.patch.images)]
     good = np.abs(none).max(axis=(1, 2)) < 1.0  # of the others nothing is known
     np.testing.assert_allclose((three - none)[good], 9.0 * (one - none)[good], rtol=0, atol=1e-12)
     assert (one - none)[good].max() > 1e-3
+    alone = none - asked().roughness ** 2 * np.eye(2)
+    np.testing.assert_allclose(alone[good], matches[0].covariance[good], rtol=0, atol=1e-12)
 
 
 def test_tie_points_are_five_times_better(flown: Simulation, control: MatchedPoints) -> None:
@@ -161,7 +166,7 @@ def test_calibration_from_images() -> None:
     setup = CalibrationSetup.read(CALIBRATE)
     campaign = fly_fields(setup.model_copy(update={"test": two_patches()}), np.random.SeedSequence(5))
     assert campaign.images is not None
-    done = screened(campaign)
+    done = screen_campaign(campaign)
     parameters_fit(done)
     (one,) = done.images or ()
     assert isinstance(one, FieldImages)

@@ -211,3 +211,16 @@ def test_the_view_in_three_dimensions_is_in_the_policy():
 @pytest.mark.parametrize("evil", EVIL)
 def test_code_between_backticks_brings_no_markup(evil):
     assert inline(f"a `{evil}` b") == f"a <code>{escape(evil)}</code> b"
+
+
+def test_names_of_many_columns_stand_upright():
+    """Four have room beside one another in half a page's width, five have not."""
+    from matplotlib.colors import SymLogNorm
+    from matplotlib.figure import Figure
+
+    from twin.main_job import spot_plots
+
+    for count, rotation in ((4, 0.0), (5, 90.0)):
+        axes = Figure().subplots()
+        spot_plots._motion_panel(axes, np.ones((2, count)), [str(k) for k in range(count)], SymLogNorm(1.0))
+        assert {text.get_rotation() for text in axes.get_xticklabels()} == {rotation}

@@ -195,6 +195,9 @@ def test_bars(sharp, aberrated, direction):
     """The contrast of Nyquist bars without noise, against the traced pupil, sharp and aberrated."""
     design = BarDesign.build(sharp, direction)
     assert np.hypot(*design.nominal) == pytest.approx(0.5 / PITCH, rel=1e-12)
+    # seven degrees from the pixels' axes, so that their phases are even over the group
+    down, along = design.per_pixel
+    assert sorted((abs(down), abs(along))) == pytest.approx(0.5 * np.array([0.121869, 0.992546]), abs=1e-6)
     for view in (sharp, aberrated):
         share = view.image(design.target)
         mean, dark, bright = (

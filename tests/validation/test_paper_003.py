@@ -58,6 +58,20 @@ def test_lost_tables_need_no_work(monkeypatch):
     assert all(len(r.how) > 60 and r.measured is None for r in results)
 
 
+@pytest.mark.parametrize("wanted", [True, False])
+def test_table_2_is_computed_where_it_is_asked_for(monkeypatch, wanted):
+    """Its images cost more than all else of these checks."""
+    for name in ("flown", "flights_of", "_biases", "_schemes", "_findings"):
+        monkeypatch.setattr(fields, name, lambda *_: [])
+    for name in ("_slope", "_interior"):
+        monkeypatch.setattr(fields, name, lambda *_: None)
+    monkeypatch.setattr(fields, "_quality", lambda *_: ["quality"])
+    context = SimpleNamespace(
+        count=lambda *_: 1, seed=1, progress=lambda *_: None, wants=lambda *ids: wanted and ids == ("003.table2",)
+    )
+    assert ("quality" in list(fields.run(context))) is wanted
+
+
 @pytest.mark.second
 def test_exact_checks_and_the_open_combination():
     """Marks to 0.01 px; the coefficients to what steps of 15 um leave; x of three lines against pitch."""
@@ -244,7 +258,7 @@ def of_mean(change):
     def broken(right):
         return lambda campaign, *given: change(campaign.laboratory, *right(campaign, *given))
 
-    return calibration_schemes, "averaged", broken
+    return calibration_schemes, "mean_parameters", broken
 
 
 def interior_twice(start, cameras, bias):
