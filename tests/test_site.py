@@ -10,7 +10,7 @@ import pytest
 import twin
 from docs.site.__main__ import HERE, NEEDED, BuildError, build, run_sphinx, with_policy
 from docs.site.command_pages import command_page, commands, programs
-from docs.site.file_pages import ACTIONS, file_pages, node_table
+from docs.site.file_pages import ACTIONS, file_pages, key_page, node_table
 from docs.site.markdown import slug
 from docs.site.run_pages import described, golden_runs
 from docs.site.spec_keys import accepted, example, flow, keys, kinds_of, sections, shipped
@@ -56,6 +56,12 @@ def test_every_key_stands_in_the_reference(pages: dict[str, str]) -> None:
 
 
 @pytest.mark.second
+@pytest.mark.second
+def test_the_page_of_all_keys_is_that_of_the_models() -> None:
+    """``python -m docs.site --keys docs/keys.md`` writes it."""
+    assert (ROOT / "docs/keys.md").read_text("utf-8") == key_page()
+
+
 def test_every_example_is_taken_by_its_model() -> None:
     """As it is shown: the line is read as YAML and put into the mapping that it is an example in."""
     for kind, model in ((kind, model) for kind, file in MODELS.items() for model in sections(file)):

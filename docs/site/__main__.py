@@ -42,10 +42,18 @@ def main(
         "build/site"
     ),
     notebooks: Annotated[bool, typer.Option(help="Whether to run the notebooks (minutes).")] = True,
+    keys: Annotated[
+        Path | None, typer.Option(help="Write only the page with every key of every file: docs/keys.md.")
+    ] = None,
 ) -> None:
     """Build the documentation as web pages that need no network: guides, notebooks, and the reference, made from the
     program. Sphinx's warnings are errors, every link within the site is followed. Needs the extra `docs`.
     """
+    if keys is not None:
+        from docs.site.file_pages import key_page
+
+        keys.write_text(key_page(), "utf-8")
+        return
     try:
         count = build(out, notebooks)
     except BuildError as error:

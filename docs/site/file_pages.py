@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import twin
-from docs.site.markdown import anchor, code, prose, sentence, table
+from docs.site.markdown import anchor, code, prose, sentence, slug, table
 from docs.site.spec_keys import Key, Spec, Takes, example, flow, keys, sections, shipped, summary
 from scenes.schema import MODELS
 from scenes.specs.file_kinds import file_kinds
@@ -23,6 +23,36 @@ def file_pages() -> dict[str, str]:
     """Path of a page in the site's source -> Markdown."""
     pages = {f"reference/files/{kind}.md": _page(kind) for kind in MODELS}
     return {"reference/files/index.md": _index(), **pages, "reference/nodes.md": _node_page()}
+
+
+def key_page() -> str:
+    """Return the page of the repository with every key of every kind of file, in Markdown, without examples."""
+    kinds = "\n".join(
+        f"- [{title(kind)}](#{slug(title(kind))}): {prose(sentence(summary(model)))}" for kind, model in MODELS.items()
+    )
+    parts = [
+        f"""# Every key of every file
+
+`python -m docs.site --keys docs/keys.md` writes this page from the models that check the files. The site has the same
+tables with an example of every key. Every quantity carries its unit, `2 arcsec`; any unit of the same dimension may be
+written. A key without a default must be written.
+
+{kinds}
+"""
+    ]
+    described: dict[type[Spec], str] = {}
+    for kind, model in MODELS.items():
+        parts.append(f"## {title(kind)}\n\nRead {read_by(kind)}.\n")
+        for below, paths in sections(model).items():
+            if (first := title(described.setdefault(below, kind))) != title(kind):
+                parts.append(f"{code(paths[0])} is described under [{first}](#{slug(first)}).\n")
+                continue
+            head = "" if paths == [""] else f"**{code(paths[0])}**: {prose(sentence(summary(below)))}\n\n"
+            rows = (
+                [code(key.name), prose(sentence(key.meaning)), _takes(key.takes), _default(key)] for key in keys(below)
+            )
+            parts.append(head + table(["Key", "Meaning", "Takes", "Default"], rows))
+    return "\n".join(parts)
 
 
 def title(kind: str) -> str:
@@ -100,9 +130,13 @@ def _row(kind: str, model: type[Spec], place: str, key: Key) -> list[str]:
     if key.below:
         below = f"see {code(f'{full}{key.below[0][0]}')} below"
         shown = below if isinstance(value, dict | list) else f"{shown}, or {below}"
-    words = ("none", "empty", "its own defaults")
-    default = (key.default if key.default in words else code(key.default)) or "must be written"
+    default = _default(key) or "must be written"
     return [f"{anchor(full)}{code(key.name)}", prose(sentence(key.meaning)), _takes(key.takes), default, shown]
+
+
+def _default(key: Key) -> str:
+    """Return the value that holds where a key is not written, in Markdown; empty where it must be written."""
+    return key.default if key.default in ("none", "empty", "its own defaults") else code(key.default)
 
 
 def _takes(takes: Takes) -> str:

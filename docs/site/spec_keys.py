@@ -31,7 +31,7 @@ BY_HAND = Path(__file__).with_name("examples.yaml")
 _ATTRIBUTE = re.compile(r"^(\w+(?:, \w+)*)(?: : .*)?\n((?:(?: {4}.*)?\n)*(?: {4}.*))", re.MULTILINE)
 """One attribute of a class under NumPy's heading: its names, and the indented text below them."""
 _QUANTITY = re.compile(r"(?:an? |the )?(.*) with its unit \((.*)\), e\.g\. '[^']*'(?:; (.*))?")
-_SI_UNIT = re.compile(r",? (?:metres|radians|seconds|kelvin)\b")
+_SI_UNIT = re.compile(r",? (?:in )?(?:metres|radians|seconds|kelvin)\b")
 _PLAIN = re.compile(
     r"(?!(?:true|false|null)$)[A-Za-z/][\w/.+*^-]*(?: [\w/.(+*^-][\w/.+*^()-]*)*"
     r"|[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)? [\w/^%-]+",
