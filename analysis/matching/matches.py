@@ -74,7 +74,7 @@ class Matches:
         return "; ".join(parts + [f"{number} x {text}" for text, number in count.most_common()])
 
 
-def match(
+def match_windows(
     image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, *, reach: int, options: MatchOptions | None = None
 ) -> Matches:
     """Find templates in an image, each near its predicted place.
@@ -97,9 +97,9 @@ def match(
     ValueError
         Wrong shapes, reach out of range, a template too small for its margin.
     """
-    plane = checked_image(image, "match")
-    patch = checked_templates(templates, "match")
-    expected = checked_places(predicted, len(patch), "match")
+    plane = checked_image(image, "match windows")
+    patch = checked_templates(templates, "match windows")
+    expected = checked_places(predicted, len(patch), "match windows")
     chosen = options or MatchOptions()
     peaks = search(plane, patch, expected, reach)
     fits = least_squares(plane, patch, peaks.place, chosen)

@@ -28,7 +28,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.arrays import Array, OfStates, shows
+from analysis.arrays import Array, StateArrays, shows
 from analysis.monitor.disturbances import Consistency, Disturbances, consistency
 from analysis.monitor.estimators import PARAMETERS_EACH, Shifts, applicable
 from analysis.monitor.limits import quantities
@@ -256,7 +256,7 @@ class MotionModel:
 
 
 @dataclass(frozen=True, eq=False)
-class Curvature(OfStates):
+class Curvature(StateArrays):
     """What retraced states say of the linear readings of an estimator in S states.
 
     Attributes
@@ -432,7 +432,7 @@ class Estimates:
 
 @shows("parameters", "before [px]", "after [px]", "sigma_after [px]")
 @dataclass(frozen=True, eq=False)
-class Recovery(OfStates):
+class Recovery(StateArrays):
     """What the images say, for S states.
 
     before, after: (S, C, 2) spot positions (row, column), px; sigma_before, sigma_after: their standard deviations.
@@ -465,7 +465,7 @@ class Recovery(OfStates):
         states : slice
             which.
         """
-        return OfStates.at(replace(self, parts=None), states)
+        return StateArrays.at(replace(self, parts=None), states)
 
     @property
     def shift(self) -> Array:
@@ -537,7 +537,7 @@ def judged_spots(
     return widened(found, states.widening), states.reshaped(calibration.template.count)
 
 
-def recover(
+def recover_monitor(
     before: NDArray[Any] | MeasuredSpots,
     after: NDArray[Any],
     calibration: MonitorCalibration,
@@ -610,13 +610,13 @@ def recovery_of(
     calibration : MonitorCalibration
         Of the nominal instrument; C must be its number of spots.
     disturbances : Disturbances | None
-        As of `recover`.
+        As of `recover_monitor`.
     keep_parts : bool
         Of the noise, which are large.
     evidence : SpotEvidence | None
         What the fits say; the positions are those of `judged_spots`.
     motions : Mapping[str, MotionModel] | None
-        As of `recover`.
+        As of `recover_monitor`.
     """
     spots = calibration.spots
     states = second.row.size // spots
@@ -665,7 +665,7 @@ def estimates(
     ground : GroundGeometry | None
         Of a pair whose altitude is known.
     motions : Mapping[str, MotionModel] | None
-        As of `recover`.
+        As of `recover_monitor`.
     """
     shifts = Shifts(start, end, covariance, cameras, disturbances)
     found: dict[str, tuple[Array, Array, Array | None]] = {}

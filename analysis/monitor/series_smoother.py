@@ -128,7 +128,7 @@ def window_of(values: int) -> int:
     return max(3, LARGEST // values)
 
 
-def smooth(
+def smooth_series(
     stated: Disturbances,
     measured: ArrayLike,
     shifts: Array,
@@ -203,7 +203,7 @@ class _Search:
     order
         (M,) numbers of the shifts in the order of time.
     reference
-        As of `smooth`.
+        As of `smooth_series`.
     """
 
     def __init__(

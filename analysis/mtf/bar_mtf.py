@@ -103,7 +103,7 @@ class BarMtf:
         return float(np.hypot(*self.frequency))
 
 
-def measure_bars(
+def bar_mtf(
     region: ArrayLike,
     dark: ArrayLike,
     bright: ArrayLike,
@@ -136,7 +136,7 @@ def measure_bars(
     frames : int
         Number of averaged frames.
     saturation : float | None
-        As in `slanted_edge.measure_edge`.
+        As in `slanted_edge_mtf`.
     offset : float
         Grey value without light, for the contrast only.
     rounding : tuple[float, float, float]
@@ -431,7 +431,7 @@ def measure_bar_pages(
     region : Array
         (P, H, W) grey values, linear in light; pages that repeat another one to the bit do not count.
     dark : Array
-        Pages (Q, ...) with the level of the spaces, as in `bar_contrast.measure_bars`.
+        Pages (Q, ...) with the level of the spaces, as in `bar_mtf`.
     bright : Array
         Likewise with that of the bars.
     frequency : ArrayLike | None
@@ -446,7 +446,7 @@ def measure_bar_pages(
     Raises
     ------
     BarError
-        As `measure_bars`, and bars that move from page to page.
+        As `bar_mtf`, and bars that move from page to page.
     """
     kept = different_pages(region)
     pages, patches = region[kept], [patch[different_pages(patch)] for patch in (dark, bright)]
@@ -459,7 +459,7 @@ def measure_bar_pages(
     rounding = [left_over(rms, step) if math.isfinite(rms) else 0.0 for rms in (own, *noise)]
 
     def measured(left: float) -> BarMtf:
-        return measure_bars(
+        return bar_mtf(
             mean, low, high, frequency, saturation=saturation, offset=offset, rounding=(left, rounding[1], rounding[2])
         )
 

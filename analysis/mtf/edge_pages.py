@@ -91,13 +91,13 @@ def measure_pages(
     pages : ArrayLike
         (P, H, W) grey values, linear in light; pages that repeat another one to the bit do not count.
     noise : NoiseModel | None
-        The detector's model, as in `slanted_edge.measure_edge`.
+        The detector's model, as in `slanted_edge_mtf`.
     saturation : float | None
         As there; one page that reaches it is enough.
     step : float
         Between the grey values of a page, which are rounded to it; 0 for real numbers.
     even : bool
-        The light is known to be even, as in `slanted_edge.measure_edge`.
+        The light is known to be even, as in `slanted_edge_mtf`.
 
     Raises
     ------

@@ -45,7 +45,7 @@ FREQUENCY.setflags(write=False)
 _SHOWN_PER_PIXEL = 16
 
 
-def measure_edge(
+def slanted_edge_mtf(
     region: ArrayLike,
     *,
     noise: NoiseModel | None = None,
@@ -95,7 +95,7 @@ def measure_edge(
 
 
 def _checked_frequency(frequency: ArrayLike) -> Array:
-    """Frequencies (F,) of `measure_edge`. ValueError if they make no sense."""
+    """Frequencies (F,) of `slanted_edge_mtf`. ValueError if they make no sense."""
     wanted = np.array(frequency, dtype=np.float64)
     if wanted.ndim != 1 or wanted.size < 2 or not np.all(np.diff(wanted) > 0) or wanted[0] < 0:
         raise ValueError("frequency must be at least two increasing values >= 0, in cycles/pixel")
@@ -135,13 +135,13 @@ def edge_result(
     fitted : FittedEdge
         Line and edge-spread function of all pages together.
     noise : NoiseModel | None
-        As in `measure_edge`.
+        As in `slanted_edge_mtf`.
     frames : int
         Each page is the mean of.
     frequency : Array
         (F,) cycles/pixel.
     rounding : tuple[float, float]
-        As in `measure_edge`.
+        As in `slanted_edge_mtf`.
 
     Raises
     ------

@@ -197,7 +197,9 @@ def widest_step(angle: ArrayLike) -> float:
     return float(max(tried, 2.0 * np.median(np.diff(x))) * (1.0 + 1e-6))
 
 
-def fit(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike, seed: int = 0) -> AngleFit:
+def fit_dividing_error(
+    angle: ArrayLike, value: ArrayLike, sigma: ArrayLike, method: str = "cubic_spline", seed: int = 0
+) -> AngleFit:
     """Fit a curve.
 
     Parameters
@@ -220,11 +222,11 @@ def fit(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike, seed: i
     NotConvergedError
         The network found no minimum.
     """
-    if name not in FITS:
-        raise ValueError(f"no fit is called {name!r}; there are {', '.join(FITS)}")
-    x, y, s = _points(name, angle, value, sigma)
-    settings, curve, derivative = FITS[name](x, y, s, seed)
-    return AngleFit(name, x, y, s, settings, curve, derivative)
+    if method not in FITS:
+        raise ValueError(f"no fit is called {method!r}; there are {', '.join(FITS)}")
+    x, y, s = _points(method, angle, value, sigma)
+    settings, curve, derivative = FITS[method](x, y, s, seed)
+    return AngleFit(method, x, y, s, settings, curve, derivative)
 
 
 def fewest(name: str) -> int:
@@ -258,7 +260,7 @@ def cross_validate(
     Raises
     ------
     ValueError, NotConvergedError
-        As `fit`; the fit needs enough points without a fold.
+        As `fit_dividing_error`; the fit needs enough points without a fold.
     """
     x, y, s = _points(name, angle, value, sigma)
     if not 2 <= folds:
@@ -274,7 +276,7 @@ def cross_validate(
     for k in range(min(folds, len(inner))):
         out = inner[k::folds]
         rest = np.setdiff1d(np.arange(len(x)), out)
-        part = fit(name, x[rest], y[rest], s[rest], seed)
+        part = fit_dividing_error(x[rest], y[rest], s[rest], name, seed)
         weights = part.weights(x[out])
         residual[out] = y[out] - part(x[out])
         variance[out] = s[out] ** 2 + (weights**2) @ s[rest] ** 2
@@ -713,7 +715,7 @@ def choose(
         say(f"fit and cross-validate: {name.replace('_', ' ')}")
         points = series.angle, series.mean, series.sigma
         try:
-            trials[name] = Trial(fit(name, *points, seed), cross_validate(name, *points, seed, folds))
+            trials[name] = Trial(fit_dividing_error(*points, name, seed), cross_validate(name, *points, seed, folds))
         except NotConvergedError as error:
             failed[name] = str(error)
     if not trials:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array, UndeterminedError
 from analysis.statistics import chance_beyond
@@ -333,7 +333,7 @@ class MapFit:
     parts: Array
 
 
-def find_pupil(measured: WavefrontMap) -> Pupil:
+def find_pupil(values: ArrayLike) -> Pupil:
     """The circle about the lit areas, but for specks; holes, spiders and edges that are cut off do not move it.
 
     Parameters
@@ -346,7 +346,8 @@ def find_pupil(measured: WavefrontMap) -> Pupil:
     UndeterminedError
         No light, or an edge that is round in less than half of the full angle.
     """
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(measured.lit.astype(np.uint8), connectivity=8)
+    light = np.isfinite(_checked_map(values))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(light.astype(np.uint8), connectivity=8)
     if count < 2:
         raise UndeterminedError("the map has no lit pixel")
     area = stats[:, cv2.CC_STAT_AREA]
@@ -398,7 +399,7 @@ def _off(points: Array, circle: tuple[float, float, float]) -> Array:
     return np.abs(np.hypot(points[:, 0] - circle[0], points[:, 1] - circle[1]) - circle[2])
 
 
-def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = None) -> MapFit:
+def fit_zernikes(values: ArrayLike, terms: Sequence[int], pupil: Pupil | None = None) -> MapFit:
     """Least squares of Zernike terms over the lit pixels of a pupil, all of the same weight.
 
     Parameters
@@ -420,8 +421,9 @@ def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = 
     terms = tuple(int(index) for index in terms)
     if not terms or any(b <= a for a, b in itertools.pairwise(terms)):
         raise MapError(f"terms are to be Noll's indices in ascending order, not {terms[:12]}")
+    measured = _checked_map(values)
     pupil = find_pupil(measured) if pupil is None else pupil
-    rows, columns = np.nonzero(measured.lit)
+    rows, columns = np.nonzero(np.isfinite(measured))
     x, y = pupil.unit(columns.astype(float), rows.astype(float))
     inside = x**2 + y**2 <= 1.0 + 1e-9
     rows, columns, x, y = rows[inside], columns[inside], x[inside], y[inside]
@@ -431,12 +433,12 @@ def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = 
             f"{count} lit pixels lie within the pupil at column {pupil.x:.1f}, row {pupil.y:.1f} of radius"
             f" {pupil.radius:.1f}; {size} terms need more: state where the pupil lies, or take fewer terms"
         )
-    values = measured.values[rows, columns]
+    lit_values = measured[rows, columns]
     # by chunks, each with the triangle of those before it: the triangle of all, with the parts as its last column
     triangle = np.zeros((0, size + 1))
     for part in _chunks(count):
         basis = circle_terms(terms, x[part], y[part])
-        both = np.column_stack([basis, values[part]]) / math.sqrt(count)
+        both = np.column_stack([basis, lit_values[part]]) / math.sqrt(count)
         triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, both]), mode="r"))
     sign = np.where(np.diag(triangle)[:size] < 0.0, -1.0, 1.0)
     factor, parts = triangle[:size, :size] * sign[:, None], triangle[:size, size] * sign
@@ -447,6 +449,16 @@ def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = 
             " before it: take fewer terms, or state where the pupil lies"
         )
     return MapFit(np.asarray(np.linalg.solve(factor, parts), dtype=np.float64), parts)
+
+
+def _checked_map(values: ArrayLike) -> Array:
+    """Return a map as float64. Raise MapError if it is not a plane of real numbers."""
+    plane = np.asarray(values)
+    if plane.ndim != 2 or plane.dtype.kind not in "iuf":
+        raise MapError(
+            f"a map is (rows, columns) of real numbers, NaN where there is no light, found {plane.dtype} {plane.shape}"
+        )
+    return plane.astype(np.float64)
 
 
 def _chunks(count: int) -> Iterator[slice]:

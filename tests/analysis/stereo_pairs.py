@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from analysis.matching.correlation import MatchOptions
-from analysis.matching.matches import Matches, match
+from analysis.matching.matches import Matches, match_windows
 from analysis.matching.spline import resampled
 from tests.analysis.texture_image import Texture, lattice
 
@@ -34,7 +34,7 @@ class Pair:
         return self.true + np.random.default_rng(9).uniform(-2.0, 2.0, self.true.shape)
 
     def matched(self, options: MatchOptions | None = None) -> Matches:
-        return match(self.second, self.templates(), self.predicted(), reach=4, options=options)
+        return match_windows(self.second, self.templates(), self.predicted(), reach=4, options=options)
 
 
 def textured(side, *, slope=1.0, noise=0.1, relief=0.0, length=12.0, radiometry="same", seed=0) -> Pair:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.mtf.bar_mtf import BarError, _design, _waves, measure_bars
+from analysis.mtf.bar_mtf import BarError, _design, _waves, bar_mtf
 from analysis.spots.noise import NoiseModel
 from tests.analysis.refusals import refuses
 from tests.analysis.test_slanted_edge import BRIGHT, DARK, FALSE_ALARM, MULTISPECTRAL, PAN, noisy, transfer
@@ -44,7 +44,7 @@ def vector(f, degrees):
 @pytest.mark.parametrize("f", [0.1, 0.2, 0.25, 0.3, 0.45, 0.5])
 def test_mtf_is_exact(f, degrees, how):
     stated = {"vector": vector(f, degrees) + 0.003, "length": f, "found": None}[how]
-    bars = measure_bars(bar_image(f, degrees), frequency=stated, **CALM)
+    bars = bar_mtf(bar_image(f, degrees), frequency=stated, **CALM)
     # what is left are the ninth and higher harmonics, which pass below 0.13 cycles/pixel only
     assert bars.mtf == pytest.approx(transfer(f, math.radians(degrees)), abs=3e-4 if f == 0.1 else 1e-5)
     if f < 0.5 or how != "found":
@@ -59,7 +59,7 @@ def test_mtf_is_exact(f, degrees, how):
 def test_aliased_images(f):
     """28 um: the third to ninth harmonics of the bars pass and alias. The eleventh and more are left: 1e-3."""
     for degrees in (3, 5, 10):
-        bars = measure_bars(bar_image(f, degrees, pitch=MULTISPECTRAL), frequency=f, **CALM)
+        bars = bar_mtf(bar_image(f, degrees, pitch=MULTISPECTRAL), frequency=f, **CALM)
         assert bars.mtf == pytest.approx(transfer(f, math.radians(degrees), MULTISPECTRAL), abs=1e-3)
         assert list(bars.harmonics) == [3, 5, 7]
         for h, amplitude in bars.harmonics.items():
@@ -74,7 +74,7 @@ def test_bars_parallel_to_the_pixels(stated):
     """Where nothing is along the row, the frequency points down the column. Its length has no sign."""
     image = bar_image(0.3, 0)
     for across, expected in ((image, (0.0, 0.3)), (image.T, (0.3, 0.0))):
-        bars = measure_bars(across, frequency=stated, **CALM)
+        bars = bar_mtf(across, frequency=stated, **CALM)
         assert bars.frequency == pytest.approx(expected, abs=1e-5)
         assert bars.mtf == pytest.approx(transfer(0.3, 0.0), abs=1e-5)
 
@@ -82,7 +82,7 @@ def test_bars_parallel_to_the_pixels(stated):
 def test_bars_above_nyquist_are_measured_when_the_frequency_is_stated():
     """0.7 cycles/pixel looks like 0.3; what it is has to be said."""
     for stated in (0.7, -0.7, vector(0.7, 4), -vector(0.7, 4)):
-        bars = measure_bars(bar_image(0.7, 4), frequency=stated, **CALM)
+        bars = bar_mtf(bar_image(0.7, 4), frequency=stated, **CALM)
         assert bars.cycles_per_pixel == pytest.approx(0.7, abs=1e-4)
         assert bars.mtf == pytest.approx(transfer(0.7, math.radians(4)), abs=1e-5)
 
@@ -91,18 +91,18 @@ def test_bars_above_nyquist_are_measured_when_the_frequency_is_stated():
 @pytest.mark.parametrize("degrees", [2, 10])
 def test_the_stated_length_tells_the_aliases_near_nyquist_apart(f, degrees):
     """f and (0, 1) - f give the same pixels; the one is as long as stated, the other by some thousandths off."""
-    bars = measure_bars(bar_image(f, degrees), frequency=f, **CALM)
+    bars = bar_mtf(bar_image(f, degrees), frequency=f, **CALM)
     assert bars.frequency == pytest.approx(vector(f, degrees), abs=1e-5)
 
 
 def test_contrast_and_coltman():
     """At Nyquist the third harmonic lies beyond the cut-off, so Coltman's first term is exact; all phases occur."""
     image = bar_image(0.5, 5)
-    bars = measure_bars(image, frequency=0.5, **CALM)
+    bars = bar_mtf(image, frequency=0.5, **CALM)
     assert bars.contrast == pytest.approx((image.max() - image.min()) / (image.max() + image.min()))
     # of 4096 phases one lies within 1e-3 cycles of the crest
     assert bars.coltman == pytest.approx(transfer(0.5, math.radians(5)), abs=2e-4)
-    with_offset = measure_bars(image + 200, CALM["dark"] + 200, CALM["bright"] + 200, 0.5, offset=200.0)
+    with_offset = bar_mtf(image + 200, CALM["dark"] + 200, CALM["bright"] + 200, 0.5, offset=200.0)
     assert with_offset.contrast == pytest.approx(bars.contrast)
     assert with_offset.coltman == pytest.approx(bars.coltman)
 
@@ -110,7 +110,7 @@ def test_contrast_and_coltman():
 def test_no_contrast_where_its_levels_cancel():
     """An offset halfway between the extremes leaves a sum of 0 to divide by; the MTF does not need it."""
     image = np.round(bar_image(0.3, 5))
-    bars = measure_bars(image, frequency=0.3, offset=(image.max() + image.min()) / 2, **CALM)
+    bars = bar_mtf(image, frequency=0.3, offset=(image.max() + image.min()) / 2, **CALM)
     assert math.isnan(bars.contrast)
     assert bars.mtf == pytest.approx(transfer(0.3, math.radians(5)), abs=1e-3)
 
@@ -129,7 +129,7 @@ def test_no_contrast_where_its_levels_cancel():
 )
 def test_harmonics_whose_aliases_fall_together_are_left_out(f, seen):
     """Of bars parallel to the pixels, whose phases repeat."""
-    assert list(measure_bars(bar_image(f, 0, size=72), frequency=f, **CALM).harmonics) == seen
+    assert list(bar_mtf(bar_image(f, 0, size=72), frequency=f, **CALM).harmonics) == seen
 
 
 def test_the_design_holds_derivatives_by_the_frequency():
@@ -156,7 +156,7 @@ def repeats(contrast, use_model, count=200, f=0.5):
 
     low, high = np.full((8, 8), 80.0), np.full((8, 8), 80.0 + contrast)
     noise = MODEL if use_model else None
-    return [measure_bars(draw(mean), draw(low), draw(high), vector(f, 4), noise=noise) for _ in range(count)]
+    return [bar_mtf(draw(mean), draw(low), draw(high), vector(f, 4), noise=noise) for _ in range(count)]
 
 
 @pytest.mark.second
@@ -210,7 +210,7 @@ def half_filled():
     ],
 )
 def test_bad_regions_are_explained(image, frequency, message):
-    refuses(BarError, message, measure_bars, image, noisy(np.full(100, DARK)), noisy(np.full(100, BRIGHT)), frequency)
+    refuses(BarError, message, bar_mtf, image, noisy(np.full(100, DARK)), noisy(np.full(100, BRIGHT)), frequency)
 
 
 @pytest.mark.parametrize("row", ["upper", "lower"])
@@ -221,7 +221,7 @@ def test_a_quarter_without_bars_is_named(row, column):
     rows, columns = (slice(0, 16) if side in ("upper", "left") else slice(48, 64) for side in (row, column))
     image[rows, columns] = 650.0
     with pytest.raises(BarError, match=f"amplitude in its {row} {column} quarter"):
-        measure_bars(image, noisy(np.full(100, DARK)), noisy(np.full(100, BRIGHT)), 0.3)
+        bar_mtf(image, noisy(np.full(100, DARK)), noisy(np.full(100, BRIGHT)), 0.3)
 
 
 @pytest.mark.parametrize(("uneven", "refused"), [(0.14, False), (0.16, True)])
@@ -231,9 +231,9 @@ def test_quarters_may_differ_by_15_per_cent(uneven, refused):
     image = 650.0 + (GOOD - 650.0) * (1.0 + uneven * side * side[:, None])
     calm = NoiseModel(1e-4, 0.0, 0.0, 0.0, 0.0, 0.0, 60000.0)
     if refused:
-        refuses(BarError, r"quarter is off by 16%", measure_bars, image, CALM["dark"], CALM["bright"], 0.3, noise=calm)
+        refuses(BarError, r"quarter is off by 16%", bar_mtf, image, CALM["dark"], CALM["bright"], 0.3, noise=calm)
     else:
-        found = measure_bars(image, CALM["dark"], CALM["bright"], 0.3, noise=calm)
+        found = bar_mtf(image, CALM["dark"], CALM["bright"], 0.3, noise=calm)
         assert found.mtf == pytest.approx(transfer(0.3, math.radians(4)), rel=0.01)
 
 
@@ -241,7 +241,7 @@ def test_quarters_may_differ_by_15_per_cent(uneven, refused):
 def test_levels_have_the_noise_of_their_pixels(frames):
     """Photon transfer by hand: gain 0.5 DN/e, 20 e dark signal and a black level of 64 DN, 2% PRNU, 10 e DSNU."""
     model = NoiseModel(0.5, 6.0, 20.0, 64.0, 0.02, 10.0, 60000.0)
-    bars = measure_bars(GOOD, np.full(400, DARK), np.full(100, BRIGHT), 0.3, noise=model, frames=frames)
+    bars = bar_mtf(GOOD, np.full(400, DARK), np.full(100, BRIGHT), 0.3, noise=model, frames=frames)
     for level, sigma, count in ((DARK, bars.dark_sigma, 400), (BRIGHT, bars.bright_sigma, 100)):
         electrons = (level - 64.0) / 0.5
         temporal = 0.25 * (electrons + 36.0) + 1 / 12
@@ -259,4 +259,4 @@ def test_bad_patches_are_explained():
         (100, DARK, 5000.0, "bright patch reaches the saturation level of 4095"),
     ):
         patches = np.full(count, dark), np.full(100, bright)
-        refuses(BarError, message, measure_bars, noisy(GOOD), *patches, 0.3, saturation=4095.0)
+        refuses(BarError, message, bar_mtf, noisy(GOOD), *patches, 0.3, saturation=4095.0)

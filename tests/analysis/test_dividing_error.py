@@ -30,7 +30,7 @@ from analysis.turntable.dividing_error import (
     covered,
     cross_validate,
     fewest,
-    fit,
+    fit_dividing_error,
     normal_reduction,
     rejection_rate,
     step_kernel,
@@ -219,7 +219,7 @@ def test_linear_fits_are_their_weights(name: str) -> None:
     """They add up to one, so that a shift of all values shifts the curve; and the curve is the same where angles are
     counted from the middle of the points: 1e-16 of an angle over a step of 0.01."""
     value, turn = noisy(0.1, 1), np.radians(-102.0)
-    made, there = fit(name, ANGLE, value, 0.1), fit(name, ANGLE + turn, value, 0.1)
+    made, there = fit_dividing_error(ANGLE, value, 0.1, name), fit_dividing_error(ANGLE + turn, value, 0.1, name)
     np.testing.assert_allclose(made.weights(BETWEEN) @ value, made(BETWEEN), rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(made.weights(BETWEEN).sum(axis=1), 1.0, rtol=0.0, atol=1e-8)
     assert there.settings == pytest.approx(made.settings)
@@ -228,19 +228,19 @@ def test_linear_fits_are_their_weights(name: str) -> None:
 
 def test_a_polynomial_is_found() -> None:
     x = np.degrees(ANGLE) - 102.0
-    made = fit("polynomial", ANGLE, x**3 - 20.0 * x, 1.0)
+    made = fit_dividing_error(ANGLE, x**3 - 20.0 * x, 1.0, "polynomial")
     at = np.degrees(BETWEEN) - 102.0
     np.testing.assert_allclose(made(BETWEEN), at**3 - 20.0 * at, rtol=0.0, atol=1e-9 * 1000.0)
     # with noise the order stays near the true one: leave-one-out does not run away to the highest
     noise = 10.0 * np.random.default_rng(3).standard_normal(41)
-    assert 3 <= fit("polynomial", ANGLE, x**3 - 20.0 * x + noise, 10.0).settings["order"] <= 8
+    assert 3 <= fit_dividing_error(ANGLE, x**3 - 20.0 * x + noise, 10.0, "polynomial").settings["order"] <= 8
 
 
 def test_smoothing_spline_is_scipys() -> None:
     """The same minimum with the smoothing that was selected, from SciPy's B-spline solver; unequal weights."""
     sigma = np.where(np.arange(41) % 5 == 0, 0.6, 0.3)
     value = wave(ANGLE) + sigma * np.random.default_rng(4).standard_normal(41)
-    made = fit("cubic_spline", ANGLE, value, sigma)
+    made = fit_dividing_error(ANGLE, value, sigma)
     assert made.settings["smoothing"] > 0.0
     step = ANGLE[1] - ANGLE[0]
     weight = sigma**-2 / np.mean(sigma**-2)
@@ -304,7 +304,9 @@ def test_cross_validation_states_its_noise() -> None:
     checked = cross_validate("piecewise_linear", ANGLE, wave(ANGLE), sigma)
     for i in (1, 20, 39):
         others = np.arange(41) != i
-        weight = fit("piecewise_linear", ANGLE[others], wave(ANGLE[others]), sigma[others]).weights(ANGLE[i : i + 1])[0]
+        weight = fit_dividing_error(ANGLE[others], wave(ANGLE[others]), sigma[others], "piecewise_linear").weights(
+            ANGLE[i : i + 1]
+        )[0]
         assert checked.variance[i - 1] == pytest.approx(sigma[i] ** 2 + weight**2 @ sigma[others] ** 2, rel=1e-9)
 
 
@@ -312,30 +314,32 @@ def test_cross_validation_states_its_noise() -> None:
 def test_too_few_angles(name: str) -> None:
     count = fewest(name)
     with pytest.raises(ValueError, match=f"{name}: {count - 1} angles, but at least {count} are needed"):
-        fit(name, ANGLE[: count - 1], ANGLE[: count - 1], 1.0)
-    assert fit(name, ANGLE[:count], wave(ANGLE[:count]), 1.0).name == name
+        fit_dividing_error(ANGLE[: count - 1], ANGLE[: count - 1], 1.0, name)
+    assert fit_dividing_error(ANGLE[:count], wave(ANGLE[:count]), 1.0, name).name == name
     assert angles_left(41, 10) == 37
     refuses(ValueError, "cross-validation leaves", cross_validate, name, ANGLE[:count], wave(ANGLE[:count]), 1.0)
 
 
 @pytest.mark.parametrize("name", FITS)
 def test_bad_angles(name: str) -> None:
-    refuses(ValueError, "all 41 angles are the same; step the table", fit, name, np.full(41, 1.7), ANGLE, 1.0)
-    refuses(ValueError, "average the repeats", fit, name, np.repeat(ANGLE[:20], 2), np.zeros(40), 1.0)
-    refuses(ValueError, "finite", fit, name, ANGLE, np.where(np.arange(41) == 3, np.nan, 0.0), 1.0)
-    refuses(ValueError, "greater than zero", fit, name, ANGLE, ANGLE, 0.0)
+    refuses(
+        ValueError, "all 41 angles are the same; step the table", fit_dividing_error, np.full(41, 1.7), ANGLE, 1.0, name
+    )
+    refuses(ValueError, "average the repeats", fit_dividing_error, np.repeat(ANGLE[:20], 2), np.zeros(40), 1.0, name)
+    refuses(ValueError, "finite", fit_dividing_error, ANGLE, np.where(np.arange(41) == 3, np.nan, 0.0), 1.0, name)
+    refuses(ValueError, "greater than zero", fit_dividing_error, ANGLE, ANGLE, 0.0, name)
 
 
 def test_unknown_fit_and_outside_of_the_points() -> None:
-    refuses(ValueError, r"'bezier'.*piecewise_linear", fit, "bezier", ANGLE, ANGLE, 1.0)
-    made = fit("cubic_spline", ANGLE, ANGLE, 1.0)
+    refuses(ValueError, r"'bezier'.*piecewise_linear", fit_dividing_error, ANGLE, ANGLE, 1.0, "bezier")
+    made = fit_dividing_error(ANGLE, ANGLE, 1.0)
     with pytest.raises(ValueError, match=r"calibrated from 92\.0000 to 112\.0000 deg; calibrate the whole range"):
         made(np.radians(112.1))
 
 
 def test_network_that_does_not_converge(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(angle_network, "MOST_ITERATIONS", 2)
-    refuses(NotConvergedError, "none of 4 trainings", fit, "network", ANGLE, wave(ANGLE), 0.1)
+    refuses(NotConvergedError, "none of 4 trainings", fit_dividing_error, ANGLE, wave(ANGLE), 0.1, "network")
     series = CalibrationSeries(ANGLE, wave(ANGLE)[:, None] + np.random.default_rng(1).normal(0.0, 0.1, (41, 5)))
     choice = choose(series, names=("network", "cubic_spline"))
     assert choice.chosen == "cubic_spline"

@@ -9,7 +9,7 @@ from scipy.stats import binom, chi2
 from analysis.monitor import series_smoother
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.jump_detection import candidates
-from analysis.monitor.series_smoother import smooth
+from analysis.monitor.series_smoother import smooth_series
 from tests.analysis.stated_motions import SpotNoise, disturbances
 
 NOISE = 0.2
@@ -39,7 +39,7 @@ def test_false_alarms_of_series_without_a_jump_are_within_the_stated_rate() -> N
     chances = []
     for seed in range(200):
         told, times, shifts = toy(seed, false_alarm=0.5)
-        chances.append(min((j.chance for j in smooth(told, times, shifts, FOUR, [0.0]).jumps or ()), default=1.0))
+        chances.append(min((j.chance for j in smooth_series(told, times, shifts, FOUR, [0.0]).jumps or ()), default=1.0))
     for rate in (0.5, 0.05):
         assert np.sum(np.array(chances) <= rate) <= binom.isf(1e-3, 200, rate)
     assert min(chances) < 0.5  # some alarm there is, so that the count above can fail
@@ -50,7 +50,7 @@ def test_the_log_ratio_is_that_of_least_squares() -> None:
     told, times, shifts = toy()
     amounts = np.array([0.3, -0.15])  # of the prism, standard deviations
     shifts = shifts + np.outer(times >= 17.0, told.spots[:, 3:] @ amounts)
-    (one,) = smooth(told, times, shifts, FOUR, [0.0]).jumps or ()
+    (one,) = smooth_series(told, times, shifts, FOUR, [0.0]).jumps or ()
     drift = told.spots[:, :1]
     spread = np.kron(told.laws[0].covariance(times[:, None], times), drift @ drift.T) + 0.04 * np.eye(160)
     rows = np.kron((times >= 17.0).astype(float)[:, None], told.spots[:, 3:])
@@ -73,11 +73,11 @@ def test_a_motion_alone_explains_what_it_moves_alone() -> None:
     named as the other's rival."""
     told, times, shifts = toy()
     moved = shifts + np.outer(times >= 17.0, 1.5 * told.spots[:, 1])
-    (one,) = smooth(told, times, moved, FOUR, [0.0]).jumps or ()
+    (one,) = smooth_series(told, times, moved, FOUR, [0.0]).jumps or ()
     assert one.labels == ("mirror shift x",)
     assert one.sizes[0] == pytest.approx(3.0, abs=5.0 * one.sigmas[0])
     alike = replace(told, spots=told.spots[:, [0, 1, 2, 1, 2]])
-    (one,) = smooth(alike, times, moved, FOUR, [0.0]).jumps or ()
+    (one,) = smooth_series(alike, times, moved, FOUR, [0.0]).jumps or ()
     # the other body explains as much alone, and with its second motion by half a chi-square of one number more
     (rival,) = one.rivals.items()
     assert rival[0] == ("prism" if one.body == "mirror" else "mirror")
@@ -92,7 +92,7 @@ def test_the_smoother_follows_a_jump_and_is_unsure_around_it() -> None:
     motions = np.stack([walk, 2.0 * (times >= 17.0)], axis=1)
     shifts = motions @ told.spots[:, [0, 3]].T + NOISE * rng.standard_normal((len(times), 4))
     wanted = np.array([5.0, 16.5, 30.0])
-    found = smooth(told, times, shifts, FOUR, wanted)
+    found = smooth_series(told, times, shifts, FOUR, wanted)
     event = replace(
         told,
         spots=told.spots[:, [0, 3]],
@@ -101,7 +101,7 @@ def test_the_smoother_follows_a_jump_and_is_unsure_around_it() -> None:
         laws=(told.laws[0], TimeLaw(event=((17.0, 1.0),))),
         **{name: getattr(told, name)[:2] for name in ("labels", "bodies", "causes", "units", "sigmas")},
     )
-    known = smooth(event, times, shifts, FOUR, wanted)
+    known = smooth_series(event, times, shifts, FOUR, wanted)
     sigma, sure = (np.sqrt(np.diagonal(one.smoothed.total, 0, 1, 2)) for one in (found, known))
     assert sigma[[0, 2]] == pytest.approx(sure[[0, 2]], rel=0.05)
     step = 2.0 * np.abs(told.parameters[:, 3])
@@ -117,7 +117,7 @@ def test_changes_since_a_reference(reference: float) -> None:
     told = replace(told, laws=(TimeLaw(white=True), *told.laws[1:]), spots=told.spots * [1e-3, 1.0, 1.0, 1.0, 1.0])
     rng, step = np.random.default_rng(4), 2.0 * told.spots[:, 3]
     truth = np.outer(times >= 17.0, step) - (reference >= 17.0) * step
-    found = smooth(told, times, truth + 0.2 * rng.standard_normal(truth.shape), FOUR, [5.0, 30.0], reference)
+    found = smooth_series(told, times, truth + 0.2 * rng.standard_normal(truth.shape), FOUR, [5.0, 30.0], reference)
     (one,) = found.jumps or ()
     assert (one.labels, one.until) == (("prism shift x",), 17.0)
     assert one.after == max(16.0, reference if reference < 17.0 else 16.0)
@@ -129,10 +129,10 @@ def test_changes_since_a_reference(reference: float) -> None:
 def test_a_long_series_in_pieces_finds_the_same(monkeypatch) -> None:
     told, times, shifts = toy(count=60)
     shifts = shifts + np.outer(times >= 17.0, 2.0 * told.spots[:, 3]) - np.outer(times >= 44.0, 2.0 * told.spots[:, 1])
-    whole = smooth(told, times, shifts, FOUR, times).jumps or ()
+    whole = smooth_series(told, times, shifts, FOUR, times).jumps or ()
     monkeypatch.setattr(series_smoother, "LARGEST", 120)
     order = np.random.default_rng(5).permutation(60)
-    pieces = smooth(told, times[order], shifts[order], FOUR, times).jumps or ()
+    pieces = smooth_series(told, times[order], shifts[order], FOUR, times).jumps or ()
     assert [(j.labels, j.until) for j in whole] == [(("prism shift x",), 17.0), (("mirror shift x",), 44.0)]
     assert [(j.labels, j.until) for j in pieces] == [(j.labels, j.until) for j in whole]
     for one, two in zip(whole, pieces, strict=True):
@@ -143,7 +143,7 @@ def test_what_moves_no_spot_is_not_looked_for() -> None:
     told, times, shifts = toy()
     blind = replace(told, spots=told.spots * [1.0, 1.0, 0.0, 0.0, 0.0])
     assert [one.motions for one in candidates(blind)] == [(1,)]
-    assert smooth(replace(told, spots=told.spots * [1.0, 0, 0, 0, 0]), times, shifts, FOUR, [0.0]).jumps == ()
+    assert smooth_series(replace(told, spots=told.spots * [1.0, 0, 0, 0, 0]), times, shifts, FOUR, [0.0]).jumps == ()
 
 
 def test_how_often_it_jumps_counts_in_a_forecast() -> None:
@@ -152,7 +152,7 @@ def test_how_often_it_jumps_counts_in_a_forecast() -> None:
     told, times, shifts = toy()
     often = replace(told, laws=(told.laws[0], *(TimeLaw(jump=True, every_s=50.0),) * 4))
     wanted = np.array([20.0, 139.0, 239.0])
-    found, plain = (smooth(one, times, shifts, FOUR, wanted) for one in (often, told))
+    found, plain = (smooth_series(one, times, shifts, FOUR, wanted) for one in (often, told))
     assert found.jumps == plain.jumps == ()
     more = np.diagonal(found.smoothed.total - plain.smoothed.total, 0, 1, 2)
     assert more[2] - more[1] == pytest.approx(np.sum(told.parameters[:, 1:] ** 2, axis=1) * 100.0 / 50.0, rel=1e-3)

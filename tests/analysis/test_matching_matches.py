@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from analysis.matching.correlation import MatchOptions, Reason, _second, distinct_points, search
-from analysis.matching.matches import Matches, consensus, match
+from analysis.matching.matches import Matches, consensus, match_windows
 from tests.analysis.refusals import refuses
 from tests.analysis.texture_image import Texture, detected
 
@@ -142,7 +142,7 @@ def test_reasons(texture):
     patches = texture.patches(np.nan_to_num(places, nan=50.0))
     patches[6, 3, 4] = np.nan
     patches[8] = 5.0
-    found = match(image, patches, places, reach=10)
+    found = match_windows(image, patches, places, reach=10)
     expected = [
         Reason.ACCEPTED,
         Reason.FLAT,
@@ -158,13 +158,13 @@ def test_reasons(texture):
     assert found.texts[3] == "pixels of the image under the template are saturated"
     assert np.isnan(found.place[[4, 5, 6, 7, 8]]).all()
     # more than the reach away, and an image with missing pixels
-    far = match(image, texture.patches([[50.0, 50.0]]), [[50.0, 64.0]], reach=10)
+    far = match_windows(image, texture.patches([[50.0, 50.0]]), [[50.0, 64.0]], reach=10)
     assert not far.accepted[0]
     holes = image.astype(float)
     holes[352, 352] = np.nan
-    assert match(holes, texture.patches([[350.0, 350.0]]), [[350.0, 350.0]], reach=10).reason[0] == Reason.IMAGE
+    assert match_windows(holes, texture.patches([[350.0, 350.0]]), [[350.0, 350.0]], reach=10).reason[0] == Reason.IMAGE
     # at the image's side the window is cut, and the point is found all the same
-    side = match(image, texture.patches([[17.3, 150.4]]), [[20.0, 150.0]], reach=10)
+    side = match_windows(image, texture.patches([[17.3, 150.4]]), [[20.0, 150.0]], reach=10)
     assert side.accepted[0]
     assert side.place[0] == pytest.approx([17.3, 150.4], abs=0.15)
 
@@ -172,10 +172,10 @@ def test_reasons(texture):
 def test_repeated_pattern_is_ambiguous_and_an_edge_is_uncertain():
     rows, columns = np.mgrid[:200.0, :200.0]
     periodic = 800 + 100 * np.sin(2 * np.pi * rows / 9) + 100 * np.sin(2 * np.pi * columns / 9)
-    found = match(detected(periodic, 1), periodic[None, 85:116, 85:116], [[100.0, 100.0]], reach=20)
+    found = match_windows(detected(periodic, 1), periodic[None, 85:116, 85:116], [[100.0, 100.0]], reach=20)
     assert found.reason[0] == Reason.AMBIGUOUS
     edge = 800 + 200 * np.tanh((columns - 100.2) / 2)
-    found = match(detected(edge, 2), edge[None, 85:116, 85:116], [[100.0, 100.0]], reach=10)
+    found = match_windows(detected(edge, 2), edge[None, 85:116, 85:116], [[100.0, 100.0]], reach=10)
     assert not found.accepted[0]
 
 
@@ -205,7 +205,7 @@ def test_sigma_is_that_of_the_worst_direction():
 
 
 def test_no_points_are_an_empty_result(frame):
-    found = match(frame, np.zeros((0, 31, 31)), np.zeros((0, 2)), reach=10)
+    found = match_windows(frame, np.zeros((0, 31, 31)), np.zeros((0, 2)), reach=10)
     assert found.place.shape == (0, 2)
     assert found.covariance.shape == (0, 2, 2)
     assert found.text == "0 of 0 accepted"
@@ -253,7 +253,7 @@ def test_second_peaks_count_from_four_pixels_on():
 @pytest.mark.second
 def test_thresholds_are_options(texture, frame, points):
     patches = texture.patches(points[:30])
-    strict = match(frame, patches, points[:30], reach=5, options=MatchOptions(largest_sigma=0.005))
+    strict = match_windows(frame, patches, points[:30], reach=5, options=MatchOptions(largest_sigma=0.005))
     assert np.all(strict.reason == Reason.UNCERTAIN)
-    low = match(frame, patches, points[:30], reach=5, options=MatchOptions(saturation=700.0))
+    low = match_windows(frame, patches, points[:30], reach=5, options=MatchOptions(saturation=700.0))
     assert np.all(low.reason == Reason.SATURATED)

@@ -29,7 +29,7 @@ from analysis.monitor.filter_state import Observed
 from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.model_fit import gain, observability
 from analysis.monitor.monitor_formulas import CameraParameters, GroundGeometry, MonitorGeometry
-from analysis.monitor.recovery import measure_spots, recover
+from analysis.monitor.recovery import measure_spots, recover_monitor
 from analysis.monitor.state_space import StateSpace
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import measure_pages
@@ -53,7 +53,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import photon_transfer, pixel_correction
 from analysis.spots.spot_positions import difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
-from analysis.turntable.dividing_error import CalibrationSeries, cross_validate, fit
+from analysis.turntable.dividing_error import CalibrationSeries, cross_validate, fit_dividing_error
 from tests.analysis import test_adjustment
 from tests.analysis.drawn_blocks import Plan, draw
 from tests.analysis.refusals import refuses
@@ -202,7 +202,7 @@ def test_monitor():
     refuses(UndeterminedError, "need noise", how.update, how.start(0.0), Observed(0.0, np.zeros(4), 0.0 * eye))
     refuses(ValueError, "no centroid 'mean'; there are", measure_spots, np.zeros((1, 9, 9)), 1, None, "mean", 1)
     frames, two = np.zeros((1, 3, 2, 8, 8)), SimpleNamespace(spots=2)
-    refuses(ValueError, "has 2 spots, the images 3", recover, frames[0], frames, two, "ml", 1)
+    refuses(ValueError, "has 2 spots, the images 3", recover_monitor, frames[0], frames, two, "ml", 1)
     refuses(ValueError, r"need \(..., 4\) and \(..., 4, 4\)", CameraParameters.from_vector, np.zeros(3), eye)
 
 
@@ -246,7 +246,7 @@ def test_edges_and_angles():
         found = fit_interior_orientation(5.5 * np.tan(wide) + bent * np.tan(wide) ** 3, wide, 1e-6, (*three, "radial3"))
         refuses(OrientationError, "do not converge", line_orientation, found)
     refuses(ValueError, "take 2 or more", cross_validate, "polynomial", angle, angle, 1.0, folds=1)
-    refuses(ValueError, "must be", fit, "polynomial", angle, angle[:3], 1.0)
+    refuses(ValueError, "must be", fit_dividing_error, angle, angle[:3], 1.0, "polynomial")
     present = np.arange(60).reshape(20, 3) > 2
     refuses(ValueError, "needs two comparisons or more", CalibrationSeries, angle, np.zeros((20, 3)), 0.0, present)
 

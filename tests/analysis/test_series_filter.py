@@ -8,7 +8,7 @@ import pytest
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.filter_state import Observed
 from analysis.monitor.kalman_filter import SeriesFilter, jointly
-from analysis.monitor.series_smoother import smooth
+from analysis.monitor.series_smoother import smooth_series
 from analysis.monitor.state_space import HeatInputs, StateSpace
 from tests.analysis.followed_series import follow, of_shifts, whole_steps
 from tests.analysis.stated_motions import SpotNoise, correlation_of, disturbances
@@ -56,7 +56,7 @@ def test_the_same_as_the_joint_normal_of_the_series(laws) -> None:
     """Values to 1e-9 of sigma and covariances to 1e-9 of themselves, at readings, between, before and after them."""
     told, (times, shifts) = stated(laws), series(40, NOISE)
     wanted = np.concatenate([times, np.random.default_rng(2).uniform(-3.0, 70.0, 25)])
-    whole = smooth(told, times, shifts, BOTH, wanted)
+    whole = smooth_series(told, times, shifts, BOTH, wanted)
     how = SeriesFilter(told, REFERENCE**2 * np.eye(SPOTS), window=0)
     found = follow(how, of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), wanted)
     for one, two in ((whole.filtered, found.filtered), (whole.smoothed, found.smoothed)):

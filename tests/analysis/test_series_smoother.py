@@ -9,7 +9,7 @@ import pytest
 
 from analysis.monitor import series_smoother
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.series_smoother import smooth
+from analysis.monitor.series_smoother import smooth_series
 from analysis.spots.spot_positions import NoiseParts, SeriesNoise
 from tests.analysis.refusals import refuses
 from tests.analysis.stated_motions import correlation_of, disturbances
@@ -114,7 +114,7 @@ def test_as_conditioning_all_times_together(reference) -> None:
     own, shared = random_noise(rng, len(measured))
     noise = noise_of(own, shared)
     shifts = rng.standard_normal((len(measured), 4))
-    found = smooth(stated, measured, shifts, noise, times, reference)
+    found = smooth_series(stated, measured, shifts, noise, times, reference)
     prior = stated.parameter_covariance
     values, spread, by_noise, square = conditioned(stated, measured, shifts, noise, times, reference)
     close(found.smoothed.values, values, prior)
@@ -145,9 +145,9 @@ def test_long_series_in_pieces(monkeypatch) -> None:
         shifts = rng.standard_normal((len(measured), 4))
         noise = noise_of(own, nothing if exact else shared)
         monkeypatch.setattr(series_smoother, "LARGEST", 2400)
-        whole = smooth(stated, measured, shifts, noise, times)
+        whole = smooth_series(stated, measured, shifts, noise, times)
         monkeypatch.setattr(series_smoother, "LARGEST", 36)
-        pieces = smooth(stated, measured, shifts, noise, times)
+        pieces = smooth_series(stated, measured, shifts, noise, times)
         prior = stated.parameter_covariance
         if exact:
             # what is 30 s away counts exp(-30 s / 1 s)
@@ -170,9 +170,9 @@ def test_refusals() -> None:
     own, shared = random_noise(rng, 2)
     shifts = np.ones((2, 4))
     with pytest.raises(ValueError, match="different laws"):
-        smooth(replace(stated, correlation=mixed), [0.0, 1.0], shifts, noise_of(own, shared), [0.0])
+        smooth_series(replace(stated, correlation=mixed), [0.0, 1.0], shifts, noise_of(own, shared), [0.0])
     still = replace(stated, laws=(CONSTANT,) * 4)
-    refuses(ValueError, "need noise", smooth, still, [0.0, 1.0], shifts, noise_of(0.0 * own, 0.0 * shared), [0.0])
+    refuses(ValueError, "need noise", smooth_series, still, [0.0, 1.0], shifts, noise_of(0.0 * own, 0.0 * shared), [0.0])
 
 
 def test_noise_of_a_series_of_images() -> None:

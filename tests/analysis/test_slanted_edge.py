@@ -17,7 +17,7 @@ from scipy import stats
 from scipy.interpolate import CubicSpline
 
 from analysis.mtf.edge_location import EdgeError, locate_edge, pixel_noise
-from analysis.mtf.slanted_edge import measure_edge
+from analysis.mtf.slanted_edge import slanted_edge_mtf
 from analysis.spots.noise import NoiseModel
 from analysis.statistics import rice_sigma, signal_modulus
 from tests.analysis.refusals import refuses
@@ -85,7 +85,7 @@ def repeats(contrast_e, count=200, use_model=True, degrees=4):
     # shot and read noise as Gaussians, then rounding to whole grey values
     sigma = np.sqrt(model.temporal_variance_dn2(mean, 1) - 1 / 12)
     noise = model if use_model else None
-    return [measure_edge(np.round(rng.normal(mean, sigma)), noise=noise) for _ in range(count)]
+    return [slanted_edge_mtf(np.round(rng.normal(mean, sigma)), noise=noise) for _ in range(count)]
 
 
 def chi_square_limits(count):
@@ -102,8 +102,8 @@ def chi_square_limits(count):
 def test_perfect_pupil(degrees, size, pitch):
     image = edge_image(degrees, size, pitch=pitch)
     # 28 um: the image is aliased, with 13% of contrast left at 1.5 cycles/pixel
-    across_columns = measure_edge(image, even=True)
-    across_rows = measure_edge(np.ascontiguousarray(image.T))
+    across_columns = slanted_edge_mtf(image, even=True)
+    across_rows = slanted_edge_mtf(np.ascontiguousarray(image.T))
     for edge, axis, levels in ((across_columns, "x", 0.1), (across_rows, "y", 0.2)):
         assert edge.axis == axis
         near, far = error_of(edge, degrees, pitch=pitch)
@@ -121,7 +121,7 @@ def test_perfect_pupil(degrees, size, pitch):
 def test_all_ways_round():
     """Bright left, right, up, down, tilted either way: the same MTF; the angle's sign and the position follow."""
     image = edge_image(5)
-    first = measure_edge(image)
+    first = slanted_edge_mtf(image)
     for changed, angle, position in (
         (image[:, ::-1], -first.angle, 63 - first.position),
         (image[::-1], -first.angle, first.position),
@@ -129,7 +129,7 @@ def test_all_ways_round():
         (image.T, first.angle, first.position),
         (image.T[::-1], -first.angle, 63 - first.position),
     ):
-        edge = measure_edge(changed)
+        edge = slanted_edge_mtf(changed)
         # mirrored pixels meet the knots at other places, so the spline differs by its own error
         assert_allclose(edge.mtf[:33], first.mtf[:33], atol=1e-4)
         assert edge.angle == pytest.approx(angle, abs=1e-5)
@@ -137,7 +137,7 @@ def test_all_ways_round():
 
 
 def test_spread_functions():
-    edge = measure_edge(edge_image(5))
+    edge = slanted_edge_mtf(edge_image(5))
     truth = edge_spread(math.radians(5), 6 + math.ceil(64 / math.sqrt(2)), PAN)
     near = np.abs(edge.place) < 20
     assert_allclose(edge.esf[near], DARK + (BRIGHT - DARK) * truth(edge.place[near]), atol=5e-4 * (BRIGHT - DARK))
@@ -150,15 +150,15 @@ def test_spread_functions():
 
 
 def test_interpolation_and_mtf50():
-    edge = measure_edge(edge_image(5))
+    edge = slanted_edge_mtf(edge_image(5))
     f = 0.3337
-    two = measure_edge(edge_image(5), frequency=[0.0, 0.5])
+    two = slanted_edge_mtf(edge_image(5), frequency=[0.0, 0.5])
     assert two.mtf == pytest.approx([1.0, edge.mtf[32]], abs=1e-12)
     assert edge.at(f)[0] == pytest.approx(transfer(np.array([f]), math.radians(5))[0], abs=ACCURACY)
     half, sigma = edge.frequency_at(0.5)
     assert transfer(np.array([half]), math.radians(5))[0] == pytest.approx(0.5, abs=ACCURACY)
     assert sigma > 0
-    assert math.isnan(measure_edge(edge_image(5), frequency=[0.0, 0.1, 0.2]).frequency_at(0.5)[0])
+    assert math.isnan(slanted_edge_mtf(edge_image(5), frequency=[0.0, 0.1, 0.2]).frequency_at(0.5)[0])
     refuses(ValueError, "outside", edge.at, 1.2)
 
 
@@ -201,19 +201,19 @@ def test_frames_and_fixed_pattern_enter_the_sigma():
     image = np.round(edge_image(4) + np.random.default_rng(3).normal(0, 4, (64, 64)))
     plain = NoiseModel(0.5, 6.0, 0.0, 64.0, 0.0, 0.0, 60000.0)
     uneven = NoiseModel(0.5, 6.0, 0.0, 64.0, 0.02, 10.0, 60000.0)
-    one, many = (measure_edge(image, noise=plain, frames=n) for n in (1, 16))
+    one, many = (slanted_edge_mtf(image, noise=plain, frames=n) for n in (1, 16))
     # temporal noise alone: a quarter. The term of the angle is of second order.
     assert many.sigma[16] == pytest.approx(one.sigma[16] / 4, rel=0.01)
-    assert measure_edge(image, noise=uneven, frames=16).sigma[16] > 2 * many.sigma[16]
+    assert slanted_edge_mtf(image, noise=uneven, frames=16).sigma[16] > 2 * many.sigma[16]
 
 
 def test_curvature_is_found():
     bend = 4e-4
-    edge = measure_edge(edge_image(4, bend=bend))
+    edge = slanted_edge_mtf(edge_image(4, bend=bend))
     # the shape is made along the row, and the fit of a straight line takes part of the blur: 10%
     assert edge.curvature == pytest.approx(bend, rel=0.1)
     assert edge.curvature > 5 * edge.curvature_sigma
-    assert abs(measure_edge(edge_image(4)).curvature) < 1e-6
+    assert abs(slanted_edge_mtf(edge_image(4)).curvature) < 1e-6
 
 
 # --- bad input ---
@@ -282,37 +282,37 @@ def ramp(degrees):
     ],
 )
 def test_bad_regions_are_explained(image, message):
-    refuses(EdgeError, message, measure_edge, image)
+    refuses(EdgeError, message, slanted_edge_mtf, image)
 
 
 @pytest.mark.parametrize("turned", [slice(None), slice(None, None, -1)])
 def test_both_sides_need_the_same_margin(turned):
     """10 px from the line's end to the last column: a column fewer is refused, wherever the bright side is."""
     image = noisy(edge_image(5))
-    edge = measure_edge(image)
+    edge = slanted_edge_mtf(image)
     end = edge.position + math.tan(abs(edge.angle)) * 63 / 2
     enough = math.ceil(end + 10.0)
     for level in (image, BRIGHT + DARK - image):
-        assert measure_edge(level[:, : enough + 1][:, turned]).mtf[0] == pytest.approx(1.0)
-        refuses(EdgeError, r"comes within 9\.\d px of the region's side", measure_edge, level[:, :enough][:, turned])
+        assert slanted_edge_mtf(level[:, : enough + 1][:, turned]).mtf[0] == pytest.approx(1.0)
+        refuses(EdgeError, r"comes within 9\.\d px of the region's side", slanted_edge_mtf, level[:, :enough][:, turned])
 
 
 def test_stated_saturation():
     image = noisy(edge_image(5))
-    refuses(EdgeError, "pixels reach the saturation level of 1100: lower", measure_edge, image, saturation=1100)
+    refuses(EdgeError, "pixels reach the saturation level of 1100: lower", slanted_edge_mtf, image, saturation=1100)
     with pytest.raises(EdgeError, match="saturation level of 1000"):
-        measure_edge(image, noise=NoiseModel(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1000.0))
+        slanted_edge_mtf(image, noise=NoiseModel(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1000.0))
     # a computed image in whole grey values has a true plateau
     plateau = np.round(edge_image(5, pitch=MULTISPECTRAL) / 4)
-    refuses(EdgeError, "computed without noise", measure_edge, plateau)
+    refuses(EdgeError, "computed without noise", slanted_edge_mtf, plateau)
     truth = transfer(np.array([0.5]), math.radians(5), MULTISPECTRAL)[0]
     # steps of 1 in 250, pi cycles of slope: 0.004 rms if they were independent
-    assert measure_edge(plateau, saturation=math.inf).mtf[32] == pytest.approx(truth, abs=0.01)
+    assert slanted_edge_mtf(plateau, saturation=math.inf).mtf[32] == pytest.approx(truth, abs=0.01)
 
 
 @pytest.mark.parametrize("wrong", [{"frequency": [0.5]}, {"frequency": [0.0, 3.0]}])
 def test_arguments_that_make_no_sense(wrong):
-    refuses(ValueError, "frequency", measure_edge, edge_image(5), **wrong)
+    refuses(ValueError, "frequency", slanted_edge_mtf, edge_image(5), **wrong)
 
 
 def test_noise_of_a_pixel_is_seen_on_slopes():
@@ -331,7 +331,7 @@ def half_an_edge():
 
 
 def test_an_edge_has_to_be_there_in_most_rows():
-    refuses(EdgeError, "cannot be followed", measure_edge, noisy(half_an_edge()))
+    refuses(EdgeError, "cannot be followed", slanted_edge_mtf, noisy(half_an_edge()))
 
 
 @pytest.mark.parametrize("turned", [False, True])

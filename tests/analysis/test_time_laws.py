@@ -9,7 +9,7 @@ import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.limits import calibrated_sigma
-from analysis.monitor.series_smoother import smooth
+from analysis.monitor.series_smoother import smooth_series
 from tests.analysis.stated_motions import SpotNoise, disturbances
 
 STATIONARY = (
@@ -57,7 +57,7 @@ def test_a_shape_of_unknown_size_is_the_fit_of_its_size(law: TimeLaw, shape, ref
     zero = 0.0 if reference is None else shape(np.array(reference))
     rows = np.kron((shape(measured) - zero)[:, None], one.spots)
     shifts = rows[:, 0] * 1.3 + 0.1 * rng.standard_normal(len(rows))
-    found = smooth(one, measured, shifts.reshape(26, 3), SpotNoise(0.01 * np.eye(3)), times, reference)
+    found = smooth_series(one, measured, shifts.reshape(26, 3), SpotNoise(0.01 * np.eye(3)), times, reference)
     variance = 1.0 / (float(rows[:, 0] @ rows[:, 0]) / 0.01 + 1.0)
     size = variance * float(rows[:, 0] @ shifts) / 0.01
     along = (shape(times) - zero)[:, None] * one.parameters[:, 0]
@@ -73,7 +73,7 @@ def test_a_step_at_an_unsure_moment_is_widened_between_the_readings() -> None:
     one = stated((TimeLaw(event=((40.0, 0.0), (60.0, 1.0))),))
     measured = np.array([20.0, 40.0, 60.0, 80.0])
     shifts = np.outer([0.0, 0.0, 1.0, 1.0], one.spots[:, 0])
-    found = smooth(one, measured, shifts, SpotNoise(1e-8 * np.eye(3)), [30.0, 45.0, 50.0, 70.0])
+    found = smooth_series(one, measured, shifts, SpotNoise(1e-8 * np.eye(3)), [30.0, 45.0, 50.0, 70.0])
     share = found.smoothed.values[:, 0] / one.parameters[0, 0]
     spread = found.smoothed.total[:, 0, 0] / one.parameters[0, 0] ** 2
     assert share == pytest.approx([0.0, 0.25, 0.5, 1.0], abs=1e-6)

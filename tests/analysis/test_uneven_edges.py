@@ -14,10 +14,10 @@ from scipy import stats
 from scipy.special import erf
 
 from analysis.images.image_file import ImageFile, Region
-from analysis.mtf.bar_mtf import measure_bars, page_warnings
+from analysis.mtf.bar_mtf import bar_mtf, page_warnings
 from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
-from analysis.mtf.slanted_edge import measure_edge
+from analysis.mtf.slanted_edge import slanted_edge_mtf
 
 FREQUENCIES = np.array([0.05, 0.1, 0.2, 0.3, 0.5])
 FALSE_ALARM = 1e-6
@@ -113,11 +113,11 @@ def test_errors_are_those_of_sigma():
 @pytest.mark.parametrize("bow", [(0.0, 0.5), (0.3, -2.0), (0.1, 0.0, 0.6), (0.0, 0.5, 0.0, 0.8)])
 def test_a_bowed_edge_is_followed(bow):
     """Without noise the error of following is below 5e-4; a straight line would lose up to a half."""
-    found = measure_edge(edge(64, 64, 5, 0.5, bow), saturation=np.inf)
+    found = slanted_edge_mtf(edge(64, 64, 5, 0.5, bow), saturation=np.inf)
     np.testing.assert_allclose([found.at(f)[0] for f in FREQUENCIES], truth(FREQUENCIES, 5, 0.5), atol=5e-4)
     assert found.order == max(k for k, c in enumerate(bow) if k and c) + 1
     assert found.position == pytest.approx(31.5 + bow[0], abs=0.01)
-    assert measure_edge(edge(64, 64, 5, 0.5), saturation=np.inf).order == 1
+    assert slanted_edge_mtf(edge(64, 64, 5, 0.5), saturation=np.inf).order == 1
 
 
 @pytest.mark.second
@@ -125,11 +125,11 @@ def test_uneven_light_is_fitted_and_reported():
     """1 % across, as of any collimator: 0.0057 too low at 0.05 cycles/px if it counts as blur."""
     image = edge(64, 64, -7, 0.6, light=plane(0.2, 0.01))
     for turned, sign in ((image, 1.0), (image[:, ::-1], 1.0), (image.T, 1.0)):
-        found = measure_edge(turned, saturation=np.inf)
+        found = slanted_edge_mtf(turned, saturation=np.inf)
         np.testing.assert_allclose([found.at(f)[0] for f in FREQUENCIES], truth(FREQUENCIES, -7, 0.6), atol=5e-5)
         # rows and columns end half a pixel inside of the region
         np.testing.assert_allclose(found.light, sign * 19000.0 * np.array([0.2, 0.01, 0.0, 0.0]) * 63 / 64, atol=3.0)
-    assert abs(measure_edge(image, saturation=np.inf, even=True).at(0.05)[0] - truth(0.05, -7, 0.6)) > 0.004
+    assert abs(slanted_edge_mtf(image, saturation=np.inf, even=True).at(0.05)[0] - truth(0.05, -7, 0.6)) > 0.004
 
 
 @pytest.mark.second
@@ -144,7 +144,7 @@ def test_uneven_light_is_fitted_and_reported():
 )
 def test_light_that_is_no_plane_is_named(light):
     pages = np.stack([noisy(edge(64, 64, 5, 0.6, light=light), 0.3, np.random.default_rng(k)) for k in (1, 2)])
-    assert "does not explain" in measure_edge(pages[0]).doubt
+    assert "does not explain" in slanted_edge_mtf(pages[0]).doubt
     assert "does not explain" in " ".join(page_warnings(measure_pages(pages, step=0.0), 0.0))
 
 
@@ -152,7 +152,7 @@ def test_light_that_is_no_plane_is_named(light):
 def test_structure_is_not_seen_in_noise():
     """At a rate of 1e-4 for 60 regions, and noise-free diffraction leaves less than what is reported."""
     rng, image = np.random.default_rng(6), edge(64, 64, 5, 0.6, (0.0, 0.3), plane(0.1, -0.1))
-    assert not any(measure_edge(noisy(image, 1.0, rng)).doubt for _ in range(60))
+    assert not any(slanted_edge_mtf(noisy(image, 1.0, rng)).doubt for _ in range(60))
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="measured data is not here: ../shared/real, or the folder of TWIN_REAL")
@@ -187,7 +187,7 @@ def bars(light, where, seed=0):
     lit = light(row / 20, column / 20)
     beside = light(row[14:26, 14:26] / 20, (column[14:26, 14:26] + 32.0) / 20)
     bright, image = 1000 + 19000 * (lit if where == "field" else beside), 1000 + 19000 * share * lit
-    found = measure_bars(*(noisy(each, 0.3, rng) for each in (image, 0 * bright + 1000.0, bright)), frequency)
+    found = bar_mtf(*(noisy(each, 0.3, rng) for each in (image, 0 * bright + 1000.0, bright)), frequency)
     return found.mtf - truth(frequency, np.degrees(angle), blur), found.sigma, found
 
 

@@ -10,7 +10,15 @@ import pytest
 
 from analysis.arrays import UndeterminedError
 from analysis.wavefront_maps.map_files import MapError, WavefrontMap
-from analysis.wavefront_maps.pupil_fit import ORIENTATIONS, READINGS, Orientation, Pupil, find_pupil, fit_map, tellable
+from analysis.wavefront_maps.pupil_fit import (
+    ORIENTATIONS,
+    READINGS,
+    Orientation,
+    Pupil,
+    find_pupil,
+    fit_zernikes,
+    tellable,
+)
 from analysis.wavefront_maps.zernike_table import circle_terms
 from tests.analysis.refusals import refuses
 from tests.tiers import quick
@@ -48,17 +56,17 @@ def test_the_pupil_is_found_by_its_light(light):
         # where the map ends in the light there is no edge
         first = int(at_x - 0.8 * radius) if light == "beyond the camera" else 0
         last = int(at_x + 0.9 * radius) if light == "beyond the camera" else 250
-        found = find_pupil(map_of(np.where(lit, 0.0, np.nan)[:, first:last]))
+        found = find_pupil(np.where(lit, 0.0, np.nan)[:, first:last])
         np.testing.assert_allclose([found.x + first, found.y, found.radius], [at_x, at_y, radius], rtol=0, atol=0.12)
 
 
 def test_light_without_a_round_edge_needs_a_stated_pupil():
     values = np.full((60, 60), np.nan)
-    refuses(UndeterminedError, "no lit pixel", find_pupil, map_of(values))
+    refuses(UndeterminedError, "no lit pixel", find_pupil, values)
     values[10:50, 10:30] = 0.0
-    refuses(UndeterminedError, "state them in pixels", find_pupil, map_of(values))
+    refuses(UndeterminedError, "state them in pixels", find_pupil, values)
     with pytest.raises(UndeterminedError, match="state them in pixels"):
-        find_pupil(map_of(np.zeros((20, 20))))  # steps at the end of a map are no edge
+        find_pupil(np.zeros((20, 20)))  # steps at the end of a map are no edge
     refuses(MapError, "radii are positive", Pupil, 1.0, 2.0, 0.0)
 
 
@@ -71,7 +79,7 @@ def test_coefficients_come_back_exactly(light):
     truth = np.random.default_rng(1).normal(size=28) * 1e-7
     values = np.full(x.shape, np.nan)
     values[lit] = circle_terms(terms, x[lit], y[lit]) @ truth
-    found = fit_map(map_of(values), terms, Pupil(44.3, 45.1, 40.0))
+    found = fit_zernikes(values, terms, Pupil(44.3, 45.1, 40.0))
     np.testing.assert_allclose(found.coefficients, truth, rtol=0, atol=1e-19)
     # parts are shares of the rms over the light
     assert np.sum(found.parts[1:] ** 2) == pytest.approx(np.var(values[lit]), rel=1e-12)
@@ -81,10 +89,10 @@ def test_terms_that_the_light_does_not_tell_apart():
     x, y = disk(100, 50.0, 50.0, 45.0)
     values = np.where((np.abs(y) < 1e-9) & (np.abs(x) <= 1.0), 0.0, np.nan)
     with pytest.raises(UndeterminedError, match="Z3 cannot be told from the terms before it"):
-        fit_map(map_of(values), range(1, 5), Pupil(50.0, 50.0, 45.0))
+        fit_zernikes(values, range(1, 5), Pupil(50.0, 50.0, 45.0))
     with pytest.raises(UndeterminedError, match="0 lit pixels lie within the pupil"):
-        fit_map(map_of(values), range(1, 5), Pupil(500.0, 50.0, 45.0))
-    refuses(MapError, "ascending order", fit_map, map_of(values), [1, 4, 2], Pupil(50.0, 50.0, 45.0))
+        fit_zernikes(values, range(1, 5), Pupil(500.0, 50.0, 45.0))
+    refuses(MapError, "ascending order", fit_zernikes, values, [1, 4, 2], Pupil(50.0, 50.0, 45.0))
 
 
 # --- wavefront maps orientation ---------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from scipy.stats import binom
 
 from analysis.arrays import ARCSEC
 from analysis.instrument_state.state_estimate import combinations
-from analysis.monitor.recovery import recover
+from analysis.monitor.recovery import recover_monitor
 from optics.geometry.tree import Motion, compose
 from optics.numerics.backend import Backend
 from scenes.specs.asbuilt import AsBuiltSetup
@@ -152,7 +152,7 @@ def test_the_bias_of_the_drawings_model_goes_away(backend, tmp_path, record_prop
     wanted = (moved[1] - moved[0])[:2] / ARCSEC
     bias = {}
     for name, experiment in (("drawing", design), ("as built", built)):
-        found = recover(frames(experiment, {}, 2), after, experiment.calibration)
+        found = recover_monitor(frames(experiment, {}, 2), after, experiment.calibration)
         read = found.parameters["forward"]["model"].vector[0][:2] / ARCSEC
         bias[name] = float(np.max(np.abs(read - wanted)))
         record_property(f"bias with the model of the {name}, arcsec", bias[name])

@@ -82,9 +82,9 @@ def test_what_is_not_known_of_heights_adds_its_variance(flown: Simulation, monke
     """Three times the sigma of the reference's heights is nine times what it adds to a match's covariance; without it
     there are the match itself and the roughness."""
     agreed, seen = image_points.consensus, []
-    matching, matches = image_points.match, []
+    matching, matches = image_points.match_windows, []
     monkeypatch.setattr(image_points, "consensus", lambda *a, **k: seen.append(k["covariance"]) or agreed(*a, **k))
-    monkeypatch.setattr(image_points, "match", lambda *a, **k: matches.append(matching(*a, **k)) or matches[-1])
+    monkeypatch.setattr(image_points, "match_windows", lambda *a, **k: matches.append(matching(*a, **k)) or matches[-1])
     for sigma in (0.0, 1.0, 3.0):
         map_points(flown.patch, asked().model_copy(update={"control": 60, "check": 20, "height_sigma": sigma}))
     none, one, three = seen[:: len(flown.patch.images)]
@@ -129,13 +129,13 @@ def test_ground_without_points_is_refused(flown: Simulation) -> None:
 
 def test_matches_that_agree_on_nothing_are_refused(flown: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
     """Places all over the windows that are searched."""
-    right, random = image_points.match, np.random.default_rng(1)
+    right, random = image_points.match_windows, np.random.default_rng(1)
 
     def wrong(*what: Any, **how: Any) -> Any:
         found = right(*what, **how)
         return replace(found, place=found.place + random.uniform(-20.0, 20.0, found.place.shape))
 
-    monkeypatch.setattr(image_points, "match", wrong)
+    monkeypatch.setattr(image_points, "match_windows", wrong)
     with pytest.raises(image_points.PointsError, match=r"forward: .*no consensus.*; .* accepted"):
         map_points(flown.patch, asked().model_copy(update={"control": 60, "check": 20}))
 

@@ -10,7 +10,7 @@ from scipy import stats
 from analysis.arrays import ARCSEC
 from analysis.monitor import model_fit, monitor_formulas
 from analysis.monitor.monitor_formulas import PER_SI
-from analysis.monitor.recovery import measure_spots, recover
+from analysis.monitor.recovery import measure_spots, recover_monitor
 from optics.geometry.tree import Motion
 from scenes.specs.instrument import BASE
 from scenes.yaml.errors import InputError
@@ -165,7 +165,7 @@ def runs(experiment):
     recovered = []
     for seed in range(SEEDS):
         before = setup.frames_before(FRAMES, seed)
-        recovered.append(recover(before, setup.frames_after(photons, FRAMES, seed), setup.calibration))
+        recovered.append(recover_monitor(before, setup.frames_after(photons, FRAMES, seed), setup.calibration))
     clean_before = measure_spots(setup.expected_frames(setup.nominal_photons), FRAMES, setup.calibration)
     clean_after = measure_spots(setup.expected_frames(photons[0]), FRAMES, setup.calibration)
     return setup, photons, recovered, clean_before, clean_after

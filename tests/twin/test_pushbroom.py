@@ -7,7 +7,7 @@ import pytest
 from scipy import constants
 from scipy.special import erf
 
-from analysis.mtf.slanted_edge import measure_edge
+from analysis.mtf.slanted_edge import slanted_edge_mtf
 from optics.numerics.array_math import UnphysicalError
 from scenes.specs.load import load_detector
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, TerrainSpec
@@ -141,7 +141,7 @@ def test_an_edge_on_the_ground_has_the_mtf_of_the_optics(name: str, direction: s
 
     done = photograph(name, Terrain.flat(height), Ground(formula), window=window)
     # marks of the image axes on the ground, to take the edge's own softness out
-    edge = measure_edge(np.ascontiguousarray(done.photons), frequency=np.linspace(0.0, 0.5, 26))
+    edge = slanted_edge_mtf(np.ascontiguousarray(done.photons), frequency=np.linspace(0.0, 0.5, 26))
     assert edge.axis == direction
     assert np.degrees(abs(edge.angle)) == pytest.approx(5.5, abs=0.3)
     f = edge.frequency

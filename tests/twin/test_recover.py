@@ -424,7 +424,7 @@ def test_spots_that_cannot_be_measured_name_their_frames(run, images, backend, m
     def lost(*words, **how):
         raise SpotError({1 if plain else 0: "it is dark"})
 
-    monkeypatch.setattr(recover_run, "recover", lost)
+    monkeypatch.setattr(recover_run, "recover_monitor", lost)
     monkeypatch.setattr(ChannelMeasurement, "_position", lost)
     monkeypatch.setattr(ChannelMeasurement, "plain", plain)
     with pytest.raises(InputError, match="it is dark") as caught:

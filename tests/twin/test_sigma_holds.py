@@ -10,7 +10,7 @@ import pytest
 
 import twin
 from analysis.monitor.limits import posterior_sigma, quantities
-from analysis.monitor.recovery import SpotEvidence, joint, judged_spots, recover, recovery_of
+from analysis.monitor.recovery import SpotEvidence, joint, judged_spots, recover_monitor, recovery_of
 from analysis.spots.centroid import mean_frames
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import difference_covariance
@@ -127,7 +127,7 @@ def test_a_large_turn_is_read_by_the_state_traced_again(pair) -> None:
     found = shot.run.recovered_dict()["retraced"]["model"]
     assert found["relinearised"]
     assert found["of"] == "forward d_f_um"
-    linear = recover(shot.run.before, shot.run.after[None], pair.experiment.calibration)
+    linear = recover_monitor(shot.run.before, shot.run.after[None], pair.experiment.calibration)
     off = linear.parameters["forward"]["model"].d_f_m[0] - 1e-6 * float(shot.truth.d_f_um.sel(camera="forward"))
     assert abs(off) > 20.0 * linear.parameters["forward"]["model"].sigma[0, 3]
 

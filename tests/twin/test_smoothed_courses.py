@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.series_smoother import SmoothedSeries, smooth
+from analysis.monitor.series_smoother import SmoothedSeries, smooth_series
 from optics.geometry.tree import State
 from scenes.models.disturbances import state_of
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -76,7 +76,7 @@ class Courses:
     @cached_property
     def smoothed(self) -> list[SmoothedSeries]:
         return [
-            smooth(self.stated, self.times[self.at], shifts, noise, self.times)
+            smooth_series(self.stated, self.times[self.at], shifts, noise, self.times)
             for shifts, noise in zip(self.shifts, self.noise, strict=True)
         ]
 

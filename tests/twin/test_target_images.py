@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 from scipy.signal import fftconvolve
 
-from analysis.mtf.slanted_edge import measure_edge
+from analysis.mtf.slanted_edge import slanted_edge_mtf
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError
@@ -102,7 +102,7 @@ def aberrated(before_gf7) -> View:
 def measured(view: View, direction: str, angle: float) -> tuple[np.ndarray, np.ndarray]:
     """MTF of the noise-free image at CURVE, and the normal of its edge."""
     imager = view.edge(direction, np.radians(angle))
-    found = measure_edge(100.0 + 1000.0 * view.edge_image(imager), frequency=CURVE)
+    found = slanted_edge_mtf(100.0 + 1000.0 * view.edge_image(imager), frequency=CURVE)
     assert found.axis == {ALONG: "x", TRACK: "y"}[direction]
     return found.mtf, imager.optics.normal
 

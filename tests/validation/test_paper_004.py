@@ -20,7 +20,7 @@ import pytest
 from analysis.focal_plane.plane_fit import FocalPlaneFit
 from analysis.turntable import dividing_error
 from analysis.turntable.angle_network import NotConvergedError
-from analysis.turntable.dividing_error import FITS, fit
+from analysis.turntable.dividing_error import FITS, fit_dividing_error
 from optics.numerics.backend import load_backend
 from scenes.specs.resolved import DistortionSetup, FocusSetup
 from tests.tiers import quick
@@ -133,7 +133,9 @@ def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, 
 def test_the_network_is_judged_as_the_other_fits_are(monkeypatch):
     """Straight lines in its place miss the held-out readings by what straight lines miss; one that fails, by any."""
     spec = turntable_checks.TurntableSetup.read(turntable_checks.TEST).test
-    monkeypatch.setattr(turntable_checks, "fit", lambda name, *series: fit("piecewise_linear", *series))
+    monkeypatch.setattr(
+        turntable_checks, "fit_dividing_error", lambda *series: fit_dividing_error(*series[:3], "piecewise_linear")
+    )
     found = turntable_checks.fit_table(spec, 3).held_out
     assert set(found) == set(FITS)
     assert found["network"] == pytest.approx(found["piecewise_linear"], rel=1e-9)
@@ -141,7 +143,7 @@ def test_the_network_is_judged_as_the_other_fits_are(monkeypatch):
     def failing(*_):
         raise NotConvergedError("network")
 
-    monkeypatch.setattr(turntable_checks, "fit", failing)
+    monkeypatch.setattr(turntable_checks, "fit_dividing_error", failing)
     again = turntable_checks.fit_table(spec, 3).held_out
     assert again == {**found, "network": float("inf")}
 
@@ -313,7 +315,7 @@ MUTATIONS = {
     ("shims", "left and right swapped"): (
         focus_checks, "shim_plan", with_fields(change=lambda f: f.change[[1, 0, 3, 2]]), PLAN,
         {"004.alignment.shims"}),
-    ("edge MTF", "half the frequency"): (focus_checks, "measure_edge", half_frequency, TABLE1, EDGES),
+    ("edge MTF", "half the frequency"): (focus_checks, "slanted_edge_mtf", half_frequency, TABLE1, EDGES),
     ("Chauvenet", "kept and rejected swapped"): (
         dividing_error, "chauvenet", chauvenet_swapped, REPEATS,
         {"004.turntable.criterion", "004.turntable.chauvenet"}),

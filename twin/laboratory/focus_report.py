@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from analysis.arrays import ARCMIN, UM_PER_M
 from analysis.arrays import UM_PER_M as UM
 from analysis.focal_plane.through_focus import QUARTIC, FocusVertex
-from analysis.mtf.slanted_edge import measure_edge
+from analysis.mtf.slanted_edge import slanted_edge_mtf
 from scenes.specs.camera_tests import MeasuredFocusSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.framework import svg
@@ -142,7 +142,7 @@ def mtf_svg(run: SimulatedFocus) -> str:
             defocus = state.true_place(number)
             for edge in DIRECTIONS:
                 frames = state.focus[number].frames[edge]
-                measured = measure_edge(frames.mean(axis=0), noise=ccd.noise, frames=len(frames), even=True)
+                measured = slanted_edge_mtf(frames.mean(axis=0), noise=ccd.noise, frames=len(frames), even=True)
                 frequency = measured.frequency / ccd.band.pitch
                 true = np.abs(site.imagers[edge].transfer(defocus, frequency))
                 colour = EDGE_COLOURS[edge]

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from analysis.monitor.recovery import recover
+from analysis.monitor.recovery import recover_monitor
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State, compose
 from optics.numerics.array_math import UnphysicalError
@@ -430,7 +430,7 @@ def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotEr
 
     try:
         mean, centroid = mean_of(before), resolved.job.analysis.centroid
-        recover(mean, mean[None], experiment.calibration, centroid, frames=before.shape[-3])
+        recover_monitor(mean, mean[None], experiment.calibration, centroid, frames=before.shape[-3])
     except SpotError as first:
         return _no_spots(experiment, "; ".join([told(first), *_blurred(experiment, focus)]))
     return _too_large(resolved, told(error))

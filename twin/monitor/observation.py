@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from analysis.arrays import shows
-from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots, recover
+from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots, recover_monitor
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
@@ -44,7 +44,7 @@ class Observing:
     record : Record
         Exposes the detectors.
     centroid : str
-        As of ``analysis.monitor.recovery.recover``.
+        As of ``analysis.monitor.recovery.recover_monitor``.
     chunk : int
         States that are done at once; the last digits of a state depend on which they are.
     single : bool
@@ -256,7 +256,7 @@ def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observa
             first = before[good]
         try:
             with one_blas_thread(), one_kernel_thread():
-                recovery = recover(
+                recovery = recover_monitor(
                     first,
                     images if whole else images[good],
                     experiment.calibration,
@@ -311,7 +311,7 @@ class StateReader:
     seed
         Of all noise.
     centroid
-        As of ``analysis.monitor.recovery.recover``.
+        As of ``analysis.monitor.recovery.recover_monitor``.
     """
 
     def __init__(self, experiment: MonitorExperiment, frames: int, seed: int, centroid: str = "ml") -> None:

@@ -13,7 +13,7 @@ from analysis.monitor.jump_detection import Jump
 from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import Curvature, Recovery, SpotEvidence, estimates_of
-from analysis.monitor.series_smoother import smooth, window_of
+from analysis.monitor.series_smoother import smooth_series, window_of
 from analysis.spots.spot_positions import NoiseParts, SeriesNoise, SpotError
 from analysis.statistics import limit_of
 from optics.geometry.tree import Motion, State
@@ -524,7 +524,7 @@ class CourseSmoother:
         shares = np.arange(1, steps) / steps
         between = (times[:-1, None] + shares * np.diff(times)[:, None]).ravel()
         with one_blas_thread():
-            found = smooth(stated, times, np.concatenate(self._shifts), noise, np.append(times, between))
+            found = smooth_series(stated, times, np.concatenate(self._shifts), noise, np.append(times, between))
 
         def part(which: slice) -> ReadingTable:
             every = {"filtered": found.filtered, "smoothed": found.smoothed}

@@ -14,7 +14,7 @@ from analysis.arrays import shows
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
 from analysis.monitor.monitor_formulas import MonitorGeometry, coefficients
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
-from analysis.monitor.recovery import MotionModel, Recovery, judged_spots, recover, recovery_of
+from analysis.monitor.recovery import MotionModel, Recovery, judged_spots, recover_monitor, recovery_of
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions
@@ -282,7 +282,7 @@ def _plain(
     for piece in pieces(states, sum(channel.after[0].frames.size for channel in channels)):
         after = np.stack([means([c.after[k] for c in channels]) for k in range(piece.start, piece.stop)])
         try:
-            found = recover(
+            found = recover_monitor(
                 before, after, calibration, centroid,
                 disturbances=bench.disturbances, keep_parts=smoother is not None, motions=bench.motions, frames=count,
             )  # fmt: skip

@@ -17,7 +17,7 @@ import pandas as pd
 import xarray as xr
 
 from analysis.monitor import parameters
-from analysis.monitor.recovery import recover
+from analysis.monitor.recovery import recover_monitor
 from optics.geometry.tree import ORIGIN, State
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.camera_sharpness import blur_warnings
@@ -320,7 +320,7 @@ class InstrumentTwin:
         second = as_frames(after, "after", keys, path.shape)
         stated = experiment.disturbances
         again = experiment.motion_models
-        recovery = recover(first, second[None], experiment.calibration, method, disturbances=stated, motions=again)
+        recovery = recover_monitor(first, second[None], experiment.calibration, method, disturbances=stated, motions=again)
         reading = MonitorReading(
             channels=tuple((channel.camera, channel.name) for channel in path.channels),
             cameras=experiment.cameras,

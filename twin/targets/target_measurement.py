@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from analysis.mtf.bar_mtf import BarError, BarMtf, measure_bars
+from analysis.mtf.bar_mtf import BarError, BarMtf, bar_mtf
 from analysis.mtf.edge_location import EdgeError
-from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
+from analysis.mtf.slanted_edge import EdgeMtf, slanted_edge_mtf
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.targets.target_shapes import TARGETS
@@ -481,7 +481,7 @@ def read_edge(view: View, direction: str, normal: np.ndarray, mean: np.ndarray, 
     found: EdgeMtf | None = None
     reason = ""
     try:
-        found = measure_edge(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE, even=True)
+        found = slanted_edge_mtf(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE, even=True)
     except EdgeError as error:
         reason = str(error)
     at_nyquist = NYQUIST * float(normal[0]), NYQUIST * float(normal[1])
@@ -517,7 +517,7 @@ def read_bars(
     found: BarMtf | None = None
     reason = ""
     try:
-        found = measure_bars(
+        found = bar_mtf(
             mean[design.group], dark[design.group], bright[design.group], design.per_pixel,
             noise=view.ccd.noise, frames=frames,
         )  # fmt: skip

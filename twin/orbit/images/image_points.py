@@ -26,7 +26,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, spline_filter, zoom
 
 from analysis.matching.correlation import MatchOptions, Reason, distinct_points
-from analysis.matching.matches import DisplacementField, consensus, match
+from analysis.matching.matches import DisplacementField, consensus, match_windows
 from analysis.matching.spline import resampled
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.number_tree import FrozenMap
@@ -585,7 +585,7 @@ def _matched(
     spec: ImagePointsSpec,
 ) -> MatchedLine:
     options = MatchOptions(least_correlation=spec.least_correlation, largest_sigma=spec.largest_sigma)
-    found = match(image.frame, patterns, at, reach=spec.reach, options=options)
+    found = match_windows(image.frame, patterns, at, reach=spec.reach, options=options)
     status = found.reason.astype(np.int64)
     good = found.accepted
     degree = _degree(int(good.sum()))

@@ -14,7 +14,7 @@ from analysis.monitor.estimators import LeastSquares, Posterior, Shifts
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.monitor_formulas import CameraParameters
 from analysis.monitor.recovery import MeasuredSpots, Recovery, SpotEvidence, judged_spots
-from analysis.monitor.series_smoother import smooth, window_of
+from analysis.monitor.series_smoother import smooth_series, window_of
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SeriesNoise, SpotError
 from optics.geometry.tree import State, compose
@@ -339,7 +339,7 @@ class MonitorSeries:
         at = np.array(self.spec.measured(interval))
         times = np.array(self.spec.times)
         with one_blas_thread():
-            found = smooth(
+            found = smooth_series(
                 stated, times[at], measured.shifts[at], _Some(noise, at), times, reference=self.spec.reference_time
             )
         own, late = self._own, found.smoothed

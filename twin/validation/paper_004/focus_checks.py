@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from analysis.arrays import ARCMIN, ARCSEC, MM_PER_M, UM_PER_M, Array
 from analysis.focal_plane.plane_fit import RigidMotion, ShimPlan, fit_focal_plane, shim_plan
 from analysis.focal_plane.through_focus import focus_vertex
-from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
+from analysis.mtf.slanted_edge import EdgeMtf, slanted_edge_mtf
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.resolved import FocusSetup
@@ -202,7 +202,7 @@ def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
     """Edges along the track at the fields of a band, measured after the alignment."""
     noise, focus = alignment.bench.ccds[band].noise, alignment.states[-1].focus
     stacks = [f.frames[TRACK] for f, site in zip(focus, alignment.bench.sites, strict=True) if site.band == band]
-    return [measure_edge(frames.mean(axis=0), noise=noise, frames=len(frames), even=True) for frames in stacks]
+    return [slanted_edge_mtf(frames.mean(axis=0), noise=noise, frames=len(frames), even=True) for frames in stacks]
 
 
 def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:

@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 from analysis.arrays import ARCSEC, Array
 from analysis.turntable.angle_network import NotConvergedError
-from analysis.turntable.dividing_error import FITS, CalibrationSeries, fit, rejection_rate
+from analysis.turntable.dividing_error import FITS, CalibrationSeries, fit_dividing_error, rejection_rate
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.resolved import TurntableSetup
 from scenes.specs.turntable import TurntableTestSpec
@@ -110,7 +110,7 @@ def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
     found = {name: rms(done.held_out_residual(name)) for name in done.fits}
     try:
         # without its cross-validation, which takes ten times as long and chooses nothing here
-        network = fit(NETWORK, series.angle, series.mean, series.sigma, seed)
+        network = fit_dividing_error(series.angle, series.mean, series.sigma, NETWORK, seed)
         found[NETWORK] = rms(held.mean - network(held.angle))
     except NotConvergedError:
         pass
