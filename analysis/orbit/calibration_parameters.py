@@ -1,35 +1,35 @@
-"""What an in-orbit geometric calibration has: fields of points, unknowns by name, and what is known of them before.
+"""Parameters of an in-orbit geometric calibration, their priors, their observability and the gauge.
 
-Names of the unknowns: "forward f", "forward x", "forward y" and so on for each line camera; "Beijing roll", "Beijing
-pitch", "Beijing yaw" for each field, or "roll", "pitch", "yaw" where all fields share one bias; "Beijing offset along",
-"... across", "... down" for a constant error of the orbit during one field, in the field's mean body axes; "Beijing
-forward d_alpha", "... d_beta", "... d_gamma", "... d_f" for the drift of a camera during one field from its reference
-state, which interior orientation and mounting describe; "roll rate", "pitch rate", "yaw rate" for a drift of the bias
-during every field, or "Beijing roll rate" and so on during each, rad/s, zero at the mean time of the field's rays.
+**Names of the unknowns.** "forward f", "forward x", "forward y" and so on are the principal distance and the principal
+point of each line camera. "Beijing roll", "Beijing pitch", "Beijing yaw" are the attitude bias of each field, or
+"roll", "pitch", "yaw" where all fields share one bias. "Beijing offset along", "... across", "... down" are a constant
+orbit error during one field, in the field's mean body axes. "Beijing forward d_alpha", "... d_beta", "... d_gamma",
+"... d_f" are the drift of a camera during one field from its reference state, to which interior orientation and
+mounting refer. "roll rate", "pitch rate", "yaw rate" are a drift of the bias during every field, or "Beijing roll rate"
+and so on during one field, in rad/s, zero at the mean time of the field's rays.
 
-Which combinations of calibration unknowns the points leave open, by name, and the gauge that closes them.
+**Observability.** `free_basis` lists the combinations of unknowns that the ground points leave undetermined, and
+applies the gauge that fixes them. Unknowns are scaled by the sigmas of their start values: what a launch may change, or
+`WORST` metres of image motion (`scale`; for a principal distance at the ends of the line, where it moves the image
+most). The normal matrix N uses the a-priori sigmas of the measurements; in these units the eigenvectors of N are
+uncorrelated combinations, each with the standard deviation 1 / sqrt(eigenvalue). A combination is called open when that
+exceeds 1: the data then determine it less well than the start values do. The space of open combinations depends neither
+on units nor on the order of the unknowns nor on their parametrisation, and everything orthogonal to it is known better
+than at the start. Poorly fitting data do not open a combination, because estimated variance factors are not used here.
+Start values with sigmas act as observations of the open combinations only; the rest is left to the points.
 
-Unknowns are counted in sigmas of their start values: what a launch may change, or `WORST` metres of image motion
-(`scale`; of a principal distance at the ends of the line, where it moves the image most). The normal matrix N carries
-the a-priori sigmas of the measurements; in these units the eigenvectors of N are combinations that are uncorrelated,
-each known to 1 / sqrt(eigenvalue). A combination is open when that is above 1: the data say less of it than the start
-values do. The space of open combinations depends on neither units nor order nor on which combinations of the unknowns
-are chosen as unknowns, and all that is square to it is known better than at the start. Misfit does not open anything:
-estimated variance factors do not count here. Start values with sigmas then are observations of the open combinations,
-and of nothing else; what the points tell is left to the points.
+The strength of a combination compares the reduced system with the lengths that its columns had before the ground points
+were eliminated: at strength s, its standard deviation is 1/s times that of its unknowns alone. Estimated combinations
+with a strength below `WEAK` are reported. Open and weak combinations of a three-line camera:
 
-The strength of a combination compares the reduced system with the lengths its columns had before the ground points were
-eliminated: at a strength s it is known 1/s times less well than its unknowns alone. What is solved for with a strength
-below `WEAK` is reported. What opens in a three-line camera:
-
-- x of all lines against pitch: exact for lines square to the track, whatever the terrain.
-- Orbit offsets against bias and interior: broken by relief and by the curvature of the Earth, a thousandth.
-- Roll against y of all lines, yaw against y of the outer ones: broken by the turn of the outer lines about their line
-  of sight, so weak or correlated, not open.
-- Drift of the cameras in each field, unless a monitor tells it: d_alpha, d_beta and d_f of one line in all fields
+- x of all lines against pitch: exact for lines perpendicular to the track, whatever the terrain.
+- Orbit offsets against bias and interior orientation: separated, to a thousandth, by relief and Earth curvature.
+- Roll against y of all lines, yaw against y of the outer ones: separated by the rotation of the outer lines about
+  their line of sight, so weak or correlated, not open.
+- Drift of the cameras in each field, unless a monitor measures it: d_alpha, d_beta and d_f of one line in all fields
   against its x, y and f; d_alpha, d_beta and d_gamma of all lines in one field against the bias of that field.
 - A drift of the bias during the fields against x and y of the outer lines, which see a field earlier and later: weak,
-  for within a line a field of 50 km passes in 7 s.
+  because a line passes a field of 50 km in 7 s.
 """
 
 from __future__ import annotations
@@ -48,32 +48,37 @@ from analysis.orbit.three_line_model import BIAS, DRIFT, INTERIOR, LineModel, Ra
 
 OFFSET = ("along", "across", "down")
 RATE = tuple(f"{n} rate" for n in BIAS)
-_SEMI_AXES = np.array([6378137.0, 6378137.0, 6356752.314245])  # WGS84
-_SHORTEST = 1e-3  # of f: half a line that is taken to be at least that long
-_FARTHEST = 12e3  # metres: no land is higher, and geodetic coordinates or kilometres are far beyond
+_SEMI_AXES = np.array([6378137.0, 6378137.0, 6356752.314245])  # WGS84, metres
+_SHORTEST = 1e-3
+"""Smallest half length assumed for a line, as a fraction of the principal distance."""
+_FARTHEST = 12e3
+"""Largest plausible height above the ellipsoid, in metres. No land is higher, and coordinates that are geodetic or in
+kilometres come out far beyond it.
+"""
 
 
 class CalibrationError(MeasurementError, ValueError):
-    """Input of a calibration that cannot be used."""
+    """Invalid input of a calibration."""
 
 
 @dataclass(frozen=True)
 class NoiseTerm:
-    """One source of noise of attitude or station.
+    """Noise source of the attitude or the station.
 
     Attributes
     ----------
     group : str
-        Variance group.
-    kind : Literal['attitude', 'station']
-        What it acts on.
+        Name of the variance group.
+    kind : {'attitude', 'station'}
+        Quantity that the noise acts on.
     sigma : float
-        Of a reading, about each body axis in radians or along each axis in metres; of a random walk what it gains in a
-        second.
-    interval : float | None
-        Of the readings, seconds, that a cubic spline joins; None where each exposure has noise of its own.
+        Standard deviation of a reading, about each body axis in radians or along each axis in metres; for a random
+        walk, the standard deviation of its increment over one second.
+    interval : float or None
+        Interval between the readings, which a cubic spline interpolates, in seconds. None if every exposure has
+        independent noise.
     walks : bool
-        Whether it is a random walk, straight between its values at the interval.
+        True for a random walk, which is linear between its nodes at the interval.
     """
 
     group: str
@@ -90,23 +95,25 @@ class Noise:
     Attributes
     ----------
     image : float
-        Of an image point in x and in y, metres; x is the image line times the pixel pitch. Independent. Where rays have
-        a spread of their own it counts in units of this.
+        Sigma of an image point in x and in y, independent, in metres; x is the image line times the pixel pitch. Rays
+        with a covariance of their own (`Rays.spread`) state it in units of this sigma squared.
     attitude : float
-        Of a reading of the attitude about each body axis, radians.
+        Sigma of an attitude reading about each body axis, in radians.
     station : float
-        Of a reading of the station along each axis, metres.
-    attitude_interval, station_interval : float | None
-        Seconds between readings, at whole multiples of it. A cubic spline joins them, so that rays with known times
-        share errors. None: each exposure has its own.
+        Sigma of a station reading along each axis, in metres.
+    attitude_interval, station_interval : float or None
+        Interval between readings, which lie at its whole multiples, in seconds. A cubic spline interpolates them, so
+        that rays with known times share errors. None: every exposure has independent noise.
     slow_attitude : float
-        Of slow errors of the attitude, a cubic spline through independent values every `slow_interval` seconds,
+        Sigma of slow attitude errors, a cubic spline through independent values every `slow_interval` seconds, in
         radians.
+    slow_interval : float or None
+        Interval between the nodes of the slow attitude errors, in seconds.
     attitude_walk : float
-        Of what a random walk of the attitude gains in a second, radians. Its level at the middle of a pass is the bias.
-        It needs the times of the rays.
+        Sigma of the increment of an attitude random walk over one second, in radians. Its value at the middle of a pass
+        belongs to the bias. It requires the times of the rays.
     walk_interval : float
-        Between the values of it that are solved for, seconds.
+        Interval between the estimated nodes of the random walk, in seconds.
     """
 
     image: float
@@ -121,44 +128,44 @@ class Noise:
 
     @property
     def terms(self) -> tuple[NoiseTerm, ...]:
-        """Terms of attitude and station that are not zero."""
-        every = (
+        """Noise terms of attitude and station that are not zero."""
+        terms = (
             NoiseTerm("attitude", "attitude", self.attitude, self.attitude_interval),
             NoiseTerm("slow attitude", "attitude", self.slow_attitude, self.slow_interval),
             NoiseTerm("station", "station", self.station, self.station_interval),
             NoiseTerm("attitude walk", "attitude", self.attitude_walk, self.walk_interval, True),
         )
-        return tuple(t for t in every if t.sigma > 0)
+        return tuple(t for t in terms if t.sigma > 0)
 
     def check(self) -> None:
-        """Raises CalibrationError for sigmas and intervals that cannot be used."""
+        """Raise CalibrationError if a sigma or an interval is invalid."""
         sigmas = (self.image, self.attitude, self.station, self.slow_attitude, self.attitude_walk)
         if not (np.isfinite(sigmas).all() and self.image > 0 and min(sigmas) >= 0):
             raise CalibrationError(
                 f"calibration: sigmas must be finite, that of the image positive and no other negative, found {self}"
             )
-        given = (self.attitude_interval, self.station_interval, self.slow_interval, self.walk_interval)
-        intervals = [v for v in given if v is not None]
+        candidates = (self.attitude_interval, self.station_interval, self.slow_interval, self.walk_interval)
+        intervals = [v for v in candidates if v is not None]
         if not all(np.isfinite(v) and v > 0 for v in intervals):
             raise CalibrationError(f"calibration: intervals must be finite and positive, found {self}")
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationField:
-    """One pass over one field of points.
+    """Pass over one test field.
 
     Attributes
     ----------
     name : str
-        Of the field.
-    rays : Mapping[str, Rays]
-        Line camera -> its image points.
-    ground : Array
-        (m, 3) coordinates of the control points, start values of the others, ITRS, metres.
-    covariance : Array
-        (m, 3, 3) of the control points; zero where they are exact, not used for others.
-    control : NDArray[np.bool_]
-        (m,) which of the points are control; the others are tie points.
+        Name of the field.
+    rays : mapping of str to Rays
+        Image points of each line camera, by its name.
+    ground : (m, 3) ndarray
+        Coordinates of the control points and start values of the tie points, ITRS, in metres.
+    covariance : (m, 3, 3) ndarray
+        Covariance of the control points, in m^2; zero where they are error-free, ignored for tie points.
+    control : (m,) ndarray of bool
+        True for control points, False for tie points.
     """
 
     name: str
@@ -176,27 +183,27 @@ class CalibrationField:
         sigma: float | tuple[float, float] | Array,
         control: ArrayLike | None = None,
     ) -> CalibrationField:
-        """The field, checked.
+        """Return a validated field.
 
         Parameters
         ----------
         name : str
-            Of the field.
-        rays : Mapping[str, Rays]
-            Line -> its image points.
-        ground : ArrayLike
-            Of the points, ITRS, (P, 3), metres.
-        sigma : float | tuple[float, float] | Array
-            Of control points, one for all axes or (each axis in plan, height), metres, 0 for exact; or their
-            covariance, (P, 3, 3), m^2, zero for exact ones.
-        control : ArrayLike | None
-            Which points are control, (P,); all by default.
+            Name of the field.
+        rays : mapping of str to Rays
+            Image points of each line camera, by its name.
+        ground : (m, 3) array_like
+            Coordinates of the points, ITRS, in metres.
+        sigma : float or (float, float) or (m, 3, 3) ndarray
+            Standard deviation of the control points in metres, one for all axes or (each horizontal axis, height), 0
+            for error-free points; or their covariance in m^2, zero for error-free points.
+        control : (m,) array_like of bool, optional
+            True for control points; all points by default.
 
         Raises
         ------
         CalibrationError
-            Shapes, values that are not finite, points far from the ellipsoid, rays of points that do not exist, tie
-            points that fewer than two lines see.
+            Shapes do not match, values are not finite, a point is far from the ellipsoid, a ray shows a point that does
+            not exist, or fewer than two lines see a tie point.
         """
         points = np.array(ground, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
@@ -226,69 +233,75 @@ class CalibrationField:
 
     @property
     def axes(self) -> Array:
-        """(3, 3) mean body axes (along, across, down) as columns, ITRS: the rotation nearest to the mean attitude."""
+        """Mean body axes (along, across, down) as columns, ITRS, (3, 3): the rotation nearest to the mean attitude."""
         attitudes = np.concatenate([r.attitude for r in self.rays.values()])
         return np.asarray(Rotation.from_matrix(attitudes).mean().as_matrix())
 
 
 def _control_covariance(name: str, points: Array, sigma: float | tuple[float, float] | Array) -> Array:
-    """(m, 3, 3) of control points, m^2."""
+    """Return the (m, 3, 3) covariance of control points, in m^2."""
     if isinstance(sigma, np.ndarray):
         exact = ~np.any(sigma, axis=(1, 2)) if sigma.shape == (len(points), 3, 3) else np.zeros(0, bool)
         if len(exact) != len(points) or not np.all(np.linalg.eigvalsh(sigma)[~exact] > 0.0):
             raise CalibrationError(f"field {name!r}: covariances must be ({len(points)}, 3, 3) and positive or zero")
         return sigma
-    plan, tall = sigma if isinstance(sigma, tuple) else (sigma, sigma)
-    if not (np.isfinite([plan, tall]).all() and min(plan, tall) >= 0 and (plan > 0) == (tall > 0)):
+    plan, height = sigma if isinstance(sigma, tuple) else (sigma, sigma)
+    if not (np.isfinite([plan, height]).all() and min(plan, height) >= 0 and (plan > 0) == (height > 0)):
         raise CalibrationError(f"field {name!r}: sigma must be finite, and positive or zero for all axes")
-    return level_covariance(points, plan, tall)
+    return level_covariance(points, plan, height)
 
 
-def level_covariance(points: Array, plan: ArrayLike, tall: ArrayLike) -> Array:
-    """(m, 3, 3) covariance in ITRS axes, m^2, of points known alike in both axes in plan.
+def level_covariance(points: Array, plan: ArrayLike, height: ArrayLike) -> Array:
+    """Return the (m, 3, 3) ITRS covariance of points with equal sigmas along both horizontal axes, in m^2.
 
     Parameters
     ----------
-    points : Array
-        ITRS, (m, 3), metres.
-    plan : ArrayLike
-        Standard deviation of each axis in plan, metres, or (m,).
-    tall : ArrayLike
-        Of the height, likewise.
+    points : (m, 3) ndarray
+        Coordinates of the points, ITRS, in metres.
+    plan : float or (m,) array_like
+        Standard deviation along each horizontal axis, in metres.
+    height : float or (m,) array_like
+        Standard deviation of the height, in metres.
     """
     up = vertical(points)
-    flat, high = (np.asarray(v, np.float64)[..., None, None] ** 2 for v in (plan, tall))
-    return np.asarray(flat * np.eye(3) + (high - flat) * up[:, :, None] * up[:, None, :])
+    plan_variance, height_variance = (np.asarray(v, np.float64)[..., None, None] ** 2 for v in (plan, height))
+    return np.asarray(plan_variance * np.eye(3) + (height_variance - plan_variance) * up[:, :, None] * up[:, None, :])
 
 
 def _rough_height(points: Array) -> Array:
-    """(m,) distance above the ellipsoid along the radius, metres."""
+    """Return the (m,) distances of points from the ellipsoid along their radius, in metres."""
     radius = np.linalg.norm(points, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(radius - radius / np.linalg.norm(points / _SEMI_AXES, axis=1))
 
 
 def vertical(points: Array) -> Array:
-    """Unit normals of the ellipsoid at points (m, 3), ITRS, m: good to h/a of the deflection, 1e-6 rad below 2 km."""
+    """Return the (m, 3) unit normals of the ellipsoid at points (m, 3), ITRS, in metres.
+
+    The error is h/a of the deflection of the radius, 1e-6 rad for heights below 2 km.
+    """
     normal = points / _SEMI_AXES**2
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What is solved for beside the interior orientation (f, x and y of every line camera) and an attitude bias of each
-    field.
+    """Choice of unknowns beside the interior orientation and the attitude bias of each field.
+
+    Interior orientation means f, x and y of every line camera.
 
     Attributes
     ----------
     offset : bool
-        Whether the orbit has a constant error in each field.
+        True to estimate a constant orbit error in each field.
     drift : bool
-        Whether every camera has changed during each field against its reference state. It is open against bias and
-        interior unless priors, for example of an on-board monitor, tell it.
-    rate : Literal['common', 'field', 'none']
-        Drift of the bias during the fields, the same in all or one in each, or none. It is weak against x and y of the
-        outer lines, which see a field before and after the nadir line, unless priors tell it.
+        True to estimate the change of every camera during each field against its reference state. It cannot be
+        separated from bias and interior orientation unless priors, for example from an on-board monitor, determine
+        it.
+    rate : {'common', 'field', 'none'}
+        Drift of the bias during the fields: one for all, one for each field, or none. It is only weakly separated
+        from x and y of the outer lines, which see a field before and after the nadir line, unless priors determine
+        it.
     """
 
     offset: bool = False
@@ -296,17 +309,30 @@ class Unknowns:
     rate: Literal["common", "field", "none"] = "none"
 
     def __post_init__(self) -> None:
-        """Refuse a word that means nothing: it would count as none."""
+        """Raise CalibrationError for an unknown `rate`, which would otherwise act like 'none'."""
         if self.rate not in ("common", "field", "none"):
             raise CalibrationError(f"calibration: rate must be common, field or none, found {self.rate!r}")
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Pseudo-observation of a linear combination of unknowns: sum of weight * unknown = value, with sigma.
+    """Pseudo-observation of a linear combination of unknowns.
+
+    The sum of weight * unknown equals `value`, with the standard deviation `sigma`.
 
     A laboratory's principal distance is `Prior({"nadir f": 1.0}, 0.65, 20e-6)`; an orbit known to 0.3 m is
-    `Prior({"Beijing offset along": 1.0}, 0.0, 0.3)`. `group` names the variance component that it belongs to.
+    `Prior({"Beijing offset along": 1.0}, 0.0, 0.3)`.
+
+    Attributes
+    ----------
+    weights : mapping of str to float
+        Weight of each unknown, by its name.
+    value : float
+        Value of the combination, in metres or radians.
+    sigma : float
+        Standard deviation of the value.
+    group : str
+        Variance component that the prior belongs to.
     """
 
     weights: Mapping[str, float]
@@ -316,23 +342,23 @@ class Prior:
 
 
 def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike) -> list[Prior]:
-    """What an on-board monitor of one camera tells of its drift during one field.
+    """Return the priors on a camera's drift during one field that follow from a reading of its on-board monitor.
 
     Parameters
     ----------
     field : str
-        Its name.
+        Name of the field.
     line : str
-        Of the camera.
-    reading : ArrayLike
-        (4,) of d_alpha, d_beta, d_gamma (radians) and d_f (metres), against the reference state.
-    sigma : ArrayLike
-        Of each, (4,); infinite where nothing is told.
+        Name of the line camera.
+    reading : (4,) array_like
+        d_alpha, d_beta, d_gamma (radians) and d_f (metres) against the reference state.
+    sigma : (4,) array_like
+        Standard deviation of each; infinite for a component that the monitor does not measure.
 
     Raises
     ------
     CalibrationError
-        Other shapes.
+        Reading or sigma is not of shape (4,).
     """
     values, sigmas = np.asarray(reading, np.float64), np.asarray(sigma, np.float64)
     if values.shape != (4,) or sigmas.shape != (4,):
@@ -343,22 +369,22 @@ def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike) 
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """The unknowns in order, with start values.
+    """Ordered unknowns with their start values.
 
     Attributes
     ----------
-    names : tuple[str, ...]
-        Of the unknowns.
-    start : Array
-        (P,) start values, metres and radians.
-    scale : Array
-        (P,) the change of each that moves the image by about one metre: 1 for principal points, 1/f rad, range/f m; of
-        f the change that moves the ends of the line by one metre.
-    columns : Mapping[tuple[str, str], tuple[Array, Array, Array, Array, Array]]
-        (field, line) -> (indices of f, x, y), (of roll, pitch, yaw), (of along, across, down), (of d_alpha, d_beta,
-        d_gamma, d_f), (of the rates of roll, pitch, yaw), -1 if fixed.
-    middles : Mapping[str, float]
-        Field -> mean time of its rays, seconds, where the bias drifts.
+    names : tuple of str
+        Names of the P unknowns.
+    start : (P,) ndarray
+        Start values, in metres and radians.
+    scale : (P,) ndarray
+        Change of each unknown that moves the image by about one metre: 1 for principal points, 1/f rad for angles,
+        range/f m for offsets; for f, the change that moves the ends of the line by one metre.
+    columns : mapping of (str, str) to tuple of ndarray
+        For each (field, line), the indices of (f, x, y), (roll, pitch, yaw), (along, across, down), (d_alpha, d_beta,
+        d_gamma, d_f) and (the rates of roll, pitch, yaw); -1 for a fixed parameter.
+    middles : mapping of str to float
+        Mean time of the rays of each field, in seconds, where the bias drifts.
     """
 
     names: tuple[str, ...]
@@ -375,40 +401,54 @@ class Parameters:
         unknowns: Unknowns,
         start: Mapping[str, float] | None = None,
     ) -> Parameters:
-        """start: by name, where not the cameras' interior and zero.
+        """Return the parameters of an adjustment, validated.
+
+        Parameters
+        ----------
+        fields : sequence of CalibrationField
+            Passes that are adjusted together.
+        cameras : mapping of str to LineModel
+            Line cameras, by name.
+        unknowns : Unknowns
+            Choice of unknowns.
+        start : mapping of str to float, optional
+            Start values by the names of the unknowns; otherwise the cameras' interior orientation, and zero for the
+            rest.
 
         Raises
         ------
         CalibrationError
-            No fields, two of one name, a line without a camera, an unknown name in start, rates without the times of
-            the rays.
+            There are no fields, two fields have the same name, a line has no camera, `start` names an unknown
+            parameter, or rates are to be estimated without the times of the rays.
         """
         if not fields:
             raise CalibrationError("calibration: no fields")
         if len({f.name for f in fields}) != len(fields):
-            raise CalibrationError("calibration: two fields have one name")
+            raise CalibrationError("calibration: two fields have the same name")
         focal = float(np.mean([c.interior[0] for c in cameras.values()]))
         entries: dict[str, tuple[float, float]] = {}
         for line, camera in cameras.items():
-            # f moves an image by the tangent of its place in the field
+            # a change of f moves an image point in proportion to the tangent of its field angle
             units = (float(camera.interior[0]) / _edge(fields, line, camera), 1.0, 1.0)
             start_values = zip(INTERIOR, camera.interior, units, strict=True)
             entries |= {f"{line} {n}": (float(v), s) for n, v, s in start_values}
-        for one in fields:
-            reach = [np.linalg.norm(one.ground[r.point] - r.station, axis=1) for r in one.rays.values() if r.point.size]
-            if not reach:
-                raise CalibrationError(f"field {one.name!r}: no image points")
-            entries |= {f"{one.name} {n}": (0.0, 1.0 / focal) for n in BIAS}
+        for site in fields:
+            ranges = [
+                np.linalg.norm(site.ground[r.point] - r.station, axis=1) for r in site.rays.values() if r.point.size
+            ]
+            if not ranges:
+                raise CalibrationError(f"field {site.name!r}: no image points")
+            entries |= {f"{site.name} {n}": (0.0, 1.0 / focal) for n in BIAS}
             if unknowns.offset:
-                metres = float(np.mean(np.concatenate(reach))) / focal
-                entries |= {f"{one.name} offset {n}": (0.0, metres) for n in OFFSET}
+                metres = float(np.mean(np.concatenate(ranges))) / focal
+                entries |= {f"{site.name} offset {n}": (0.0, metres) for n in OFFSET}
             if unknowns.drift:
-                for line, rays in one.rays.items():
-                    # d_gamma swings the ends of the line
+                for line, rays in site.rays.items():
+                    # d_gamma moves the ends of the line most
                     ends = max(float(np.abs(rays.image[:, 1]).max(initial=0.0)), _SHORTEST * focal)
                     sizes = (1.0 / focal, 1.0 / focal, 1.0 / ends, 1.0)
-                    entries |= {f"{one.name} {line} {n}": (0.0, s) for n, s in zip(DRIFT, sizes, strict=True)}
-        middles = {} if unknowns.rate == "none" else {one.name: _middle(one) for one in fields}
+                    entries |= {f"{site.name} {line} {n}": (0.0, s) for n, s in zip(DRIFT, sizes, strict=True)}
+        middles = {} if unknowns.rate == "none" else {site.name: _middle(site) for site in fields}
         if middles:
             spans = [np.ptp(np.concatenate([r.time for r in f.rays.values() if r.time is not None])) for f in fields]
             swings = [2.0 / (focal * max(float(span), _SHORTEST)) for span in spans]
@@ -417,117 +457,132 @@ class Parameters:
             else:
                 entries |= {f"{f.name} {n}": (0.0, size) for f, size in zip(fields, swings, strict=True) for n in RATE}
         names = tuple(entries)
-        where = {n: i for i, n in enumerate(names)}
+        position = {n: i for i, n in enumerate(names)}
         values = np.array([entries[n][0] for n in names])
         for n, v in (start or {}).items():
             values[index(names, n)] = v
         columns = {}
-        for one in fields:
-            for line in one.rays:
+        for site in fields:
+            for line in site.rays:
                 if line not in cameras:
-                    raise CalibrationError(f"field {one.name!r}: no camera is called {line!r}")
+                    raise CalibrationError(f"field {site.name!r}: no camera is called {line!r}")
                 groups = (
                     [f"{line} {n}" for n in INTERIOR],
-                    [f"{one.name} {n}" for n in BIAS],
-                    [f"{one.name} offset {n}" for n in OFFSET],
-                    [f"{one.name} {line} {n}" for n in DRIFT],
-                    [n if unknowns.rate == "common" else f"{one.name} {n}" for n in RATE],
+                    [f"{site.name} {n}" for n in BIAS],
+                    [f"{site.name} offset {n}" for n in OFFSET],
+                    [f"{site.name} {line} {n}" for n in DRIFT],
+                    [n if unknowns.rate == "common" else f"{site.name} {n}" for n in RATE],
                 )
-                inner, turn, shift, drift, rate = (np.array([where.get(n, -1) for n in g]) for g in groups)
-                columns[one.name, line] = (inner, turn, shift, drift, rate)
+                interior, bias, offset, drift, rate = (np.array([position.get(n, -1) for n in g]) for g in groups)
+                columns[site.name, line] = (interior, bias, offset, drift, rate)
         return cls(names, values, np.array([entries[n][1] for n in names]), columns, middles)
 
     def since_middle(self, name: str, rays: Rays) -> Array:
-        """(n,) seconds from the middle of a field to its rays; zero where the bias does not drift."""
+        """Return the (n,) seconds from a field's mean time to its rays; zero where the bias does not drift."""
         if name not in self.middles or rays.time is None:
             return np.zeros(len(rays.point))
         return np.asarray(rays.time - self.middles[name])
 
     def turned(self, values: Array, name: str, line: str, rays: Rays) -> Rays:
-        """Rays with the drift of the bias since the middle of the field taken into their attitude.
+        """Return rays whose attitude includes the drift of the bias since the middle of the field.
 
         Parameters
         ----------
-        values : Array
-            Of all unknowns, (U,), SI.
+        values : (P,) ndarray
+            Values of all unknowns, SI units.
         name : str
-            Of the field.
+            Name of the field.
         line : str
-            Of the camera.
+            Name of the line camera.
         rays : Rays
-            Of that line.
+            Rays of that line.
         """
         columns = self.columns[name, line][4]
         if columns[0] < 0 or not len(rays.point):
             return rays
-        turn = self.since_middle(name, rays)[:, None] * values[columns]
-        return replace(rays, attitude=rays.attitude @ Rotation.from_rotvec(turn).as_matrix())
+        rotation = self.since_middle(name, rays)[:, None] * values[columns]
+        return replace(rays, attitude=rays.attitude @ Rotation.from_rotvec(rotation).as_matrix())
 
     def parts(self, values: Array, name: str, line: str, camera: LineModel) -> tuple[LineModel, Array, Array]:
-        """Camera with interior and drift, bias (3,) and offset (3,) (field axes) of one line of one field.
+        """Return the camera, the bias (3,) and the offset (3,) in field axes for one line of one field.
 
         Parameters
         ----------
-        values : Array
-            Of all unknowns, (U,), SI.
+        values : (P,) ndarray
+            Values of all unknowns, SI units.
         name : str
-            Of the field.
+            Name of the field.
         line : str
-            Of the camera.
+            Name of the line camera.
         camera : LineModel
-            As the laboratory knows it.
+            Camera before calibration; its mounting is kept.
+
+        Returns
+        -------
+        tuple of (LineModel, ndarray, ndarray)
+            Camera with the estimated interior orientation and drift, bias in radians, offset in metres.
         """
-        inner, turn, shift, drift, _ = self.columns[name, line]
-        bias, offset = (values[c] if c[0] >= 0 else np.zeros(3) for c in (turn, shift))
-        camera = camera.with_interior(values[inner]) if inner[0] >= 0 else camera
+        interior, bias_columns, offset_columns, drift, _ = self.columns[name, line]
+        bias, offset = (values[c] if c[0] >= 0 else np.zeros(3) for c in (bias_columns, offset_columns))
+        camera = camera.with_interior(values[interior]) if interior[0] >= 0 else camera
         return (camera.drifted(values[drift]) if drift[0] >= 0 else camera), bias, offset
 
 
 def _edge(fields: Sequence[CalibrationField], line: str, camera: LineModel) -> float:
-    """Distance of the ends of a line, or of the outermost of its image points, from its middle, metres."""
+    """Return the distance from the middle of a line to its ends or its outermost image point, in metres."""
     places = [float(np.abs(f.rays[line].image[:, 1]).max(initial=0.0)) for f in fields if line in f.rays]
     return max(camera.half_length, *places, _SHORTEST * float(camera.interior[0]))
 
 
-def _middle(one: CalibrationField) -> float:
-    times = [r.time for r in one.rays.values() if r.point.size]
+def _middle(site: CalibrationField) -> float:
+    """Return the mean time of a field's rays, in seconds."""
+    times = [r.time for r in site.rays.values() if r.point.size]
     if any(t is None for t in times):
-        raise CalibrationError(f"field {one.name!r}: a drift of the bias needs the times of all rays")
+        raise CalibrationError(f"field {site.name!r}: a drift of the bias needs the times of all rays")
     return float(np.mean(np.concatenate([t for t in times if t is not None])))
 
 
 def index(names: Sequence[str], name: str) -> int:
-    """Place of a name. Raises CalibrationError that lists the names."""
+    """Return the index of a name; raise CalibrationError, listing the names, if it is not among them."""
     if name not in names:
         raise CalibrationError(f"calibration: no unknown is called {name!r}; there are {', '.join(names)}")
     return list(names).index(name)
 
 
-# Image motion: 15 px of 6.5 um, 32 arcsec, 75 m on the ground, as without any calibration (paper 003: 100 m class). A
-# camera that is mounted askew by one arc minute lets the pitch be seen, but to 400 px with sixty points of 0.3 px.
 WORST = 1e-4
-# Of the noise of a single image point: a combination that may move the image by so much without the points' noticing is
-# none of theirs, whatever start values say of it. Six points over the width of a field leave 500 times or less.
+"""Image motion of a start value of unknown accuracy, in metres: 15 px of 6.5 um, 32 arcsec, 75 m on the ground, as
+without any calibration (paper 003: 100 m class). With a camera mounted askew by one arc minute the pitch becomes
+observable, but only to 400 px with sixty points of 0.3 px.
+"""
 LOST = 3e3
+"""Ratio of a combination's image motion to the noise of a single image point above which the points do not determine
+it, whatever the start values say. Six points over the width of a field give 500 or less.
+"""
 WEAK = 3e-2
+"""Strength below which an estimated combination is reported as weak."""
 _CLOSED = 10.0
+"""Factor on the sigma of an unknown's prior that makes the prior close the combinations with this unknown."""
 _SHOWN = 1e-2
+"""Smallest share of the largest motion with which an unknown is listed in a combination."""
 _ANGLES = (*BIAS, *DRIFT[:3], "rate")
 
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """A change of unknowns that (nearly) moves no image point.
+    """Change of unknowns that moves (nearly) no image point.
 
     Attributes
     ----------
-    names, change : tuple[str, ...]
-        The unknowns that take part and their changes, metres and radians, for a largest image motion of any single one
-        of 1 mm.
+    names : tuple of str
+        Unknowns that take part.
+    change : (k,) ndarray
+        Change of each of them, in metres and radians, scaled so that the largest image motion caused by any single one
+        is 1 mm.
     strength : float
-        How much less well it is known than its unknowns alone would be.
+        Ratio of the standard deviations of the unknowns alone to that of the combination.
     sigma : float
-        What one sigma of the data allows it, metres of image motion of the unknown that moves the image most.
+        Standard deviation of the combination from the data, as the image motion of the unknown that moves the image
+        most, in metres.
     """
 
     names: tuple[str, ...]
@@ -542,15 +597,15 @@ class Combination:
 
 @dataclass(frozen=True)
 class Gauge:
-    """Rule that closes open combinations.
+    """Rule that fixes open combinations.
 
     Attributes
     ----------
-    held : tuple[str, ...]
-        Unknowns that keep their start values, for example ("nadir x",).
-    start : Mapping[str, float] | float | None
-        Sigmas of the start values, which observe open combinations and nothing else: by name, metres or radians, or one
-        for all, metres of image motion. None: nothing closes what the points leave open.
+    held : tuple of str
+        Unknowns that are fixed at their start values, for example ("nadir x",).
+    start : mapping of str to float, float or None
+        Sigmas of the start values, which act as observations of open combinations only: by name in metres or radians,
+        or one for all in metres of image motion. None: nothing fixes what the points leave open.
     """
 
     held: tuple[str, ...] = ()
@@ -558,33 +613,41 @@ class Gauge:
 
     def __str__(self) -> str:
         held = f"held at the start values: {', '.join(self.held)}" if self.held else ""
-        sure = "to what is stated of them"
+        accuracy = "with the specified sigmas"
         if isinstance(self.start, float):
-            sure = f"to {self.start:g} m of image motion"
-        start = "" if self.start is None else f"open combinations keep their start values, {sure}"
+            accuracy = f"with {self.start:g} m of image motion (1 sigma)"
+        start = "" if self.start is None else f"open combinations are constrained to their start values, {accuracy}"
         return "; ".join(t for t in (held, start) if t) or "none"
 
     def sigmas(self, names: Sequence[str], scale: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """(P,) sigmas of the start values, SI, `WORST` of image motion where none is stated; (P,) whether it is.
+        """Return the (P,) sigmas of the start values in SI units, and a (P,) mask of those that were specified.
 
-        Raises CalibrationError for one that is not positive.
+        Start values without a specified sigma have `WORST` metres of image motion.
+
+        Raises
+        ------
+        CalibrationError
+            A sigma is not positive.
         """
         if self.start is None:
             return WORST * scale, np.zeros(len(names), bool)
         if isinstance(self.start, Mapping):
-            given = np.array([self.start.get(n, np.nan) for n in names])
+            values = np.array([self.start.get(n, np.nan) for n in names])
         else:
-            given = self.start * scale
-        stated = ~np.isnan(given)
-        if not np.all(np.isfinite(given[stated]) & (given[stated] > 0)):
+            values = self.start * scale
+        specified = ~np.isnan(values)
+        if not np.all(np.isfinite(values[specified]) & (values[specified] > 0)):
             raise CalibrationError(f"calibration: sigmas of start values must be positive, found {self.start}")
-        return np.where(stated, given, WORST * scale), stated
+        return np.where(specified, values, WORST * scale), specified
 
 
 class RankError(CalibrationError):
-    """The points leave combinations of unknowns open and no gauge closes them.
+    """Ground points leave combinations of unknowns undetermined, and no gauge fixes them.
 
-    open: the combinations. They are also in the message, by name.
+    Attributes
+    ----------
+    open : tuple of Combination
+        The undetermined combinations, which the message lists, too.
     """
 
     def __init__(self, message: str, open_combinations: Sequence[Combination]) -> None:
@@ -594,16 +657,16 @@ class RankError(CalibrationError):
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """What a gauge lets an adjustment solve for.
+    """Estimable part of the unknowns under a gauge.
 
     Attributes
     ----------
-    kept : NDArray[np.intp]
-        (R,) unknowns that are solved for.
-    rows : Array
-        (k, P) what the start values observe: rows @ (unknowns - start) is zero to a standard deviation of 1.
-    opened : tuple[Combination, ...]
-        The open combinations before the gauge.
+    kept : (R,) ndarray of int
+        Indices of the unknowns that are estimated.
+    rows : (k, P) ndarray
+        Observations by the start values: rows @ (unknowns - start) is zero with unit standard deviation.
+    opened : tuple of Combination
+        Open combinations before the gauge.
     """
 
     kept: NDArray[np.intp]
@@ -612,14 +675,14 @@ class Freedom:
 
 
 def null_vectors(reduced: Array, sigma: Array) -> Array:
-    """(P, k) orthonormal basis of what is open, in units of `sigma`.
+    """Return a (P, k) orthonormal basis of the open combinations, in units of `sigma`.
 
     Parameters
     ----------
-    reduced : Array
-        (P, P) normal matrix, of the a-priori sigmas.
-    sigma : Array
-        (P,) of the start values.
+    reduced : (P, P) ndarray
+        Reduced normal matrix with the a-priori sigmas of the measurements.
+    sigma : (P,) ndarray
+        Sigmas of the start values.
     """
     values, vectors = eigh(sigma[:, None] * reduced * sigma)
     # an eigenvalue below the rounding of the largest one is no information
@@ -628,18 +691,18 @@ def null_vectors(reduced: Array, sigma: Array) -> Array:
 
 
 def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> Array:
-    """(P, k) combinations within `basis` whose strength is below `WEAK`, in units of `scale`.
+    """Return the (P, k) combinations within `basis` whose strength is below `WEAK`, in units of `scale`.
 
     Parameters
     ----------
-    reduced : Array
-        Normal matrix without the ground points, (P, P).
-    length : Array
-        (P,) of the columns of the normal matrix before the ground points were eliminated.
-    scale : Array
-        a-priori sigmas of the unknowns, (P,), SI.
-    basis : Array
-        Of what may be solved for, (P, r), in units of `scale`.
+    reduced : (P, P) ndarray
+        Normal matrix after elimination of the ground points.
+    length : (P,) ndarray
+        Lengths of the columns of the design before the ground points were eliminated.
+    scale : (P,) ndarray
+        Units of the unknowns, SI.
+    basis : (P, r) ndarray
+        Basis of what may be estimated, in units of `scale`.
     """
     unit = scale * np.where(length > 0, length, 1.0)
     squares = basis.T @ (unit[:, None] ** 2 * basis)
@@ -650,36 +713,38 @@ def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> A
 def combinations(
     names: Sequence[str], scale: Array, vectors: Array, reduced: Array, length: Array
 ) -> tuple[Combination, ...]:
-    """The space of vectors (P, k), in units of `scale`, by name: what takes part with a hundredth of the largest motion
-    or more. Each combination has an unknown that is in no other one.
+    """Return the space spanned by vectors (P, k), in units of `scale`, as combinations of named unknowns.
+
+    A combination lists the unknowns that take part with at least a hundredth of the largest motion. Each combination
+    has an unknown that is in no other one.
 
     Parameters
     ----------
-    names : Sequence[str]
-        Of the P unknowns.
-    scale : Array
-        Their units, (P,), SI.
-    vectors : Array
-        (P, k), in units of `scale`.
-    reduced : Array
-        Normal matrix without the ground points, (P, P).
-    length : Array
-        Of the columns before the ground points were eliminated, (P,).
+    names : sequence of str
+        Names of the P unknowns.
+    scale : (P,) ndarray
+        Units of the unknowns, SI.
+    vectors : (P, k) ndarray
+        Basis of the space, in units of `scale`.
+    reduced : (P, P) ndarray
+        Normal matrix after elimination of the ground points.
+    length : (P,) ndarray
+        Lengths of the columns before the ground points were eliminated.
     """
-    found = []
+    result = []
     for vector in echelon(vectors).T:
         change = scale * vector / np.abs(vector).max()
         form = float(np.sqrt(max(float(change @ reduced @ change), 0.0)))
-        taking = np.flatnonzero(np.abs(vector) >= _SHOWN * np.abs(vector).max())
-        found.append(
+        members = np.flatnonzero(np.abs(vector) >= _SHOWN * np.abs(vector).max())
+        result.append(
             Combination(
-                tuple(names[i] for i in taking.tolist()),
-                1e-3 * change[taking],
+                tuple(names[i] for i in members.tolist()),
+                1e-3 * change[members],
                 form / max(float(np.linalg.norm(change * length)), 1e-300),
                 1.0 / max(form, 1e-300),
             )
         )
-    return tuple(found)
+    return tuple(result)
 
 
 def free_basis(
@@ -689,76 +754,79 @@ def free_basis(
     names: Sequence[str],
     gauge: Gauge | None,
     ray: float = np.inf,
-    told: Mapping[str, float] | None = None,
+    prior_sigmas: Mapping[str, float] | None = None,
 ) -> Freedom:
-    """What may be solved for. `reduced` (P, P) is of the a-priori sigmas.
+    """Return the estimable part of the unknowns under a gauge.
 
     Parameters
     ----------
-    reduced : Array
-        Normal matrix without the ground points, (P, P), of the a-priori sigmas.
-    length : Array
-        Of the columns before they were eliminated, (P,).
-    scale : Array
-        Units of the unknowns, (P,), SI.
-    names : Sequence[str]
-        Of the P unknowns.
-    gauge : Gauge | None
-        What closes open combinations, None for nothing.
+    reduced : (P, P) ndarray
+        Normal matrix after elimination of the ground points, with the a-priori sigmas of the measurements.
+    length : (P,) ndarray
+        Lengths of the columns before the ground points were eliminated.
+    scale : (P,) ndarray
+        Units of the unknowns, SI.
+    names : sequence of str
+        Names of the P unknowns.
+    gauge : Gauge or None
+        Rule that fixes open combinations; None for no rule.
     ray : float
-        Standard deviation of a single image point, metres, for `LOST`.
-    told : Mapping[str, float] | None
-        Unknowns without a stated start value that have priors of their own, with the sigmas of these.
+        Standard deviation of a single image point, in metres, to which `LOST` refers.
+    prior_sigmas : mapping of str to float, optional
+        Sigmas of the priors of unknowns whose start values have no specified sigma.
 
     Raises
     ------
     RankError
-        Open combinations that the gauge does not close, or that may move the image by `LOST` times the noise of a
-        single image point; points that tell nothing at all.
+        The gauge leaves combinations open, a combination may move the image by `LOST` times the noise of a single image
+        point, or the points determine nothing at all.
     CalibrationError
-        a held unknown that does not exist, a start value whose sigma is not positive.
+        A fixed unknown does not exist, or the sigma of a start value is not positive.
     """
     gauge = gauge or Gauge()
     sigma, stated = gauge.sigmas(names, scale)
     if np.any(stated):
-        # counted so that their own priors in `reduced` close them
-        own_prior = np.array([_CLOSED * (told or {}).get(n, np.nan) for n in names])
-        sigma = np.where(stated | np.isnan(own_prior), sigma, own_prior)
+        # scaled so that their priors, which are in `reduced`, close them
+        prior_sigma = np.array([_CLOSED * (prior_sigmas or {}).get(n, np.nan) for n in names])
+        sigma = np.where(stated | np.isnan(prior_sigma), sigma, prior_sigma)
     opened = combinations(names, scale, _in_scale(null_vectors(reduced, sigma), sigma, scale), reduced, length)
-    kept = np.setdiff1d(np.arange(len(names)), [index(names, n) for n in gauge.held])
-    within, own = reduced[np.ix_(kept, kept)], sigma[kept]
-    inside = null_vectors(within, own)
-    # a row says nothing of unknowns whose start values nobody knows
-    rows = np.where(stated[kept], inside.T / own, 0.0)
-    # what start values close has an eigenvalue of 1 or more then
-    checks = [(within + rows.T @ rows, np.where(stated[kept], np.sqrt(2.0), 1.0) * own)]
+    estimated = np.setdiff1d(np.arange(len(names)), [index(names, n) for n in gauge.held])
+    within, estimated_sigma = reduced[np.ix_(estimated, estimated)], sigma[estimated]
+    inside = null_vectors(within, estimated_sigma)
+    # a start value of unknown accuracy is no observation
+    rows = np.where(stated[estimated], inside.T / estimated_sigma, 0.0)
+    # combinations that start values close then have an eigenvalue of 1 or more
+    checks = [(within + rows.T @ rows, np.where(stated[estimated], np.sqrt(2.0), 1.0) * estimated_sigma)]
     if np.any(stated) and np.isfinite(ray):
-        checks.append((within, LOST * ray * scale[kept]))
+        checks.append((within, LOST * ray * scale[estimated]))
     for matrix, units in checks:
         vectors = null_vectors(matrix, units)
         if vectors.shape[1]:
             if matrix is within:
-                vectors, units = inside, own  # all that is open, of which some is lost
-            shown = _in_scale(vectors, units, scale[kept])
-            found = combinations([names[i] for i in kept.tolist()], scale[kept], shown, within, length[kept])
-            text = "; ".join(str(c) for c in found)
-            raise RankError(
-                f"calibration: the points cannot tell: {text}. Gauge: {gauge}. Hold or weight some of these", found
+                vectors, units = inside, estimated_sigma  # list all open combinations, of which some are lost
+            shown = _in_scale(vectors, units, scale[estimated])
+            unresolved = combinations(
+                [names[i] for i in estimated.tolist()], scale[estimated], shown, within, length[estimated]
             )
-    if inside.shape[1] == len(kept):
+            text = "; ".join(str(c) for c in unresolved)
+            raise RankError(
+                f"calibration: the points do not determine: {text}. Gauge: {gauge}. Hold or weight some of these",
+                unresolved,
+            )
+    if inside.shape[1] == len(estimated):
         raise RankError("calibration: the points determine none of the unknowns", opened)
     padded = np.zeros((len(rows), len(names)))
-    padded[:, kept] = rows
-    return Freedom(kept, padded, opened)
+    padded[:, estimated] = rows
+    return Freedom(estimated, padded, opened)
 
 
 def _in_scale(vectors: Array, sigma: Array, scale: Array) -> Array:
-    """(P, k) combinations in units of `sigma` (P,) as vectors in units of `scale` (P,)."""
+    """Return combinations (P, k) in units of `sigma` (P,) as vectors in units of `scale` (P,)."""
     return np.asarray(vectors * (sigma / scale)[:, None])
 
 
 def solved(normal: Array, right: Array) -> Array:
-    """Solution of a positive definite system, its unknowns brought to one size first."""
+    """Solve a positive definite system after scaling its unknowns to unit diagonal."""
     size = 1.0 / np.sqrt(np.diag(normal))
     factor = cho_factor(size[:, None] * normal * size)
     wide = right.reshape(len(size), -1)
@@ -766,21 +834,22 @@ def solved(normal: Array, right: Array) -> Array:
 
 
 def echelon(vectors: Array) -> Array:
-    """(P, k) of the same space as independent vectors (P, k), each with an unknown of its own and a largest entry of 1.
+    """Return the space of vectors (P, k) in reduced echelon form, each vector with a largest entry of 1.
 
-    The own unknowns are those that have most part in the space, which does not depend on the vectors that span it.
+    Each of the (P, k) independent vectors has a pivot unknown that is in no other one. The pivots are the unknowns with
+    the largest part in the space, which does not depend on the vectors that span it.
     """
     if not vectors.shape[1]:
         return vectors
     basis = np.linalg.qr(vectors)[0]
-    own = qr(basis.T, mode="r", pivoting=True)[1][: basis.shape[1]]
-    found = np.linalg.solve(basis[own].T, basis.T).T
-    largest = np.abs(found).argmax(axis=0)
-    return np.asarray(found / found[largest, np.arange(found.shape[1])])
+    pivots = qr(basis.T, mode="r", pivoting=True)[1][: basis.shape[1]]
+    reduced = np.linalg.solve(basis[pivots].T, basis.T).T
+    largest = np.abs(reduced).argmax(axis=0)
+    return np.asarray(reduced / reduced[largest, np.arange(reduced.shape[1])])
 
 
 def shown(name: str, change: float) -> str:
-    """A change of an unknown, metres or radians, in words."""
+    """Return a change of an unknown, given in metres or radians, as text with its unit."""
     if "offset" in name or "height" in name:
         return f"{name} {change:+.4g} m"
     if name.split()[-1] in _ANGLES:

@@ -1,41 +1,39 @@
-"""Forward intersection of points without ground control, also from line cameras corrected by their on-board monitor.
+"""Forward intersection of points without ground control, with and without corrections by an on-board monitor.
 
-Each ray weighs by what noise of image, attitude and station does in its image. The covariance is that of this noise,
-for each point by itself: that points exposed within a few readings of the attitude share errors is not in it, and is
-what `strip_adjustment` uses. Errors of the calibration, which all points share, are in neither.
+**Intersection.** Each ray is weighted by the effect of image, attitude and station noise in its image. The covariance
+follows from this noise for each point alone: it omits the errors that points exposed within a few attitude readings
+share, which `strip_adjustment` models. Neither includes the errors of the calibration, which all points share.
 
-The monitor says how the line of sight has turned since the calibration (d_alpha about the camera's Y, d_beta about X,
-d_gamma about the line of sight) and how the principal distance has grown (d_f). A calibrated look (x, y, z) in the
-camera's axes becomes
+**Correction by the monitor.** The monitor measures how the line of sight has rotated since the calibration (d_alpha
+about the camera's Y, d_beta about X, d_gamma about the line of sight) and the change d_f of the principal distance. A
+calibrated look vector (x, y, z) in the camera's axes becomes
 
     Ry(d_alpha) Rx(d_beta) Rz(d_gamma) (x, y f / (f + d_f), z),
 
 which gives the corrected line exactly these four changes as docs/conventions.md defines them: the line of sight is
-turned first about the calibrated camera's Y, then about the turned X; a longer f makes the angles along the line
-smaller. What the four cannot say, such as a change of distortion, stays as it was calibrated.
+rotated first about the calibrated camera's Y, then about the rotated X; a longer f makes the angles along the line
+smaller. Changes that the four parameters do not describe, such as of distortion, stay uncorrected.
 
-Noise of an image point by measured attitude and station, of which cubic splines join readings at fixed intervals.
-
-Attitude and station of an exposure are interpolated between readings. The correction at time t is a cubic B-spline sum
+**Interpolation noise.** Attitude and station of an exposure are interpolated between readings at fixed intervals. The
+correction at time t is a cubic B-spline sum
 
     sigma * sum over k of beta(t / h - k) z_k,    readings at whole multiples of h,
 
-which is the cubic spline through its own values at the readings (z_{k-1} + 4 z_k + z_{k+1}) / 6. Readings independent
-with unit variance make z a stationary second-order autoregression with the double root -rho, rho = 2 - sqrt 3; its
-covariance is 3 (-rho)^n (n + (1 + rho^2) / (1 - rho^2)), and the precision of a stretch of it has five diagonals.
+which is the cubic spline through its values at the readings, (z_{k-1} + 4 z_k + z_{k+1}) / 6. Independent readings of
+unit variance make z a stationary second-order autoregression with the double root -rho, rho = 2 - sqrt 3; its
+covariance is 3 (-rho)^n (n + (1 + rho^2) / (1 - rho^2)), and the precision matrix of a segment of it has five
+diagonals.
 
-Quality of an orbit or attitude series by its third differences (paper 003, Table 2).
+**Third differences** assess an orbit or attitude series (paper 003, Table 2). A third difference x[k+3] - 3 x[k+2] + 3
+x[k+1] - x[k] removes a smooth motion, up to its third derivative times dt^3, and leaves noise: white noise with
+standard deviation s gives it the RMS s sqrt(1 + 9 + 9 + 1) = s sqrt(20), and neighbours correlate by -15/20. It is
+blind to a bias, a drift or noise that is slower than a few samples, and data that were smoothed before look better than
+they are. The smooth part is not always small: along a circular orbit at 500 km the third derivative is 8.4e-3 m/s^3, so
+8 mm at 1 s but 8 m at 10 s.
 
-A third difference x[k+3] - 3 x[k+2] + 3 x[k+1] - x[k] removes a smooth motion, up to its third derivative times dt^3,
-and leaves noise: of white noise with standard deviation s it has the RMS s sqrt(1 + 9 + 9 + 1) = s sqrt(20), and
-neighbours correlate by -15/20. It says nothing of a bias, of a drift or of noise that is slower than a few samples, and
-data that were smoothed before look better than they are. The smooth part is not always small: along a circular orbit at
-500 km the third derivative is 8.4e-3 m/s^3, so 8 mm at 1 s but 8 m at 10 s.
-
-Errors of points on the ground as map standards count them: circles and intervals that hold a share of them.
-
-CE90 is the radius in plan that holds nine points in ten, LE90 the height that does: of one point by its covariance, of
-a set of points with different covariances for a point that is drawn from the set, and of errors that are known.
+**CE90 and LE90** are the horizontal radius and the height interval that hold 90 % of the errors, as map standards
+define them: of one point by its covariance, of a set of points with different covariances (for a point drawn from the
+set), and of a sample of known errors.
 """
 
 from __future__ import annotations
@@ -57,29 +55,38 @@ from analysis.orbit.calibration_parameters import CalibrationError, Noise, verti
 from analysis.orbit.three_line_model import LineModel, Partials, Rays, bias_rotation, misclosure, partials
 
 _RHO = 2.0 - np.sqrt(3.0)
+"""Absolute double root of the autoregression that describes the coefficients of the interpolating cubic spline."""
 _NEEDED = 4
-"""Neighbouring z that one moment needs: no stretch is shorter."""
+"""Number of neighbouring spline coefficients z that affect one moment; no segment is shorter."""
 
 
 def reading_variance(time: Array, interval: float) -> Array:
-    """(n,) variance of the spline at times (n,) for readings of unit variance: 1 at a reading, 0.76 halfway."""
+    """Return the (n,) variance of the interpolating spline at times (n,) for readings of unit variance.
+
+    The variance is 1 at a reading and 0.76 halfway between two.
+    """
     _, blend = spline_blend(time, interval)
     return np.asarray(np.einsum("ni,ij,nj->n", blend, _covariance(_NEEDED), blend))
 
 
 def ray_covariance(noise: Noise, rays: Rays, by: Partials, *, shared: bool) -> Array:
-    """(n, 2, 2) covariance of image points, metres^2.
+    """Return the (n, 2, 2) covariance of image points, in m^2.
 
     Parameters
     ----------
     noise : Noise
-        Model of the errors.
+        Standard deviations of the measurements.
     rays : Rays
-        n image points.
+        Image points, n of them.
     by : Partials
         Derivatives of their misclosures.
     shared : bool
-        With the noise that they share, as for one point alone; otherwise without what SharedNoise carries.
+        True to include the noise that rays share, as for one point alone; False to leave out what `SharedNoise` models.
+
+    Raises
+    ------
+    CalibrationError
+        The noise includes a random walk, and the rays have no times.
     """
     unit = np.eye(2) if rays.spread is None else rays.spread
     spread = np.broadcast_to(noise.image**2 * unit, (len(rays.point), 2, 2))
@@ -98,7 +105,7 @@ def ray_covariance(noise: Noise, rays: Rays, by: Partials, *, shared: bool) -> A
 
 
 def spline_blend(time: Array, interval: float) -> tuple[NDArray[np.intp], Array]:
-    """Number (n,) of the first of four cubic B-splines at times, and their values (n, 4)."""
+    """Return the index (n,) of the first of the four cubic B-splines that act at each time, and their values (n, 4)."""
     place = np.asarray(time, np.float64) / interval
     reading = np.floor(place)
     u = place - reading
@@ -107,13 +114,16 @@ def spline_blend(time: Array, interval: float) -> tuple[NDArray[np.intp], Array]
 
 
 def _covariance(count: int) -> Array:
-    """(count, count) of neighbouring z, for readings of unit variance."""
+    """Return the (count, count) covariance of neighbouring spline coefficients, for readings of unit variance."""
     n = np.arange(count)
     return np.asarray(toeplitz(3.0 * (-_RHO) ** n * (n + (1 + _RHO**2) / (1 - _RHO**2))))
 
 
 def spline_precision(count: int) -> sparse.csr_matrix:
-    """Inverse of `_covariance`, for four or more: inside the square of (1 4 1) / 6, special in two rows at each end."""
+    """Return the inverse of `_covariance` for four or more coefficients.
+
+    Its interior is the square of the (1 4 1) / 6 band matrix; two rows at each end differ.
+    """
     bands = [np.full(count - abs(k), v / 36.0) for k, v in ((0, 18.0), (1, 8.0), (2, 1.0))]
     matrix = sparse.diags([bands[2], bands[1], bands[0], bands[1], bands[2]], [-2, -1, 0, 1, 2]).tolil()
     corner = np.linalg.inv(_covariance(_NEEDED))
@@ -122,20 +132,23 @@ def spline_precision(count: int) -> sparse.csr_matrix:
 
 
 WHITE_GAIN = float(np.sqrt(20.0))
-# Steps of time that differ by more are gaps: third differences over them mean something else.
+"""Ratio of the RMS of third differences to the standard deviation of white noise."""
 _UNEVEN = 1e-3
+"""Largest relative deviation of a time step from the median; a larger one is a gap, over which third differences have
+another meaning.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class ThirdDifference:
-    """Quality of one series.
+    """Quality of a series of k columns by its third differences.
 
     Attributes
     ----------
-    rms : Array
-        (k,) of the third differences of each column, as in Table 2.
-    white_sigma : Array
-        (k,) rms / sqrt(20), standard deviation of one sample if the noise is white.
+    rms : (k,) ndarray
+        RMS of the third differences of each column, as in Table 2 of paper 003.
+    white_sigma : (k,) ndarray
+        rms / sqrt(20), the standard deviation of one sample if the noise is white.
     """
 
     rms: Array
@@ -143,19 +156,19 @@ class ThirdDifference:
 
 
 def third_difference(time: ArrayLike, series: ArrayLike) -> ThirdDifference:
-    """Third differences of an evenly sampled series.
+    """Compute the third differences of an evenly sampled series.
 
     Parameters
     ----------
-    time : ArrayLike
-        (n,) seconds.
-    series : ArrayLike
-        (n,) or (n, k), metres or radians.
+    time : (n,) array_like
+        Times of the samples, in seconds.
+    series : (n,) or (n, k) array_like
+        Samples, in metres or radians.
 
     Raises
     ------
     ValueError
-        Fewer than five samples, values that are not finite, gaps.
+        There are fewer than five samples, values are not finite, or the times have gaps.
     """
     t, x = np.asarray(time, np.float64), np.asarray(series, np.float64)
     x = x[:, None] if x.ndim == 1 else x
@@ -175,25 +188,27 @@ def third_difference(time: ArrayLike, series: ArrayLike) -> ThirdDifference:
 
 
 _STEPS = 10
-_CONVERGED = 1e-6  # metres; coordinates of 6.4e6 m are rounded to 1e-9 m
-# Two rays at less than one arc minute do not meet: a base of 150 m under 500 km.
+"""Largest number of Gauss-Newton steps."""
+_CONVERGED = 1e-6
+"""Largest step of a converged iteration, in metres; coordinates of 6.4e6 m are rounded to 1e-9 m."""
 _PARALLEL = 3e-4
+"""Smallest angle between two rays that intersect, in radians: one arc minute, a base of 150 m at 500 km."""
 
 
 @dataclass(frozen=True, eq=False)
 class Intersection:
-    """Intersected points.
+    """Points from forward intersection.
 
     Attributes
     ----------
-    ground : Array
-        (m, 3) ITRS, metres; NaN where fewer than two rays see a point.
-    covariance : Array
-        (m, 3, 3).
-    rays : NDArray[np.intp]
-        (m,) how many see it.
-    chi_square : Array
-        (m,) of its rays; degrees of freedom 2 rays - 3.
+    ground : (m, 3) ndarray
+        Coordinates, ITRS, in metres; NaN where fewer than two rays see a point.
+    covariance : (m, 3, 3) ndarray
+        Covariance of each point, in m^2.
+    rays : (m,) ndarray of int
+        Number of rays that see each point.
+    chi_square : (m,) ndarray
+        Chi-square of each point's rays, with 2 rays - 3 degrees of freedom.
     """
 
     ground: Array
@@ -204,7 +219,19 @@ class Intersection:
 
 @dataclass(frozen=True, eq=False)
 class CheckErrors:
-    """Found minus given at check points: error (m, 3) east, north, up; RMS in plan (both axes) and height, metres."""
+    """Errors at check points, intersected minus surveyed.
+
+    Attributes
+    ----------
+    error : (m, 3) ndarray
+        Errors toward east, north and up, in metres; NaN for points that were not intersected.
+    plan_rms : float
+        RMS of the horizontal error over both axes, in metres.
+    height_rms : float
+        RMS of the height error, in metres.
+    count : int
+        Number of points in the RMS values.
+    """
 
     error: Array
     plan_rms: float
@@ -221,41 +248,41 @@ def intersect(
     offset: ArrayLike = (0.0, 0.0, 0.0),
     count: int | None = None,
 ) -> Intersection:
-    """Points of one pass from the rays of all lines.
+    """Intersect the points of one pass from the rays of all lines.
 
     Parameters
     ----------
-    rays : Mapping[str, Rays]
-        Line -> its image points.
-    cameras : Mapping[str, LineModel]
-        Line -> calibrated camera, in its state during this pass (`LineModel.drifted`).
+    rays : mapping of str to Rays
+        Image points of each line, by its name.
+    cameras : mapping of str to LineModel
+        Calibrated line cameras in their state during this pass (`LineModel.drifted`), by name.
     noise : Noise
-        Of image, attitude and station.
-    bias : ArrayLike
-        (3,) roll, pitch, yaw, radians.
-    offset : ArrayLike
-        (3,) of the station, ITRS, metres.
-    count : int | None
-        Of points; from the rays where not given.
+        Standard deviations of image, attitude and station.
+    bias : (3,) array_like
+        Attitude bias in roll, pitch, yaw, in radians.
+    offset : (3,) array_like
+        Offset of the station, ITRS, in metres.
+    count : int, optional
+        Number of points; derived from the rays by default.
 
     Raises
     ------
     CalibrationError
-        No point with two rays, rays that are parallel, no convergence.
+        No point has two rays, the rays of a point are parallel, or the iteration does not converge.
     """
-    turn, shift, small = bias_rotation(bias), np.asarray(offset, np.float64), np.asarray(bias, np.float64)
+    rotation, shift, small = bias_rotation(bias), np.asarray(offset, np.float64), np.asarray(bias, np.float64)
     total = count or 1 + max((int(r.point.max()) for r in rays.values() if r.point.size), default=-1)
-    seen = np.zeros(max(total, 0), np.intp)
+    counts = np.zeros(max(total, 0), np.intp)
     for row in rays.values():
-        np.add.at(seen, row.point, 1)
-    good = seen >= 2
-    if not np.any(good):
+        np.add.at(counts, row.point, 1)
+    intersected = counts >= 2
+    if not np.any(intersected):
         raise CalibrationError("forward intersection: no point is seen by two lines")
-    ground = _start(rays, cameras, turn, shift, good)
+    ground = _start(rays, cameras, rotation, shift, intersected)
     for _ in range(_STEPS):
         normal, right, square = np.zeros((total, 3, 3)), np.zeros((total, 3)), np.zeros(total)
         for line, row in rays.items():
-            used = row.taken(good[row.point])
+            used = row.taken(intersected[row.point])
             shown = ground[used.point]
             by = partials(cameras[line], used, shown, small, shift)
             white = np.linalg.inv(np.linalg.cholesky(ray_covariance(noise, used, by, shared=True)))
@@ -264,46 +291,48 @@ def intersect(
             np.add.at(normal, used.point, np.swapaxes(design, 1, 2) @ design)
             np.add.at(right, used.point, np.einsum("nij,ni->nj", design, miss))
             np.add.at(square, used.point, np.sum(miss**2, axis=1))
-        step = -np.linalg.solve(normal[good], right[good][..., None])[..., 0]
-        ground[good] += step
+        step = -np.linalg.solve(normal[intersected], right[intersected][..., None])[..., 0]
+        ground[intersected] += step
         if np.abs(step).max() < _CONVERGED:
             break
     else:
         raise CalibrationError(f"forward intersection: no convergence, the last step is {np.abs(step).max():.3g} m")
     covariance = np.full((total, 3, 3), np.nan)
-    covariance[good] = np.linalg.inv(normal[good])
-    return Intersection(ground, covariance, seen, np.where(good, square, np.nan))
+    covariance[intersected] = np.linalg.inv(normal[intersected])
+    return Intersection(ground, covariance, counts, np.where(intersected, square, np.nan))
 
 
-def check_errors(found: Array, given: ArrayLike) -> CheckErrors:
-    """Errors (m, 3) of found points against given ones, ITRS, metres; points that were not found do not count.
+def check_errors(intersected: Array, surveyed: ArrayLike) -> CheckErrors:
+    """Compare intersected points (m, 3) with surveyed coordinates (m, 3), ITRS, in metres.
+
+    Points that were not intersected (NaN) are ignored.
 
     Raises
     ------
     CalibrationError
-        Shapes differ, given coordinates are not finite, no points.
+        Shapes differ, surveyed coordinates are not finite, or no point was intersected.
     """
-    truth = np.asarray(given, np.float64)
-    if truth.shape != found.shape or not np.all(np.isfinite(truth)):
-        raise CalibrationError(f"check points: need {found.shape} finite coordinates, found {truth.shape}")
-    good = np.isfinite(found).all(axis=1)
+    truth = np.asarray(surveyed, np.float64)
+    if truth.shape != intersected.shape or not np.all(np.isfinite(truth)):
+        raise CalibrationError(f"check points: need {intersected.shape} finite coordinates, found {truth.shape}")
+    good = np.isfinite(intersected).all(axis=1)
     if not np.any(good):
         raise CalibrationError("check points: none was intersected")
     error = np.full_like(truth, np.nan)
-    error[good] = np.einsum("nij,nj->ni", level_axes(truth[good]), found[good] - truth[good])
+    error[good] = np.einsum("nij,nj->ni", level_axes(truth[good]), intersected[good] - truth[good])
     square = np.mean(error[good] ** 2, axis=0)
     return CheckErrors(error, float(np.sqrt(square[0] + square[1])), float(np.sqrt(square[2])), int(good.sum()))
 
 
 def _start(
-    rays: Mapping[str, Rays], cameras: Mapping[str, LineModel], turn: Array, shift: Array, good: NDArray[np.bool_]
+    rays: Mapping[str, Rays], cameras: Mapping[str, LineModel], rotation: Array, shift: Array, good: NDArray[np.bool_]
 ) -> Array:
-    """Points nearest to their rays as lines in space."""
+    """Return the points nearest to their rays, as straight lines in space."""
     normal, right = np.zeros((len(good), 3, 3)), np.zeros((len(good), 3))
     for line, row in rays.items():
         camera = cameras[line]
-        look = np.einsum("nij,nj->ni", row.attitude, camera.directions(row.image) @ turn.T)
-        origin = row.station + shift + np.einsum("nij,j->ni", row.attitude, turn @ camera.position)
+        look = np.einsum("nij,nj->ni", row.attitude, camera.directions(row.image) @ rotation.T)
+        origin = row.station + shift + np.einsum("nij,j->ni", row.attitude, rotation @ camera.position)
         across = np.eye(3) - look[:, :, None] * look[:, None, :]
         np.add.at(normal, row.point, across)
         np.add.at(right, row.point, np.einsum("nij,nj->ni", across, origin))
@@ -316,30 +345,27 @@ def _start(
     return ground
 
 
-"""Radians; two rays at less than one arc minute do not meet."""
-
-
 class IntersectionError(MeasurementError, ValueError):
-    """Points cannot be intersected."""
+    """Points that cannot be intersected."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedLine:
-    """What a calibration knows of a line camera.
+    """Calibrated geometry of a line camera.
 
     Attributes
     ----------
     pixels : int
-        Of the line; the centre of the first is 0.
-    directions : Array
-        (K, 3) Chebyshev coefficients over the line, from -0.5 to pixels - 0.5, of a vector along the look in the body's
-        axes; its length does not matter.
-    origins : Array
-        (J, 3) those of a point on the look, body frame, metres.
-    axes : Array
-        (3, 3) columns X, Y, Z of the camera in the body: Y along the line, Z the line of sight.
+        Number of pixels of the line; the centre of the first is 0.
+    directions : (K, 3) ndarray
+        Chebyshev coefficients over the line, from -0.5 to pixels - 0.5, of a vector along the look direction in the
+        body's axes; its length does not matter.
+    origins : (J, 3) ndarray
+        Chebyshev coefficients of a point on the ray, body frame, in metres.
+    axes : (3, 3) ndarray
+        Columns X, Y, Z of the camera in the body: Y along the line, Z the line of sight.
     principal_distance : float
-        f, metres.
+        Principal distance f, in metres.
     """
 
     pixels: int
@@ -349,10 +375,17 @@ class CalibratedLine:
     principal_distance: float
 
     def corrected(self, change: ArrayLike) -> CalibratedLine:
-        """The line after a change.
+        """Return the line after a change of the camera.
 
-        change: (4,) d_alpha, d_beta, d_gamma (rad) and d_f (m) since the calibration.
-        Raises ValueError for another shape, numbers that are not finite, and a principal distance of zero or less.
+        Parameters
+        ----------
+        change : (4,) array_like
+            d_alpha, d_beta, d_gamma (radians) and d_f (metres) since the calibration.
+
+        Raises
+        ------
+        ValueError
+            The shape is not (4,), a number is not finite, or the principal distance becomes zero or negative.
         """
         values = np.asarray(change, np.float64)
         if values.shape != (4,) or not np.all(np.isfinite(values)):
@@ -365,31 +398,31 @@ class CalibratedLine:
         return replace(self, directions=self.directions @ matrix.T, principal_distance=distance)
 
     def look(self, pixel: Array) -> Array:
-        """(n, 3) unit directions toward the scene in the body's axes, of pixels (n,)."""
+        """Return the (n, 3) unit directions toward the scene of pixels (n,), in the body's axes."""
         vector = self._series(self.directions, pixel)
         return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
 
     def origin(self, pixel: Array) -> Array:
-        """(n, 3) points on the looks, body frame, metres."""
+        """Return an (n, 3) point on the ray of each pixel (n,), body frame, in metres."""
         return self._series(self.origins, pixel)
 
     def _series(self, coefficients: Array, pixel: Array) -> Array:
-        place = (2.0 * np.asarray(pixel, np.float64) + 1.0) / self.pixels - 1.0
-        return np.asarray(np.moveaxis(chebyshev.chebval(place, coefficients), 0, -1))
+        position = (2.0 * np.asarray(pixel, np.float64) + 1.0) / self.pixels - 1.0
+        return np.asarray(np.moveaxis(chebyshev.chebval(position, coefficients), 0, -1))
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Where one line saw points, in the points' order.
+    """Image positions of points on one line, in the points' order.
 
     Attributes
     ----------
-    pixel : Array
-        (n,) places on the line.
-    station : Array
-        (n, 3) measured position of the body's origin at their times, ITRS, metres.
-    attitude : Array
-        (n, 3, 3) measured body to ITRS.
+    pixel : (n,) ndarray
+        Positions on the line, in pixels.
+    station : (n, 3) ndarray
+        Measured position of the body's origin at the exposure times, ITRS, in metres.
+    attitude : (n, 3, 3) ndarray
+        Measured rotation from the body to ITRS.
     """
 
     pixel: Array
@@ -399,14 +432,14 @@ class Sightings:
 
 @dataclass(frozen=True, eq=False)
 class StereoPoints:
-    """Intersected points.
+    """Points intersected from two rays each.
 
     Attributes
     ----------
-    ground : Array
-        (n, 3) ITRS, metres.
-    miss : Array
-        (n,) distance at which the two rays pass each other, metres.
+    ground : (n, 3) ndarray
+        Coordinates, ITRS, in metres.
+    miss : (n,) ndarray
+        Smallest distance between the two rays, in metres.
     """
 
     ground: Array
@@ -416,12 +449,12 @@ class StereoPoints:
 def intersect_pair(
     first: CalibratedLine, second: CalibratedLine, seen_first: Sightings, seen_second: Sightings
 ) -> StereoPoints:
-    """Points nearest to their two rays in the sense of angles: each ray's miss counts against its own length.
+    """Return the points nearest to their two rays in angle: each ray's miss counts relative to its length.
 
     Raises
     ------
     IntersectionError
-        Different numbers of sightings, rays that are parallel.
+        The numbers of sightings differ, or two rays are parallel.
     """
     if len(seen_first.pixel) != len(seen_second.pixel):
         raise IntersectionError("both lines must see the same points")
@@ -429,12 +462,43 @@ def intersect_pair(
     for camera, seen in ((first, seen_first), (second, seen_second)):
         looks.append(np.einsum("nij,nj->ni", seen.attitude, camera.look(seen.pixel)))
         origins.append(seen.station + np.einsum("nij,nj->ni", seen.attitude, camera.origin(seen.pixel)))
+    return intersect_rays(origins[0], looks[0], origins[1], looks[1])
+
+
+def intersect_rays(
+    first_origin: ArrayLike, first_direction: ArrayLike, second_origin: ArrayLike, second_direction: ArrayLike
+) -> StereoPoints:
+    """Intersect pairs of rays in the points that are nearest to both, each distance relative to the ray's length.
+
+    Parameters
+    ----------
+    first_origin, second_origin : (n, 3) or (3,) array_like
+        Points on the rays, such as the stations, in metres.
+    first_direction, second_direction : (n, 3) or (3,) array_like
+        Directions of the rays, of any length.
+
+    Returns
+    -------
+    StereoPoints
+        The points `ground` (n, 3), and `miss` (n,), the distance at which the two rays pass each other, in metres.
+
+    Raises
+    ------
+    ValueError
+        Arrays of other shapes, values that are not finite, or parallel rays.
+    """
+    given = first_origin, first_direction, second_origin, second_direction
+    shaped = np.broadcast_arrays(*(np.atleast_2d(np.asarray(one, np.float64)) for one in given))
+    if shaped[0].ndim != 2 or shaped[0].shape[1] != 3 or not np.all(np.isfinite(np.stack(shaped))):
+        raise IntersectionError(f"rays need finite origins and directions (n, 3), found {[np.shape(g) for g in given]}")
+    origins = shaped[0], shaped[2]
+    looks = [u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-300) for u in (shaped[1], shaped[3])]
     base = origins[1] - origins[0]
     normal = np.cross(looks[0], looks[1])
     square = np.sum(normal**2, axis=-1)
     if np.any(square < _PARALLEL**2):
         raise IntersectionError(f"the rays of point {int(np.argmin(square))} are parallel")
-    # each ray's point nearest to the other one; between them, as far from each as its ray is long
+    # nearest point of each ray to the other; the result divides their connection in proportion to the rays' lengths
     along = [np.sum(np.cross(base, looks[1 - k]) * normal, axis=-1) / square for k in (0, 1)]
     ends = [o + t[:, None] * u for o, t, u in zip(origins, along, looks, strict=True)]
     weight = along[1] ** 2 / (along[0] ** 2 + along[1] ** 2)
@@ -443,31 +507,42 @@ def intersect_pair(
 
 
 def between(times: ArrayLike, measured: ArrayLike, values: ArrayLike) -> Array:
-    """(T, 4) changes at times (T,) from those (m, 4) measured at ascending times (m,): linear, held beyond the ends.
+    """Interpolate changes (m, 4) linearly to times (T,), constant beyond the ends.
 
     Parameters
     ----------
-    times : ArrayLike
-        (T,), seconds.
-    measured : ArrayLike
-        (m,), ascending, seconds.
-    values : ArrayLike
-        (m, 4) changes then.
+    times : (T,) array_like
+        Times of the result, in seconds.
+    measured : (m,) array_like
+        Ascending times of the measured changes, in seconds.
+    values : (m, 4) array_like
+        Measured changes.
     """
-    wanted, at, known = (np.asarray(v, np.float64) for v in (times, measured, values))
-    return np.stack([np.interp(wanted, at, column) for column in known.T], axis=-1)
+    target, at, known = (np.asarray(v, np.float64) for v in (times, measured, values))
+    return np.stack([np.interp(target, at, column) for column in known.T], axis=-1)
 
 
 _SHARE = 0.9
+"""Share of the errors within CE90 and LE90."""
 _DIRECTIONS = 0.5 * np.pi * (np.arange(32) + 0.5) / 32
-"""Of the mean over a quarter of a circle, 1e-12 of CE90 for axes of any ratio."""
+"""Angles of the midpoint rule over a quarter circle, accurate to 1e-12 of CE90 for any ratio of the axes."""
 _FARTHEST = 40.0
-"""Radius beyond which nothing lies, in standard deviations."""
+"""Upper bound of an error radius, in standard deviations."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """CE90 and LE90, metres, and of how many points."""
+    """Accuracy of a set of points.
+
+    Attributes
+    ----------
+    ce90 : float
+        Horizontal radius that holds 90 % of the errors, in metres.
+    le90 : float
+        Half width of the height interval that holds 90 % of the errors, in metres.
+    count : int
+        Number of points.
+    """
 
     ce90: float
     le90: float
@@ -475,7 +550,7 @@ class Accuracy:
 
 
 def level_axes(points: Array) -> Array:
-    """(m, 3, 3) east, north and up as rows, at points (m, 3), ITRS, metres."""
+    """Return the (m, 3, 3) east, north and up axes as rows, at points (m, 3), ITRS, in metres."""
     up = vertical(points)
     east = np.cross([0.0, 0.0, 1.0], up)
     east = east / np.linalg.norm(east, axis=1, keepdims=True)
@@ -483,33 +558,34 @@ def level_axes(points: Array) -> Array:
 
 
 def linear_error(variance: ArrayLike, share: float = _SHARE) -> Array:
-    """Half width (...) of the interval about zero that holds a share of normal errors of these variances (...); LE90
-    for 0.9, 1.645 sigma.
+    """Return the half width of the zero-centred interval that holds a share of normal errors.
+
+    The errors have zero mean and the given variance (...). The result is LE90, 1.645 sigma, for a share of 0.9.
     """
     return np.asarray(float(ndtri(0.5 + 0.5 * share)) * np.sqrt(variance))
 
 
 def circular_error(covariance: ArrayLike, share: float = _SHARE) -> Array:
-    """Radius of the circle about zero that holds a share of normal errors in the plane; CE90 for 0.9.
+    """Return the radius of the zero-centred circle that holds a share of normal errors in the plane; CE90 for 0.9.
 
-    A round covariance has 2.146 sigma, one along a line 1.645 sigma.
+    A circular covariance gives 2.146 sigma, a degenerate one (along a line) 1.645 sigma.
 
     Parameters
     ----------
-    covariance : ArrayLike
-        (..., 2, 2).
+    covariance : (..., 2, 2) array_like
+        Covariance of the errors.
     share : float
-        Of the errors, between 0 and 1.
+        Share of the errors, between 0 and 1.
 
     Returns
     -------
-    Array
-        (...), in the unit of the covariance's root.
+    (...) ndarray
+        Radius, in the unit of the square root of the covariance.
 
     Raises
     ------
     ValueError
-        a share that is none, a covariance that is none.
+        The share is not between 0 and 1, or a covariance has a negative variance.
     """
     values = _axes(covariance, share)
     longer = np.sqrt(values[..., 1])
@@ -518,12 +594,12 @@ def circular_error(covariance: ArrayLike, share: float = _SHARE) -> Array:
     def missing(radius: Array, short: Array) -> Array:
         return share - _within(radius, np.stack([short, np.ones_like(short)], axis=-1))
 
-    found = elementwise.find_root(missing, (np.zeros_like(ratio), np.full_like(ratio, _FARTHEST)), args=(ratio,))
-    return np.asarray(longer * found.x)
+    root = elementwise.find_root(missing, (np.zeros_like(ratio), np.full_like(ratio, _FARTHEST)), args=(ratio,))
+    return np.asarray(longer * root.x)
 
 
 def circle_of_points(covariance: Array) -> float:
-    """Radius that holds a share of points with covariances (m, 2, 2) in plan; see `circular_error`."""
+    """Return CE90 of a point drawn from a set with horizontal covariances (m, 2, 2); see `circular_error`."""
     values = _axes(covariance, _SHARE)
 
     def missing(radius: float) -> float:
@@ -533,7 +609,7 @@ def circle_of_points(covariance: Array) -> float:
 
 
 def interval_of_points(variance: Array) -> float:
-    """Distance, metres, that holds the share of points with variances (m,), m^2."""
+    """Return LE90, in metres, of a point drawn from a set with height variances (m,), in m^2."""
     sigma = np.sqrt(np.maximum(variance, 1e-300))
 
     def missing(size: float) -> float:
@@ -543,21 +619,21 @@ def interval_of_points(variance: Array) -> float:
 
 
 def predicted(points: Array, covariance: Array) -> Accuracy:
-    """By covariances (m, 3, 3), ITRS, of points (m, 3)."""
+    """Return CE90 and LE90 of points (m, 3) predicted by their covariances (m, 3, 3), ITRS."""
     axes = level_axes(points)
     level = axes @ covariance @ np.swapaxes(axes, 1, 2)
     return Accuracy(circle_of_points(level[:, :2, :2]), interval_of_points(level[:, 2, 2]), len(points))
 
 
 def realised(points: Array, error: Array) -> Accuracy:
-    """By errors (m, 3), ITRS, metres, of points (m, 3): quantiles of the sample."""
+    """Return CE90 and LE90 of points (m, 3) as sample quantiles of their errors (m, 3), ITRS, in metres."""
     level = np.einsum("nij,nj->ni", level_axes(points), error)
     plan, height = np.linalg.norm(level[:, :2], axis=1), np.abs(level[:, 2])
     return Accuracy(float(np.quantile(plan, _SHARE)), float(np.quantile(height, _SHARE)), len(points))
 
 
 def _axes(covariance: ArrayLike, share: float) -> Array:
-    """(..., 2) variances along the axes of the ellipses, the shorter first."""
+    """Return the (..., 2) variances along the axes of the error ellipses, the smaller first."""
     if not 0.0 < share < 1.0:
         raise ValueError("a share lies between 0 and 1")
     values = np.linalg.eigvalsh(np.asarray(covariance, np.float64))
@@ -567,10 +643,10 @@ def _axes(covariance: ArrayLike, share: float) -> Array:
 
 
 def _within(radius: ArrayLike, variances: Array) -> Array:
-    """(...) share of normal errors with variances (..., 2) along two axes that lie within radii (...).
+    """Return the share (...) of normal errors with variances (..., 2) along two axes that lie within radii (...).
 
-    In units of the axes the errors are round: directions are alike, and in each the length is Rayleigh's. The ellipse
-    that the circle becomes has the radius R / sqrt(a cos^2 + b sin^2) there.
+    In units of the axes the errors are isotropic: directions are uniform, and the length follows a Rayleigh
+    distribution. The circle becomes an ellipse with the radius R / sqrt(a cos^2 + b sin^2) in each direction.
     """
     along = variances[..., :1] * np.sin(_DIRECTIONS) ** 2 + variances[..., 1:] * np.cos(_DIRECTIONS) ** 2
     square = np.asarray(radius, np.float64)[..., None] ** 2

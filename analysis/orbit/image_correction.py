@@ -1,8 +1,9 @@
-"""How far an image's model is off in the image, from control points: a shift, or an affine function of the place.
+"""Image-space correction of an image's sensor model from control points: a shift or an affine function.
 
-Each point has a covariance in the image, of its measurement and of its coordinates on the ground. The estimate is the
-one of least variance; its covariance follows from those of the points alone, and chi-square of what is left says
-whether they can be true. Points that lie beyond their covariances are left out one after the other, the farthest first.
+Each point has a covariance in the image, from its measurement and from its ground coordinates. The estimate is the
+generalised least-squares one; its covariance follows from those of the points alone, and chi-square of the residuals
+tests these covariances. Points whose residuals exceed their covariances are excluded one after the other, the largest
+first.
 """
 
 from __future__ import annotations
@@ -19,36 +20,39 @@ from analysis.arrays import Array
 Kind = Literal["shift", "affine"]
 
 _FALSE_ALARM = 1e-3
-"""Chance that any point of a file without gross errors is left out."""
+"""Probability that any point of a file without gross errors is excluded."""
 _SAME_PLACE = 1e-6
-"""Smallest over largest extent of points that do not lie on one line."""
+"""Smallest ratio of the minor to the major extent of points that do not lie on one line."""
 LEAST_POINTS = {"shift": 1, "affine": 3}
+"""Smallest number of points that determine each kind of correction."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageCorrection:
-    """A correction, measured minus predicted.
+    """Correction of image coordinates, measured minus predicted.
 
     Attributes
     ----------
-    kind : Kind
-        Shift or affine.
-    middle, size : Array
-        Of the places, line and sample, (2,) each; the function counts from the one in units of the other.
-    coefficients : Array
-        (2, K) of line and sample; K is 1 for a shift, and 3 for 1, line and sample of an affine function.
-    covariance : Array
-        (2 K, 2 K) of them, those of the line first.
-    residual : Array
-        (N, 2) line and sample that is left, of all points, pixels.
-    variance : Array
-        (N, 2, 2) of what is left at points that were used, and of what lies there of those that were not.
-    used : NDArray[np.bool_]
-        (N,) whether the points made the estimate.
+    kind : {'shift', 'affine'}
+        Kind of the correction.
+    middle, size : (2,) ndarray
+        Centre and half extent of the points in line and sample, in pixels; the affine function counts from the centre
+        in units of the half extent.
+    coefficients : (2, K) ndarray
+        Coefficients for line and sample, in pixels; K is 1 for a shift, and 3 (constant, line, sample) for an affine
+        function.
+    covariance : (2 K, 2 K) ndarray
+        Covariance of the coefficients, those of the line first, in pixels^2.
+    residual : (N, 2) ndarray
+        Residuals of all points in line and sample, in pixels.
+    variance : (N, 2, 2) ndarray
+        Covariance of the residual of each used point, and of the prediction error at each excluded one, in pixels^2.
+    used : (N,) ndarray of bool
+        True for points that contributed to the estimate.
     chi_square : float
-        Of what is left at points that were used, by their covariances.
+        Chi-square of the residuals of the used points under their covariances.
     freedom : int
-        Of it.
+        Degrees of freedom of the chi-square.
     """
 
     kind: Kind
@@ -63,22 +67,22 @@ class ImageCorrection:
     freedom: int
 
     def at(self, line: ArrayLike, sample: ArrayLike) -> Array:
-        """Correction (N, 2) of line and sample at predicted places (N,), pixels."""
+        """Return the (N, 2) correction of line and sample at predicted positions (N,), in pixels."""
         return np.asarray(self._basis(line, sample) @ self.coefficients.T)
 
     def covariance_at(self, line: ArrayLike, sample: ArrayLike) -> Array:
-        """Its covariance there, (N, 2, 2), pixels^2."""
+        """Return the (N, 2, 2) covariance of the correction at predicted positions (N,), in pixels^2."""
         rows = _rows(self._basis(line, sample))
         return np.asarray(rows @ self.covariance @ np.swapaxes(rows, 1, 2))
 
     @property
     def factor(self) -> float:
-        """By how much the variances of the points would have to grow for what is left; 1 where nothing tells."""
+        """Variance factor, chi-square per degree of freedom; 1 without redundancy."""
         return self.chi_square / self.freedom if self.freedom else 1.0
 
     @property
     def probability(self) -> float:
-        """Chance of as large a chi-square if the covariances are true; 1 where nothing tells."""
+        """p-value of the chi-square; 1 without redundancy."""
         return statistics.p_value(self.chi_square, self.freedom)
 
     def _basis(self, line: ArrayLike, sample: ArrayLike) -> Array:
@@ -90,14 +94,14 @@ class ImageCorrection:
         )
 
 
-def _basis(kind: Kind, middle: Array, size: Array, place: Array) -> Array:
-    """(N, K) functions of places (N, 2)."""
-    one = np.ones((len(place), 1))
-    return one if kind == "shift" else np.concatenate([one, (place - middle) / size], axis=1)
+def _basis(kind: Kind, middle: Array, size: Array, position: Array) -> Array:
+    """Return the (N, K) basis functions at positions (N, 2)."""
+    one = np.ones((len(position), 1))
+    return one if kind == "shift" else np.concatenate([one, (position - middle) / size], axis=1)
 
 
 def _rows(basis: Array) -> Array:
-    """(N, 2, 2 K) derivatives of line and sample by the coefficients."""
+    """Return the (N, 2, 2 K) derivatives of line and sample with respect to the coefficients."""
     nothing = np.zeros_like(basis)
     return np.stack([np.concatenate([basis, nothing], 1), np.concatenate([nothing, basis], 1)], axis=1)
 
@@ -105,78 +109,87 @@ def _rows(basis: Array) -> Array:
 def image_correction(
     predicted: ArrayLike, measured: ArrayLike, covariance: ArrayLike, kind: Kind, screened: bool = True
 ) -> ImageCorrection:
-    """The correction that points tell.
+    """Estimate the image-space correction of a sensor model from control points.
 
     Parameters
     ----------
-    predicted : ArrayLike
-        (N, 2) line and sample where the model sees them, pixels.
-    measured : ArrayLike
-        (N, 2) where they are.
-    covariance : ArrayLike
-        (N, 2, 2) of the difference, pixels^2.
-    kind : Kind
-        Shift, from one point on, or affine, from three.
+    predicted : (N, 2) array_like
+        Line and sample at which the model sees the points, in pixels.
+    measured : (N, 2) array_like
+        Measured line and sample, in pixels.
+    covariance : (N, 2, 2) array_like
+        Covariance of measured minus predicted, in pixels^2.
+    kind : {'shift', 'affine'}
+        Shift, which needs one point, or affine function, which needs three.
     screened : bool
-        Whether points far beyond their covariances are left out.
+        True to exclude points whose residuals far exceed their covariances.
 
     Raises
     ------
     ValueError
-        Too few points, points on one line, values that are not finite, a covariance that is none.
+        There are too few points, the points lie on one line, a value is not finite, or a covariance is not positive
+        definite.
     """
-    place, seen = np.asarray(predicted, np.float64), np.asarray(measured, np.float64)
+    position, image = np.asarray(predicted, np.float64), np.asarray(measured, np.float64)
     spread = np.asarray(covariance, np.float64)
-    count = len(place)
-    if place.shape != (count, 2) or seen.shape != place.shape or spread.shape != (count, 2, 2):
-        raise ValueError("predicted and measured places must be (N, 2), with covariances (N, 2, 2)")
+    count = len(position)
+    if position.shape != (count, 2) or image.shape != position.shape or spread.shape != (count, 2, 2):
+        raise ValueError("predicted and measured positions must be (N, 2), with covariances (N, 2, 2)")
     if count < LEAST_POINTS[kind]:
-        raise ValueError(f"{count} points do not determine this: {kind} takes {LEAST_POINTS[kind]} or more")
-    if not (np.all(np.isfinite(place)) and np.all(np.isfinite(seen)) and np.all(np.isfinite(spread))):
-        raise ValueError("a place or a covariance is not finite")
+        raise ValueError(f"{count} points are too few: the correction {kind} needs {LEAST_POINTS[kind]} or more")
+    if not (np.all(np.isfinite(position)) and np.all(np.isfinite(image)) and np.all(np.isfinite(spread))):
+        raise ValueError("a position or a covariance is not finite")
     if np.any(np.linalg.eigvalsh(spread) <= 0.0):
-        raise ValueError("a covariance is not above zero")
-    middle = np.mean(place, axis=0)
-    size = np.maximum(np.max(np.abs(place - middle), axis=0), 1.0)
-    rows = _rows(_basis(kind, middle, size, place))
-    off = seen - place
+        raise ValueError("a covariance is not positive definite")
+    middle = np.mean(position, axis=0)
+    size = np.maximum(np.max(np.abs(position - middle), axis=0), 1.0)
+    rows = _rows(_basis(kind, middle, size, position))
+    difference = image - position
     used = np.ones(count, dtype=bool)
     while True:
-        _require_spread(kind, place[used], size)
-        found, known = _solved(rows[used], off[used], spread[used])
-        left = off - rows @ found
-        share = rows @ known @ np.swapaxes(rows, 1, 2)
-        # what was used pulls the estimate to itself; what was not is met by an estimate that errs independently
+        _require_spread(kind, position[used], size)
+        coefficients, cofactor = _solved(rows[used], difference[used], spread[used])
+        residual = difference - rows @ coefficients
+        share = rows @ cofactor @ np.swapaxes(rows, 1, 2)
+        # the residual of a used point correlates with the estimate, that of an excluded point does not
         variance = np.where(used[:, None, None], spread - share, spread + share)
         if not screened or np.sum(used) <= LEAST_POINTS[kind] + 1:
             break
-        size_left = _squares(left, variance)
-        size_left[~used] = 0.0
-        far = int(np.argmax(size_left))
-        if size_left[far] <= statistics.limit_of(_FALSE_ALARM / count, 2):
+        squares = _squares(residual, variance)
+        squares[~used] = 0.0
+        farthest = int(np.argmax(squares))
+        if squares[farthest] <= statistics.limit_of(_FALSE_ALARM / count, 2):
             break
-        used[far] = False
-    square = float(np.sum(_squares(left, spread)[used]))
+        used[farthest] = False
+    chi_square = float(np.sum(_squares(residual, spread)[used]))
     freedom = 2 * int(np.sum(used)) - rows.shape[2]
-    return ImageCorrection(kind, middle, size, found.reshape(2, -1), known, left, variance, used, square, freedom)
+    return ImageCorrection(
+        kind, middle, size, coefficients.reshape(2, -1), cofactor, residual, variance, used, chi_square, freedom
+    )
 
 
-def _require_spread(kind: Kind, place: Array, size: Array) -> None:
+def _require_spread(kind: Kind, position: Array, size: Array) -> None:
+    """Raise ValueError if points on one line do not determine an affine function."""
     if kind == "affine":
-        extent = np.linalg.svd((place - np.mean(place, axis=0)) / size, compute_uv=False)
+        extent = np.linalg.svd((position - np.mean(position, axis=0)) / size, compute_uv=False)
         if extent[-1] < _SAME_PLACE * extent[0] or not extent[0] > 0.0:
-            raise ValueError("the points lie on one line of the image, which does not determine an affine function")
+            raise ValueError("the points lie on one straight line of the image and do not determine an affine function")
 
 
-def _solved(rows: Array, off: Array, spread: Array) -> tuple[Array, Array]:
-    """Coefficients (2 K,) and their covariance, through whitened rows."""
+def _solved(rows: Array, difference: Array, spread: Array) -> tuple[Array, Array]:
+    """Return the coefficients (2 K,) and their covariance from whitened equations."""
     root = np.linalg.cholesky(spread)
     white = np.linalg.solve(root, rows).reshape(-1, rows.shape[2])
-    right = np.linalg.solve(root, off[..., None]).reshape(-1)
+    right = np.linalg.solve(root, difference[..., None]).reshape(-1)
     inverse = statistics.gain(white)
     return np.asarray(inverse @ right), np.asarray(inverse @ inverse.T)
 
 
-def _squares(left: Array, variance: Array) -> Array:
-    """(N,) squares of residuals by their covariances; pseudo-inverse, as what one point alone determines has none."""
-    return np.asarray(np.einsum("ni,nij,nj->n", left, np.linalg.pinv(variance, hermitian=True, rcond=1e-10), left))
+def _squares(residual: Array, variance: Array) -> Array:
+    """Return the (N,) squared residuals normalised by their covariances.
+
+    The pseudo-inverse is used because a component that one point alone determines has no residual variance.
+    """
+    return np.asarray(
+        np.einsum("ni,nij,nj->n", residual, np.linalg.pinv(variance, hermitian=True, rcond=1e-10), residual)
+    )

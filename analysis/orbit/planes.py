@@ -1,42 +1,41 @@
-"""The plane in which one CCD line photographs at one moment, from ground points on its strip (paper 000, eqs. 1-5).
+"""Planes in which CCD lines photograph at one moment (paper 000, eqs. 1-5), and their angles (eqs. 6-7).
 
-The station O and the n >= 3 points of the strip lie in one plane but for their errors. Three fits with one interface:
+**Plane.** The station O and the n >= 3 ground points of the strip that one line sees lie in one plane except for their
+errors. Three fits have the same interface:
 
 - ``printed``: z = a0 x + a1 y + a2 through O, with eq. 5 as the paper prints it. Its right side has the wrong sign, so
-  both slopes come out negated: the normal (-a0, -a1, -1) is the true one after half a turn about the frame's z axis.
-  The half turn is the same for every plane in the frame, hence angles between printed planes are right to rounding,
+  both slopes come out negated: the normal (-a0, -a1, -1) is the true one rotated by 180 deg about the frame's z axis.
+  This rotation is the same for every plane in the frame, hence angles between printed planes are right to rounding,
   while the plane itself misses its points by as much as the camera's height.
 - ``corrected``: the same with the right sign. It minimises distances along z, not from the plane. The two agree to
   second order of the noise unless the plane is nearly vertical in the frame: then x - x0 and y - y0 of the strip lie on
-  one line, only noise tells them apart, and the slopes are biased toward zero. `PlaneFit.near_vertical` says so, with a
-  `NearVerticalWarning`; an exactly vertical plane is an error.
+  one line, only noise separates them, and the slopes are biased toward zero. `PlaneFit.near_vertical` reports this,
+  with a `NearVerticalWarning`; an exactly vertical plane is an error.
 - ``tls``: total least squares, the right singular vector of the smallest singular value of the points from O, whitened
-  by their sigmas and by the error of O that they share. The frame plays no part. With isotropic errors it is the
-  maximum-likelihood normal (Van Huffel and Vandewalle, The Total Least Squares Problem, 1991, section 8.4); with full
-  covariances Gauss-Helmert steps from there lead to it.
+  by their sigmas and by the error of O that they share. It does not depend on the frame. With isotropic errors it is
+  the maximum-likelihood normal (Van Huffel and Vandewalle, The Total Least Squares Problem, 1991, section 8.4); with
+  full covariances Gauss-Helmert steps lead from there to it.
 
-All coordinates in one Cartesian frame (Earth-fixed, local or orbital), metres.
+All coordinates are in one Cartesian frame (Earth-fixed, local or orbital), in metres.
 
-Intersection angles of line cameras from the planes in which they photograph (paper 000, eqs. 6-7), and their errors.
+**Angles.** alpha is the angle between the forward and the nadir plane, beta that between the nadir and the backward
+plane; both are acute and positive. Any other pair of lines, such as the nadir and a high-resolution line, has an angle
+in the same way. The paper's form is arccos |a . b|; its rounding error grows as 1/sin(angle) and exceeds angles below
+1e-8 rad, so the value used here is atan2(|a x b|, |a . b|), accurate to rounding at every angle.
 
-alpha is the angle between the forward and the nadir plane, beta between the nadir and the backward plane; both acute
-and positive. Any other pair of lines, such as the nadir and a high-resolution line, has an angle in the same way. The
-paper's form is arccos |a . b|; its rounding error grows as 1/sin(angle) and swallows angles below
-1e-8 rad, so the value used here is atan2(|a x b|, |a . b|), good to rounding at every angle.
+The sigmas come from first-order propagation. All planes pass through one station, whose error they share, and alpha and
+beta share the nadir plane, so their errors are correlated: the result is a joint covariance.
 
-The sigmas come from first-order propagation. All planes pass through one station, whose error they share, and alpha
-and beta share the nadir plane, so their errors are correlated: the result is a joint covariance.
+Three different angles are in use. The planes give the **dihedral** angle. The **look** angle is that between the lines
+of sight of the lines' centres. They are equal if the CCD lines are parallel and start at the same position across the
+track; a line rotated by k about its line of sight makes cos(dihedral) = cos(k) cos(look), a dihedral angle larger by
+k^2 / (2 tan(look)). Both are unsigned, so that for nearly parallel lines k and the offset across the track determine
+them, and noise folds them at zero. The **along-track** angle is the rotation about the lines' direction that takes one
+central ray to the other: signed, zero for lines that look in the same direction, and not folded. It is the part that
+determines heights, and for lines far apart it is the look angle.
 
-Three angles bear the name. The planes give the **dihedral** angle. The **look** angle lies between the lines of sight
-of the lines' centres. They are equal when the CCD lines are parallel and start at the same place across the track; a
-line turned by k about its own line of sight makes cos(dihedral) = cos(k) cos(look), a dihedral angle larger by
-k^2 / (2 tan(look)). Both are unsigned, so that for nearly parallel lines k and the offset across the track decide what
-they are, and noise folds them at zero. The **along-track** angle is the turn about the lines' direction that takes one
-central ray to the other: signed, zero for lines that look the same way, and not folded. It is the part that makes
-heights, and for lines far apart the look angle.
-
-One thing at a time, the station or all points of one strip, is moved along one axis of the frame by 0-10 m. The change
-of the angles comes by exact recomputation and by the linear derivative.
+**Sensitivity.** The station, or all points of one strip, are moved along one axis of the frame by 0-10 m. The change of
+the angles comes from exact recomputation and from the linear derivative.
 """
 
 from __future__ import annotations
@@ -54,44 +53,71 @@ from analysis.arrays import ARCSEC, Array, MeasurementError
 
 Method = Literal["printed", "corrected", "tls"]
 METHODS: tuple[Method, ...] = get_args(Method)
-# Points fix the turn of the plane about their line of sight when they spread across it by more than so many sigmas.
 _LEAST_SPREAD = 10.0
-# Eq. 5 is called nearly vertical when its bias is no longer small beside the sigma, or when noise makes up more than
-# this part of its normal matrix.
+"""Smallest spread of the points across their line of sight, in sigmas, that fixes the rotation of the plane about it.
+"""
+# Eq. 5 counts as nearly vertical if its bias exceeds `_BIAS` sigmas, or if noise makes up more than `_ATTENUATION` of
+# its normal matrix.
 _BIAS, _ATTENUATION = 0.1, 0.01
-# A normal matrix of float64 sums keeps no digit of its smallest eigenvalue beyond this condition number.
 _SINGULAR = 1e15
+"""Largest condition number of a normal matrix of float64 sums whose smallest eigenvalue still has a correct digit."""
 
 
 class PlaneError(MeasurementError, ValueError):
-    """The points do not determine the plane, or not in the form that was asked for."""
+    """Points that do not determine the plane, or not in the requested form."""
 
 
 class NearVerticalWarning(UserWarning):
-    """The plane is so steep in its frame that z = a0 x + a1 y + a2 is biased."""
+    """Plane that is so steep in its frame that z = a0 x + a1 y + a2 is biased."""
 
 
 @dataclass(frozen=True, eq=False)
 class Station:
-    """Perspective centre at the moment of exposure. position: (3,) metres. covariance: (3, 3) m^2, zero if exact."""
+    """Perspective centre at the moment of exposure.
+
+    Attributes
+    ----------
+    position : (3,) ndarray
+        Coordinates, in metres.
+    covariance : (3, 3) ndarray
+        Covariance of the coordinates, in m^2; zero if error-free.
+    """
 
     position: Array
     covariance: Array
 
     @classmethod
     def of(cls, position: ArrayLike, noise: ArrayLike = 0.0) -> Station:
-        """noise: sigma of each coordinate in metres (a number), or the covariance (3, 3) in m^2. Raises PlaneError."""
-        place = np.array(position, np.float64)
-        if place.shape != (3,) or not np.all(np.isfinite(place)):
+        """Return a validated station.
+
+        Parameters
+        ----------
+        position : (3,) array_like
+            Coordinates, in metres.
+        noise : float or (3, 3) array_like
+            Standard deviation of each coordinate in metres, or the covariance in m^2.
+
+        Raises
+        ------
+        PlaneError
+            A shape is wrong, a value is not finite, or the covariance is not positive semidefinite.
+        """
+        coordinates = np.array(position, np.float64)
+        if coordinates.shape != (3,) or not np.all(np.isfinite(coordinates)):
             raise PlaneError(f"station: need three finite coordinates, found {position!r}")
-        return cls(place, _covariances(noise, 1, "station", definite=False)[0])
+        return cls(coordinates, _covariances(noise, 1, "station", definite=False)[0])
 
 
 @dataclass(frozen=True, eq=False)
 class Strip:
     """Ground points that one CCD line sees at one moment; errors of different points are independent.
 
-    points: (n, 3) metres. covariance: (n, 3, 3) m^2, positive definite.
+    Attributes
+    ----------
+    points : (n, 3) ndarray
+        Coordinates, in metres.
+    covariance : (n, 3, 3) ndarray
+        Covariance of each point, in m^2, positive definite.
     """
 
     points: Array
@@ -99,30 +125,59 @@ class Strip:
 
     @classmethod
     def of(cls, points: ArrayLike, noise: ArrayLike) -> Strip:
-        """noise: sigma of each coordinate in metres (a number or (n,)), or covariance (3, 3) or (n, 3, 3) in m^2."""
-        place = np.array(points, np.float64)
-        if place.ndim != 2 or place.shape[1] != 3:
-            raise PlaneError(f"strip: points must be (n, 3), found {place.shape}")
-        if not np.all(np.isfinite(place)):
-            raise PlaneError("strip: coordinates must be finite; leave out points that were not found")
-        return cls(place, _covariances(noise, len(place), "strip", definite=True))
+        """Return a validated strip.
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+            Coordinates, in metres.
+        noise : float, (n,), (3, 3) or (n, 3, 3) array_like
+            Standard deviation of each coordinate in metres, or the covariance in m^2.
+
+        Raises
+        ------
+        PlaneError
+            A shape is wrong, a value is not finite, or a covariance is not positive definite.
+        """
+        coordinates = np.array(points, np.float64)
+        if coordinates.ndim != 2 or coordinates.shape[1] != 3:
+            raise PlaneError(f"strip: points must be (n, 3), found {coordinates.shape}")
+        if not np.all(np.isfinite(coordinates)):
+            raise PlaneError("strip: coordinates must be finite; exclude points that were not measured")
+        return cls(coordinates, _covariances(noise, len(coordinates), "strip", definite=True))
 
     def shifted(self, shift: ArrayLike) -> Strip:
-        """The strip with all points moved by `shift` (3,) metres."""
+        """Return the strip with all points moved by `shift` (3,), in metres."""
         return Strip(self.points + np.asarray(shift, np.float64), self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneFit:
-    """A plane through the station.
+    """Plane through the station.
 
-    normal: (3,) unit vector, z component negative (or zero) like the paper's (a0, a1, -1).
-    point_gain: (n, 3, 3) derivative of the normal with respect to each point, 1/m, to first order of the residuals.
-    residual: (n,) distance of the points from the plane along the normal, metres.
-    chi_square: of the residuals with the points' and the station's covariance. degrees_of_freedom: n - 2.
-    condition: of the normal matrix: eq. 5's, or for tls that of the turns about the two directions in the plane.
-    attenuation: part of eq. 5's normal matrix in its weakest direction that is noise, by which the slope there shrinks;
-        0 for tls. bias: (3,) estimate of the error of the normal that comes from it, radians; zero for tls.
+    Attributes
+    ----------
+    method : {'printed', 'corrected', 'tls'}
+        Method of the fit; see the module.
+    station : Station
+        Station that the plane contains.
+    strip : Strip
+        Points that the plane was fitted to.
+    normal : (3,) ndarray
+        Unit normal, z component negative (or zero) like the paper's (a0, a1, -1).
+    point_gain : (n, 3, 3) ndarray
+        Derivative of the normal with respect to each point, 1/m, to first order of the residuals.
+    residual : (n,) ndarray
+        Distance of the points from the plane along the normal, in metres.
+    chi_square : float
+        Chi-square of the residuals with the points' and the station's covariance; n - 2 degrees of freedom.
+    condition : float
+        Condition number of the normal matrix: that of eq. 5, or for tls that of the rotations about the two directions
+        in the plane.
+    attenuation : float
+        Noise share of eq. 5's normal matrix in its weakest direction, by which the slope there shrinks; 0 for tls.
+    bias : (3,) ndarray
+        Estimated error of the normal caused by the attenuation, in radians; zero for tls.
     """
 
     method: Method
@@ -143,29 +198,29 @@ class PlaneFit:
 
     @property
     def p_value(self) -> float:
-        """Chance of such a chi-square or a larger one. Exact for tls; the explicit forms leave a little more."""
+        """p-value of the chi-square; exact for tls, slightly too small for the explicit forms."""
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     @property
     def station_gain(self) -> Array:
-        """(3, 3) derivative of the normal with respect to the station, 1/m: minus that of all points moved together."""
+        """Derivative (3, 3) of the normal with respect to the station, 1/m: minus that of all points moved together."""
         return np.asarray(-self.point_gain.sum(axis=0))
 
     @property
     def point_covariance(self) -> Array:
-        """(3, 3) of the normal from the errors of the points alone, rad^2; independent from strip to strip."""
+        """Covariance (3, 3) of the normal from the points' errors alone, in rad^2; independent between strips."""
         gain = self.point_gain
         return np.asarray(np.einsum("nij,njk,nlk->il", gain, self.strip.covariance, gain))
 
     @property
     def covariance(self) -> Array:
-        """(3, 3) of the normal, rad^2, of rank two: points and station."""
+        """Covariance (3, 3) of the normal from points and station, in rad^2, of rank two."""
         gain = self.station_gain
         return np.asarray(self.point_covariance + gain @ self.station.covariance @ gain.T)
 
     @property
     def coefficients(self) -> tuple[float, float, float]:
-        """a0, a1, a2 of z = a0 x + a1 y + a2, a2 by eq. 1. Raises PlaneError for an exactly vertical plane."""
+        """Coefficients a0, a1, a2 of z = a0 x + a1 y + a2, a2 by eq. 1; PlaneError for an exactly vertical plane."""
         if self.normal[2] == 0.0:
             raise PlaneError("plane: it is vertical in this frame and has no form z = a0 x + a1 y + a2")
         a0, a1 = (float(v) for v in -self.normal[:2] / self.normal[2])
@@ -174,7 +229,7 @@ class PlaneFit:
 
     @property
     def near_vertical(self) -> bool:
-        """True when the explicit form is biased by the steepness of the plane in its frame. Never for tls."""
+        """True if the steepness of the plane in its frame biases the explicit form; never for tls."""
         shift = float(np.linalg.norm(self.bias))
         along = self.bias / shift if shift > 0 else self.bias
         sigma = float(np.sqrt(along @ self.covariance @ along))
@@ -182,10 +237,18 @@ class PlaneFit:
 
 
 def fit_plane(station: Station, strip: Strip, method: Method = "tls") -> PlaneFit:
-    """Plane through the station fitted to the strip's points; see the module for the methods.
+    """Fit a plane through the station to the strip's points; see the module for the methods.
 
-    Raises PlaneError for fewer than three points, points that lie at one place or on one line through the station
-        (within ten sigmas), and an explicit form of an exactly vertical plane. Warns with NearVerticalWarning.
+    Raises
+    ------
+    PlaneError
+        There are fewer than three points, the points lie at one place or on one line through the station (within ten
+        sigmas), or an explicit form is requested of an exactly vertical plane.
+
+    Warns
+    -----
+    NearVerticalWarning
+        An explicit form is biased because the plane is nearly vertical.
     """
     if method not in METHODS:
         raise PlaneError(f"plane: method must be one of {', '.join(METHODS)}, found {method!r}")
@@ -195,8 +258,8 @@ def fit_plane(station: Station, strip: Strip, method: Method = "tls") -> PlaneFi
     if fit.near_vertical:
         warnings.warn(
             f"plane: z = a0 x + a1 y + a2 is nearly vertical in this frame (|normal z| = {abs(fit.normal[2]):.2g},"
-            f" condition {fit.condition:.2g}): noise is {100 * fit.attenuation:.2g}% of its normal matrix and turns the"
-            " plane toward the horizontal; use total least squares or another frame",
+            f" condition {fit.condition:.2g}): noise is {100 * fit.attenuation:.2g}% of its normal matrix and biases"
+            " the plane toward the horizontal; use total least squares or another frame",
             NearVerticalWarning,
             stacklevel=2,
         )
@@ -204,7 +267,7 @@ def fit_plane(station: Station, strip: Strip, method: Method = "tls") -> PlaneFi
 
 
 def _explicit(station: Station, strip: Strip, arm: Array, method: Method) -> PlaneFit:
-    """Eqs. 1 and 5, with the printed or the right sign."""
+    """Fit the plane by eqs. 1 and 5, with the printed or the right sign."""
     flat = arm[:, :2]
     matrix = flat.T @ flat
     condition = float(np.linalg.cond(matrix))
@@ -217,26 +280,26 @@ def _explicit(station: Station, strip: Strip, arm: Array, method: Method) -> Pla
     length = float(np.sqrt(1.0 + slopes @ slopes))
     normal = np.array([slopes[0], slopes[1], -1.0]) / length
     across = (np.eye(3) - np.outer(normal, normal))[:, :2]
-    # slopes answer to z errors -length * (distance from the plane); the normal to slopes by `across` / length
+    # the z error of a point is -length * (distance from the plane); `across` / length maps slopes to the normal
     gain = -across @ np.linalg.solve(matrix, flat.T)
     spread = strip.covariance.sum(axis=0) + len(arm) * station.covariance
     noise = np.linalg.solve(matrix, spread[:2, :2])
     shrink = np.linalg.solve(matrix, spread[:2, 2]) - noise @ slopes
     bias = across @ shrink / length
-    seen = normal
+    fitted = normal
     if method == "printed":
         half_turn = np.array([-1.0, -1.0, 1.0])
-        seen, gain, bias = half_turn * normal, half_turn[:, None] * gain, half_turn * bias
-    residual = arm @ seen
+        fitted, gain, bias = half_turn * normal, half_turn[:, None] * gain, half_turn * bias
+    residual = arm @ fitted
     return PlaneFit(
         method=method,
         station=station,
         strip=strip,
-        normal=seen,
-        # what moves the plane is how far a point leaves the true plane, also where the printed one lies elsewhere
+        normal=fitted,
+        # a point moves the plane by its distance from the true plane, for the printed one, too
         point_gain=gain.T[:, :, None] * normal,
         residual=residual,
-        chi_square=float(residual @ _DistanceNoise.of(station, strip, seen).weighted(residual)),
+        chi_square=float(residual @ _DistanceNoise.of(station, strip, fitted).weighted(residual)),
         condition=condition,
         attenuation=float(np.max(np.linalg.eigvals(noise).real)),
         bias=bias,
@@ -244,7 +307,7 @@ def _explicit(station: Station, strip: Strip, arm: Array, method: Method) -> Pla
 
 
 def _total(station: Station, strip: Strip, arm: Array) -> PlaneFit:
-    """Total least squares; Gauss-Helmert steps where the covariances are not isotropic."""
+    """Fit the plane by total least squares, with Gauss-Helmert steps if the covariances are not isotropic."""
     variance = np.trace(strip.covariance, axis1=1, axis2=2) / 3.0
     shared = float(np.trace(station.covariance)) / 3.0
     normal = np.linalg.svd(_DistanceNoise(variance, shared).white(arm), full_matrices=False)[2][2]
@@ -276,7 +339,10 @@ def _total(station: Station, strip: Strip, arm: Array) -> PlaneFit:
 
 
 def _gauss_helmert(station: Station, strip: Strip, arm: Array, normal: Array) -> Array:
-    """Maximum-likelihood normal with full covariances: conditions n . (p - O) = 0 linearised at the adjusted points."""
+    """Return the maximum-likelihood normal with full covariances.
+
+    The conditions n . (p - O) = 0 are linearised at the adjusted points.
+    """
     adjusted = arm
     for _ in range(20):
         basis = _tangent(normal)
@@ -285,7 +351,7 @@ def _gauss_helmert(station: Station, strip: Strip, arm: Array, normal: Array) ->
         miss = arm @ normal
         step = -np.linalg.solve(design.T @ noise.weighted(design), design.T @ noise.weighted(miss))
         pull = noise.weighted(miss + design @ step)
-        # corrections of the points, and of the station that all arms share
+        # corrections of the points, and of the station that all of them share
         adjusted = arm - np.einsum("nij,j,n->ni", strip.covariance, normal, pull)
         adjusted = adjusted - station.covariance @ normal * pull.sum()
         normal = normal + basis @ step
@@ -297,9 +363,14 @@ def _gauss_helmert(station: Station, strip: Strip, arm: Array, normal: Array) ->
 
 @dataclass(frozen=True, eq=False)
 class _DistanceNoise:
-    """Errors of the points' distances from a plane through the station: covariance diag(own) + shared, m^2.
+    """Covariance diag(own) + shared of the points' distances from a plane through the station, in m^2.
 
-    own: (n,) variances from the points. shared: variance from the station, common to all.
+    Attributes
+    ----------
+    own : (n,) ndarray
+        Variances from the points, in m^2.
+    shared : float
+        Variance from the station, common to all points, in m^2.
     """
 
     own: Array
@@ -311,14 +382,14 @@ class _DistanceNoise:
         return cls(own, float(normal @ station.covariance @ normal))
 
     def weighted(self, rows: Array) -> Array:
-        """Inverse covariance times (n,) or (n, k), by the Sherman-Morrison formula."""
+        """Return the inverse covariance times rows (n,) or (n, k), by the Sherman-Morrison formula."""
         weight = 1.0 / self.own
         scaled = (rows.T * weight).T
         ratio = self.shared / (1.0 + self.shared * weight.sum())
         return np.asarray(scaled - ratio * np.multiply.outer(weight, scaled.sum(axis=0)))
 
     def white(self, rows: Array) -> Array:
-        """Symmetric-root form of the inverse covariance times (n, k): rows with independent unit errors."""
+        """Return the symmetric root of the inverse covariance times rows (n, k), which have independent unit errors."""
         unit = self.own**-0.5
         total = float(unit @ unit)
         scaled = rows * unit[:, None]
@@ -327,12 +398,12 @@ class _DistanceNoise:
 
 
 def _tangent(normal: Array) -> Array:
-    """(3, 2) orthonormal columns square to a unit vector."""
+    """Return (3, 2) orthonormal columns perpendicular to a unit vector."""
     return np.asarray(np.linalg.svd(normal[None, :])[2][1:].T)
 
 
 def _check_points(arm: Array, strip: Strip) -> None:
-    """PlaneError when the points do not fix a plane through the station."""
+    """Raise PlaneError if the points do not fix a plane through the station."""
     if len(arm) < 3:
         raise PlaneError(f"plane: need three or more points on the strip, found {len(arm)}")
     distance = np.linalg.norm(arm, axis=1)
@@ -346,47 +417,55 @@ def _check_points(arm: Array, strip: Strip) -> None:
     where = "at one place" if extent <= _LEAST_SPREAD * sigma else "on one line through the station"
     raise PlaneError(
         f"plane: all points lie {where}; they spread across the line of sight by {spread:.3g} m, and {_LEAST_SPREAD:g}"
-        f" sigmas ({_LEAST_SPREAD * sigma:.3g} m) are needed to tell how the plane is turned about it"
+        f" sigmas ({_LEAST_SPREAD * sigma:.3g} m) are needed to fix the rotation of the plane about it"
     )
 
 
 def _covariances(noise: ArrayLike, count: int, owner: str, definite: bool) -> Array:
-    """(count, 3, 3) from sigmas or covariances."""
-    given = np.asarray(noise, np.float64)
-    if given.ndim == 0 or given.shape == (count,):
-        if not np.all(np.isfinite(given)) or np.any(given < 0) or (definite and np.any(given == 0)):
+    """Return (count, 3, 3) covariances from sigmas or covariances."""
+    values = np.asarray(noise, np.float64)
+    if values.ndim == 0 or values.shape == (count,):
+        if not np.all(np.isfinite(values)) or np.any(values < 0) or (definite and np.any(values == 0)):
             raise PlaneError(f"{owner}: sigmas must be finite and {'positive' if definite else 'not negative'}")
-        return np.asarray(np.broadcast_to(given**2, (count,))[:, None, None] * np.eye(3))
-    if given.shape not in ((3, 3), (count, 3, 3)):
+        return np.asarray(np.broadcast_to(values**2, (count,))[:, None, None] * np.eye(3))
+    if values.shape not in ((3, 3), (count, 3, 3)):
         raise PlaneError(
             f"{owner}: noise must be a sigma, ({count},) sigmas, a covariance (3, 3) or ({count}, 3, 3), found"
-            f" {given.shape}"
+            f" {values.shape}"
         )
-    if not np.all(np.isfinite(given)) or not np.allclose(given, np.swapaxes(given, -1, -2), rtol=1e-9, atol=0):
+    if not np.all(np.isfinite(values)) or not np.allclose(values, np.swapaxes(values, -1, -2), rtol=1e-9, atol=0):
         raise PlaneError(f"{owner}: a covariance must be finite and symmetric")
-    least = np.linalg.eigvalsh(given)[..., 0]
-    largest = np.abs(given).max(axis=(-2, -1))
+    least = np.linalg.eigvalsh(values)[..., 0]
+    largest = np.abs(values).max(axis=(-2, -1))
     if np.any(least <= 0) if definite else np.any(least < -1e-12 * largest):
         raise PlaneError(f"{owner}: a covariance must be positive {'definite' if definite else 'semidefinite'}")
-    return np.array(np.broadcast_to(given, (count, 3, 3)))
+    return np.array(np.broadcast_to(values, (count, 3, 3)))
 
 
-# Below so many sigmas an angle, which cannot be negative, is no longer normally distributed.
 _FOLDED = 3.0
+"""Angle, in sigmas, below which an angle, which cannot be negative, is no longer normally distributed."""
 
 
 class AngleError(MeasurementError, ValueError):
-    """Planes or rays have no angle that could be told."""
+    """Planes or rays that determine no angle."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneAngles:
-    """Angles between pairs of planes.
+    """Angles between m pairs of k planes.
 
-    values: (m,) acute angles by atan2, radians. printed: (m,) the same by the paper's arccos.
-    covariance: (m, m) rad^2, points and station.
-    gradient: (m, k, 3) derivative of each angle with respect to the unit normals of the k planes.
-    folded: (m,) the angle is below three sigmas; its sigma then says little, for it cannot be negative.
+    Attributes
+    ----------
+    values : (m,) ndarray
+        Acute angles by atan2, in radians.
+    printed : (m,) ndarray
+        Acute angles by the paper's arccos, in radians.
+    covariance : (m, m) ndarray
+        Covariance from points and station, in rad^2.
+    gradient : (m, k, 3) ndarray
+        Derivative of each angle with respect to the unit normals of the planes.
+    folded : (m,) ndarray of bool
+        True for an angle below three sigmas; its sigma is unreliable, because the angle cannot be negative.
     """
 
     values: Array
@@ -397,18 +476,30 @@ class PlaneAngles:
 
     @property
     def sigma(self) -> Array:
-        """(m,) radians."""
+        """Standard deviation (m,) of the angles, in radians."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 def angles_between(planes: Sequence[PlaneFit], pairs: Sequence[tuple[int, int]]) -> PlaneAngles:
-    """Acute angles between pairs of planes through one station, with their joint covariance.
+    """Return the acute angles between pairs of planes through one station, with their joint covariance.
 
-    pairs: indices into `planes`. Raises AngleError when planes belong to different stations or methods, or coincide.
+    Parameters
+    ----------
+    planes : sequence of PlaneFit
+        Planes fitted by one method through one station.
+    pairs : sequence of (int, int)
+        Indices into `planes`.
+
+    Raises
+    ------
+    AngleError
+        The planes belong to different stations or methods, or two planes coincide.
     """
     for plane in planes[1:]:
         if plane.method != planes[0].method:
-            raise AngleError(f"angles: a {planes[0].method} and a {plane.method} plane have no angle in common")
+            raise AngleError(
+                f"angles: a plane of method {planes[0].method} cannot be compared with one of {plane.method}"
+            )
     station = _common_station(planes)
     normals = np.array([plane.normal for plane in planes])
     values, printed = np.empty(len(pairs)), np.empty(len(pairs))
@@ -417,10 +508,10 @@ def angles_between(planes: Sequence[PlaneFit], pairs: Sequence[tuple[int, int]])
         a, b = normals[i], normals[j]
         dot, sine = float(a @ b), float(np.linalg.norm(np.cross(a, b)))
         if sine < 1e-14:
-            raise AngleError("angles: two planes coincide; their angle has no direction to change in")
+            raise AngleError("angles: two planes coincide; the derivative of their angle is undefined")
         values[row] = np.arctan2(sine, abs(dot))
         printed[row] = np.arccos(min(abs(dot), 1.0))
-        # a step of one normal toward the other closes the angle
+        # moving one normal toward the other reduces the angle
         side = np.copysign(1.0, dot)
         gradient[row, i] = -(side * b - abs(dot) * a) / sine
         gradient[row, j] = -(side * a - abs(dot) * b) / sine
@@ -430,7 +521,7 @@ def angles_between(planes: Sequence[PlaneFit], pairs: Sequence[tuple[int, int]])
 
 
 def _common_station(planes: Sequence[PlaneFit]) -> Station:
-    """Through which all planes were fitted. Raises AngleError for several."""
+    """Return the station through which all planes were fitted; raise AngleError for several."""
     first = planes[0].station
     for plane in planes[1:]:
         same = np.array_equal(plane.station.position, first.position)
@@ -440,38 +531,96 @@ def _common_station(planes: Sequence[PlaneFit]) -> Station:
 
 
 def _propagated(gradient: Array, planes: Sequence[PlaneFit], station: Station) -> Array:
-    """(m, m) covariance of what depends on the planes' normals, by `gradient` (m, k, 3), and on their station."""
+    """Return the (m, m) covariance of quantities with the derivatives `gradient` (m, k, 3) by the planes' normals."""
     points = np.array([plane.point_covariance for plane in planes])
     shared = np.einsum("mki,kij->mj", gradient, np.array([plane.station_gain for plane in planes]))
-    own = np.einsum("mki,kij,lkj->ml", gradient, points, gradient)
-    return np.asarray(own + shared @ station.covariance @ shared.T)
+    from_points = np.einsum("mki,kij,lkj->ml", gradient, points, gradient)
+    return np.asarray(from_points + shared @ station.covariance @ shared.T)
 
 
 def intersection_angles(forward: PlaneFit, nadir: PlaneFit, backward: PlaneFit) -> PlaneAngles:
-    """Angles alpha (forward, nadir) and beta (nadir, backward), eqs. 6 and 7, in this order. Raises AngleError."""
+    """Return the angles alpha (forward, nadir) and beta (nadir, backward), eqs. 6 and 7, in this order.
+
+    Raises
+    ------
+    AngleError
+        The planes belong to different stations or methods, or two planes coincide.
+    """
     return angles_between((forward, nadir, backward), ((0, 1), (1, 2)))
 
 
 def off_axis_angle(line: PlaneFit, nadir: PlaneFit) -> PlaneAngles:
-    """Off-axis angle of another line (high-resolution, multispectral) against the nadir line, (1,); unsigned.
+    """Return the unsigned off-axis angle (1,) of another line (such as multispectral) against the nadir line.
 
-    The paper's outlook. Both planes must belong to the same moment, hence the same station. Raises AngleError.
+    The paper names it in its outlook. Both planes must belong to the same moment, hence the same station.
+
+    Raises
+    ------
+    AngleError
+        The planes belong to different stations or methods, or coincide.
     """
     return angles_between((line, nadir), ((0, 1),))
 
 
 def look_angle(ray_a: ArrayLike, ray_b: ArrayLike) -> Array:
-    """Angle between two lines of sight (..., 3) of any length, radians, 0 to pi."""
+    """Return the angle between two lines of sight (..., 3) of any length, in radians, 0 to pi."""
     a, b = np.asarray(ray_a, np.float64), np.asarray(ray_b, np.float64)
     return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1)))
 
 
+def intersection_angle(
+    first: ArrayLike, second: ArrayLike, station: ArrayLike, *, sigma: ArrayLike, station_sigma: float = 0.0
+) -> tuple[float, float]:
+    """Return the angle between the planes in which two line cameras see the ground, with its standard deviation.
+
+    Each plane runs through the station and is fitted to the ground points of one line by total least squares.
+
+    Parameters
+    ----------
+    first, second : (n, 3) array_like
+        Ground points that each line sees at the moment of the station, in metres, at least three.
+    station : (3,) array_like
+        Perspective centre at that moment, in metres, in the same frame.
+    sigma : float or array_like
+        Standard deviation of the coordinates of the points, in metres: a number, or (n,) if both have n points.
+    station_sigma : float
+        Standard deviation of each coordinate of the station, in metres.
+
+    Returns
+    -------
+    angle, sigma : float
+        Acute angle between the planes, and its standard deviation, in radians.
+
+    Raises
+    ------
+    ValueError
+        Fewer than three points, points on one line through the station, coincident planes, values that are not finite.
+
+    Notes
+    -----
+    Liu and Huang, Infrared and Laser Engineering 43(10) (2014), equations 5 to 7. `fit_plane` and `angles_between`
+    of this module give the fits and the joint covariance of several angles.
+    """
+    centre = Station.of(station, station_sigma)
+    planes = [fit_plane(centre, Strip.of(points, sigma)) for points in (first, second)]
+    angles = angles_between(planes, [(0, 1)])
+    return float(angles.values[0]), float(angles.sigma[0])
+
+
 @dataclass(frozen=True, eq=False)
 class LineFrame:
-    """Where one line looks; unit vectors (3,).
+    """Line of sight and direction of one CCD line.
 
-    central: along the line of sight of its centre. side: along the line, the way in which the tangents rise; square
-        to `central`. plane: the fit. variance: of the central ray out of the plane, rad^2, beside the plane's own.
+    Attributes
+    ----------
+    central : (3,) ndarray
+        Unit vector along the line of sight of the line's centre.
+    side : (3,) ndarray
+        Unit vector along the line in the direction in which the tangents rise, perpendicular to `central`.
+    plane : PlaneFit
+        Plane fitted to the line's points.
+    variance : float
+        Variance of the central ray out of the plane, in rad^2, in addition to that of the plane.
     """
 
     central: Array
@@ -481,25 +630,29 @@ class LineFrame:
 
     @property
     def forward(self) -> Array:
-        """Side x central, which looks ahead where the tangents rise to the right of the track."""
+        """Unit vector side x central, which points ahead if the tangents rise to the right of the track."""
         return np.asarray(np.cross(self.side, self.central))
 
 
 def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFrame:
-    """The line of sight of a CCD line's centre and the line's direction, from the plane and the interior orientation.
-
-    Raises AngleError for bad tangents.
+    """Return the line of sight of a CCD line's centre and the line's direction, from plane and interior orientation.
 
     Parameters
     ----------
     plane : PlaneFit
-        Fitted to the line.
-    tangent : ArrayLike
-        (n,) tangent of the angle of each point from the line of sight along the CCD line, from its pixel number and the
+        Plane fitted to the line's points; not the printed one.
+    tangent : (n,) array_like
+        Tangent of the angle of each point from the line of sight along the CCD line, from its pixel number and the
         interior orientation; either sense of counting.
     bend : float
-        How far the ends of a line that the laboratory knows as straight may have bent out of its plane since, one
-        sigma, radians. The bend is estimated with this sigma as its prior, and the central ray follows it. 0: not.
+        Standard deviation, in radians, by which the ends of a line that was straight in the laboratory may have bent
+        out of its plane since. The bend is estimated with this sigma as its prior, and the central ray follows it. 0:
+        no bend.
+
+    Raises
+    ------
+    AngleError
+        The plane is the printed one, the tangents are not (n,) finite numbers, or they do not match the points.
     """
     if plane.method == "printed":
         raise AngleError("central ray: the printed plane does not contain its points")
@@ -518,12 +671,12 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
     slope = float(spread @ (seen - seen.mean()) / (spread @ spread)) if np.any(spread) else 0.0
     if abs(abs(slope) - 1.0) > 0.1:
         raise AngleError(
-            f"central ray: the points open {abs(slope):.3g} times the angle that their tangents say; wrong tangents?"
+            f"central ray: the points subtend {abs(slope):.3g} times the angle of their tangents; are these wrong?"
         )
-    # a point's angle is good to its sigma over its distance
+    # the sigma of a point's angle is its sigma over its distance
     weight = np.sum(arm**2, axis=1) / np.trace(strip.covariance, axis1=1, axis2=2)
-    turn = float(np.sum(weight * (seen - np.copysign(1.0, slope) * interior)) / np.sum(weight))
-    central = np.cos(turn) * middle + np.sin(turn) * side
+    rotation = float(np.sum(weight * (seen - np.copysign(1.0, slope) * interior)) / np.sum(weight))
+    central = np.cos(rotation) * middle + np.sin(rotation) * side
     side = np.copysign(1.0, slope) * np.cross(plane.normal, central)
     if bend <= 0.0 or not np.any(spread):
         return LineFrame(central, side, plane, 0.0)
@@ -532,7 +685,7 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
 
 
 def _off_plane(plane: PlaneFit, arm: Array, interior: Array, bend: float) -> tuple[float, float]:
-    """Angle of the central ray out of the plane when the line may be bent, and what its variance grows by."""
+    """Return the angle of the central ray out of the plane of a bent line, in radians, and its additional variance."""
     distance = np.linalg.norm(arm, axis=1)
     spread = np.sqrt(np.einsum("i,nij,j->n", plane.normal, plane.strip.covariance, plane.normal)) / distance
     columns = np.column_stack([np.cos(interior), np.sin(interior), (interior / np.abs(interior).max()) ** 2])
@@ -547,33 +700,46 @@ def _off_plane(plane: PlaneFit, arm: Array, interior: Array, bend: float) -> tup
 
 @dataclass(frozen=True, eq=False)
 class AlongTrackAngles:
-    """Signed angles along the track between pairs of lines. values: (m,) radians. covariance: (m, m) rad^2."""
+    """Signed angles along the track between m pairs of lines.
+
+    Attributes
+    ----------
+    values : (m,) ndarray
+        Angles, in radians.
+    covariance : (m, m) ndarray
+        Covariance of the angles, in rad^2.
+    """
 
     values: Array
     covariance: Array
 
     @property
     def sigma(self) -> Array:
-        """(m,) radians."""
+        """Standard deviation (m,) of the angles, in radians."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 def along_track_angle(central_a: ArrayLike, side_a: ArrayLike, central_b: ArrayLike, side_b: ArrayLike) -> float:
-    """Turn about the mean direction of two lines that takes the second's central ray to the first's, radians.
+    """Return the rotation, in radians, about the mean direction of two lines between their central rays.
 
-    Unit vectors (3,). Positive where the first looks ahead of the second, sides pointing to the right of the track.
-    Raises AngleError for lines that run in opposite directions.
+    It takes the second line's central ray to the first's: positive where the first looks ahead of the second, with the
+    lines' directions pointing to the right of the track.
 
     Parameters
     ----------
-    central_a : ArrayLike
-        Central ray of the first line, unit, (3,).
-    side_a : ArrayLike
-        Direction of the first line, unit, (3,).
-    central_b : ArrayLike
-        Of the second line, likewise.
-    side_b : ArrayLike
-        likewise.
+    central_a : (3,) array_like
+        Central ray of the first line, unit vector.
+    side_a : (3,) array_like
+        Direction of the first line, unit vector.
+    central_b : (3,) array_like
+        Central ray of the second line, unit vector.
+    side_b : (3,) array_like
+        Direction of the second line, unit vector.
+
+    Raises
+    ------
+    AngleError
+        The lines run in opposite directions.
     """
     first, second = np.asarray(central_a, np.float64), np.asarray(central_b, np.float64)
     axis = np.asarray(side_a, np.float64) + np.asarray(side_b, np.float64)
@@ -585,11 +751,22 @@ def along_track_angle(central_a: ArrayLike, side_a: ArrayLike, central_b: ArrayL
 
 
 def along_track_angles(lines: Sequence[LineFrame], pairs: Sequence[tuple[int, int]]) -> AlongTrackAngles:
-    """Signed angles between pairs of lines seen from one station, with their joint covariance.
+    """Return the signed angles between pairs of lines seen from one station, with their joint covariance.
 
-    A plane that turns about its line's direction moves its central ray by as much; turns within a plane count only by
-    the angle between the two lines, and are left out of the covariance. pairs: indices into `lines`. Raises AngleError,
-    for several stations, too.
+    A plane that rotates about its line's direction moves its central ray by the same angle; rotations within a plane
+    count only by the angle between the two lines, and are omitted from the covariance.
+
+    Parameters
+    ----------
+    lines : sequence of LineFrame
+        Lines seen from one station.
+    pairs : sequence of (int, int)
+        Indices into `lines`.
+
+    Raises
+    ------
+    AngleError
+        The lines belong to different stations, or run in opposite directions.
     """
     planes = [line.plane for line in lines]
     station = _common_station(planes)
@@ -598,35 +775,35 @@ def along_track_angles(lines: Sequence[LineFrame], pairs: Sequence[tuple[int, in
     for row, (i, j) in enumerate(pairs):
         a, b = lines[i], lines[j]
         values[row] = along_track_angle(a.central, a.side, b.central, b.side)
-        for k, way in ((i, 1.0), (j, -1.0)):
+        for k, direction in ((i, 1.0), (j, -1.0)):
             line = lines[k]
-            # the normal that looks ahead turns away from the central ray when the plane turns ahead
-            gradient[row, k] = -way * line.central * np.copysign(1.0, line.plane.normal @ line.forward)
-            sign[row, k] = way
-    own = np.array([line.variance for line in lines])
-    covariance = _propagated(gradient, planes, station) + (sign * own) @ sign.T
+            # rotating the plane forward moves the forward-pointing normal away from the central ray
+            gradient[row, k] = -direction * line.central * np.copysign(1.0, line.plane.normal @ line.forward)
+            sign[row, k] = direction
+    variances = np.array([line.variance for line in lines])
+    covariance = _propagated(gradient, planes, station) + (sign * variances) @ sign.T
     return AlongTrackAngles(values, covariance)
 
 
 def height_error(
     angle_error: ArrayLike, slant_range: ArrayLike, convergence: ArrayLike, zenith: ArrayLike = 0.0
 ) -> Array:
-    """Error of intersected heights when a look angle is taken wrong by `angle_error`, metres, to first order.
+    """Return the first-order error of intersected heights caused by an error of a look angle, in metres.
 
     The wrong ray passes the ground point at slant_range * angle_error and so meets the other ray, at the angle
-    `convergence` on the ground, farther along by that over sin(convergence); `zenith`: zenith angle of the other ray.
-    For a camera at height H over flat ground, against nadir: H * angle_error / (sin a cos a). Radians, metres.
+    `convergence` on the ground, farther along by that over sin(convergence). For a camera at height H over flat ground,
+    against nadir: H * angle_error / (sin a cos a).
 
     Parameters
     ----------
-    angle_error : ArrayLike
-        Of the look angle, radians, any shape.
-    slant_range : ArrayLike
-        To the ground point, metres.
-    convergence : ArrayLike
-        Angle between the rays on the ground, radians.
-    zenith : ArrayLike
-        Zenith angle of the other ray, radians.
+    angle_error : array_like
+        Error of the look angle, in radians, any shape.
+    slant_range : array_like
+        Distance to the ground point, in metres.
+    convergence : array_like
+        Angle between the rays on the ground, in radians.
+    zenith : array_like
+        Zenith angle of the other ray, in radians.
     """
     along = np.asarray(slant_range) * np.asarray(angle_error) / np.sin(np.asarray(convergence, np.float64))
     return np.asarray(along * np.cos(np.asarray(zenith, np.float64)))
@@ -637,10 +814,22 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """Answer of m dihedral angles to a move of one thing along one axis.
+    """Response of m dihedral angles to a displacement of the station or of one strip along one axis.
 
-    angles: their names. what: "station", or the line whose points move. axis: "x", "y" or "z". amount: (k,) metres.
-    change: (m, k) by recomputation, radians. slope: (m,) linear derivatives at zero, rad/m.
+    Attributes
+    ----------
+    angles : tuple of str
+        Names of the angles.
+    what : str
+        "station", or the line whose points are moved.
+    axis : {'x', 'y', 'z'}
+        Axis of the displacement.
+    amount : (k,) ndarray
+        Displacements, in metres.
+    change : (m, k) ndarray
+        Change of the angles by recomputation, in radians.
+    slope : (m,) ndarray
+        Linear derivatives at zero, in rad/m.
     """
 
     angles: tuple[str, ...]
@@ -651,7 +840,7 @@ class Sensitivity:
     slope: Array
 
     def to_dict(self) -> dict[str, Any]:
-        """what, axis, and the linear answer to 10 m in arcseconds."""
+        """Return what is moved, the axis, and the linear response to 10 m in arcseconds."""
         answers = {
             f"{name}_arcsec_per_10m": float(s) * 10.0 / ARCSEC + 0.0
             for name, s in zip(self.angles, self.slope, strict=True)
@@ -667,22 +856,29 @@ def sensitivity(
     method: Method = "tls",
     amounts: ArrayLike | None = None,
 ) -> tuple[Sensitivity, ...]:
-    """Rows for the station and the points of each strip, each along x, y, z of the coordinates' frame.
-
-    Raises PlaneError and AngleError.
+    """Return the sensitivity of the angles to the station and to the points of each strip, along x, y and z.
 
     Parameters
     ----------
     station : Station
-        From which the strips are seen.
-    strips : Mapping[str, Strip]
-        Line -> its points.
-    pairs : Mapping[str, tuple[str, str]]
-        Angle -> the two lines that it lies between.
-    method : Method
-        Of the planes' fit.
-    amounts : ArrayLike | None
-        (k,) metres, first 0; 0 to 10 m in steps of 1 m by default.
+        Station from which the strips are seen.
+    strips : mapping of str to Strip
+        Points of each line, by its name.
+    pairs : mapping of str to (str, str)
+        Two lines of each angle, by its name.
+    method : {'printed', 'corrected', 'tls'}
+        Method of the plane fit.
+    amounts : (k,) array_like, optional
+        Displacements, in metres, rising from 0; 0 to 10 m in steps of 1 m by default.
+
+    Raises
+    ------
+    ValueError
+        The displacements are not three or more rising numbers from 0.
+    PlaneError
+        A plane cannot be fitted.
+    AngleError
+        Two planes coincide.
     """
     steps = np.linspace(0.0, 10.0, 11) if amounts is None else np.asarray(amounts, np.float64)
     if steps.ndim != 1 or len(steps) < 3 or steps[0] != 0 or not np.all(np.diff(steps) > 0):
@@ -709,10 +905,10 @@ def sensitivity(
 def _moved(
     station: Station, strips: Mapping[str, Strip], fits: list[PlaneFit], what: str, shift: Array, method: Method
 ) -> list[PlaneFit]:
-    """The planes after a move; only what moved is fitted anew."""
+    """Return the planes after a displacement, fitting again only those that it affects."""
     if what == "station":
-        place = Station(station.position + shift, station.covariance)
-        return [fit_plane(place, strip, method) for strip in strips.values()]
+        moved = Station(station.position + shift, station.covariance)
+        return [fit_plane(moved, strip, method) for strip in strips.values()]
     return [
         fit_plane(station, strip.shifted(shift), method) if name == what else fit
         for (name, strip), fit in zip(strips.items(), fits, strict=True)

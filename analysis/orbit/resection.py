@@ -1,20 +1,21 @@
 """Space resection of a camera of two or more lines: attitude and angles from one moment's ground points together.
 
-The photogrammetric method that paper 000 compares its planes with. Each point p has a place on its CCD line, hence a
-known direction in the line's frame, (tx, ty, 1) up to length: X flight direction, Y along the line, Z toward the scene.
-Line k hangs in the body at the look angle look_k, a rotation about the body's Y, positive forward; one line, the
-reference, at zero. Its projection centre stands at c_k in the line's frame:
+This is the photogrammetric method that paper 000 compares its planes with. Each point p has a position on its CCD line,
+hence a known direction in the line's frame, (tx, ty, 1) up to length: X flight direction, Y along the line, Z toward
+the scene. Line k is mounted in the body at the look angle look_k, a rotation about the body's Y, positive forward; that
+of one line, the reference, is zero. Its projection centre is at c_k in the line's frame:
 
     (tx, ty, 1) ~ Ry(look_k)^T R^T (p - O) - c_k.
 
-Unknown are the rotation R from the body to the ground's frame (three turns: roll, pitch, yaw about the body's X, Y, Z),
-the look angles, and where the station is not exact its correction, held by its covariance. Gauss-Newton with analytic
-partials; the point's covariance is carried into the image and added to the image's own. Unlike the planes, the
-resection uses where along the line a point lies, and one attitude for all lines.
+The unknowns are the rotation R from the body to the ground frame (three angles: roll, pitch, yaw about the body's X, Y,
+Z), the look angles, and a correction of the station, constrained by its covariance, unless the station is error-free.
+The solution is Gauss-Newton with analytic partials; each point's covariance is propagated to the image and added to
+that of the image measurement. Unlike the planes, the resection uses the position of a point along the line, and one
+attitude for all lines.
 
-What it assumes: the interior orientation is still the laboratory's, and since then lines have turned against each
-other in pitch only. One line in roll or yaw against the rest shows in the chi-square, not in an unknown. Two lines, one
-angle, are enough: each alone tells roll, yaw and its own pitch.
+Assumptions: the interior orientation is still the laboratory's, and since then the lines have rotated against each
+other in pitch only. A roll or yaw of one line against the rest shows in the chi-square, not in an unknown. Two lines
+(one angle) suffice: each alone determines roll, yaw and its own pitch.
 """
 
 from __future__ import annotations
@@ -32,17 +33,24 @@ from analysis.orbit.planes import Station, Strip
 
 _ATTITUDE = ("roll", "pitch", "yaw")
 _STATION = ("station x", "station y", "station z")
-# A look angle farther than this from the laboratory's, radians, is a mistake and not a change: 1 deg.
 _GROSS = 0.0175
-# Columns of unit length that combine to less than this part of the largest singular value are dependent. Partials in
-# float64 hold 1e-15; three good strips and a station known only from them stay above 5e-3.
+"""Largest plausible change of a look angle from the laboratory's, in radians: 1 deg."""
 _RANK = 1e-9
-# A step of less than this many sigmas ends the iteration; rounding of the misclosures is 1e-9 of a sigma.
+"""Smallest singular value, relative to the largest, of independent unit-length columns. Partials in float64 are
+accurate to 1e-15; three good strips and a station that only they determine stay above 5e-3.
+"""
 _CONVERGED = 1e-6
+"""Largest step of a converged iteration, in sigmas; the rounding of the misclosures is 1e-9 sigma."""
 
 
 class ResectionError(MeasurementError, ValueError):
-    """The points do not determine the unknowns. null_vectors: (k, P) combinations that move no image point."""
+    """Points that do not determine the unknowns.
+
+    Attributes
+    ----------
+    null_vectors : (k, P) ndarray
+        Combinations of the unknowns that move no image point.
+    """
 
     def __init__(self, message: str, null_vectors: Array | None = None) -> None:
         super().__init__(message)
@@ -51,12 +59,22 @@ class ResectionError(MeasurementError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class ObservedLine:
-    """Points of one strip with their places on the CCD line.
+    """Points of one strip with their positions on the CCD line.
 
-    tangent: (n, 2) tangents (tx across, ty along the line) of the points' directions in the line's frame; tx is what
-    the line's distortion makes of it, 0 for a straight line. sigma: of both tangents, image measurement alone.
-    look: the laboratory's look angle, radians; NaN where it is not known. It is no observation: results are only
-    checked against it. offset: (n, 3) metres, projection centre of each point in the line's frame, from the station.
+    Attributes
+    ----------
+    strip : Strip
+        Ground points that the line sees, n of them.
+    tangent : (n, 2) ndarray
+        Tangents (tx across, ty along the line) of the points' directions in the line's frame; tx follows from the
+        line's distortion, 0 for a straight line.
+    sigma : float
+        Standard deviation of both tangents, from the image measurement alone.
+    look : float
+        The laboratory's look angle, in radians; NaN if unknown. It is not an observation: results are only checked
+        against it.
+    offset : (n, 3) ndarray
+        Projection centre of each point in the line's frame, from the station, in metres.
     """
 
     strip: Strip
@@ -75,47 +93,69 @@ class ObservedLine:
         look: float = float("nan"),
         offset: ArrayLike = (0.0, 0.0, 0.0),
     ) -> ObservedLine:
-        """The line, checked.
-
-        Raises ResectionError for bad input.
+        """Return a validated line.
 
         Parameters
         ----------
         strip : Strip
             Ground points that the line sees, n of them.
-        tangent : ArrayLike
-            (n,) along the line, or (n, 2).
+        tangent : (n,) or (n, 2) array_like
+            Tangents along the line, or across and along it.
         sigma : float
-            Of the tangents.
+            Standard deviation of the tangents.
         look : float
-            The laboratory's look angle, radians; NaN where it is not known.
-        offset : ArrayLike
-            (n, 3) or (3,).
+            The laboratory's look angle, in radians; NaN if unknown.
+        offset : (3,) or (n, 3) array_like
+            Projection centre in the line's frame, from the station, in metres.
+
+        Raises
+        ------
+        ResectionError
+            A shape is wrong, a value is not finite, or sigma is negative.
         """
-        given = np.array(tangent, np.float64)
-        if given.ndim == 1:
-            given = np.column_stack([np.zeros_like(given), given])
-        if given.shape != (len(strip.points), 2) or not np.all(np.isfinite(given)):
+        tangents = np.array(tangent, np.float64)
+        if tangents.ndim == 1:
+            tangents = np.column_stack([np.zeros_like(tangents), tangents])
+        if tangents.shape != (len(strip.points), 2) or not np.all(np.isfinite(tangents)):
             raise ResectionError(
-                f"resection: {len(strip.points)} points need as many finite tangents, found {given.shape}"
+                f"resection: {len(strip.points)} points need as many finite tangents, found {tangents.shape}"
             )
         if not (np.isfinite(sigma) and sigma >= 0):
             raise ResectionError(f"resection: sigma of the tangents must be finite and not negative, found {sigma}")
-        place = np.asarray(offset, np.float64)
-        if place.shape not in ((3,), (len(given), 3)) or not np.all(np.isfinite(place)):
-            raise ResectionError(f"resection: offset must be (3,) or ({len(given)}, 3), finite, found {place.shape}")
-        return cls(strip, given, float(sigma), float(look), np.broadcast_to(place, (len(given), 3)))
+        centre = np.asarray(offset, np.float64)
+        if centre.shape not in ((3,), (len(tangents), 3)) or not np.all(np.isfinite(centre)):
+            raise ResectionError(
+                f"resection: offset must be (3,) or ({len(tangents)}, 3), finite, found {centre.shape}"
+            )
+        return cls(strip, tangents, float(sigma), float(look), np.broadcast_to(centre, (len(tangents), 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class Resection:
     """Solution of a space resection.
 
-    attitude: (3, 3) body to the ground's frame. looks: line -> look angle against the reference line, radians, positive
-        forward; 0 for the reference. station: (3,) adjusted, metres.
-    names: of the unknowns that were solved for. covariance: in their order; rad^2, and m^2 for the station.
-    residual: line -> (n, 2) predicted minus given tangents. chi_square, degrees_of_freedom: of all residuals and the
-        station's correction. condition: of the weighted partials with unit columns. iterations: Gauss-Newton steps.
+    Attributes
+    ----------
+    attitude : (3, 3) ndarray
+        Rotation from the body to the ground frame.
+    looks : mapping of str to float
+        Look angle of each line against the reference line, in radians, positive forward; 0 for the reference.
+    station : (3,) ndarray
+        Adjusted station, in metres.
+    names : tuple of str
+        Estimated unknowns.
+    covariance : (P, P) ndarray
+        Covariance of the unknowns in their order, in rad^2, and m^2 for the station.
+    residual : mapping of str to (n, 2) ndarray
+        Predicted minus observed tangents of each line.
+    chi_square : float
+        Chi-square of all residuals and of the station's correction.
+    degrees_of_freedom : int
+        Degrees of freedom of the chi-square.
+    condition : float
+        Condition number of the weighted partials with unit columns.
+    iterations : int
+        Number of Gauss-Newton steps.
     """
 
     attitude: Array
@@ -131,7 +171,7 @@ class Resection:
 
     @property
     def p_value(self) -> float:
-        """Chance of such a chi-square or a larger one; 1 without redundancy."""
+        """p-value of the chi-square; 1 without redundancy."""
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     @property
@@ -140,12 +180,24 @@ class Resection:
         return dict(zip(self.names, (float(s) for s in np.sqrt(np.diag(self.covariance))), strict=True))
 
     def angles(self, pairs: Sequence[tuple[str, str]]) -> Array:
-        """(m,) look of the first line minus that of the second, radians. ResectionError for a missing line."""
+        """Return the (m,) look angles of the first minus the second line of each pair, in radians.
+
+        Raises
+        ------
+        ResectionError
+            A line is missing.
+        """
         self._known(pairs)
         return np.array([self.looks[a] - self.looks[b] for a, b in pairs])
 
     def angle_covariance(self, pairs: Sequence[tuple[str, str]]) -> Array:
-        """(m, m) of `angles`, rad^2. ResectionError for a missing line."""
+        """Return the (m, m) covariance of `angles`, in rad^2.
+
+        Raises
+        ------
+        ResectionError
+            A line is missing.
+        """
         self._known(pairs)
         root = np.zeros((len(pairs), len(self.names)))
         for row, pair in zip(root, pairs, strict=True):
@@ -155,7 +207,7 @@ class Resection:
         return np.asarray(root @ self.covariance @ root.T)
 
     def axes(self, line: str) -> Array:
-        """(3, 3) from the line's frame, at its look angle, to the ground's."""
+        """Return the (3, 3) rotation from a line's frame, at its look angle, to the ground frame."""
         return np.asarray(self.attitude @ _pitched(self.looks[line]))
 
     def _known(self, pairs: Sequence[tuple[str, str]]) -> None:
@@ -166,13 +218,24 @@ class Resection:
 def resect(
     station: Station, lines: Mapping[str, ObservedLine], *, reference: str | None = None, iterations: int = 20
 ) -> Resection:
-    """Attitude, look angles and station from the points of one moment.
+    """Estimate attitude, look angles and station from the ground points of one moment.
 
-    station: its covariance must be zero (exact, not solved for) or positive definite.
-    lines: by name. reference: the line whose look angle is zero; None for "nadir", or else the first.
-    Raises ResectionError, naming the combination, when the points leave an unknown open; when a look angle comes out
-        far from the laboratory's (lines exchanged, or tangents counted from the wrong end); and when it does not
-        converge.
+    Parameters
+    ----------
+    station : Station
+        Measured station; its covariance must be zero (error-free, not estimated) or positive definite.
+    lines : mapping of str to ObservedLine
+        Observed lines, by name.
+    reference : str, optional
+        Line whose look angle is zero; "nadir" if there is one, or else the first, by default.
+    iterations : int
+        Largest number of Gauss-Newton steps.
+
+    Raises
+    ------
+    ResectionError
+        The points leave a combination of unknowns undetermined, which the message lists; a look angle is far from the
+        laboratory's (lines exchanged, or tangents counted from the wrong end); or the iteration does not converge.
     """
     if not lines:
         raise ResectionError("resection: no lines")
@@ -183,28 +246,28 @@ def resect(
         if len(line.strip.points) < 1:
             raise ResectionError(f"resection: the {name} line has no points")
     names = [*_ATTITUDE, *(f"{name} look" for name in lines if name != zero)]
-    free = bool(np.any(station.covariance))
-    if free:
+    station_estimated = bool(np.any(station.covariance))
+    if station_estimated:
         if np.linalg.eigvalsh(station.covariance)[0] <= 0:
             raise ResectionError("resection: the station's covariance must be zero or positive definite")
         names += _STATION
     attitude, looks = _start(station, lines, zero)
-    place = station.position.copy()
-    prior = np.linalg.inv(np.linalg.cholesky(station.covariance)) if free else np.empty((0, 3))
-    held = np.zeros((len(prior), len(names)))
-    if free:
-        held[:, -3:] = prior
+    position = station.position.copy()
+    prior = np.linalg.inv(np.linalg.cholesky(station.covariance)) if station_estimated else np.empty((0, 3))
+    station_rows = np.zeros((len(prior), len(names)))
+    if station_estimated:
+        station_rows[:, -3:] = prior
 
     def system() -> tuple[Array, Array, dict[str, Array]]:
-        """Partials and misclosures of the points and of the station's prior, and the plain residuals."""
-        design, miss, plain = _system(place, attitude, looks, lines, names)
-        return np.vstack([design, held]), np.concatenate([miss, prior @ (place - station.position)]), plain
+        """Return partials and misclosures of the points and of the station's prior, and the plain residuals."""
+        design, miss, plain = _system(position, attitude, looks, lines, names)
+        return np.vstack([design, station_rows]), np.concatenate([miss, prior @ (position - station.position)]), plain
 
-    count, size = 0, np.inf
+    steps, size = 0, np.inf
     while not size < _CONVERGED:
-        if count == iterations:
-            raise ResectionError(f"resection: no convergence in {count} steps, the last of {size:.3g} sigmas")
-        count += 1
+        if steps == iterations:
+            raise ResectionError(f"resection: no convergence in {steps} steps, the last of {size:.3g} sigmas")
+        steps += 1
         design, miss, _ = system()
         length = np.linalg.norm(design, axis=0)
         _check_rank(design, length, names)
@@ -213,8 +276,8 @@ def resect(
         for name in looks:
             if name != zero:
                 looks[name] += float(step[names.index(f"{name} look")])
-        if free:
-            place = place + step[-3:]
+        if station_estimated:
+            position = position + step[-3:]
         size = float(np.max(np.abs(step * length)))
     for name, look in looks.items():
         expected = lines[name].look - lines[zero].look
@@ -229,38 +292,38 @@ def resect(
     return Resection(
         attitude=attitude,
         looks=looks,
-        station=place,
+        station=position,
         names=tuple(names),
         covariance=inverse @ inverse.T,
         residual=residual,
         chi_square=float(miss @ miss),
         degrees_of_freedom=len(miss) - len(names),
         condition=float(np.linalg.cond(design / length)),
-        iterations=count,
+        iterations=steps,
     )
 
 
 def _system(
-    place: Array, attitude: Array, looks: Mapping[str, float], lines: Mapping[str, ObservedLine], names: list[str]
+    station: Array, attitude: Array, looks: Mapping[str, float], lines: Mapping[str, ObservedLine], names: list[str]
 ) -> tuple[Array, Array, dict[str, Array]]:
-    """Whitened partials (M, P), whitened misclosures (M,), and the plain residuals of each line."""
+    """Return whitened partials (M, P), whitened misclosures (M,), and the plain residuals of each line."""
     rows, misses, plain = [], [], {}
     for name, line in lines.items():
         tilt = _pitched(looks[name])
-        body = (line.strip.points - place) @ attitude
+        body = (line.strip.points - station) @ attitude
         arm = body @ tilt
-        seen = arm - line.offset
-        if np.any(seen[:, 2] <= 0):
+        camera = arm - line.offset
+        if np.any(camera[:, 2] <= 0):
             raise ResectionError(f"resection: points of the {name} line lie behind the camera")
-        x, y, z = seen.T
+        x, y, z = camera.T
         zero = np.zeros_like(z)
         image = np.stack([np.stack([1 / z, zero, -x / z**2], -1), np.stack([zero, 1 / z, -y / z**2], -1)], axis=1)
-        # R exp(w) turns the direction by -w x body; a look angle turns it by -(Y x seen)
-        turn = np.stack([np.cross(body, axis) for axis in np.eye(3)], axis=-1)
+        # R exp(w) rotates the direction by -w x body; a look angle rotates it by -(Y x camera)
+        rotation = np.stack([np.cross(body, axis) for axis in np.eye(3)], axis=-1)
         pitch = np.stack([-arm[:, 2], zero, arm[:, 0]], axis=-1)
         to_line = tilt.T @ attitude.T
         columns = np.zeros((len(z), 2, len(names)))
-        columns[:, :, :3] = image @ (tilt.T @ turn)
+        columns[:, :, :3] = image @ (tilt.T @ rotation)
         if (unknown := f"{name} look") in names:
             columns[:, :, names.index(unknown)] = np.einsum("nij,nj->ni", image, pitch)
         if names[-1] == _STATION[-1]:
@@ -276,12 +339,12 @@ def _system(
 
 
 def _pitched(look: float) -> Array:
-    """From the frame of a line at a look angle to the body."""
+    """Return the rotation from the frame of a line at a look angle to the body."""
     return np.asarray(Rotation.from_rotvec([0.0, look, 0.0]).as_matrix())
 
 
 def _start(station: Station, lines: Mapping[str, ObservedLine], zero: str) -> tuple[Array, dict[str, float]]:
-    """Attitude from the reference line's directions (or another's), look angles from mean directions."""
+    """Return the attitude from the reference line's directions (or another's) and look angles from mean directions."""
     spread = {name: float(np.ptp(line.tangent[:, 1])) for name, line in lines.items()}
     base = zero if spread[zero] > 0 else max(spread, key=lambda name: spread[name])
     if spread[base] <= 0:
@@ -306,9 +369,9 @@ def _start(station: Station, lines: Mapping[str, ObservedLine], zero: str) -> tu
 
 
 def _check_rank(design: Array, length: Array, names: list[str]) -> None:
-    """ResectionError that names what the points cannot tell."""
+    """Raise ResectionError, listing the combinations of unknowns that the points leave undetermined."""
     scaled = design / np.where(length > 0, length, 1.0)
-    # rows of zeros, so that all P right vectors come out of fewer observations than unknowns, too
+    # zero rows, so that all P right vectors result from fewer observations than unknowns, too
     padded = np.vstack([scaled, np.zeros((max(len(names) - len(scaled), 0), len(names)))])
     _, values, vt = np.linalg.svd(padded, full_matrices=False)
     null = vt[values <= _RANK * max(float(values[0]), 1e-300)]
@@ -319,4 +382,4 @@ def _check_rank(design: Array, length: Array, names: list[str]) -> None:
     text = "; ".join(
         " ".join(f"{v:+.3g} x {n}" for v, n in zip(row, names, strict=True) if abs(v) > 1e-6) for row in vectors
     )
-    raise ResectionError(f"resection: the points cannot tell: {text}; these changes move no image point", vectors)
+    raise ResectionError(f"resection: the points do not determine: {text}; these changes move no image point", vectors)

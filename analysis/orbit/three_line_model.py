@@ -1,6 +1,7 @@
-"""Rigorous model of a three-line camera in orbit (paper 003): collinearity of an image point at its exposure time.
+"""Rigorous model of a three-line camera in orbit (paper 003): collinearity at the exposure time.
 
     ground = station + offset + R_body R_bias (position + scale R_camera l),
+
     l = [-(x - x0)(1 + d), -(y - y0)(1 + d), f],    d = k1 r^2 + k2 r^4,  r from the principal point.
 
 R_body (measured attitude, body to ITRS) and station belong to the exposure time of the image line, R_bias to a field,
@@ -8,14 +9,15 @@ R_camera and `position` to a line camera. Solved for the image, the condition of
 
     x: (x - x0)(1 + d) + f a / c = 0        y: (y - y0)(1 + d) + f b / c = 0
 
-with (a, b, c) the ground point in the camera's axes (X along the track, Y along the line, Z toward the scene). The
-image is the real one: a point at +y sees the scene at -Y. x is the place of the CCD line in the focal plane, normally
-0: the measurement of the image line is in the exposure time. An error of one line acts as an error of one pixel in x at
-nadir, where lines are spaced as pixels are, and of cos^2 of the look angle (0.82) in the outer lines.
+with (a, b, c) the ground point in the camera's axes (X along the track, Y along the line, Z toward the scene). Image
+coordinates are those of the real, inverted image: a point at +y sees the scene at -Y. x is the position of the CCD line
+in the focal plane, normally 0: the measurement of the image line is in the exposure time. An error of one image line
+acts as an error of one pixel in x at nadir, where lines have the spacing of pixels, and of cos^2 of the look angle
+(0.82) in the outer lines.
 
-A camera that has drifted since its reference state is turned in its own axes, R_camera Rx(d_beta) Ry(d_alpha)
-Rz(d_gamma), and sees with f + d_f: d_gamma is a turn about the line of sight, + d_alpha moves it toward +X, + d_beta
-toward -Y.
+A camera that has drifted since its reference state is rotated in its own axes, R_camera Rx(d_beta) Ry(d_alpha)
+Rz(d_gamma), and has the principal distance f + d_f: d_gamma is a rotation about the line of sight, + d_alpha moves it
+toward +X, + d_beta toward -Y.
 
 R_bias = Rx(roll) Ry(pitch) Rz(yaw) about the body's axes. `misclosure` is analytic in all arguments, so that a complex
 step through it gives derivatives to rounding; `partials` has them in closed form.
@@ -41,23 +43,23 @@ _UNIT = np.eye(3)
 
 @dataclass(frozen=True, eq=False)
 class LineModel:
-    """One line camera: how it is mounted (known) and its interior orientation (to be calibrated).
+    """Line camera with its known mounting and its interior orientation, which is to be calibrated.
 
     Attributes
     ----------
-    to_body : Array
-        (3, 3) rotation from the camera's axes to the body's.
-    interior : Array
-        (3,) principal distance f and principal point x0, y0, metres.
-    position : Array
-        (3,) projection centre in the body frame, metres.
+    to_body : (3, 3) ndarray
+        Rotation from the camera's axes to the body's.
+    interior : (3,) ndarray
+        Principal distance f and principal point x0, y0, in metres.
+    position : (3,) ndarray
+        Projection centre in the body frame, in metres.
     k1, k2 : float
-        Radial distortion, 1/m^2 and 1/m^4.
-    drift : Array
-        (4,) d_alpha, d_beta, d_gamma (radians) and d_f (metres) against that state; zero in the reference state.
+        Radial distortion, in 1/m^2 and 1/m^4.
+    drift : (4,) ndarray
+        d_alpha, d_beta, d_gamma (radians) and d_f (metres) against the reference state; zero in that state.
     half_length : float
-        Metres from the middle of the line to its ends, where a change of f moves the image most; 0 where it is not
-        known.
+        Distance from the middle of the line to its ends, where a change of f moves the image most, in metres; 0 if
+        unknown.
     """
 
     to_body: Array
@@ -78,48 +80,56 @@ class LineModel:
         k2: float = 0.0,
         half_length: float = 0.0,
     ) -> LineModel:
-        """The model, checked.
-
-        Raises ValueError for shapes, values that are not finite, f <= 0, a to_body that is no rotation, a length
-        below zero.
+        """Return a validated model.
 
         Parameters
         ----------
-        to_body : ArrayLike
-            Rotation from the camera's axes to the body's, (3, 3).
-        interior : ArrayLike
-            f, x0 and y0, (3,), metres.
-        position : ArrayLike
-            Projection centre in the body frame, (3,), metres.
+        to_body : (3, 3) array_like
+            Rotation from the camera's axes to the body's.
+        interior : (3,) array_like
+            f, x0 and y0, in metres.
+        position : (3,) array_like
+            Projection centre in the body frame, in metres.
         k1 : float
-            Radial distortion, 1/m^2.
+            Radial distortion, in 1/m^2.
         k2 : float
-            Likewise, 1/m^4.
+            Radial distortion, in 1/m^4.
         half_length : float
-            From the middle of the line to its ends, metres; 0 where it is not known.
+            Distance from the middle of the line to its ends, in metres; 0 if unknown.
+
+        Raises
+        ------
+        ValueError
+            A shape is wrong, a value is not finite, f is not positive, to_body is not a rotation, or the length is
+            negative.
         """
-        turn, inner, place = (np.array(v, np.float64) for v in (to_body, interior, position))
-        if turn.shape != (3, 3) or inner.shape != (3,) or place.shape != (3,):
+        rotation, interior_values, centre = (np.array(v, np.float64) for v in (to_body, interior, position))
+        if rotation.shape != (3, 3) or interior_values.shape != (3,) or centre.shape != (3,):
             raise ValueError("line model: to_body must be (3, 3), interior and position (3,)")
         if (
-            not np.all(np.isfinite(np.concatenate([turn.ravel(), inner, place, [k1, k2, half_length]])))
-            or inner[0] <= 0
+            not np.all(np.isfinite(np.concatenate([rotation.ravel(), interior_values, centre, [k1, k2, half_length]])))
+            or interior_values[0] <= 0
         ):
             raise ValueError("line model: all numbers must be finite and f positive")
         if half_length < 0:
-            raise ValueError("line model: half the length of a line is not below zero")
-        if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-9) and np.linalg.det(turn) > 0):
+            raise ValueError("line model: half_length must not be negative")
+        if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) and np.linalg.det(rotation) > 0):
             raise ValueError("line model: to_body must be a rotation")
-        return cls(turn, inner, place, float(k1), float(k2), half_length=float(half_length))
+        return cls(rotation, interior_values, centre, float(k1), float(k2), half_length=float(half_length))
 
     def with_interior(self, interior: ArrayLike) -> LineModel:
-        """The camera with another f, x0, y0."""
+        """Return the camera with another interior orientation f, x0, y0."""
         return replace(self, interior=np.array(interior, np.float64))
 
     def drifted(self, drift: ArrayLike) -> LineModel:
-        """The camera in another state: (4,) d_alpha, d_beta, d_gamma, d_f against the reference state.
+        """Return the camera with a drift (4,), d_alpha, d_beta, d_gamma, d_f against the reference state.
 
-        It replaces an earlier drift. Raises ValueError for another shape.
+        The drift replaces an earlier one.
+
+        Raises
+        ------
+        ValueError
+            The shape is not (4,).
         """
         change = np.asarray(drift)
         if change.shape != (4,):
@@ -128,7 +138,7 @@ class LineModel:
 
     @cached_property
     def axes(self) -> Array:
-        """(3, 3) rotation from the axes of the drifted camera to the body's."""
+        """Rotation (3, 3) from the axes of the drifted camera to the body's."""
         return np.asarray(self.to_body @ self._turned)
 
     @property
@@ -137,7 +147,7 @@ class LineModel:
         return np.asarray(self.interior[0] + self.drift[3])
 
     def directions(self, image: Array) -> Array:
-        """(n, 3) unit vectors in the body frame that image points (n, 2) look along."""
+        """Return the (n, 3) unit vectors in the body frame of the rays of image points (n, 2)."""
         at = image - self.interior[1:]
         square = np.sum(at**2, axis=1)
         at = at * (1.0 + square * (self.k1 + self.k2 * square))[:, None]
@@ -145,50 +155,52 @@ class LineModel:
         return np.asarray(look / np.linalg.norm(look, axis=1, keepdims=True))
 
     def seen(self, body: Array, image: Array) -> Seen:
-        """What image points see of places in the body frame.
+        """Return misclosures and derivatives of image points for ground points in the body frame.
 
         Parameters
         ----------
-        body : Array
-            Ground points from the body's origin, in its true axes, (n, 3), metres.
-        image : Array
-            x and y in the focal plane, (n, 2), metres.
+        body : (n, 3) ndarray
+            Ground points from the body's origin, in its true axes, in metres.
+        image : (n, 2) ndarray
+            x and y in the focal plane, in metres.
 
         Raises
         ------
         UndeterminedError
-            a ground point behind a camera.
+            A ground point is behind the camera.
         """
         f, mounted = self.principal_distance, (body - self.position) @ self.to_body
         a, b, c = np.ascontiguousarray((mounted @ self._turned).T)
         if np.any(c <= 0):
             raise UndeterminedError("three-line model: a ground point lies behind a camera")
-        place = image - self.interior[1:]
-        square = np.sum(place**2, axis=1)
-        grown = 1.0 + square * (self.k1 + self.k2 * square)
+        position = image - self.interior[1:]
+        square = np.sum(position**2, axis=1)
+        scale = 1.0 + square * (self.k1 + self.k2 * square)
         along = np.stack([a / c, b / c], axis=1)
-        own = np.zeros((len(c), 2, 3), np.result_type(c, f))
-        own[:, 0, 0] = own[:, 1, 1] = f / c
-        own[:, :, 2] = (-f / c)[:, None] * along
-        swung = np.concatenate(self._turned_slopes, axis=1)
-        swung = (mounted @ swung).reshape(-1, 3, 3).swapaxes(1, 2)
-        by_drift = np.concatenate([own @ swung, along[:, :, None]], axis=2)
-        return Seen(place * grown[:, None] + f * along, (own.reshape(-1, 3) @ self.axes.T).reshape(-1, 2, 3), by_drift)
+        by_camera = np.zeros((len(c), 2, 3), np.result_type(c, f))
+        by_camera[:, 0, 0] = by_camera[:, 1, 1] = f / c
+        by_camera[:, :, 2] = (-f / c)[:, None] * along
+        slopes = np.concatenate(self._turned_slopes, axis=1)
+        slopes = (mounted @ slopes).reshape(-1, 3, 3).swapaxes(1, 2)
+        by_drift = np.concatenate([by_camera @ slopes, along[:, :, None]], axis=2)
+        return Seen(
+            position * scale[:, None] + f * along, (by_camera.reshape(-1, 3) @ self.axes.T).reshape(-1, 2, 3), by_drift
+        )
 
     @cached_property
     def _turned(self) -> Array:
-        """Rx(d_beta) Ry(d_alpha) Rz(d_gamma)."""
+        """Rotation Rx(d_beta) Ry(d_alpha) Rz(d_gamma) of the drift."""
         return bias_rotation(self._turns)
 
     @cached_property
     def _turned_slopes(self) -> tuple[Array, ...]:
-        """Its derivatives by d_alpha, d_beta, d_gamma."""
+        """Derivatives of the drift's rotation with respect to d_alpha, d_beta, d_gamma."""
         slopes = _rotation_slopes(self._turns)
         return tuple(slopes[axis] for axis in _DRIFT_AXIS)
 
     @property
     def _turns(self) -> Array:
-        """(3,) of the drift about x, y and z."""
+        """Rotation angles (3,) of the drift about x, y and z, in radians."""
         turns = np.empty(3, self.drift.dtype)
         turns[list(_DRIFT_AXIS)] = self.drift[:3]
         return turns
@@ -196,8 +208,16 @@ class LineModel:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Misclosures (n, 2) of image points, metres in the image as of `misclosure`, and their derivatives: (n, 2, 3) by
-    the place in the body frame, (n, 2, 4) by d_alpha, d_beta, d_gamma, d_f.
+    """Misclosures of image points and their derivatives.
+
+    Attributes
+    ----------
+    miss : (n, 2) ndarray
+        Misclosures, in metres in the image, as from `misclosure`.
+    by_body : (n, 2, 3) ndarray
+        Derivatives with respect to the ground point in the body frame.
+    by_drift : (n, 2, 4) ndarray
+        Derivatives with respect to d_alpha, d_beta, d_gamma, d_f.
     """
 
     miss: Array
@@ -207,23 +227,23 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Image points of one line camera with the measured station and attitude of their exposure times.
+    """Image points of one line camera with the measured station and attitude at their exposure times.
 
     Attributes
     ----------
-    point : NDArray[np.intp]
-        (n,) which ground point each of them shows.
-    image : Array
-        (n, 2) x and y in the focal plane, metres, counted from the line's centre.
-    station : Array
-        (n, 3) of the body's origin, ITRS, metres.
-    attitude : Array
-        (n, 3, 3) body to ITRS.
-    time : Array | None
-        (n,) of the exposures, seconds, on the scale of the readings of attitude and station; None where unknown, the
-        rays' noise then counts as independent.
-    spread : Array | None
-        (n, 2, 2) covariance of the image points in units of `Noise.image` squared; None for unit matrices.
+    point : (n,) ndarray of int
+        Index of the ground point that each ray shows.
+    image : (n, 2) ndarray
+        x and y in the focal plane, from the line's centre, in metres.
+    station : (n, 3) ndarray
+        Position of the body's origin, ITRS, in metres.
+    attitude : (n, 3, 3) ndarray
+        Rotation from the body to ITRS.
+    time : (n,) ndarray or None
+        Exposure times, in seconds, on the time scale of the attitude and station readings. None if unknown; the rays'
+        noise then counts as independent.
+    spread : (n, 2, 2) ndarray or None
+        Covariance of the image points in units of `Noise.image` squared; None for unit matrices.
     """
 
     point: NDArray[np.intp]
@@ -237,26 +257,29 @@ class Rays:
     def of(
         cls, point: ArrayLike, image: ArrayLike, station: ArrayLike, attitude: ArrayLike, time: ArrayLike | None = None
     ) -> Rays:
-        """The rays, checked.
-
-        Raises ValueError for shapes that do not match, values that are not finite, points shown twice.
+        """Return validated rays.
 
         Parameters
         ----------
-        point : ArrayLike
-            Which ground point each of n rays shows, (n,).
-        image : ArrayLike
-            x and y in the focal plane, (n, 2), metres.
-        station : ArrayLike
-            Of the body's origin, ITRS, (n, 3), metres.
-        attitude : ArrayLike
-            Body to ITRS, (n, 3, 3).
-        time : ArrayLike | None
-            Of the exposures, (n,), seconds; None where unknown.
+        point : (n,) array_like of int
+            Index of the ground point that each ray shows.
+        image : (n, 2) array_like
+            x and y in the focal plane, in metres.
+        station : (n, 3) array_like
+            Position of the body's origin, ITRS, in metres.
+        attitude : (n, 3, 3) array_like
+            Rotation from the body to ITRS.
+        time : (n,) array_like, optional
+            Exposure times, in seconds; unknown by default.
+
+        Raises
+        ------
+        ValueError
+            Shapes do not match, a value is not finite, or a point appears twice.
         """
         which = np.array(point)
         if which.ndim != 1 or (which.size and not np.issubdtype(which.dtype, np.integer)):
-            raise ValueError("rays: point must be a row of whole numbers")
+            raise ValueError("rays: point must be a one-dimensional array of integers")
         n = len(which)
         moments = np.zeros(n) if time is None else time
         rows = [np.array(v, np.float64) for v in (image, station, attitude, moments)]
@@ -266,14 +289,14 @@ class Rays:
                 raise ValueError(f"rays: {what} must be {shape} for {n} points, found {row.shape}")
             bad = np.flatnonzero(~np.isfinite(row.reshape(n, -1)).all(axis=1))
             if len(bad):
-                raise ValueError(f"rays: {what} of ray {bad[0]} is not finite; leave out what was not measured")
+                raise ValueError(f"rays: {what} of ray {bad[0]} is not finite; exclude what was not measured")
         if len(np.unique(which)) != n:
             raise ValueError("rays: a point appears twice in one line")
-        places, stations, attitudes, times = rows
-        return cls(which.astype(np.intp), places, stations, attitudes, None if time is None else times)
+        images, stations, attitudes, times = rows
+        return cls(which.astype(np.intp), images, stations, attitudes, None if time is None else times)
 
     def taken(self, keep: ArrayLike) -> Rays:
-        """Some of the rays, by mask or index."""
+        """Return the rays that a mask or an index selects."""
         where = np.asarray(keep)
         time, spread = (None if v is None else v[where] for v in (self.time, self.spread))
         return Rays(self.point[where], self.image[where], self.station[where], self.attitude[where], time, spread)
@@ -281,9 +304,20 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Partials:
-    """Derivatives of `misclosure`, (n, 2, 3): interior by f, x0, y0; bias by roll, pitch, yaw; ground by the point
-    (by the station: its negative); attitude by a small turn of the measured attitude about the body's axes; drift,
-    (n, 2, 4), by d_alpha, d_beta, d_gamma, d_f.
+    """Derivatives of `misclosure`.
+
+    Attributes
+    ----------
+    interior : (n, 2, 3) ndarray
+        Derivatives with respect to f, x0, y0.
+    bias : (n, 2, 3) ndarray
+        Derivatives with respect to roll, pitch, yaw.
+    ground : (n, 2, 3) ndarray
+        Derivatives with respect to the ground point; those with respect to the station are their negatives.
+    attitude : (n, 2, 3) ndarray
+        Derivatives with respect to a small rotation of the measured attitude about the body's axes.
+    drift : (n, 2, 4) ndarray
+        Derivatives with respect to d_alpha, d_beta, d_gamma, d_f.
     """
 
     interior: Array
@@ -294,103 +328,109 @@ class Partials:
 
 
 def bias_rotation(bias: ArrayLike) -> Array:
-    """(3, 3) Rx(roll) Ry(pitch) Rz(yaw) from (3,) radians."""
+    """Return the (3, 3) rotation Rx(roll) Ry(pitch) Rz(yaw) of a bias (3,), in radians."""
     roll, pitch, yaw = np.asarray(bias)
-    return np.asarray(_turn(0, roll) @ _turn(1, pitch) @ _turn(2, yaw))
+    return np.asarray(_axis_rotation(0, roll) @ _axis_rotation(1, pitch) @ _axis_rotation(2, yaw))
 
 
 def _rotation_slopes(bias: Array) -> list[Array]:
-    """Derivatives of `bias_rotation` by roll, pitch and yaw."""
-    turns = [_turn(axis, angle) for axis, angle in enumerate(bias)]
+    """Return the derivatives of `bias_rotation` with respect to roll, pitch and yaw."""
+    turns = [_axis_rotation(axis, angle) for axis, angle in enumerate(bias)]
     out = []
     for axis, angle in enumerate(bias):
         chain = [*turns]
-        chain[axis] = _turn_slope(axis, angle)
+        chain[axis] = _axis_rotation_slope(axis, angle)
         out.append(chain[0] @ chain[1] @ chain[2])
     return out
 
 
 def misclosure(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: Array) -> Array:
-    """Left sides of the two conditions, metres in the image: (n, 2), zero for perfect data.
+    """Return the (n, 2) left sides of the collinearity conditions, in metres in the image; zero for perfect data.
 
     Parameters
     ----------
     camera : LineModel
-        Interior and mounting of the line.
+        Interior orientation and mounting of the line.
     rays : Rays
-        n image points.
-    ground : Array
-        (n, 3) of each ray's point, ITRS.
-    bias : Array
-        (3,) radians.
-    offset : Array
-        (3,) of the station, ITRS, metres.
+        Image points, n of them.
+    ground : (n, 3) ndarray
+        Ground point of each ray, ITRS, in metres.
+    bias : (3,) ndarray
+        Attitude bias, in radians.
+    offset : (3,) ndarray
+        Offset of the station, ITRS, in metres.
     """
     f, (x0, y0) = camera.principal_distance, camera.interior[1:]
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
-    seen = (q @ bias_rotation(bias) - camera.position) @ camera.axes
+    camera_frame = (q @ bias_rotation(bias) - camera.position) @ camera.axes
     x, y = rays.image[:, 0] - x0, rays.image[:, 1] - y0
     square = x * x + y * y
-    grown = 1.0 + square * (camera.k1 + camera.k2 * square)
-    return np.stack([x * grown + f * seen[:, 0] / seen[:, 2], y * grown + f * seen[:, 1] / seen[:, 2]], axis=-1)
+    scale = 1.0 + square * (camera.k1 + camera.k2 * square)
+    return np.stack(
+        [
+            x * scale + f * camera_frame[:, 0] / camera_frame[:, 2],
+            y * scale + f * camera_frame[:, 1] / camera_frame[:, 2],
+        ],
+        axis=-1,
+    )
 
 
 def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: Array) -> Partials:
-    """Derivatives of `misclosure` in closed form.
+    """Return the derivatives of `misclosure` in closed form.
 
     Parameters
     ----------
     camera : LineModel
-        Interior and mounting of the line.
+        Interior orientation and mounting of the line.
     rays : Rays
-        n image points.
-    ground : Array
-        (n, 3) of each ray's point, ITRS, metres.
-    bias : Array
-        Of the attitude, (3,), radians.
-    offset : Array
-        Of the station, (3,), ITRS, metres.
+        Image points, n of them.
+    ground : (n, 3) ndarray
+        Ground point of each ray, ITRS, in metres.
+    bias : (3,) ndarray
+        Attitude bias, in radians.
+    offset : (3,) ndarray
+        Offset of the station, ITRS, in metres.
 
     Raises
     ------
-    ValueError
-        a ground point behind a camera.
+    UndeterminedError
+        A ground point is behind the camera.
     """
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
-    turn = bias_rotation(bias)
-    seen = camera.seen(q @ turn, rays.image)
+    rotation = bias_rotation(bias)
+    seen = camera.seen(q @ rotation, rays.image)
     x, y = (rays.image - camera.interior[1:]).T
     square = x * x + y * y
-    grown = 1.0 + square * (camera.k1 + camera.k2 * square)
+    scale = 1.0 + square * (camera.k1 + camera.k2 * square)
     slope = 2.0 * (camera.k1 + 2.0 * camera.k2 * square)
     interior = np.empty((len(x), 2, 3), np.result_type(seen.by_drift, x))
     interior[:, :, 0] = seen.by_drift[:, :, 3]
-    interior[:, 0, 1], interior[:, 1, 2] = -(grown + slope * x * x), -(grown + slope * y * y)
+    interior[:, 0, 1], interior[:, 1, 2] = -(scale + slope * x * x), -(scale + slope * y * y)
     interior[:, 1, 1] = interior[:, 0, 2] = -(slope * x * y)
     turned = np.stack([q @ by_bias for by_bias in _rotation_slopes(bias)], axis=-1)
-    to_measured = seen.by_body @ turn.T  # by the point in the body frame of the measured attitude
-    spun = np.stack([np.cross(q, axis) for axis in _UNIT], axis=-1)
+    to_measured = seen.by_body @ rotation.T  # with respect to the point in the body frame of the measured attitude
+    by_rotation = np.stack([np.cross(q, axis) for axis in _UNIT], axis=-1)
     return Partials(
         interior=interior,
         bias=seen.by_body @ turned,
         ground=to_measured @ np.swapaxes(rays.attitude, 1, 2),
-        attitude=to_measured @ spun,
+        attitude=to_measured @ by_rotation,
         drift=seen.by_drift,
     )
 
 
-def _turn(axis: int, angle: float | complex) -> np.ndarray:
-    """Right-handed rotation about a coordinate axis; the angle may be complex."""
+def _axis_rotation(axis: int, angle: float | complex) -> np.ndarray:
+    """Return the right-handed rotation about a coordinate axis; the angle may be complex."""
     i, j = _NEXT[axis]
     cos, sin = np.cos(angle), np.sin(angle)
-    turn = _UNIT.astype(complex) if np.iscomplexobj(angle) else _UNIT.copy()
-    turn[i, i] = turn[j, j] = cos
-    turn[i, j], turn[j, i] = -sin, sin
-    return turn
+    matrix = _UNIT.astype(complex) if np.iscomplexobj(angle) else _UNIT.copy()
+    matrix[i, i] = matrix[j, j] = cos
+    matrix[i, j], matrix[j, i] = -sin, sin
+    return matrix
 
 
-def _turn_slope(axis: int, angle: float) -> Array:
-    """Derivative of `_turn` by the angle."""
-    slope = _turn(axis, angle + 0.5 * np.pi)
+def _axis_rotation_slope(axis: int, angle: float) -> Array:
+    """Return the derivative of `_axis_rotation` with respect to the angle."""
+    slope = _axis_rotation(axis, angle + 0.5 * np.pi)
     slope[axis, axis] = 0.0
     return slope

@@ -217,7 +217,7 @@ def test_bad_input_is_told():
         (CalibrationError, "field 'bare': no image points", [field, bare], LABORATORY, NOISE, hold),
         (RankError, "Hold or weight", [few], LABORATORY, NOISE, {}),
         (CalibrationError, "no fields", [], LABORATORY, NOISE, {}),
-        (CalibrationError, "two fields have one name", [field, field], LABORATORY, NOISE, {}),
+        (CalibrationError, "two fields have the same name", [field, field], LABORATORY, NOISE, {}),
         (CalibrationError, "called 'nadir z'", [field], LABORATORY, NOISE, {"gauge": Gauge(held=("nadir z",))}),
         (CalibrationError, "no camera is called 'backward'", [field], two, NOISE, {}),
         (CalibrationError, "sigmas must be finite", [field], LABORATORY, Noise(np.nan), {}),

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from analysis.orbit.jitter import JitterError, Observations, periodogram, search, splined
+from analysis.orbit.jitter import JitterError, Observations, periodogram, search, fit_spline
 from tests.analysis.refusals import refuses
 
 GAPS = (0.1216, 0.1024)
@@ -173,7 +173,7 @@ def test_a_spline_follows_what_is_no_line() -> None:
             for f, a, p in zip(frequency, 0.1 * random.rayleigh(size=40), random.uniform(0.0, 6.28, 40), strict=True)
         )
         one = Pass(lines, count=600)
-        value, spread = splined(one.observed(seed), 0.1, 1.0).at(at)
+        value, spread = fit_spline(one.observed(seed), 0.1, 1.0).at(at)
         # what is slow is known to a trend only: it is taken off all that is compared
         slow = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, len(at)), 2)
         away = np.eye(len(at)) - slow @ np.linalg.pinv(slow)
@@ -260,7 +260,7 @@ def test_the_noise_of_each_line_is_estimated() -> None:
     """
     given = three_lines(1, (2.0, 1.0, 1.0), 1500)
     assert_allclose(given.factors() - [4.0, 1.0, 1.0], 0.0, atol=0.6)
-    even = given.evened(given.factors())
+    even = given.rewhitened(given.factors())
     assert_allclose(even.factors(), 1.0, atol=0.05)
     assert np.var(even.rest(even.value)) == pytest.approx(1.0, abs=0.15)
     # two lines that are only seen against each other are one noise

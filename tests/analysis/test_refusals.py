@@ -44,7 +44,7 @@ from analysis.orbit.forward_intersection import (
     intersect_pair,
 )
 from analysis.orbit.image_correction import image_correction
-from analysis.orbit.jitter import JitterError, Observations, periodogram, splined
+from analysis.orbit.jitter import JitterError, Observations, periodogram, fit_spline
 from analysis.orientation.interior import OrientationError, fit_interior_orientation, line_orientation
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import FramesError
@@ -226,9 +226,9 @@ def test_jitter(monkeypatch):
     refuses(JitterError, "do not match", Observations.of, given.value[:9], *parts[1:])
     refuses(JitterError, "their groups are mixed", Observations.of, given.value, given.group[::-1], *parts[2:])
     refuses(JitterError, "do not match mixtures", Observations.of, *parts, mix=np.ones((9, 2, 1)))
-    refuses(JitterError, "moments that lie apart", splined, given, 0.0, 1.0)
+    refuses(JitterError, "moments that lie apart", fit_spline, given, 0.0, 1.0)
     once = of_disparities(0.0 * time, 0.0 * time, 0.0 * time, 0.1, 0 * time, degree=0)
-    refuses(JitterError, "all observations are of one moment", periodogram, once, 0.5, 6.0)
+    refuses(JitterError, "all observations have the same time", periodogram, once, 0.5, 6.0)
     refuses(JitterError, "moves nothing", jitter._fitted, given, np.array([2.0]), np.zeros(1))
     periodogram(given, 0.5, 2.0)
     monkeypatch.setattr(jitter, "BLIND", 2.0)
@@ -280,8 +280,8 @@ def test_photon_transfer():
     rng, noise = np.random.default_rng(2), NoiseModel(0.5, 6.0, 0.0, 64.0, 0.0, 0.0, 4095.0)
     dark, flat = (np.rint(level + 4.0 * rng.standard_normal((4, 32, 32))) for level in (64.0, 900.0))
     for first, second, said in (
-        (dark[:1], flat, "1 dark frame: its noise cannot be told"),
-        (dark, np.where(flat > 905.0, np.nan, flat), "flat frames hold values that are not finite"),
+        (dark[:1], flat, "1 dark frame: its noise cannot be measured"),
+        (dark, np.where(flat > 905.0, np.nan, flat), "flat frames contain values that are not finite"),
         (dark, flat[:, :30], "different sizes"),
         (dark, dark + 1.0, "DN brighter than the dark ones"),
     ):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.orbit.jitter import Course, Found, JitterError, search, splined
+from analysis.orbit.jitter import Course, JitterSearch, JitterError, search, fit_spline
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.jitter_search import AXES, OrbitJitterSpec
@@ -65,7 +65,7 @@ class PassJitter:
 
     setup: AnyJitter
     sights: Sights
-    found: Found
+    found: JitterSearch
     course: Course | None
     measurements: PassMeasurements
     truth: Jitter | None = None
@@ -213,7 +213,7 @@ def run_jitter(setup: AnyJitter, backend: Backend | None, seed: int, advance: Ad
             lines = search(given, sought.lowest, sought.highest, sought.false_alarm, fastest)
             spline = spec.search.spline
             kept = given.taken(lines.used)
-            course = None if spline is None else splined(kept, spline.interval, spline.sigma)
+            course = None if spline is None else fit_spline(kept, spline.interval, spline.sigma)
         except (JitterError, SightsError, ValueError) as error:
             key = "points" if isinstance(setup, JitterSetup) else "data"
             raise BenchError(f"{one.name}: {error}", (key,), _REMEDY) from error
