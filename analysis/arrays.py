@@ -1,6 +1,9 @@
-"""Arrays of float64, and dataclasses of them that show themselves in a few words.
+"""Array types, unit factors, measurement errors and short representations of result objects.
 
-`shows` gives a class a ``__repr__`` of chosen fields with units, arrays by shape and range:
+Measured data and results are in SI units and radians inside the program. An angle in arc seconds is ``angle / ARCSEC``
+and a length in micrometres is ``length * UM_PER_M``; these two forms round only once.
+
+The decorator `shows` gives a class a ``__repr__`` of chosen fields with units, arrays by shape and range:
 
 >>> @shows("rms [um]", "rays [um]")
 ... @dataclass
@@ -10,14 +13,7 @@
 >>> Spot(2e-6, np.zeros((217, 2)))
 <Spot: rms 2 um; rays 217 x 2, all 0 um>
 
-`OfStates` are results of several states, measurements or spots, whose first axis counts the states.
-
-Units of measured data and results; inside, everything is in radians and metres.
-
-An angle in seconds of arc is ``angle / ARCSEC``, a length in micrometres ``length * UM_PER_M``: the factors are those
-of which one rounding is left.
-
-What measurements do not tell, as against faults of the program.
+`StateArrays` is the base of results of several states, measurements or spots, whose first axis counts the states.
 """
 
 from __future__ import annotations
@@ -43,15 +39,15 @@ UM_PER_M, MM_PER_M = 1e6, 1e3
 
 
 class MeasurementError(Exception):
-    """What was measured does not say what is asked: no spot, too few readings, a fit that finds no end.
+    """Error raised when measurements cannot give the quantity asked for: no spot, too few readings, no convergence.
 
-    The base of all errors that say so. Who evaluates many measurements counts such a one as failed; any other error is
-    a fault of the program.
+    Base class of all such errors. A caller that evaluates many measurements counts one that raises it as failed; any
+    other exception is a fault of the program.
     """
 
 
 class UndeterminedError(MeasurementError, ValueError):
-    """Measurements that do not settle a number; the message says which and why."""
+    """Error raised when measurements do not determine a quantity; the message says which one and why."""
 
 
 Array = NDArray[np.float64]
@@ -59,7 +55,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 """Array of indices."""
 Mask = NDArray[np.bool_]
-"""Array of truths."""
+"""Boolean array."""
 PER_SI: Mapping[str, float] = {
     "mm": MM_PER_M,
     "um": UM_PER_M,
@@ -69,10 +65,10 @@ PER_SI: Mapping[str, float] = {
     "cycles/mm": 1.0 / MM_PER_M,
     "percent": 100.0,
 }
-"""How many of a unit make one SI unit; any other unit is written as it stands, to the number as it is."""
+"""Number of each unit in one SI unit. A unit that is not listed is printed after the unscaled number."""
 
 LONGEST, MOST, FEW = 70, 400, 4
-"""Characters of a value and of the whole text; numbers of an array that are written out."""
+"""Greatest number of characters of one value and of the whole text; most elements of an array printed one by one."""
 
 _FIELD = re.compile(r"(?P<path>[\w.]+)(?: \[(?P<unit>[^\]]+)\])?")
 _SI_ENDING = re.compile(r"_(rad|m|s)$")
@@ -80,20 +76,20 @@ Kind = TypeVar("Kind", bound=type)
 
 
 def shows(*chosen: str) -> Callable[[Kind], Kind]:
-    """Give a class a short ``__repr__``, which those that inherit from it have, too.
+    """Return a decorator that gives a class a short ``__repr__`` of chosen fields; subclasses inherit it.
 
     Parameters
     ----------
     chosen : str
-        ``name``, or ``name [unit]`` for a value that is kept in SI units; a name may be a property, or lead to one
-        (``report.verdict``). All fields of a dataclass that its own repr would tell, where none is named.
+        Fields, each written ``name``, or ``name [unit]`` for a value held in SI units. A name may be a property, or a
+        dotted path to one (``report.verdict``). Without any, all fields that the dataclass's default repr would print.
     """
     parsed = [match for text in chosen if (match := _FIELD.fullmatch(text)) is not None]
     if len(parsed) != len(chosen):
         raise ValueError(f"fields are written 'name' or 'name [unit]', found {chosen}")
 
     def shown(self: Any) -> str:
-        named = [(one["path"], one["unit"] or "") for one in parsed] or _own(self)
+        named = [(one["path"], one["unit"] or "") for one in parsed] or _default_fields(self)
         parts = []
         for path, unit in named:
             if text := summary(_value(self, path), unit):
@@ -109,14 +105,14 @@ def shows(*chosen: str) -> Callable[[Kind], Kind]:
 
 
 def summary(value: Any, unit: str = "") -> str:
-    """One value in a few words; empty for nothing.
+    """Return a value as a short text with its unit; an empty text for None and for empty containers.
 
     Parameters
     ----------
     value : Any
-        SI where a unit is given.
+        The value, in SI units if `unit` is a unit of `PER_SI`.
     unit : str
-        In which it is told.
+        Unit in which the value is printed.
     """
     if value is None or (isinstance(value, tuple | list | Mapping | str) and not value):
         return ""
@@ -142,19 +138,19 @@ def summary(value: Any, unit: str = "") -> str:
     if isinstance(value, np.ndarray | tuple | list):
         return _array(np.asarray(value), unit)
     text = repr(value)
-    # what would be written out at length, and what says no more than where it is kept, is told by its kind
+    # a long repr, or the default one with a memory address, is replaced by the name of the class
     return text if len(text) <= LONGEST and " object at 0x" not in text else type(value).__name__
 
 
-def _own(value: Any) -> list[tuple[str, str]]:
-    """Fields of a dataclass that its own repr would tell; units are those of their names."""
+def _default_fields(value: Any) -> list[tuple[str, str]]:
+    """Return the fields that a dataclass's default repr would print, each without a unit."""
     if not is_dataclass(value):
         return []
     return [(one.name, "") for one in fields(value) if one.repr and not one.name.startswith("_")]
 
 
 def _label(path: str, unit: str) -> str:
-    """A field's name for readers, without the SI unit that it ends in where another one is told."""
+    """Return a field's name with blanks for underscores, without its SI suffix if another unit is printed."""
     name = path.rpartition(".")[2]
     return (_SI_ENDING.sub("", name) if unit else name).replace("_", " ")
 
@@ -192,7 +188,7 @@ def _array(values: np.ndarray, unit: str) -> str:
 
 
 def _range(values: np.ndarray, unit: str) -> str:
-    """From the least to the largest of the finite numbers, as a further part; empty where there are none."""
+    """Return ", low to high unit" of the finite elements of an array, or an empty text if there are none."""
     if values.dtype.kind == "b":
         return f", {np.count_nonzero(values)} true"
     if values.dtype.kind not in "iuf" or not values.size:
@@ -204,35 +200,35 @@ def _range(values: np.ndarray, unit: str) -> str:
     return _with(f", all {low}" if low == high else f", {low} to {high}", unit)
 
 
-class OfStates:
-    """Base of a dataclass whose fields are arrays of S states along the first axis.
+class StateArrays:
+    """Base class of dataclasses whose fields are arrays of S states along the first axis.
 
     A field may also be None, a mapping of arrays, or another result of the same states.
     """
 
     def at(self, states: slice) -> Self:
-        """The result of some of the states.
+        """Return the result of a slice of the states.
 
         Parameters
         ----------
         states : slice
-            Which, along the first axis.
+            Range along the first axis.
         """
         return type(self)(**{name: _at(getattr(self, name), states) for name in _names(self)})
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """The result of several series of states, one after the other.
+        """Return the results of several series of states joined along the first axis.
 
         Parameters
         ----------
-        parts : Sequence[Self]
-            At least one; a field is None in all of them or in none.
+        parts : sequence of the class
+            At least one result; a field is None in all of them or in none.
         """
         return cls(**{name: _joined([getattr(one, name) for one in parts]) for name in _names(cls)})
 
 
-def _names(result: OfStates | type[OfStates]) -> list[str]:
+def _names(result: StateArrays | type[StateArrays]) -> list[str]:
     return [one.name for one in fields(cast(Any, result))]
 
 

@@ -1,11 +1,10 @@
-"""Distributions and scales that measurements are judged by: chi-square, shares, robust scales, and Rice's distribution;
-the inverse of least squares.
+"""Statistical functions: chi-square, binomial intervals, robust scales, Rice's distribution, weighted least squares.
 
-The functions of chi-square are what ``scipy.stats.chi2`` calls, to the bit, without that package's import, which is a
-tenth of a short command.
+The chi-square functions are those that ``scipy.stats.chi2`` calls, with results equal to the last bit, without the
+import of that package, which takes a tenth of the time of a short command.
 
-A modulation is the modulus of a Fourier coefficient. Noise makes the modulus longer on average: where the signal is
-gone, sigma sqrt(pi/2) is left (Rice, Bell Syst. Tech. J. 24, 46 (1945)).
+A modulation is the modulus of a Fourier coefficient. Noise makes the modulus longer on average: where the signal
+vanishes, sigma sqrt(pi/2) remains (Rice, Bell Syst. Tech. J. 24, 46 (1945)).
 """
 
 from __future__ import annotations
@@ -19,72 +18,72 @@ from scipy.special import chdtrc, chdtri, gammaln, i0e, i1e, xlogy
 from analysis.arrays import Array
 
 _NORMAL_SIZE = 1.4826
-"""Standard deviation of a normal distribution over the median of the sizes."""
+"""Standard deviation of a normal distribution divided by the median of the absolute deviations."""
 
 
 def chance_beyond(chi_square: Any, degrees: Any) -> Any:
-    """Probability of a larger chi-square.
+    """Return the probability that chi-square exceeds a value (upper tail).
 
     Parameters
     ----------
-    chi_square : Any
-        At least 0, a number or an array of any shape.
-    degrees : Any
-        Of freedom, likewise.
+    chi_square : float or ndarray
+        Chi-square, at least 0, of any shape.
+    degrees : float or ndarray
+        Degrees of freedom, of the same shape or a number.
     """
     return chdtrc(degrees, chi_square)
 
 
 def limit_of(chance: Any, degrees: Any) -> Any:
-    """Chi-square that is exceeded with a probability.
+    """Return the chi-square that is exceeded with a given probability.
 
     Parameters
     ----------
-    chance : Any
-        Above 0 and at most 1, a number or an array of any shape.
-    degrees : Any
-        Of freedom, likewise.
+    chance : float or ndarray
+        Probability, above 0 and at most 1, of any shape.
+    degrees : float or ndarray
+        Degrees of freedom, of the same shape or a number.
     """
     return chdtri(degrees, chance)
 
 
 def density(chi_square: Any, degrees: Any) -> Any:
-    """Probability density.
+    """Return the probability density of the chi-square distribution.
 
     Parameters
     ----------
-    chi_square : Any
-        At least 0, a number or an array of any shape.
-    degrees : Any
-        Of freedom, likewise.
+    chi_square : float or ndarray
+        Chi-square, at least 0, of any shape.
+    degrees : float or ndarray
+        Degrees of freedom, of the same shape or a number.
     """
     half = 0.5 * np.asarray(degrees, dtype=np.float64)
     return np.exp(xlogy(half - 1.0, chi_square) - 0.5 * np.asarray(chi_square) - gammaln(half) - np.log(2.0) * half)
 
 
 def p_value(chi_square: float, degrees: int) -> float:
-    """Return the probability of such a chi-square or a larger one; 1 without degrees of freedom."""
+    """Return the p-value of a chi-square, the probability of a larger one; 1 without degrees of freedom."""
     return float(chdtrc(degrees, chi_square)) if degrees > 0 else 1.0
 
 
 def gain(columns: np.ndarray, root: np.ndarray | None = None, cutoff: float = 1e-15) -> np.ndarray:
-    """Return the least-squares inverse: G of the estimates G y of observations y, with covariance G C G'.
+    """Return the least-squares inverse: the matrix G of the estimates G y of observations y, with covariance G C G'.
 
-    The columns are scaled to length one, as their units may differ by many orders of magnitude.
+    The columns are scaled to unit length, as their units may differ by many orders of magnitude.
 
     Parameters
     ----------
-    columns : np.ndarray
-        Derivatives of the observations by the unknowns, (..., N, P).
-    root : np.ndarray | None
-        Cholesky factor of the observations' covariance, (..., N, N); None where all are alike.
+    columns : (..., N, P) ndarray
+        Derivatives of the observations with respect to the unknowns.
+    root : (..., N, N) ndarray or None
+        Cholesky factor of the observations' covariance; None for equal weights.
     cutoff : float
-        Share of the largest singular value below which a combination of unknowns is none.
+        Singular values below this fraction of the largest one count as zero.
 
     Returns
     -------
-    np.ndarray
-        (..., P, N).
+    (..., P, N) ndarray
+        The inverse.
     """
     white: np.ndarray = columns
     if root is not None:
@@ -95,20 +94,22 @@ def gain(columns: np.ndarray, root: np.ndarray | None = None, cutoff: float = 1e
 
 
 def share_interval(met: int, count: int, confidence: float) -> tuple[float, float]:
-    """Return the interval of Clopper and Pearson (Biometrika 26, 404 (1934)) of a share; 0 to 1 of none.
+    """Return the Clopper-Pearson confidence interval of a proportion; (0, 1) without trials.
+
+    Reference: Clopper and Pearson, Biometrika 26, 404 (1934).
 
     Parameters
     ----------
     met : int
-        How many of the trials succeeded.
+        Number of successes.
     count : int
-        trials.
+        Number of trials.
     confidence : float
-        With which the interval holds the share, at least.
+        Least probability with which the interval contains the proportion.
     """
     if count == 0:
         return 0.0, 1.0
-    # not at the top: this import takes longer than short commands
+    # imported here, as the import takes longer than a short command
     from scipy.stats import binomtest
 
     interval = binomtest(met, count).proportion_ci(confidence, "exact")
@@ -116,33 +117,39 @@ def share_interval(met: int, count: int, confidence: float) -> tuple[float, floa
 
 
 def robust_sigma(residuals: ArrayLike) -> float:
-    """Return the standard deviation of normal residuals by the median of their sizes, of which half may be wrong.
+    """Return the standard deviation of normal residuals from their median size; up to half may be outliers.
 
     Parameters
     ----------
-    residuals : ArrayLike
-        About their middle, of any shape.
+    residuals : array_like
+        Residuals about their median, of any shape.
     """
     return _NORMAL_SIZE * float(np.median(np.abs(np.asarray(residuals))))
 
 
 def robust_variance(squares: ArrayLike) -> float:
-    """Return the variance of normal residuals in a plane, in each direction, by the median: half of them may be wrong.
+    """Return the variance per axis of residuals in a plane from their median squared length, robust to outliers.
 
     Parameters
     ----------
-    squares : ArrayLike
-        Of their lengths, (n,).
+    squares : (n,) array_like
+        Squared lengths of the residuals.
     """
     # median of chi-square with two degrees of freedom is 2 ln 2
     return float(np.median(np.asarray(squares)) / (2.0 * np.log(2.0)))
 
 
 def rice_bias(modulus: ArrayLike, sigma: ArrayLike) -> Array:
-    """Mean of |m + noise| minus |m|, >= 0.
+    """Return the bias of a modulus by noise: the mean of |m + noise| minus |m|, >= 0.
 
-    modulus: |m|, true value. sigma: rms of the noise in the direction across m, same unit; the noise along m moves the
-    mean only to higher order. About sigma^2 / (2 m) where m is large.
+    The noise along m moves the mean only to higher order. For a large modulus the bias is about sigma^2 / (2 m).
+
+    Parameters
+    ----------
+    modulus : array_like
+        True modulus |m|.
+    sigma : array_like
+        Rms of the noise in the direction perpendicular to m, in the unit of `modulus`.
     """
     m, s = np.broadcast_arrays(np.asarray(modulus, dtype=np.float64), np.asarray(sigma, dtype=np.float64))
     quiet = s <= 1e-9 * m
@@ -159,23 +166,25 @@ def rice_bias(modulus: ArrayLike, sigma: ArrayLike) -> Array:
 
 
 def measured_bias(modulus: ArrayLike, sigma_across: ArrayLike) -> Array:
-    """What to expect of `rice_bias` from a measured |m + noise| alone: its mean is the bias at the true |m|, nearly.
+    """Return an estimate of `rice_bias` from the measured |m + noise| alone.
 
-    |m + noise|^2 is (m + along)^2 + across^2. Less the mean of across^2 its root has the mean |m| but for terms of
-    sigma^4 / m^3, so that r - sqrt(r^2 - sigma_across^2) is the bias. `rice_bias` of `signal_modulus` is not: that
-    guess scatters, and the mean of a convex function is more than the function of the mean, 0.2 sigma to 0.3 sigma
-    more from 0.7 sigma to 2 sigma. Where r is below sigma there is no root, and the bias is that without a signal.
+    The mean of the estimate is nearly the bias at the true |m|. |m + noise|^2 is (m + along)^2 + across^2. The root of
+    this minus the mean of across^2 has the mean |m| but for terms of sigma^4 / m^3, so that r - sqrt(r^2 -
+    sigma_across^2) estimates the bias. `rice_bias` at `signal_modulus` does not: that estimate scatters, and the mean
+    of a convex function exceeds the function of the mean, by 0.2 sigma to 0.3 sigma between 0.7 sigma and 2 sigma.
+    Where r is below sigma there is no real root, and the bias is that without a signal.
 
-    The mean of any function of r is an analytic function of m^2, which |m| at 0 is not: no estimate is right at all
-    |m|. The mean of this one is right to 0.03 sigma from |m| = 3 sigma on, to 0.09 sigma from 0.6 sigma on, and too
-    small below, by half a sigma where there is no signal. It falls from sigma sqrt(pi/2) at r = 0 on.
+    The mean of any function of r is an analytic function of m^2, which |m| at 0 is not: no estimator is unbiased
+    everywhere. The mean of this one is right to 0.03 sigma for |m| of 3 sigma and more, to 0.09 sigma for 0.6 sigma and
+    more, and too small below, by half a sigma where there is no signal. The estimate decreases with r from sigma
+    sqrt(pi/2) at r = 0.
 
     Parameters
     ----------
-    modulus : ArrayLike
-        |m + noise|, any shape.
-    sigma_across : ArrayLike
-        Rms of the noise across m, of that shape, same unit.
+    modulus : array_like
+        Measured modulus |m + noise|, of any shape.
+    sigma_across : array_like
+        Rms of the noise perpendicular to m, of that shape, in the same unit.
     """
     r, s = np.broadcast_arrays(np.asarray(modulus, dtype=np.float64), np.asarray(sigma_across, dtype=np.float64))
     root = np.sqrt(np.maximum(r - s, 0.0) * (r + s))
@@ -185,18 +194,18 @@ def measured_bias(modulus: ArrayLike, sigma_across: ArrayLike) -> Array:
 
 
 def rice_sigma(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLike) -> Array:
-    """Standard deviation of |m + noise|.
+    """Return the standard deviation of |m + noise|.
 
     Exact for equal noise along and across m, and in the limit of a large m, where only the noise along it counts.
 
     Parameters
     ----------
-    modulus : ArrayLike
-        |m|, any shape.
-    sigma_along : ArrayLike
-        Of the noise along m, of that shape.
-    sigma_across : ArrayLike
-        Across m, likewise.
+    modulus : array_like
+        True modulus |m|, of any shape.
+    sigma_along : array_like
+        Rms of the noise along m, of that shape.
+    sigma_across : array_like
+        Rms of the noise perpendicular to m, of that shape.
     """
     m, along, across = np.broadcast_arrays(
         np.asarray(modulus, dtype=np.float64), np.asarray(sigma_along), np.asarray(sigma_across)
@@ -208,16 +217,19 @@ def rice_sigma(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLi
 
 
 def signal_modulus(modulus: ArrayLike, sigma_along: ArrayLike, sigma_across: ArrayLike) -> Array:
-    """Best guess of |m| from a measured |m + noise|: its square less the mean square of the noise, not below 0.
+    """Return an estimate of the true modulus |m| from a measured |m + noise|.
+
+    The estimate is the root of the square of the measurement minus the mean square of the noise, or 0 if that is
+    negative.
 
     Parameters
     ----------
-    modulus : ArrayLike
-        |m + noise|, any shape.
-    sigma_along : ArrayLike
-        Of the noise along m, of that shape.
-    sigma_across : ArrayLike
-        Across m, likewise.
+    modulus : array_like
+        Measured modulus |m + noise|, of any shape.
+    sigma_along : array_like
+        Rms of the noise along m, of that shape.
+    sigma_across : array_like
+        Rms of the noise perpendicular to m, of that shape.
     """
     square = np.square(modulus) - np.square(sigma_along) - np.square(sigma_across)
     return np.sqrt(np.maximum(square, 0.0))

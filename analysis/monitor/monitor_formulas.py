@@ -49,7 +49,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from analysis.arrays import ARCSEC, UM_PER_M, Array, OfStates, UndeterminedError, shows
+from analysis.arrays import ARCSEC, UM_PER_M, Array, StateArrays, UndeterminedError, shows
 
 FORMULAS = ("paper_single", "paper_joint", "derived")
 PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
@@ -98,7 +98,7 @@ class MonitorGeometry:
 
 @shows("d_alpha_rad [arcsec]", "d_beta_rad [arcsec]", "d_gamma_rad [arcsec]", "d_f_m [um]")
 @dataclass(frozen=True, eq=False)
-class CameraParameters(OfStates):
+class CameraParameters(StateArrays):
     """Changes of one camera, scalars or arrays of one shape (...).
 
     d_alpha_rad, d_beta_rad, d_gamma_rad: rotations of the camera about Y, X, Z. d_f_m: change of the principal
@@ -288,7 +288,7 @@ def linear(matrix: Array, before: ArrayLike, after: ArrayLike, covariance: Array
 
 @shows()
 @dataclass(frozen=True, eq=False)
-class IntersectionAngleChange(OfStates):
+class IntersectionAngleChange(StateArrays):
     """change_rad: (...) new angle minus nominal angle, rad; sigma_rad: (...) standard deviation of its error;
     sigma_noise_rad: of that what the noise of the images does, None where that is all.
     """
@@ -391,7 +391,7 @@ _PLACES = 9
 
 @shows()
 @dataclass(frozen=True, eq=False)
-class GroundError(OfStates):
+class GroundError(StateArrays):
     """Errors of points on the ground for S states.
 
     Attributes

@@ -42,7 +42,7 @@ from analysis.monitor.monitor_formulas import (
 from analysis.monitor.parameters import CameraCalibration, MonitorCalibration
 from analysis.spots import CENTROIDS
 from analysis.spots.centroid import mean_frames
-from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, require_rest, widened
+from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, require_convergence, widened
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
 
 ALIKE = 2.0
@@ -511,7 +511,7 @@ def measure_spots(
     """
     if centroid not in CENTROIDS:
         raise ValueError(f"recovery: no centroid {centroid!r}; there are {', '.join(CENTROIDS)}")
-    return require_rest(CENTROIDS[centroid].measure(mean, frames, calibration.noise, calibration.template, threads))
+    return require_convergence(CENTROIDS[centroid].measure(mean, frames, calibration.noise, calibration.template, threads))
 
 
 def judged_spots(

@@ -1,6 +1,7 @@
-"""Centres of spots with their covariance, and the methods that find them.
+"""Spot positions with their covariance, and the table of centroid methods.
 
-The methods are listed here and import what computes when they are called: files that name one are checked before.
+The table's methods import their code when they are called, so that input files that name a method can be checked
+quickly.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Centroid:
-    """A method that finds the centres of spots.
+    """A centroid method.
 
     Attributes
     ----------
     title : str
-        For readers.
-    measure : Callable[[Array, int, NoiseModel, SpotTemplate, int], SpotPositions]
-        Mean frames of B spots, (B, H, W), grey values; number of frames of each mean; the detector's noise; the
-        calibrated shapes; number of threads -> their centres.
+        Name shown to readers.
+    measure : callable
+        Function of the mean frames of B spots ((B, H, W), DN), the number of frames averaged into each, the detector's
+        noise model, the calibrated spot shapes and the number of threads, that returns the spots' positions.
     """
 
     title: str
@@ -59,4 +60,4 @@ _CENTROIDS = {
     "energy": Centroid("windowed energy centroid, as in the paper", _energy),
 }
 CENTROIDS = ExtensionTable("centroids", _CENTROIDS, Centroid)
-"""Name that a file may write under ``analysis: {centroid: ...}`` -> method. A new one is added here."""
+"""Centroid methods by the name that a file writes under ``analysis: {centroid: ...}``. New methods are added here."""

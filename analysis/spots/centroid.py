@@ -1,5 +1,4 @@
-"""Spot centres from mean frames: windowed energy centroid, Gaussian fit, maximum-likelihood fit of the calibrated
-shape.
+"""Spot centroids from mean frames: energy centroid, Gaussian fit and fit of the calibrated shape.
 
 All functions take `mean`, (B, H, W) mean grey values of `frames` frames each (see `mean_frames`), and the detector's
 NoiseModel, and return SpotPositions with the covariance split into temporal and fixed-pattern parts. They work on all
@@ -8,8 +7,8 @@ printed: the first moment over the energy). Weights always come from the model a
 would bias the flux (Humphrey, Liu, Buote, Astrophys. J. 693, 822 (2009)). Pixel coordinates: (row, column), the centre
 of the first pixel is (0, 0).
 
-Raised by all three: SpotError, naming the spots, when a spot is saturated, is not there, or is too near the image's
-edge; ValueError for input of the wrong shape.
+All three raise SpotError, naming the spots, when a spot is saturated, absent or too near the image's edge, and
+ValueError for input of the wrong shape.
 """
 
 from __future__ import annotations
@@ -24,12 +23,15 @@ from analysis.spots import spot_image
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotPositions
 
-# How far the Gaussian's centre may wander from the first guess, px.
+# Greatest distance of the fitted centre from the first guess, px.
 _GAUSS_MOVE_PX = 4
 
 
 def mean_frames(frames: NDArray[np.integer[Any]]) -> Array:
-    """Mean over the frame axis: (..., N, H, W) grey values to (..., H, W), float64. The sum is exact (integer)."""
+    """Return the mean over the frame axis as float64: (..., N, H, W) grey values to (..., H, W).
+
+    The sum is exact, in integers.
+    """
     if frames.ndim < 3 or frames.shape[-3] < 1 or not np.issubdtype(frames.dtype, np.integer):
         raise ValueError(f"mean frames: need integers (..., frames, H, W), found {frames.dtype} {frames.shape}")
     small = np.iinfo(frames.dtype).max <= 0xFFFF and frames.shape[-3] <= 0x10000
@@ -45,24 +47,23 @@ def energy_centroid(
     border_px: int = 4,
     keep_maps: bool = True,
 ) -> SpotPositions:
-    """First moment over the energy inside a window that is re-centred on the result until it rests (paper 001, Fig.
-    4).
+    """Return the first moment over the energy in a circular window that is re-centred until convergence.
 
-    The window must stay inside the image.
+    The method is that of paper 001, Fig. 4. The window must stay inside the image.
 
     Parameters
     ----------
-    mean : ArrayLike
-        Mean frames, (B, H, W), DN.
+    mean : (B, H, W) array_like
+        Mean frames, DN.
     frames : int
-        Of each mean.
+        Number of frames averaged into each image.
     noise : NoiseModel
-        Of the detector.
-    radius_px : float | None
-        Of the circular window; default a quarter of the image's smaller side. Its edge is one pixel soft, so that the
-        result is a smooth function of the image.
+        Noise of the detector.
+    radius_px : float or None
+        Radius of the window in pixels; default a quarter of the image's smaller side. The window's edge is one pixel
+        soft, so that the result is a smooth function of the image.
     border_px : int
-        Width of the frame at the image's edge whose mean is the background.
+        Width in pixels of the border of the image whose mean is the background.
     keep_maps : bool
         Keep the influence of every pixel, for covariances of differences.
     """
@@ -83,7 +84,7 @@ def energy_centroid(
 def _energy(
     image: Array, frames: int, noise: NoiseModel, radius: float, border_px: int, keep_maps: bool
 ) -> SpotPositions:
-    """The energy centroid of a few spots together."""
+    """Return the energy centroids of one piece of a batch."""
     count, height, width = image.shape
     row, column, _, _, _ = spot_image.coarse(image, frames, noise)
     border = np.ones((height, width), dtype=bool)
@@ -110,7 +111,7 @@ def _energy(
     mask, slope = spot_image.soft_window(place, height, width, radius)
     arm = spot_image.arms(place, height, width)
     flux = (mask * signal).sum(axis=(1, 2))[:, None, None]
-    # The window follows the centre: c = C(image, c), so dc = (1 - dC/dc)^-1 dC/d(image).
+    # The window moves with the centre: c = C(image, c), so dc = (1 - dC/dc)^-1 dC/d(image).
     follow = np.einsum("bihw,bjhw->bij", arm * signal[:, None], slope) / flux
     direct = mask[:, None] * arm
     direct -= border * (direct.sum(axis=(2, 3), keepdims=True) / border.sum())
@@ -125,25 +126,25 @@ def _energy(
 def gaussian_fit(
     mean: ArrayLike, frames: int, noise: NoiseModel, radius_px: float | None = None, elliptical: bool = False
 ) -> SpotPositions:
-    """Weighted least squares of background + amplitude exp(-q/2) in a soft circular window that follows the centre.
+    """Fit background + amplitude exp(-q/2) by weighted least squares in a soft circular window that follows the centre.
 
-    q = a (dr^2 + dc^2), or a dr^2 + 2 b dr dc + c dc^2 when elliptical. A diffraction spot is not a Gaussian, so the
-    covariance is the sandwich of the estimating equation with its full derivative (White, Econometrica 50, 1 (1982)),
-    not the inverse of the normal matrix. radius_px: default an eighth of the image's smaller side; about the first
-    dark ring is best.
+    The exponent q is a (dr^2 + dc^2), or a dr^2 + 2 b dr dc + c dc^2 when elliptical. A diffraction spot is not a
+    Gaussian, so the covariance is the sandwich of the estimating equation with its full derivative (White, Econometrica
+    50, 1 (1982)), not the inverse of the normal matrix.
 
     Parameters
     ----------
-    mean : ArrayLike
-        Mean frames, (B, H, W), DN.
+    mean : (B, H, W) array_like
+        Mean frames, DN.
     frames : int
-        Of each mean.
+        Number of frames averaged into each image.
     noise : NoiseModel
-        Of the detector.
-    radius_px : float | None
-        Of the window; default an eighth of the image's smaller side; about the first dark ring is best.
+        Noise of the detector.
+    radius_px : float or None
+        Radius of the window in pixels; default an eighth of the image's smaller side. About the radius of the first
+        dark ring is best.
     elliptical : bool
-        Fit a, b and c.
+        Fit a, b and c instead of a alone.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
@@ -162,7 +163,7 @@ def _wandered(theta: Array, row: Array, column: Array) -> NDArray[np.bool_]:
 
 
 def _gauss(image: Array, frames: int, noise: NoiseModel, radius: float, elliptical: bool) -> SpotPositions:
-    """The Gaussian fit of a few spots together, on the part of each image that the window can reach."""
+    """Fit the Gaussians of one piece of a batch, each on the part of its image that the window can cover."""
     count, full_height, full_width = image.shape
     row, column, background, peak, area = spot_image.coarse(image, frames, noise)
     spot_image.check_edge(np.stack([row, column], axis=1), full_height, full_width, radius)

@@ -1,14 +1,12 @@
-"""Frames of one spot in one state, compared with each other: what is not the same in all of them.
+"""Screening of the frames of one spot in one state: pixels and frames that disagree with the others are excluded.
 
 The reference is the median of the frames. Each frame is fitted to it by its light, its level and a small movement
-(first and second derivatives of the reference), and what sticks out of that by more than noise does is left out of the
-mean: cosmic rays and other transients pixel by pixel, frames without the light or unlike the others as a whole. What is
-the same in every frame is found by `static_defects`.
+(first and second derivatives of the reference). Residuals larger than the noise are excluded from the mean: cosmic rays
+and other transients pixel by pixel, frames without the light or unlike the others as a whole. Defects that are the same
+in every frame are found by `static_defects`.
 
-The mean of clean frames is that of `centroid.mean_frames`, to the bit. False alarms: a set of clean frames is changed
-once in 1 / FALSE_ALARM.
-
-Movement of a spot from frame to frame, and the terms by which frames are fitted to their median.
+The mean of clean frames equals that of `centroid.mean_frames` to the last bit. False alarms: a set of clean frames is
+changed with a probability of FALSE_ALARM.
 """
 
 from __future__ import annotations
@@ -25,78 +23,82 @@ from scipy import ndimage
 from scipy.stats import chi2, norm
 
 from analysis.arrays import Array, Mask, MeasurementError
-from analysis.spots.noise import SHOWN, WHOLE, NoiseModel
+from analysis.spots.noise import MEASURABLE, ROUNDING_VARIANCE, NoiseModel
 
 FALSE_ALARM = 1e-6
-"""Chance that a test finds something in clean frames of one spot in one state."""
+"""Probability that a test rejects anything in clean frames of one spot in one state."""
 MEDIAN = math.pi / 2.0
-"""Variance of a median over that of a mean, of many normal numbers."""
+"""Variance of the median over that of the mean, for many normally distributed numbers."""
 MOST_MOVES = 4
-"""Steps in which a frame that has moved is followed, and in which the place of its light is found."""
+"""Greatest number of iterations in which a frame's movement is fitted, and in which the centroid of its light is found.
+"""
 _SLOPES, _SMOOTHED = 2.0 / (8.0 * math.pi), 1.0 / (4.0 * math.pi * 1.5**2)
-"""Variance of both slopes of white noise through a normal distribution of 1 px, and of what one of 1.5 px leaves of it,
-over its own."""
+"""Variance of both slopes of white noise smoothed by a Gaussian of 1 px, and variance of white noise smoothed by one of
+1.5 px, each over the variance of the white noise."""
 _FAINT, _UNSURE = 0.01, 0.1
-"""Share of noise in the squares of the slopes of a median from which only pixels about the spot count, and from which a
-movement cannot be told."""
+"""Fraction of noise in the squared slopes of the median above which only pixels about the spot count, and above which a
+movement cannot be detected."""
 _LEAST_MOVED_PX, _FARTHEST_PX, _ABOUT_PX, _ALIGNED = 0.3, 12.0, 10.0, 64
-"""Movement (in the median, and the farthest of a frame) for which frames are aligned before their median is taken, the
-radius of the light that says where each is, and the number of frames of that median."""
+"""Median movement from which, and largest movement up to which, frames are aligned before their median is taken; radius
+of the light whose centroid gives each frame's position; number of frames of that median."""
 
 
-def shown_pixels(middle: Array, noise: NoiseModel, count: int, follows: Mask) -> Mask | None:
-    """Pixels (H, W) by which the light and the movement of frames are fitted: all of a bright spot. The median of faint
-    frames is noise where there is no light, and its slopes are, so that only those about the spot count; None where
-    the slopes there are noise as well.
+def reliable_pixels(middle: Array, noise: NoiseModel, count: int, follows: Mask) -> Mask | None:
+    """Return the pixels by which light and movement of frames are fitted, (H, W); None if noise dominates the slopes.
+
+    For a bright spot these are all pixels. The median of faint frames is noise where there is no light, and so are its
+    slopes, so that only the pixels about the spot are used.
 
     Parameters
     ----------
-    middle : Array
-        (H, W) median of the frames, DN.
+    middle : (H, W) ndarray
+        Median of the frames, DN.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     count : int
         Number of frames.
-    follows : Mask
-        (H, W) pixels that follow the light.
+    follows : (H, W) ndarray of bool
+        Pixels that respond to the light.
     """
-    slopes = sum(ndimage.gaussian_filter(middle, 1.0, one, mode="nearest") ** 2 for one in ((1, 0), (0, 1)))
+    slopes = sum(ndimage.gaussian_filter(middle, 1.0, order, mode="nearest") ** 2 for order in ((1, 0), (0, 1)))
     low = float(np.median(middle))
     variance = MEDIAN / count * float(noise.frame_variance_dn2(low)) + noise.dsnu_variance_dn2
     if variance * _SLOPES * middle.size < _FAINT * float(np.sum(slopes)):
         return np.ones(middle.shape, dtype=bool)
-    # the same light in a tenth of the noise
+    # smoothing keeps the light and leaves a tenth of the noise
     smooth = np.where(follows, ndimage.gaussian_filter(middle, 1.5, mode="nearest") - low, 0.0)
-    own, _ = ndimage.label(smooth > 5.0 * math.sqrt(variance * _SMOOTHED))
-    at = np.unravel_index(int(np.argmax(smooth)), smooth.shape)
-    if own[at] == 0:
+    labels, _ = ndimage.label(smooth > 5.0 * math.sqrt(variance * _SMOOTHED))
+    top = np.unravel_index(int(np.argmax(smooth)), smooth.shape)
+    if labels[top] == 0:
         return None
-    about = np.asarray(ndimage.binary_dilation(own == own[at], np.ones((3, 3)), iterations=2))
-    known = variance * _SLOPES * np.count_nonzero(about) < _UNSURE * float(np.sum(slopes, where=about))
-    return about if known else None
+    near = np.asarray(ndimage.binary_dilation(labels == labels[top], np.ones((3, 3)), iterations=2))
+    reliable = variance * _SLOPES * np.count_nonzero(near) < _UNSURE * float(np.sum(slopes, where=near))
+    return near if reliable else None
 
 
-def aligned(
+def aligned_median(
     each: Callable[[], Iterator[tuple[Array, Mask]]], count: int, middle: Array, follows: Mask
 ) -> tuple[Array, Array]:
-    """The median of frames that are moved to one place, and by how much (N, 2) each is off that; the plain median and
-    zeros where they hardly move. Places are first moments of the light about the brightest pixel of the median.
+    """Return the median of the frames shifted to a common position, and each frame's displacement from it, (N, 2) px.
+
+    Where the frames hardly move, these are the plain median and zeros. Positions are first moments of the light about
+    the brightest pixel of the median.
 
     Parameters
     ----------
-    each : Callable[[], Iterator[tuple[Array, Mask]]]
-        Gives the frames (H, W), DN, one after the other, and where they have a value.
+    each : callable
+        Function that yields the frames, (H, W) DN, one after the other, each with the mask of its defined pixels.
     count : int
         Number of frames.
-    middle : Array
-        (H, W) their median, DN.
-    follows : Mask
-        (H, W) pixels that follow the light.
+    middle : (H, W) ndarray
+        Median of the frames, DN.
+    follows : (H, W) ndarray of bool
+        Pixels that respond to the light.
     """
     low = float(np.median(middle))
     bright = ndimage.gaussian_filter(np.where(follows, middle - low, 0.0), 2.0)
     row, column = np.indices(middle.shape)
-    places = np.empty((count, 2))
+    positions = np.empty((count, 2))
     for k, (frame, finite) in enumerate(each()):
         at = np.array(np.unravel_index(int(np.argmax(bright)), middle.shape), np.float64)
         light = np.where(finite & follows, frame - low, 0.0)
@@ -105,48 +107,50 @@ def aligned(
             weight = np.maximum(light * inside, 0.0)
             total = float(weight.sum())
             at = np.array([(weight * row).sum(), (weight * column).sum()]) / total if total > 0.0 else at
-        places[k] = at
-    places -= np.median(places, axis=0)
-    # in the median, lest a cosmic ray in the light of a frame is taken for movement
-    away = np.hypot(places[:, 0], places[:, 1])
+        positions[k] = at
+    positions -= np.median(positions, axis=0)
+    # the median, so that a cosmic ray in the light of one frame does not count as movement
+    away = np.hypot(positions[:, 0], positions[:, 1])
     if np.median(away) < _LEAST_MOVED_PX or np.max(away) > _FARTHEST_PX:
-        return middle, np.zeros_like(places)
+        return middle, np.zeros_like(positions)
     moved = [
-        ndimage.shift(frame, -place, order=3, mode="nearest")
-        for (frame, _), place in zip(islice(each(), _ALIGNED), places, strict=False)
+        ndimage.shift(frame, -position, order=3, mode="nearest")
+        for (frame, _), position in zip(islice(each(), _ALIGNED), positions, strict=False)
     ]
-    return np.median(moved, axis=0), places
+    return np.median(moved, axis=0), positions
 
 
-def basis_of(reference: Array) -> Array:
-    """(7, H, W): the reference over its median, its first and second derivatives, and 1.
+def frame_basis(reference: Array) -> Array:
+    """Return the terms that frames are fitted by, (7, H, W).
+
+    They are the reference above its median, its first and second derivatives, and 1.
 
     Parameters
     ----------
-    reference : Array
-        (H, W) DN.
+    reference : (H, W) ndarray
+        Reference image, DN.
     """
     order = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-    smooth = [reference, *(ndimage.gaussian_filter(reference, 1.0, one, mode="nearest") for one in order[1:])]
+    smooth = [reference, *(ndimage.gaussian_filter(reference, 1.0, orders, mode="nearest") for orders in order[1:])]
     return np.stack([smooth[0] - np.median(reference), *smooth[1:], np.ones_like(reference)])
 
 
 def robust_fit(basis: Array, frame: Array, weight: Array) -> tuple[Array, Array]:
-    """Least squares that outliers do not pull: solution (K,) and inverse normal matrix (K, K).
+    """Fit the terms to a frame by robust least squares; return the solution (K,) and the inverse normal matrix (K, K).
 
     Parameters
     ----------
-    basis : Array
-        (K, H, W) terms.
-    frame : Array
-        (H, W) that is fitted.
-    weight : Array
-        (H, W) one over its variance.
+    basis : (K, H, W) ndarray
+        Terms of the fit.
+    frame : (H, W) ndarray
+        Frame, DN.
+    weight : (H, W) ndarray
+        Reciprocal of the variance of each pixel.
     """
     flat, y = basis.reshape(len(basis), -1), frame.ravel()
     scale = np.sqrt(np.maximum((flat**2).mean(axis=1), 1e-300))
     design, base = flat / scale[:, None], weight.ravel()
-    # most pixels are background, of which the median is no outlier
+    # start from the reference itself, since most pixels are background
     solution = np.zeros(len(basis))
     solution[0] = scale[0]
     w = base
@@ -159,15 +163,15 @@ def robust_fit(basis: Array, frame: Array, weight: Array) -> tuple[Array, Array]
     return solution / scale, inverse / np.outer(scale, scale)
 
 
-def place_scatter(offset: Array, spread: Array, count: int) -> Array:
-    """Covariance (2, 2) of the places beyond noise, px^2; zeros where noise explains them.
+def position_scatter(offset: Array, spread: Array, count: int) -> Array:
+    """Return the covariance of the spot's positions over the frames beyond noise, (2, 2) px^2; zeros if none.
 
     Parameters
     ----------
-    offset : Array
-        (N, 2) places of the frames, px.
-    spread : Array
-        (N, 2, 2) their covariances by noise, px^2.
+    offset : (N, 2) ndarray
+        Positions of the spot in the frames, px.
+    spread : (N, 2, 2) ndarray
+        Covariances of these by noise, px^2.
     count : int
         Number of frames.
     """
@@ -178,44 +182,44 @@ def place_scatter(offset: Array, spread: Array, count: int) -> Array:
     if chi <= chi2.isf(FALSE_ALARM, 2 * (count - 1)):
         return np.zeros((2, 2))
     value, vector = np.linalg.eigh(away.T @ away / (count - 1) - spread.mean(axis=0))
-    # known from few frames only: what makes the mean of the error's square over it 1 (Hotelling's T^2 in a plane)
+    # the covariance is known from few frames only: this factor makes the mean squared error over it 1 (Hotelling's T^2)
     few = (count - 1) / max(count - 4, 0.5)
     return np.asarray((vector * np.maximum(value, 0.0) * few) @ vector.T)
 
 
 Released = Callable[[NDArray[Any]], None]
 _HELD = 1 << 25
-"""Bytes of frames that are worked on at a time."""
+"""Number of bytes of frames that are processed at a time."""
 GROWTH_SIGMAS = 3.5
-"""Neighbours of a transient belong to it from this on."""
+"""Residual, in sigmas, from which a neighbour of a transient belongs to it."""
 _DIM = 0.5
-"""Share of the light of the brightest frame below which a frame does not hold the spot."""
+"""Fraction of the light of the brightest frame below which a frame does not contain the spot."""
 _UNLIKE = 0.01
-"""Share of its pixels from which a whole frame is unlike the others."""
+"""Fraction of deviating pixels from which a whole frame is rejected."""
 _FEWEST_UNLIKE = 40
 _BORDER_PX = 4
 _SATURATION_SIGMAS = 4.0
 _LEAST_SHARE, _UNKNOWN, _LEAST_DRIFT_DN = 1e-3, 1e12, 0.5
 _ROUNDS = 20
-"""In which the cut-off of differences follows the noise that is found."""
+"""Greatest number of iterations in which the clipping limit of differences is adapted to the noise."""
 _SMALL_PX, _LARGEST_PX = 0.1, 5.0
-"""A frame that has moved by more than the first is compared with the reference there, up to the second."""
+"""Movement, px, above which a frame is compared with the shifted reference, and the largest such movement."""
 _NOISE_OFF, _MOST_SIGMAS = 0.15, 4.0
-"""By which the noise of frames may differ from the stated one, as a share of that; and where single differences are cut
-off, in standard deviations, for cosmic rays."""
+"""Tolerated relative difference between the noise of frames and the specified one; and the clipping limit of single
+differences, in standard deviations, against cosmic rays."""
 _LIT = 0.02
-"""Share of the peak from which a pixel is in the light, where movement and smear look like noise."""
+"""Fraction of the peak from which a pixel is illuminated, so that movement and smear look like noise there."""
 _LEAST_LEVEL_DN = 1.0
-"""By which the level of frames is below the dark level before it counts as subtracted."""
+"""Least difference of the frames' level below the dark level, DN, that counts as a subtracted dark level."""
 
 
 class FramesError(MeasurementError, ValueError):
-    """Frames that cannot be used.
+    """Error raised for frames that cannot be used.
 
     Attributes
     ----------
-    remedy
-        What to do about it.
+    remedy : str
+        Advice on what to do about it.
     """
 
     def __init__(self, problem: str, remedy: str) -> None:
@@ -225,16 +229,16 @@ class FramesError(MeasurementError, ValueError):
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found, and what became of it.
+    """A defect of the frames and its treatment.
 
     Attributes
     ----------
     kind : str
-        What it is, a few words.
+        Kind of defect, in a few words.
     text : str
-        How much and where, and what was done.
+        Extent, position and treatment.
     corrects : bool
-        Whether the measurement was changed for it.
+        True if the measurement was changed because of it.
     """
 
     kind: str
@@ -244,24 +248,24 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class ScreenedFrames:
-    """What is used of the frames of one spot in one state.
+    """Usable part of the frames of one spot in one state.
 
     Attributes
     ----------
-    mean : Array
-        (H, W) DN.
-    counts : Array
-        (H, W) frames that each pixel is the mean of.
-    good : Mask
-        (H, W) pixels that can be used.
+    mean : (H, W) ndarray
+        Mean frame, DN.
+    counts : (H, W) ndarray
+        Number of frames averaged in each pixel.
+    good : (H, W) ndarray of bool
+        Usable pixels.
     frames : int
-        Number of frames that are used.
+        Number of frames used.
     recorded : int
-        Number of frames that there are.
-    jitter : Array
-        (2, 2) px^2, covariance of the spot's place over the frames beyond noise; zeros where none is seen.
-    findings : tuple[Finding, ...]
-        What was found.
+        Number of frames recorded.
+    jitter : (2, 2) ndarray
+        Covariance of the spot's position over the frames beyond noise, px^2; zeros where none is detected.
+    findings : tuple of Finding
+        Defects that were found.
     """
 
     mean: Array
@@ -274,30 +278,30 @@ class ScreenedFrames:
 
     @property
     def clean(self) -> bool:
-        """Whether nothing was changed."""
+        """True if no defect changed the measurement."""
         return not any(finding.corrects for finding in self.findings)
 
 
-def _kept(frames: NDArray[Any]) -> None:
-    """Frames that are in memory anyway."""
+def _in_memory(frames: NDArray[Any]) -> None:
+    """Do nothing, for frames that are held in memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """Frames of one state of which a few at a time are in memory as real numbers.
+    """Frames of one state, of which a few at a time are in memory as floating-point numbers.
 
     Attributes
     ----------
-    frames : NDArray[Any]
-        (N, H, W) grey values as recorded.
-    numbers : NDArray[np.intp]
-        (K,) of the frames that are looked at.
-    bad : Mask
-        (H, W) pixels that are of no use in any frame.
-    released : Released
-        Is told when some frames have been gone over, which may lie in a file.
+    frames : (N, H, W) ndarray
+        Grey values as recorded.
+    numbers : (K,) ndarray of int
+        Indices of the frames that are processed.
+    bad : (H, W) ndarray of bool
+        Pixels that are unusable in all frames.
+    released : callable
+        Function called after some frames, which may lie in a file, have been read.
     blank : bool
-        Whether bad pixels are taken as 0.
+        True to set bad pixels to 0.
     """
 
     frames: NDArray[Any]
@@ -308,7 +312,7 @@ class _Stack:
 
     @classmethod
     def of(cls, frames: NDArray[Any], bad: Mask | None, released: Released, blank: bool = False) -> _Stack:
-        """All frames."""
+        """Return the stack of all frames."""
         known = np.zeros(frames.shape[1:], dtype=bool) if bad is None else bad
         return cls(frames, np.arange(len(frames)), known, released, blank)
 
@@ -317,15 +321,15 @@ class _Stack:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Number of rows and columns."""
         return self.frames.shape[1], self.frames.shape[2]
 
     def taken(self, numbers: NDArray[np.intp]) -> _Stack:
-        """Some of the frames, by their numbers among all."""
+        """Return the stack of some of the frames, by their indices among all."""
         return replace(self, numbers=numbers)
 
     def each(self, backwards: bool = False) -> Iterator[tuple[Array, Mask]]:
-        """Frame after frame: (H, W) its values, 0 where it has none, and where it has one."""
+        """Yield each frame's values (H, W), 0 where undefined, and the mask of its defined pixels."""
         each = self.frames.itemsize * self.frames[0].size
         for k, number in enumerate(self.numbers[::-1] if backwards else self.numbers):
             yield self._read(self.frames[number], self.bad)
@@ -339,117 +343,118 @@ class _Stack:
         return np.where(finite & ~bad if self.blank else finite, values, 0.0), finite
 
     def known(self) -> tuple[Mask, Mask]:
-        """(H, W) pixels that have a value in all frames, and in any."""
-        every, some = np.ones(self.shape, dtype=bool), np.zeros(self.shape, dtype=bool)
+        """Return the pixels (H, W) that are defined in all frames, and those that are defined in any."""
+        all_frames, any_frame = np.ones(self.shape, dtype=bool), np.zeros(self.shape, dtype=bool)
         if np.issubdtype(self.frames.dtype, np.integer):
-            return every, ~some
+            return all_frames, ~any_frame
         for _, finite in self.each():
-            every &= finite
-            some |= finite
-        return every, some
+            all_frames &= finite
+            any_frame |= finite
+        return all_frames, any_frame
 
     def median(self, filled: bool = False) -> Array:
-        """(H, W) medians over the frames.
+        """Return the median over the frames, (H, W).
 
         Parameters
         ----------
         filled : bool
-            Where a frame has no value it has that median, instead of 0.
+            True to replace undefined values by that median instead of 0.
         """
         out = np.empty(self.shape)
         rows = max(1, _HELD // (24 * len(self) * self.shape[1]))
-        some = max(1, _HELD // (self.frames.itemsize * self.frames[0].size))
+        batch = max(1, _HELD // (self.frames.itemsize * self.frames[0].size))
         for start in range(0, self.shape[0], rows):
-            own = slice(start, start + rows)
-            values = np.empty((len(self), *out[own].shape))
+            band = slice(start, start + rows)
+            values = np.empty((len(self), *out[band].shape))
             finite = np.empty(values.shape, dtype=bool)
-            for first in range(0, len(self), some):
-                part = slice(first, first + some)
-                values[part], finite[part] = self._read(self.frames[self.numbers[part], own], self.bad[own])
+            for first in range(0, len(self), batch):
+                part = slice(first, first + batch)
+                values[part], finite[part] = self._read(self.frames[self.numbers[part], band], self.bad[band])
                 self.released(self.frames)
-            out[own] = np.median(values, axis=0)
+            out[band] = np.median(values, axis=0)
             if filled and not finite.all():
-                out[own] = np.median(np.where(finite, values, out[own]), axis=0)
+                out[band] = np.median(np.where(finite, values, out[band]), axis=0)
         return out
 
 
 def screen_frames(
-    frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = None, released: Released = _kept
+    frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = None, released: Released = _in_memory
 ) -> ScreenedFrames:
-    """Leave out what is not the same in all frames, and what is saturated.
+    """Exclude saturated pixels and everything that differs between the frames, and average the rest.
 
-    Few of the frames are in memory at a time as real numbers, so that there may be many of them in a file.
+    Few of the frames are in memory at a time as floating-point numbers, so that a file may hold many.
 
     Parameters
     ----------
-    frames : NDArray[Any]
-        (N, H, W) grey values as recorded, integers or real numbers; NaN for pixels without a value.
+    frames : (N, H, W) ndarray
+        Grey values as recorded, integers or real numbers; NaN for undefined pixels.
     noise : NoiseModel
-        Of the detector.
-    bad : Mask | None
-        (H, W) pixels that are known to be bad; None for none.
-    released : Released
-        Is told when some frames have been gone over.
+        Noise of the detector.
+    bad : (H, W) ndarray of bool or None
+        Pixels that are known to be bad; None for none.
+    released : callable
+        Function called after some frames have been read.
 
     Raises
     ------
     FramesError
-        Too few of the frames hold the light, or none of their pixels can be used.
+        Too few of the frames contain the light, or none of their pixels can be used.
     """
     stack = _Stack.of(frames, bad, released)
     known, (finite, defined) = stack.bad, stack.known()
     findings: list[Finding] = []
     if np.any(known):
-        findings.append(Finding("bad pixels", f"{np.count_nonzero(known)} of the bad-pixel map are left out"))
+        findings.append(Finding("bad pixels", f"{np.count_nonzero(known)} of the bad-pixel map are excluded"))
     if not np.all(finite):
-        findings.append(Finding("undefined pixels", f"{np.count_nonzero(~finite)} without a value are left out"))
-    kept = _lit(stack, finite & ~known, noise, findings)
-    found: _Compared | None = None
+        findings.append(Finding("undefined pixels", f"{np.count_nonzero(~finite)} without a value are excluded"))
+    kept = _illuminated(stack, finite & ~known, noise, findings)
+    comparison: _Compared | None = None
     jitter = np.zeros((2, 2))
     if len(kept) > 1:
-        found = _compared(stack.taken(kept), noise)
-        unlike = found.unlike()
+        comparison = _compared(stack.taken(kept), noise)
+        unlike = comparison.unlike()
         if np.any(unlike):
             names = _numbers(kept[unlike])
-            findings.append(Finding("spoilt frames", f"{names} unlike the others are left out"))
+            findings.append(Finding("corrupted frames", f"{names} unlike the others excluded"))
             if np.count_nonzero(~unlike) < 0.5 * len(frames):
                 raise FramesError(
                     f"{len(frames) - np.count_nonzero(~unlike)} of {len(frames)} frames are unlike the others or dark",
                     "record frames of one state under one name, with the light on",
                 )
             kept = kept[~unlike]
-            found = _compared(stack.taken(kept), noise) if len(kept) > 1 else None
-        if found is not None:
-            findings += found.findings()
-            jitter = found.jitter
+            comparison = _compared(stack.taken(kept), noise) if len(kept) > 1 else None
+        if comparison is not None:
+            findings += comparison.findings()
+            jitter = comparison.jitter
     used = stack.taken(kept)
     saturated = _saturated(used, noise) & ~known
     if np.any(saturated):
         findings.append(
-            Finding("saturation", f"{np.count_nonzero(saturated)} pixels at and beside saturated ones are left out")
+            Finding("saturation", f"{np.count_nonzero(saturated)} saturated and neighbouring pixels are excluded")
         )
-    total, lost = _summed(used, found)
+    total, lost = _summed(used, comparison)
     counts = len(kept) - lost
-    # a pixel that flickers in more than a third of the frames is no detector of light
+    # a pixel that is rejected in more than a third of the frames is unusable
     flickers = (counts < np.ceil(2.0 / 3.0 * len(kept))) & ~known
     if np.any(flickers & defined):
-        findings.append(Finding("flickering pixels", f"{np.count_nonzero(flickers)} are left out"))
+        findings.append(Finding("flickering pixels", f"{np.count_nonzero(flickers)} are excluded"))
     good = ~known & ~saturated & ~flickers
     mean = total / len(kept)
     return ScreenedFrames(mean, np.maximum(counts, 1.0), good, len(kept), len(frames), jitter, tuple(findings))
 
 
-def _summed(used: _Stack, found: _Compared | None) -> tuple[Array, Array]:
-    """(H, W) sums over the frames, in which what is lost has its model's value, and how many are lost. Of whole numbers
-    the sum is exact, and by ``len(used)`` the mean of `centroid.mean_frames`.
+def _summed(used: _Stack, comparison: _Compared | None) -> tuple[Array, Array]:
+    """Return the sum over the frames (H, W) with rejected values replaced by their model, and their number.
+
+    The sum of whole numbers is exact; divided by ``len(used)`` it is the mean of `centroid.mean_frames`.
     """
     total, lost = np.zeros(used.shape), np.zeros(used.shape)
     for k, (values, finite) in enumerate(used.each()):
         gone = ~finite
-        if found is None:
+        if comparison is None:
             values[gone] = 0.0
         else:
-            where, instead = found.replaced[k]
+            where, instead = comparison.replaced[k]
             values.flat[where] = instead
             gone.flat[where] = True
         total += values
@@ -458,39 +463,42 @@ def _summed(used: _Stack, found: _Compared | None) -> tuple[Array, Array]:
 
 
 def _numbers(frames: NDArray[np.intp]) -> str:
-    """``frames 2, 5``, counted from 1."""
+    """Return the text ``frames 2, 5``, counted from 1."""
     shown = ", ".join(str(k + 1) for k in frames[:8])
     more = f" and {len(frames) - 8} more" if len(frames) > 8 else ""
     return f"frame{'s' * (len(frames) > 1)} {shown}{more}"
 
 
-def _lit(stack: _Stack, inside: Mask, noise: NoiseModel, findings: list[Finding]) -> NDArray[np.intp]:
-    """Numbers of the frames that hold the light; ``inside`` are the pixels that can be used in all of them."""
+def _illuminated(stack: _Stack, inside: Mask, noise: NoiseModel, findings: list[Finding]) -> NDArray[np.intp]:
+    """Return the indices of the frames that contain the light; ``inside`` are the pixels that are usable in all of
+    them.
+    """
     edge = np.ones(stack.shape, dtype=bool)
     edge[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = False
     border = inside & edge if np.any(inside & edge) else edge
     light = np.array([((values - np.median(values[border])) * inside).sum() for values, _ in stack.each()])
-    # the brightest but for a few: a frame may be bright by accident
+    # the upper quartile, since a few frames may be bright by accident
     reference = float(np.sort(light)[max(len(light) - 1 - len(light) // 4, 0)])
-    # the sum of faint light is noise, which is no missing light
+    # the sum over a faint spot is mostly noise and must not count as missing light
     spread = math.sqrt(np.count_nonzero(inside) * float(noise.frame_variance_dn2(noise.dark_level_dn)))
     dark = light < min(_DIM * reference, reference - 5.0 * spread)
     kept = np.flatnonzero(~dark)
     if 2 * len(kept) < len(light):
         raise FramesError(
-            f"{len(light) - len(kept)} of {len(light)} frames hold less than half of the light",
+            f"{len(light) - len(kept)} of {len(light)} frames contain less than half of the light",
             "record frames of one state under one name, with the light on",
         )
     if np.any(dark):
-        findings.append(Finding("missing light", f"{_numbers(np.flatnonzero(dark))} without the spot are left out"))
+        findings.append(Finding("missing light", f"{_numbers(np.flatnonzero(dark))} without the spot excluded"))
     return kept
 
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """N frames of so many pixels against their reference: of each the number of pixels that were hit (N,), and which
-    pixels its model replaces by what values; light and level (N,) with the largest sigma of each, offsets (N, 2) px and
-    their covariance (N, 2, 2).
+    """Comparison of N frames of a number of pixels with their reference.
+
+    For each frame: the number of rejected pixels (N,), the pixels that its model replaces with their values, light and
+    level (N,) with the largest sigma of each, displacements (N, 2) in px and their covariance (N, 2, 2).
     """
 
     pixels: int
@@ -505,29 +513,29 @@ class _Compared:
     jitter: Array
 
     def unlike(self) -> Mask:
-        """Which frames as a whole."""
+        """Return the mask of the frames that deviate as a whole, (N,)."""
         return np.asarray(self.hits > max(_UNLIKE * self.pixels, _FEWEST_UNLIKE))
 
     def findings(self) -> list[Finding]:
         out = []
         if np.any(self.hits):
             struck = np.flatnonzero(self.hits)
-            out.append(Finding("cosmic rays", f"{self.hits.sum()} pixels of {_numbers(struck)} are left out"))
+            out.append(Finding("cosmic rays", f"{self.hits.sum()} pixels of {_numbers(struck)} are excluded"))
         if np.any(self.jitter):
             rms = math.sqrt(float(np.trace(self.jitter)))
-            out.append(Finding("movement between frames", f"{rms:.2g} px rms; its share in the mean is added to sigma"))
+            out.append(Finding("movement between frames", f"{rms:.2g} px rms; included in sigma"))
         drift = float(np.ptp(self.level))
         if drift > max(12.0 * self.level_sigma, _LEAST_DRIFT_DN):
-            out.append(Finding("drifting level", f"by {drift:.3g} DN over the frames; it is fitted", corrects=False))
+            out.append(Finding("drifting level", f"{drift:.3g} DN over the frames; fitted", corrects=False))
         flicker = float(np.ptp(self.light))
         if flicker > max(0.02, 12.0 * self.light_sigma):
-            out.append(Finding("changing light", f"by {100.0 * flicker:.2g} % over the frames", corrects=False))
+            out.append(Finding("changing light", f"{100.0 * flicker:.2g} % over the frames", corrects=False))
         return out
 
 
 def _compared(stack: _Stack, noise: NoiseModel) -> _Compared:
     count, pixels = len(stack), stack.frames[0].size
-    # what is saturated does not follow the light
+    # saturated pixels do not respond to the light
     follows = ~stack.bad & ~_saturated(stack, noise)
     blind = np.flatnonzero([not np.any(finite & follows) for _, finite in stack.each()])
     if blind.size:
@@ -536,15 +544,15 @@ def _compared(stack: _Stack, noise: NoiseModel) -> _Compared:
             "frames below saturation, and a map of bad pixels that leaves some",
         )
     threshold = float(norm.isf(FALSE_ALARM / (2.0 * count * pixels)))
-    # of a median the same for all frames that have not moved
+    # the basis is the same for all frames that have not moved
     middle = stack.median(filled=True) if count > 2 else None
     places = np.zeros((count, 2))
     shown: Mask | None = np.ones(stack.shape, dtype=bool)
     if middle is not None:
-        shown = shown_pixels(middle, noise, count, follows)
+        shown = reliable_pixels(middle, noise, count, follows)
         if shown is not None and np.all(shown):
-            middle, places = aligned(stack.each, len(stack), middle, follows)
-    still = None if middle is None else basis_of(middle)
+            middle, places = aligned_median(stack.each, len(stack), middle, follows)
+    still = None if middle is None else frame_basis(middle)
     excess = 1.0 + MEDIAN / count if count > 2 else 2.0
     others = repeat(middle) if middle is not None else (values for values, _ in stack.each(backwards=True))
     light, level, sigmas, light_sigmas = np.empty((4, count))
@@ -557,11 +565,11 @@ def _compared(stack: _Stack, noise: NoiseModel) -> _Compared:
         place = places[k]
         for _ in range(MOST_MOVES):
             if np.any(place):
-                basis = basis_of(ndimage.shift(reference, place, order=3, mode="nearest"))
+                basis = frame_basis(ndimage.shift(reference, place, order=3, mode="nearest"))
             else:
-                basis = basis_of(reference) if still is None else still
+                basis = frame_basis(reference) if still is None else still
             solution, inverse = robust_fit(basis, frame, weight)
-            # of frames without light nothing can be said
+            # without light a movement is undefined
             share = max(abs(float(solution[0])), _LEAST_SHARE)
             further = -solution[1:3] / share
             if np.max(np.abs(further)) < _SMALL_PX or np.max(np.abs(place + further)) > _LARGEST_PX:
@@ -575,12 +583,12 @@ def _compared(stack: _Stack, noise: NoiseModel) -> _Compared:
         # a spot that has moved by d is its reference minus d times the slope
         offset[k] = place + further
         spread[k] = np.clip(inverse[1:3, 1:3], -_UNKNOWN, _UNKNOWN) / share**2
-        # of two frames that differ the brighter one was struck
+        # of two frames that differ, the brighter one was hit
         struck = _grown(z > threshold if count == 2 else np.abs(z) > threshold, np.abs(z) > GROWTH_SIGMAS)
         where = np.flatnonzero(struck | ~finite)
         hits[k] = np.count_nonzero(struck)
         replaced.append((where, model.flat[where]))
-    moved = np.zeros((2, 2)) if shown is None else place_scatter(offset, spread, count)
+    moved = np.zeros((2, 2)) if shown is None else position_scatter(offset, spread, count)
     known = float(sigmas.max()), float(light_sigmas.max())
     return _Compared(pixels, hits, tuple(replaced), light, level, *known, offset, spread, moved)
 
@@ -590,29 +598,29 @@ def noise_ratio(
     noise: NoiseModel,
     bad: Mask | None = None,
     where: Mask | None = None,
-    released: Released = _kept,
+    released: Released = _in_memory,
 ) -> float | None:
-    """Noise of frames that hold the light, beside the spot, over the stated one, by the differences of each to the
-    next; None where they agree, and where frames cannot show it.
+    """Return the ratio of the frames' noise to the specified one; None if they agree or it cannot be measured.
 
-    Every pair of frames has a say, and the middle one counts, lest one spoilt frame is taken for noise.
+    The noise is that of the differences of each frame to the next, among frames that contain the light. The result is
+    the median over all pairs, so that one corrupted frame is not taken for noise.
 
     Parameters
     ----------
-    frames : NDArray[Any]
-        (N, H, W) grey values of one state; NaN for pixels without a value.
+    frames : (N, H, W) ndarray
+        Grey values of one state; NaN for undefined pixels.
     noise : NoiseModel
-        Of the detector, as stated.
-    bad : Mask | None
-        (H, W) pixels that are not to be used; None for none.
-    where : Mask | None
-        (H, W) pixels to look at; None for those beside the spot.
-    released : Released
-        Is told when some frames have been gone over.
+        Specified noise of the detector.
+    bad : (H, W) ndarray of bool or None
+        Unusable pixels; None for none.
+    where : (H, W) ndarray of bool or None
+        Pixels to use; None for those beside the spot.
+    released : callable
+        Function called after some frames have been read.
     """
     stack = _Stack.of(frames, bad, released, blank=True)
     try:
-        kept = _lit(stack, stack.known()[0] & ~stack.bad, noise, [])
+        kept = _illuminated(stack, stack.known()[0] & ~stack.bad, noise, [])
     except FramesError:
         return None
     stack = stack.taken(kept)
@@ -620,8 +628,8 @@ def noise_ratio(
         return None
     middle = stack.median()
     low = float(np.median(middle))
-    if noise.frame_variance_dn2(low) < SHOWN**2 + WHOLE:
-        # frames show what rounding makes of it, more or less, as pixels stand between two steps
+    if noise.frame_variance_dn2(low) < MEASURABLE**2 + ROUNDING_VARIANCE:
+        # the variance of the grey values depends on the level between two steps
         return None
     beside = middle < low + _LIT * (float(middle.max()) - low) if where is None else where
     beside = beside & ~stack.bad
@@ -636,7 +644,7 @@ def noise_ratio(
         square = 1.0
         for _ in range(_ROUNDS):
             known, square = square, max(float(np.minimum(z2, _MOST_SIGMAS**2 * square).mean()), 1e-12)
-            # noise that is not more than stated is told at once
+            # noise within the specification needs no further iteration
             if square < (1.0 + _NOISE_OFF) ** 2 or square < 1.001 * known:
                 break
         squares.append(square)
@@ -648,70 +656,73 @@ def noise_ratio(
     return ratio if max(ratio, 1.0 / ratio) > 1.0 + max(_NOISE_OFF, 6.0 * spread) else None
 
 
-def shown_noise(
-    frames: NDArray[Any], noise: NoiseModel, ratio: float | None, bad: Mask | None = None, released: Released = _kept
+def observed_noise(
+    frames: NDArray[Any],
+    noise: NoiseModel,
+    ratio: float | None,
+    bad: Mask | None = None,
+    released: Released = _in_memory,
 ) -> NoiseModel:
-    """The detector with the noise that its frames show, where that is more than stated: what is more is taken for read
-    noise.
+    """Return the noise model with any excess noise of the frames added as read noise.
 
     Parameters
     ----------
-    frames : NDArray[Any]
-        (N, H, W) grey values.
+    frames : (N, H, W) ndarray
+        Grey values.
     noise : NoiseModel
-        As stated.
-    ratio : float | None
-        See `noise_ratio`.
-    bad : Mask | None
-        As there.
-    released : Released
-        As there.
+        Specified noise of the detector.
+    ratio : float or None
+        Result of `noise_ratio`.
+    bad : (H, W) ndarray of bool or None
+        Unusable pixels; None for none.
+    released : callable
+        Function called after some frames have been read.
     """
     if ratio is None or ratio <= 1.0:
         return noise
-    # of the medians of all pixels, most of which have no light
+    # the median over all pixels, most of which have no light
     level = float(np.median(_Stack.of(frames, bad, released, blank=True).median()))
-    own = float(noise.frame_variance_dn2(level))
-    read = noise.dark_noise_e**2 + (ratio**2 - 1.0) * own / noise.gain_dn_per_e**2
+    variance = float(noise.frame_variance_dn2(level))
+    read = noise.dark_noise_e**2 + (ratio**2 - 1.0) * variance / noise.gain_dn_per_e**2
     return replace(noise, dark_noise_e=math.sqrt(read))
 
 
 def subtracted_level(
-    frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = None, released: Released = _kept
+    frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = None, released: Released = _in_memory
 ) -> float:
-    """Return by how much the level of frames beside the spot is below the detector's dark level, DN; 0 where it is not.
+    """Return by how much the frames' level lies below the dark level, DN; 0 if not significant.
 
-    Light only adds, so that a level of frames below that in the dark was subtracted from them. Their shot noise is that
-    of the light above the level that is left.
+    Light only adds, so that a level below the dark level was subtracted from the frames. Their shot noise is that of
+    the light above the remaining level.
 
     Parameters
     ----------
-    frames : NDArray[Any]
-        (N, H, W) grey values.
+    frames : (N, H, W) ndarray
+        Grey values.
     noise : NoiseModel
-        Of the detector.
-    bad : Mask | None
-        (H, W) pixels that are not to be used; None for none.
-    released : Released
-        Is told when some frames have been gone over.
+        Noise of the detector.
+    bad : (H, W) ndarray of bool or None
+        Unusable pixels; None for none.
+    released : callable
+        Function called after some frames have been read.
     """
     stack = _Stack.of(frames, bad, released, blank=True)
     middle = stack.median()[~stack.bad]
     away = noise.dark_level_dn - float(np.median(middle))
     pixel = noise.dark_variance_dn2 / len(stack) + noise.dsnu_variance_dn2
-    # a median of whole numbers stands up to half a grey value off
+    # a median of whole numbers is up to half a grey value off
     return away if away > _LEAST_LEVEL_DN + 6.0 * math.sqrt(MEDIAN * pixel / middle.size) else 0.0
 
 
 def _grown(seed: Mask, grows: Mask) -> Mask:
-    """The seeds and all of ``grows`` that hangs together with them."""
+    """Return the seeds and all pixels of ``grows`` that are connected to them."""
     if not np.any(seed):
         return seed
     return np.asarray(ndimage.binary_propagation(seed, np.ones((3, 3)), seed | grows))
 
 
 def _saturated(stack: _Stack, noise: NoiseModel) -> Mask:
-    """Pixels that are saturated in most frames, and those beside them, whose charge may have run over."""
+    """Return the pixels that are saturated in most frames, and their neighbours, which may hold overflowed charge."""
     limit = noise.saturation_dn - _SATURATION_SIGMAS * math.sqrt(noise.frame_variance_dn2(noise.saturation_dn))
     clipped = stack.median() >= limit
     return np.asarray(ndimage.binary_dilation(clipped, np.ones((3, 3)))) if np.any(clipped) else clipped

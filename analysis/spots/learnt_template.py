@@ -1,28 +1,28 @@
-"""The shape of a spot learnt from frames of the spot itself, and what the noise of that shape does to a shift.
+"""Spot shape learnt from frames of the spot itself, and the effect of its noise on a measured shift.
 
-The mean image without its level is low-passed where it holds more noise than light: a radial Wiener filter of its own
-power spectrum, real and even, so that it moves nothing. Noise is what is new in every frame and the pattern of the
-pixels, which has all frequencies as well. Beyond the image the shape is zero. What is left of the noise stands in the
-covariance of a shift by `learnt_noise`.
+The mean image without its level is low-passed where it contains more noise than light: a radial Wiener filter of its
+own power spectrum, real and even, so that it shifts nothing. The noise comprises temporal noise and the pixels' fixed
+pattern, which has all frequencies as well. Beyond the image the shape is zero. The remaining noise enters the
+covariance of a shift (`learnt_shift`).
 
-The shape is T = L F, with the mean image before F and the linear operations L of learning it. To first order the places
-before and after, of influence g1 and g2 on their images F and D, move with noise n of F and m of D by
+The shape is T = L F, with the mean image before F and the linear operations L of learning it. To first order the
+positions before and after, of influence g1 and g2 on their images F and D, move with noise n of F and m of D by
 
     e1 = g1 (n - A1 n),     e2 = g2 (m - A2 n),     A = (fitted model of the state) by T, times L,
 
-for the model that is held against an image has noise itself: A is the smeared, interpolated, brightened shape, wherever
-the state has one. So the image before has the influence b = g1 - g1 A1 + g2 A2 on the shift, with the sign of a place
-before, and the shift's covariance is that of two independent images with the maps b and g2. Where both states are alike
-b = g1. Where after is brighter or the middle of its spot is left out the noise of the shape counts for more than that
-of the image that it is held against.
+since the model that is compared with an image is noisy itself: A is the smeared, interpolated and scaled shape of the
+state. The image before therefore has the influence b = g1 - g1 A1 + g2 A2 on the shift, with the sign of a position
+before, and the shift's covariance is that of two independent images with the maps b and g2. Where both states are
+alike, b = g1. Where the spot after is brighter, or its middle is excluded, the noise of the shape counts for more than
+that of the image that it is compared with.
 
-The next order counts where a spot is narrow or faint, since learning leaves noise that is as fine as the spot is:
+The next order matters where a spot is narrow or faint, since learning leaves noise that is as fine as the spot is:
 
-- **Curvature.** The noise's own slopes stand in the normal matrix I as if they were the spot's, with N = sum of
-  w cov(n', n'), and the residuals take them off again: the fit has the curvature I - N, and answers by I / (I - N).
-- **Lean.** The noise of the shape is least half way between pixels, and pattern of the pixels is in both images: the
-  fit is drawn there, by (I - N)^-1 sum of w (cov(n', m) - cov(n', n)). The place is not moved by it; the covariance of
-  the shift gets the square of it.
+- **Curvature.** The slopes of the noise itself enter the normal matrix I as if they were the spot's, with N = sum of
+  w cov(n', n'), and the residuals subtract them again: the fit has the curvature I - N, and responds by I / (I - N).
+- **Bias.** The noise of the shape is least half way between pixels, and the pixels' fixed pattern is in both images:
+  the fit is biased towards these positions by (I - N)^-1 sum of w (cov(n', m) - cov(n', n)). The position is not
+  corrected for it; the covariance of the shift contains its square.
 
 Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 """
@@ -45,25 +45,27 @@ from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, 
 from analysis.spots.spot_template import SmearedShape, SpotTemplate
 
 MARGIN_PX = 40
-"""By which the shape is larger than the image, so that it can be shifted over it."""
+"""Margin by which the shape is larger than the image on every side, px, so that it can be shifted over it."""
 _TAPER_PX = 4
 _CORE = 0.05
 _LOOKS, _FILLS = 3, 40
-"""How often the frequencies of the light are looked for, and steps by which missing pixels are filled with them."""
+"""Number of passes that estimate the light's band of frequencies, and iterations of filling in each."""
 _UNEVEN = 0.5
-"""Rms of a slope, in sigmas of a pixel, from which it is the background's; rings of the spot at the edge make less."""
+"""Rms of the slopes, in sigmas of a pixel, from which they belong to the background; rings of the spot make less."""
 
 
 def without_slopes(screened: ScreenedFrames, noise: NoiseModel) -> ScreenedFrames:
-    """Frames of which an uneven background is taken off, by a plane through the pixels at the edge, lest it is learnt
-    as the spot's and goes with it; the same where there is none.
+    """Return the frames with a sloping background subtracted; the same frames if there is none.
+
+    The slopes are those of a plane through the pixels at the edge. Otherwise they would be learnt as part of the spot
+    and move with it.
 
     Parameters
     ----------
     screened : ScreenedFrames
         Frames of the state that the shape is learnt from.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     """
     mean = screened.mean
     edge = _edge(mean.shape) & screened.good
@@ -78,8 +80,8 @@ def without_slopes(screened: ScreenedFrames, noise: NoiseModel) -> ScreenedFrame
     if float(np.mean(slopes[edge] ** 2)) < _UNEVEN**2 * float(variance):
         return screened
     rise = f"{np.ptp(slopes):.2g} DN between the corners"
-    told = Finding("uneven background", f"its slopes, {rise}, are taken off before the shape is learnt")
-    return replace(screened, mean=mean - slopes, findings=(*screened.findings, told))
+    finding = Finding("uneven background", f"slopes, {rise}, subtracted before the shape is learnt")
+    return replace(screened, mean=mean - slopes, findings=(*screened.findings, finding))
 
 
 def _edge(shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -90,20 +92,20 @@ def _edge(shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class LearntTemplate:
-    """A shape, and what every pixel of the image that it is from has to do with it.
+    """Learnt spot shape, with the linear operator that relates it to the pixels of the image that it was learnt from.
 
     Attributes
     ----------
     shape : SpotTemplate
-        Of the spot.
+        Shape of the spot.
     light : float
-        DN, what the samples that the shape is made of sum to.
-    passed : Array
-        (H, W) share of each frequency that is kept, in the order of the discrete Fourier transform.
-    good : NDArray[np.bool_]
-        (H, W) pixels that were used.
-    fills : tuple[NDArray[np.bool_], ...]
-        (n, H, W) frequencies by which the others were filled, step by step.
+        Sum of the samples that the shape is made of, DN.
+    passed : (H, W) ndarray
+        Transmission of the filter at each frequency, in the order of the discrete Fourier transform.
+    good : (H, W) ndarray of bool
+        Pixels that were used.
+    fills : tuple of (H, W) ndarrays of bool
+        Frequencies by which the missing pixels were filled, one mask for each pass.
     """
 
     shape: SpotTemplate
@@ -113,24 +115,24 @@ class LearntTemplate:
     fills: tuple[NDArray[np.bool_], ...]
 
     def impulse(self, pixel: tuple[int, int]) -> Array:
-        """(H, W) what 1 DN in a pixel of the image adds to what is learnt, holes and edges aside.
+        """Return the learnt image of 1 DN in one pixel, (H, W), without the effect of missing pixels and edges.
 
         Parameters
         ----------
-        pixel : tuple[int, int]
-            Row and column.
+        pixel : tuple of int
+            Row and column of the pixel.
         """
         image = np.zeros(self.good.shape)
         image[pixel] = 1.0
         return _filtered(image, self.passed)
 
     def returned(self, maps: Array) -> Array:
-        """What pixels of the image do to numbers that the shape's samples make: the transpose of learning, (n, H, W).
+        """Return the derivatives with respect to the image's pixels, (n, H, W), by the transpose of learning.
 
         Parameters
         ----------
-        maps : Array
-            (n, M, N) derivatives of the numbers by the samples, which sum to `light`.
+        maps : (n, M, N) ndarray
+            Derivatives of n quantities with respect to the shape's samples, which sum to `light`.
         """
         inner = maps[:, MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX] * _taper(self.good.shape)
         out = _filtered(inner, self.passed)
@@ -147,19 +149,19 @@ class LearntTemplate:
 
 
 def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> LearntTemplate:
-    """The shape of the spot in one state's frames.
+    """Learn the shape of the spot from one state's frames.
 
     Parameters
     ----------
     screened : ScreenedFrames
         Frames of the state.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
 
     Raises
     ------
     SpotError
-        There is no spot, or one so narrow that pixels do not sample it.
+        There is no spot, or it is so narrow that the pixels undersample it.
     """
     image = spot_image.filled(screened.mean, screened.good)
     frames = max(int(np.median(screened.counts)), 1)
@@ -172,9 +174,9 @@ def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> LearntTemplat
     if not np.all(screened.good):
         light, fills = _completed(light, screened.good, variance)
     passed = _passed(light, variance)
-    # holes that are not filled to the last leave noise of all frequencies, which no light is
+    # missing pixels that are not filled completely leave noise of all frequencies
     if np.all(screened.good) and (passed[light.shape[0] // 2, 0] > 0.0 or passed[0, light.shape[1] // 2] > 0.0):
-        raise SpotError({0: "too narrow: a light with detail finer than two pixels has no shape between pixels"})
+        raise SpotError({0: "too narrow: a spot with detail finer than two pixels cannot be interpolated"})
     light = _filtered(light, passed)
     wide = np.pad(light * _taper(light.shape), MARGIN_PX)
     core = np.where(wide > _CORE * wide.max(), wide, 0.0)
@@ -186,7 +188,7 @@ def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> LearntTemplat
 
 
 def _taper(shape: tuple[int, ...]) -> Array:
-    """1 inside, falling to 0 at the edge like a raised cosine."""
+    """Return a window of an image's shape that is 1 inside and falls to 0 at the edge as a raised cosine."""
     parts = []
     for size in shape:
         away = np.minimum(np.arange(size) + 1, size - np.arange(size)) / (_TAPER_PX + 1.0)
@@ -195,20 +197,21 @@ def _taper(shape: tuple[int, ...]) -> Array:
 
 
 def _filtered(image: Array, passed: NDArray[Any]) -> Array:
-    """Images (..., H, W) in the share of each frequency that is passed."""
+    """Return images (..., H, W) multiplied by a transmission in the frequency domain."""
     return np.asarray(np.real(np.fft.ifft2(np.fft.fft2(image) * passed)))
 
 
 def _completed(light: Array, good: NDArray[np.bool_], variance: Array) -> tuple[Array, tuple[NDArray[np.bool_], ...]]:
-    """The image with its holes filled by what the light in the other pixels says, which optics let through up to a
-    frequency only: the hole takes the value of the low-passed image again and again (Papoulis, IEEE Trans. Circuits
-    Syst. 22, 735 (1975); Gerchberg, Opt. Acta 21, 709 (1974)). With the frequencies of each look.
+    """Return the image with missing pixels filled by band-limited extrapolation, and the frequency masks of each pass.
+
+    Optics transmit light up to a cut-off frequency only: missing pixels repeatedly take the values of the low-passed
+    image (Papoulis, IEEE Trans. Circuits Syst. 22, 735 (1975); Gerchberg, Opt. Acta 21, 709 (1974)).
     """
     fills = []
     frequency = np.hypot(np.fft.fftfreq(light.shape[0])[:, None], np.fft.fftfreq(light.shape[1])[None, :])
     ring = np.rint(frequency * min(light.shape)).astype(np.intp)
     for _ in range(_LOOKS):
-        # holes that are not filled well yet make noise of all frequencies
+        # missing pixels that are not filled well yet make noise of all frequencies
         power = np.abs(np.fft.fft2(light)) ** 2
         middle = np.array([np.median(power[ring == k]) for k in range(int(ring.max()) + 1)])
         noise = max(float(variance.sum()), 2.0 * float(np.median(middle[3 * middle.size // 4 :])))
@@ -221,13 +224,13 @@ def _completed(light: Array, good: NDArray[np.bool_], variance: Array) -> tuple[
 
 
 def _passed(light: Array, variance: Array) -> Array:
-    """(H, W) share of each frequency that is kept: those in which the image stands above its noise."""
+    """Return the transmission of each frequency (H, W): it passes frequencies at which the image exceeds its noise."""
     power = np.abs(np.fft.fft2(light)) ** 2
     floor = float(variance.sum())
     frequency = np.hypot(np.fft.fftfreq(light.shape[0])[:, None], np.fft.fftfreq(light.shape[1])[None, :])
     ring = np.rint(frequency * min(light.shape)).astype(np.intp)
     mean = np.bincount(ring.ravel(), power.ravel()) / np.maximum(np.bincount(ring.ravel()), 1)
-    # beyond the optics' cut-off there is nothing: the first rings that are noise end it
+    # the optics pass no light beyond their cut-off: the first ring that is noise ends the band
     noisy = np.flatnonzero(mean < 2.0 * floor)
     last = int(noisy[0]) if noisy.size else mean.size
     gain = np.clip(1.0 - floor / np.maximum(mean, 1e-300), 0.0, 1.0)
@@ -236,27 +239,26 @@ def _passed(light: Array, variance: Array) -> Array:
 
 
 _LEAST = 0.4
-"""Least share of the normal matrix that is no noise, in any direction: below it the theory, which is of first order in
-that, ends."""
+"""Least fraction of the normal matrix that is not noise, in any direction, for which the first-order theory holds."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedSpot:
-    """One spot in one state, to which the learnt shape was fitted.
+    """Spot in one state, with the learnt shape fitted to it.
 
     Attributes
     ----------
     positions : SpotPositions
-        Of the spot in its image, with their maps.
-    counts : Array
-        (H, W) frames that each pixel is the mean of.
-    jitter : Array
-        (2, 2) px^2, what movement between frames adds to the covariance of the place.
-    others : Array
-        (G, 3) row, column (px) and share of the light of what else was fitted with the same shape.
-    smear : Array
-        (2, 2) px^2 by which the shape was smeared.
-    offset : tuple[int, int]
+        Position of the spot in its image, with influence maps.
+    counts : (H, W) ndarray
+        Number of frames averaged in each pixel.
+    jitter : (2, 2) ndarray
+        Covariance that movement between frames adds to the position, px^2.
+    others : (G, 3) ndarray
+        Row, column (px) and relative light of further spots that were fitted with the same shape.
+    smear : (2, 2) ndarray
+        Second moments by which the shape was smeared, px^2.
+    offset : tuple of int
         Row and column of the detector at which the image begins.
     """
 
@@ -269,85 +271,85 @@ class FittedSpot:
 
     @property
     def maps(self) -> Array:
-        """(2, H, W) px/DN."""
+        """Influence of each pixel on row and column, (2, H, W) px/DN."""
         assert self.positions.gain_maps is not None
         return self.positions.gain_maps[0]
 
     @property
     def light(self) -> Array:
-        """(H, W) DN."""
+        """Expected light signal, (H, W) DN."""
         assert self.positions.light_dn is not None
         return self.positions.light_dn[0]
 
     def temporal(self, noise: NoiseModel) -> Array:
-        """(H, W) DN^2, variance of the mean by what is new in every frame."""
+        """Return the variance of the mean image by temporal noise, (H, W) DN^2."""
         return np.asarray(noise.temporal_variance_dn2(self.light + noise.dark_level_dn, 1) / self.counts)
 
     def fixed(self, noise: NoiseModel) -> Array:
-        """(H, W) DN^2, variance by the detector's pattern."""
+        """Return the variance by the detector's fixed pattern, (H, W) DN^2."""
         return np.asarray(noise.fixed_variance_dn2(self.light + noise.dark_level_dn))
 
 
 @dataclass(frozen=True, eq=False)
 class LearntShift:
-    """What noise does to after - before.
+    """Noise of a shift (after - before) that was measured with a learnt shape.
 
     Attributes
     ----------
-    covariance : Array
-        (2, 2) px^2.
-    lean : Array
-        (2,) px, by which the fit is drawn, and which stands in the covariance.
-    parts : tuple[NoiseParts, NoiseParts]
-        Of images before and after, for the covariance of several shifts against the same image before. What this one
-        does differs from shift to shift, and stands in those after.
+    covariance : (2, 2) ndarray
+        Covariance of the shift, px^2.
+    lean : (2,) ndarray
+        Bias of the fit, px, whose square is in the covariance.
+    parts : tuple of NoiseParts
+        Noise of the images before and after, for the covariance of several shifts against the same image before. The
+        contribution of the image before differs from shift to shift and is therefore in the part after.
     """
 
     covariance: Array
-    lean: Array
+    fit_bias: Array
     parts: tuple[NoiseParts, NoiseParts]
 
 
 def learnt_shift(
     learnt: LearntTemplate, before: FittedSpot, after: FittedSpot, noise: NoiseModel, ccd: tuple[int, int]
 ) -> LearntShift:
-    """Noise of one spot's shift.
+    """Compute the noise of one spot's shift.
 
     Parameters
     ----------
     learnt : LearntTemplate
-        The shape.
+        Shape of the spot.
     before : FittedSpot
-        The spot in the image that it was learnt from.
+        Spot in the image that the shape was learnt from.
     after : FittedSpot
-        The same spot in another one.
+        The same spot in another image.
     noise : NoiseModel
-        Of the detector.
-    ccd : tuple[int, int]
-        (H, W) of the detector.
+        Noise of the detector.
+    ccd : tuple of int
+        Rows and columns (H, W) of the detector.
 
     Raises
     ------
     SpotError
         The shape is mostly noise.
     """
-    more, lean = _second_order(learnt, before, after, noise)
-    own = np.tensordot(more, after.maps, 1)
-    maps = before.maps - _by_image(learnt, before, before.maps) + _by_image(learnt, after, own)
+    gain, fit_bias = _second_order(learnt, before, after, noise)
+    after_maps = np.tensordot(gain, after.maps, 1)
+    maps = before.maps - _by_image(learnt, before, before.maps) + _by_image(learnt, after, after_maps)
     temporal = before.temporal(noise)
-    new = after.jitter + _spread(own, after.temporal(noise)) + before.jitter
-    brought = maps * np.sqrt(temporal)
+    new = after.jitter + _spread(after_maps, after.temporal(noise)) + before.jitter
+    variance_root = maps * np.sqrt(temporal)
     first = _on_ccd(before, maps, ccd)
-    second = _on_ccd(after, own, ccd)
+    second = _on_ccd(after, after_maps, ccd)
     pattern = noise_parts(second, noise).pattern - noise_parts(first, noise).pattern
-    whole = np.concatenate([pattern[0], brought.reshape(2, -1), lean[:, None]], axis=1)
+    whole = np.concatenate([pattern[0], variance_root.reshape(2, -1), fit_bias[:, None]], axis=1)
     parts = (
         NoiseParts(before.jitter[None], np.zeros((1, *whole.shape), np.float32)),
         NoiseParts((new - before.jitter)[None], whole.astype(np.float32)[None]),
     )
     fixed = pattern[0].astype(np.float64)
-    covariance = new + _spread(maps, temporal) + fixed @ fixed.T + np.outer(lean, lean)
-    return LearntShift(covariance, lean, parts)
+    covariance = new + _spread(maps, temporal) + fixed @ fixed.T + np.outer(fit_bias, fit_bias)
+    return LearntShift(covariance, fit_bias, parts)
 
 
 def _spread(maps: Array, variance: Array) -> Array:
@@ -361,8 +363,9 @@ def _shape_of(learnt: LearntTemplate, spot: FittedSpot) -> SpotTemplate:
 
 
 def _by_image(learnt: LearntTemplate, spot: FittedSpot, maps: Array) -> Array:
-    """(2, H, W) what the pixels of the image before do to the fitted model of a state, and that to numbers of which the
-    derivatives by the state's image are ``maps``.
+    """Return the influence of the image before on quantities of a state through the fitted model, (2, H, W).
+
+    ``maps`` are the derivatives of these quantities with respect to the state's image.
     """
     shape = SmearedShape(_shape_of(learnt, spot))
     place, flux = spot.positions.position[0], float(spot.positions.flux[0])
@@ -374,39 +377,40 @@ def _by_image(learnt: LearntTemplate, spot: FittedSpot, maps: Array) -> Array:
 def _second_order(
     learnt: LearntTemplate, before: FittedSpot, after: FittedSpot, noise: NoiseModel
 ) -> tuple[Array, Array]:
-    """What the answer of the fit is more than the normal matrix says, (2, 2), and lean (2,) px."""
+    """Return the gain of the fit over that of the normal matrix, (2, 2), and its bias, (2,) px."""
     ratio = float(after.positions.flux[0]) / learnt.light
-    # of a pixel at the spot
+    # kernel of the pixel at the spot's centre
     at = np.rint(before.positions.position[0]).astype(np.intp)
     middle = int(at[0]), int(at[1])
     kernel = _kernel(learnt, before, after, middle)
     weight = _weight(after, noise)
-    brought = before.temporal(noise) + before.fixed(noise)
-    # sum over pixels of the model and of the image: of each difference of place how much there is
+    variance = before.temporal(noise) + before.fixed(noise)
+    # correlation of weight and variance: the weighted variance at each difference of positions
     size = weight.shape
-    meets = signal.fftconvolve(weight, brought[::-1, ::-1], mode="full")
-    rows, columns = (slice(n - 1 - m, n - 1 - m + k) for n, m, k in zip(brought.shape, middle, size, strict=True))
-    meets = np.maximum(meets[rows, columns], 0.0)
-    own = ratio**2 * np.einsum("ipq,pq,pq->i", kernel[1:], kernel[0], meets)
-    slopes = ratio**2 * np.einsum("ipq,jpq,pq->ij", kernel[1:], kernel[1:], meets)
+    correlation = signal.fftconvolve(weight, variance[::-1, ::-1], mode="full")
+    rows, columns = (slice(n - 1 - m, n - 1 - m + k) for n, m, k in zip(variance.shape, middle, size, strict=True))
+    correlation = np.maximum(correlation[rows, columns], 0.0)
+    shape_noise = ratio**2 * np.einsum("ipq,pq,pq->i", kernel[1:], kernel[0], correlation)
+    slopes = ratio**2 * np.einsum("ipq,jpq,pq->ij", kernel[1:], kernel[1:], correlation)
     shared = ratio * _shared(kernel[1:], weight, before, after, noise, middle)
     information = np.linalg.inv(after.positions.covariance[0] - after.jitter)
-    left = information - slopes
+    curvature = information - slopes
     root = np.linalg.inv(np.linalg.cholesky(information))
-    if np.linalg.eigvalsh(root @ left @ root.T).min() < _LEAST:
-        raise SpotError({0: "the shape that the frames before show is mostly noise"})
-    return np.linalg.solve(left, information), np.linalg.solve(left, shared - own)
+    if np.linalg.eigvalsh(root @ curvature @ root.T).min() < _LEAST:
+        raise SpotError({0: "the shape learnt from the frames before is mostly noise"})
+    return np.linalg.solve(curvature, information), np.linalg.solve(curvature, shared - shape_noise)
 
 
 def _weight(spot: FittedSpot, noise: NoiseModel) -> Array:
-    """(H, W) 1/DN^2; 0 where a pixel was left out."""
+    """Return the weights of a fit, (H, W) 1/DN^2; 0 for excluded pixels."""
     used = np.any(spot.maps != 0.0, axis=0)
     return np.asarray(np.where(used, 1.0 / (spot.temporal(noise) + spot.fixed(noise)), 0.0))
 
 
 def _kernel(learnt: LearntTemplate, before: FittedSpot, after: FittedSpot, pixel: tuple[int, int]) -> Array:
-    """(3, H, W) what a pixel of the image before does to the state's model for equal light, and the derivatives of that
-    by the place.
+    """Return the influence of a pixel of the image before on the state's model, and its two slopes, (3, H, W).
+
+    The influence is for equal light; the slopes are its derivatives with respect to the position.
     """
     wide = np.pad(learnt.impulse(pixel), MARGIN_PX)
     height, width = after.light.shape
@@ -419,22 +423,22 @@ def _kernel(learnt: LearntTemplate, before: FittedSpot, after: FittedSpot, pixel
 def _shared(
     slopes: Array, weight: Array, before: FittedSpot, after: FittedSpot, noise: NoiseModel, middle: tuple[int, int]
 ) -> Array:
-    """(2,) sum of weight and covariance of the model's slopes with the image, by the pattern of the pixels in both."""
-    # a pixel of the detector stands here in both images
+    """Return the weighted covariance of the model's slopes with the image by the fixed pattern in both, (2,)."""
+    # the same pixels of the detector in both images
     rows, columns = (slice(max(a, b), None) for a, b in zip(before.offset, after.offset, strict=True))
-    one = before.light[rows.start - before.offset[0] :, columns.start - before.offset[1] :]
-    two = after.light[rows.start - after.offset[0] :, columns.start - after.offset[1] :]
-    own = weight[rows.start - after.offset[0] :, columns.start - after.offset[1] :]
-    height, width = (min(sizes) for sizes in zip(one.shape, two.shape, strict=True))
-    pattern = noise.prnu**2 * one[:height, :width] * two[:height, :width] + noise.dsnu_variance_dn2
+    light_before = before.light[rows.start - before.offset[0] :, columns.start - before.offset[1] :]
+    light_after = after.light[rows.start - after.offset[0] :, columns.start - after.offset[1] :]
+    weights = weight[rows.start - after.offset[0] :, columns.start - after.offset[1] :]
+    height, width = (min(sizes) for sizes in zip(light_before.shape, light_after.shape, strict=True))
+    pattern = noise.prnu**2 * light_before[:height, :width] * light_after[:height, :width] + noise.dsnu_variance_dn2
     at = tuple(m + b - a for m, b, a in zip(middle, before.offset, after.offset, strict=True))
     if not all(0 <= k < n for k, n in zip(at, weight.shape, strict=True)):
         return np.zeros(2)
-    return np.asarray(slopes[:, at[0], at[1]] * float((own[:height, :width] * pattern).sum()))
+    return np.asarray(slopes[:, at[0], at[1]] * float((weights[:height, :width] * pattern).sum()))
 
 
 def _on_ccd(spot: FittedSpot, maps: Array, ccd: tuple[int, int]) -> SpotPositions:
-    """Positions of which maps and light are those of the whole detector."""
+    """Return the positions with maps and light on the whole detector."""
     gain, light = np.zeros((1, 2, *ccd)), np.zeros((1, *ccd))
     rows, columns = (slice(a, a + n) for a, n in zip(spot.offset, spot.light.shape, strict=True))
     gain[0, :, rows, columns], light[0, rows, columns] = maps, spot.light

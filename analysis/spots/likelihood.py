@@ -1,15 +1,14 @@
-"""Maximum-likelihood fit of the calibrated spot shape, and the bound that no unbiased estimator can beat.
+"""Maximum-likelihood fit of the calibrated spot shape, its Cramer-Rao bound, and tests of the fit.
 
 Model of a pixel: background + flux * shape(row, column); normal likelihood with the variance temporal / frames + fixed
-pattern at the model's grey value. Fisher scoring (Kay, Estimation Theory, 1993, sec. 7.7), from two starts. The
-functions are public through `centroid`. Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
+pattern at the model's grey value. Fisher scoring (Kay, Estimation Theory, 1993, sec. 7.7) is run from two starts. Pixel
+coordinates: (row, column), the centre of the first pixel is (0, 0).
 
-What is to be thought of fits of spots: did they come to rest, and has the spot the shape that was fitted?
-
-Reduced chi-squares are judged twice: over the whole image, which the noise of the frames decides, and over the spot's
-core, which its shape decides. Each limit is exceeded with a chance of `FALSE_ALARM` by a spot that has the calibrated
-shape in frames of the stated noise; both stand for pixels whose noise is that of a normal distribution with the excess
-that shot noise of few electrons has (Satterthwaite, Biometrics Bulletin 2, 110 (1946)).
+A fit is tested for convergence and for the spot having the fitted shape. Reduced chi-squares are tested twice: over the
+whole image, where the noise of the frames dominates, and over the spot's core, where its shape dominates. Each limit is
+exceeded with probability `FALSE_ALARM` by a spot of the calibrated shape in frames of the specified noise; both assume
+pixels with normal noise plus the excess kurtosis of shot noise of few electrons (Satterthwaite, Biometrics Bulletin 2,
+110 (1946)).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from analysis.arrays import Array, OfStates
+from analysis.arrays import Array, StateArrays
 from analysis.spots import spot_image
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
@@ -49,9 +48,9 @@ _EVERY = 4
 _HALVINGS = 6
 
 EDGE_PX = 10.0
-"""Least distance of a spot's centre from the outermost pixel centres."""
+"""Least distance of a spot's centre from the outermost pixel centres, px."""
 CORE_SHARE = 0.02
-"""Share of a spot's peak above which a pixel belongs to its core."""
+"""Fraction of a spot's peak above which a pixel belongs to its core."""
 
 
 def maximum_likelihood_fit(
@@ -71,12 +70,12 @@ def maximum_likelihood_fit(
 
     Parameters
     ----------
-    mean : ArrayLike
-        Mean frames, (B, H, W), DN.
+    mean : (B, H, W) array_like
+        Mean frames, DN.
     frames : int
-        Of each mean.
+        Number of frames averaged into each image.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     template : SpotTemplate
         T shapes; spot b has shape b modulo T.
     edge_px : float
@@ -84,9 +83,10 @@ def maximum_likelihood_fit(
     keep_maps : bool
         Keep the influence of every pixel, for covariances of differences.
     threads : int
-        The batch is cut into small pieces that fit the cache; results do not depend on the number of threads.
+        Number of threads. The batch is cut into small pieces that fit the cache; results do not depend on the number of
+        threads.
     max_iterations : int
-        Of the scoring; a spot that needs more is marked.
+        Greatest number of scoring steps; a spot that needs more is marked as not converged.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
@@ -110,7 +110,7 @@ def maximum_likelihood_fit(
 def _score(
     rule: _Rule, image: Array, which: NDArray[np.intp], edge_px: float, keep_maps: bool, max_iterations: int
 ) -> SpotPositions:
-    """Fisher scoring of a few spots together; arguments as `maximum_likelihood_fit`."""
+    """Fit one piece of a batch by Fisher scoring; arguments as in `maximum_likelihood_fit`."""
     count, height, width = image.shape
     noise, frames = rule.noise, rule.frames
     row, column, background, _, _ = spot_image.coarse(image, frames, noise)
@@ -157,8 +157,9 @@ def _score(
 
 
 def _degrees(of: NDArray[np.bool_], excess: Array) -> Array:
-    """Degrees of freedom (B,) of the chi-square that has the variance of a sum of squares over some pixels (B, P), each
-    of which has the variance 2 + excess.
+    """Return the degrees of freedom (B,) of a sum of squares over some pixels (B, P), matched to its variance.
+
+    Each square has the variance 2 + excess; the chi-square distribution has the variance of their sum.
     """
     count = of.sum(axis=1)
     return np.asarray(2.0 * count**2 / np.maximum(np.sum(of * (2.0 + excess), axis=1), 1e-300))
@@ -166,8 +167,10 @@ def _degrees(of: NDArray[np.bool_], excess: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """Where scoring ended: theta (B, 4), step at which each came to rest (B,) (one more than allowed where it did not),
-    and of the last step level, weight and residual (B, P), design and design times weight (B, 4, P), inverse
+    """Result of Fisher scoring.
+
+    The parameters theta (B, 4), the step at which each spot converged (B,) (one more than allowed if it did not), and
+    of the last step level, weight and residual (B, P), design and design times weight (B, 4, P) and the inverse
     information (B, 4, 4).
     """
 
@@ -184,7 +187,7 @@ class _Scored:
 
 @dataclass(frozen=True, eq=False)
 class _Rule:
-    """What a fit is of."""
+    """Template, noise model and number of frames of a fit."""
 
     template: SpotTemplate
     noise: NoiseModel
@@ -193,9 +196,9 @@ class _Rule:
     def scored(
         self, image: Array, theta: Array, which: NDArray[np.intp], most: int, work: Array, damped: bool = False
     ) -> _Scored:
-        """Fisher scoring of spots (B, H, W) from some places; `work` (2, B, 4, P) holds the designs.
+        """Run Fisher scoring of spots (B, H, W) from given parameters; `work` (2, B, 4, P) is storage for the designs.
 
-        Damped, a step is halved until the squares under its weights become less.
+        If `damped`, a step is halved until the weighted sum of squares decreases.
         """
         flat = image.reshape(len(image), -1)
         steps = np.full(len(image), most + 1)
@@ -220,7 +223,7 @@ class _Rule:
     def _descended(
         self, flat: Array, start: Array, end: Array, which: NDArray[np.intp], weight: Array, residual: Array
     ) -> Array:
-        """The end of a step (B, 4), or nearer to its start where the squares would grow."""
+        """Return the end of a step (B, 4), moved towards its start where the sum of squares would grow."""
         square = np.sum(residual * residual * weight, axis=1)
         for _ in range(_HALVINGS):
             _, level = spot_image.template_model(end, which, self.template)
@@ -231,51 +234,51 @@ class _Rule:
         return end
 
     def deviance(self, found: _Scored) -> Array:
-        """(B,) minus twice the logarithm of the likelihood, at the last step."""
+        """Return minus twice the log-likelihood of the last step, (B,)."""
         return np.asarray(np.sum(found.residual**2 * found.weight - np.log(found.weight), axis=1))
 
 
 def _second_start(
     image: Array, first: _Scored, which: NDArray[np.intp], rule: _Rule, edge_px: float, most: int
 ) -> Array | None:
-    """Where the fits end that start where else the fitted shape is as like the image, (B, 4).
+    """Return the parameters after fits from second starts, (B, 4); None if no spot needs one.
 
-    The correlation of image and shape has its largest value where the least squares are, of all places. Where it has no
-    other top as high as where the first fit ended, which is so for every sharp spot, both starts have the same end.
-    None where that holds for all spots.
+    The correlation of image and shape is greatest where the sum of squares is least, among all positions. If it has no
+    other maximum as high as at the end of the first fit, which holds for every sharp spot, both starts have the same
+    end.
 
     Raises
     ------
     SpotError
-        Two places fit the image alike.
+        Two positions fit the image equally well.
     """
     _, height, width = image.shape
     shape = first.design[:, 2].reshape(image.shape)
     light = image - first.theta[:, 3, None, None]
     # single precision finds the pixel
-    spectra = (fft.rfft2(one.astype(np.float32)) for one in (light, shape))
+    spectra = (fft.rfft2(image.astype(np.float32)) for image in (light, shape))
     surface = fft.irfft2(next(spectra) * np.conj(next(spectra)), (height, width))
     size, resting = np.array([height, width]), np.asarray(first.steps <= most)
-    lag = np.stack([_best_elsewhere(one) for one in surface])
+    lag = np.stack([_best_elsewhere(correlation) for correlation in surface])
     again = np.flatnonzero(~resting | np.any(lag != 0, axis=1))
     if not len(again):
         return None
-    out, told = first.theta.copy(), rule.deviance(first)
+    out, deviance = first.theta.copy(), rule.deviance(first)
     chi = np.mean(first.residual**2 * first.weight, axis=1)
     unclear: dict[int, str] = {}
     for k in again.tolist():
-        own = slice(k, k + 1)
-        theta = first.theta[own].copy()
+        spot = slice(k, k + 1)
+        theta = first.theta[spot].copy()
         theta[:, :2] = np.clip(theta[:, :2] + lag[k], edge_px, size - 1 - edge_px)
         try:
             work = np.empty((2, 1, 4, height * width))
-            second = rule.scored(image[own], theta, which[own], _MOST_DAMPED, work, damped=True)
+            second = rule.scored(image[spot], theta, which[spot], _MOST_DAMPED, work, damped=True)
         except (TemplateRangeError, np.linalg.LinAlgError):
             continue
         if second.steps[0] > _MOST_DAMPED:
             continue
         apart = float(np.max(np.abs(second.theta[0, :2] - first.theta[k, :2])))
-        gain = float(told[k] - rule.deviance(second)[0])
+        gain = float(deviance[k] - rule.deviance(second)[0])
         least = min(float(chi[k]), float(np.mean(second.residual**2 * second.weight)))
         if not resting[k] or gain > 0.0:
             out[k] = second.theta[0]
@@ -283,14 +286,14 @@ def _second_start(
             places = ", ".join(
                 f"({row:.2f}, {column:.2f})" for row, column in (first.theta[k, :2], second.theta[0, :2])
             )
-            unclear[k] = f"its shape fits alike in two places, {places} px, so that neither can be relied on"
+            unclear[k] = f"its shape fits equally well at two positions, {places} px, so that neither is reliable"
     if unclear:
         raise SpotError(unclear)
     return out
 
 
 def _start(rule: _Rule, image: Array, theta: Array, which: NDArray[np.intp]) -> Array:
-    """A better start from the few pixels about each spot, (B, 4): they hold most of what the image knows."""
+    """Return improved start parameters (B, 4) from the few pixels about each spot."""
     height, width = image.shape[1:]
     size = (min(_NEAR_PX, height), min(_NEAR_PX, width))
     corner = np.rint(theta[:, :2] - 0.5 * (np.array(size) - 1)).astype(np.intp)
@@ -305,9 +308,7 @@ def _start(rule: _Rule, image: Array, theta: Array, which: NDArray[np.intp]) -> 
 
 
 def _best_elsewhere(surface: Array) -> NDArray[np.intp]:
-    """Row and column, px, from where a shape stands to where it is as like the image (H, W); 0 where there is no such
-    place farther than a step or two away.
-    """
+    """Return the lag (row, column) in px to the best correlation away from the fit; 0 if there is none."""
     size = np.array(surface.shape)
     # few places are as high, and only these need to be looked at for tops
     high = np.argwhere(surface > _LIKE * surface.max())
@@ -325,8 +326,10 @@ def _best_elsewhere(surface: Array) -> NDArray[np.intp]:
 def _step(
     theta: Array, design: Array, weight: Array, residual: Array, out: Array | None = None
 ) -> tuple[Array, Array, Array, Array]:
-    """One step of Fisher scoring: parameters (B, 4), length of the step (B,) px, inverse information (B, 4, 4), design
-    times weight (B, 4, P), which goes to `out` if that is given.
+    """Take one step of Fisher scoring.
+
+    Returns the parameters (B, 4), the length of the step (B,) in px, the inverse information (B, 4, 4) and the design
+    times weight (B, 4, P), which is stored in `out` if that is given.
     """
     weighted = np.multiply(design, weight[:, None], out=out)
     inverse: Array = np.asarray(np.linalg.inv(weighted @ design.transpose(0, 2, 1)), dtype=np.float64)
@@ -339,20 +342,20 @@ def _step(
 
 
 def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: int) -> Array:
-    """Cramer-Rao bound (B, 2, 2) px^2 of spots of which there is an image without noise, and no template.
+    """Return the Cramer-Rao bound of the positions of spots given by noise-free images, (B, 2, 2) px^2.
 
     Parameters
     ----------
-    light : ArrayLike
-        (B, H + 4, W + 4) DN of the spots without background; two pixels more on every side than the detector, for the
-        slopes (differences of fourth order: the sigmas of a spot whose first dark ring is at 7 px come out 2e-3 too
-        low, of wider ones less).
+    light : (B, H + 4, W + 4) array_like
+        Light of the spots without background, DN, with two pixels more on every side than the detector for the slopes
+        (differences of fourth order: the sigmas of a spot whose first dark ring is at 7 px come out 2e-3 too low, of
+        wider ones less).
     background : float
-        DN with black level.
+        Background with black level, DN.
     noise : NoiseModel
-        Of the detector; the fixed pattern counts: the bound is for one image by itself.
+        Noise of the detector. The fixed pattern counts: the bound is for one image by itself.
     frames : int
-        Of which an image is the mean.
+        Number of frames averaged into an image.
     """
     image = np.asarray(light, np.float64)
     count, inner = len(image), image[:, 2:-2, 2:-2]
@@ -367,33 +370,35 @@ def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: 
 
 
 def _bound(design: Array, level: Array, noise: NoiseModel, frames: int) -> Array:
-    """Covariance of row and column (B, 2, 2) by the derivatives (B, 4, P) of all pixels and their level (B, P), DN."""
+    """Return the covariance of row and column, (B, 2, 2), from the derivatives and levels of all pixels."""
     design = design / np.sqrt(spot_image.variance(level, noise, frames))[:, None]
     information = design @ design.transpose(0, 2, 1)
     return np.asarray(np.linalg.inv(information)[:, :2, :2], dtype=np.float64)
 
 
 FALSE_ALARM = 1e-8
-"""Chance that one of both limits of one fit is exceeded by a spot that is as calibrated: 2e-7 of a run with four spots
-before and after, 1e-4 of a course of a thousand times."""
-UNRESTED = "the fit does not come to rest from either of two starts; the spot has not the calibrated shape"
-"""Why a spot is refused."""
+"""Probability that a spot of the calibrated shape exceeds one of the two limits of a fit.
+
+It gives 2e-7 for a run with four spots before and after, and 1e-4 for a course of a thousand times.
+"""
+NOT_CONVERGED = "the fit does not converge from either of two starts; the spot does not have the calibrated shape"
+"""Reason given for refusing a spot whose fit does not converge."""
 
 
 @dataclass(frozen=True, eq=False)
-class FitStates(OfStates):
-    """Judgements of fits, arrays of one shape: (B,), or (S, C) as `reshaped` makes them.
+class FitStates(StateArrays):
+    """Goodness of fit of spots, arrays of one shape: (B,), or (S, C) after `reshaped`.
 
     Attributes
     ----------
-    whole, core : Array
+    whole, core : ndarray
         Reduced chi-squares of all pixels and of the core's; NaN where no shape was fitted.
-    whole_limit, core_limit : Array
-        Of these; infinite where no shape was fitted.
-    whole_sigma, core_sigma : Array
-        What the noise of the frames makes of them, one standard deviation.
-    noise : Array
-        The noise of the frames over the stated one, squared, by the median of all pixels.
+    whole_limit, core_limit : ndarray
+        Limits of these; infinite where no shape was fitted.
+    whole_sigma, core_sigma : ndarray
+        Standard deviations of these by the noise of the frames.
+    noise : ndarray
+        Squared ratio of the frames' noise to the specified one, from the median of all pixels.
     """
 
     whole: Array
@@ -406,37 +411,38 @@ class FitStates(OfStates):
 
     @property
     def fits(self) -> NDArray[np.bool_]:
-        """Whether the spot has the shape and the noise that were assumed; true where that cannot be told."""
+        """True where the spot has the assumed shape and noise, and where that cannot be tested."""
         beyond = (self.whole > self.whole_limit) | (self.core > self.core_limit)
         return np.asarray(~beyond)
 
     @property
     def widening(self) -> Array:
-        """Factor of sigma: 1 for a spot that fits; else the root of the larger reduced chi-square (Birge, Physical
-        Review 40, 207 (1932)).
+        """Factor of sigma: 1 for a spot that fits, else the root of the larger reduced chi-square (Birge ratio).
+
+        Reference: Birge, Physical Review 40, 207 (1932).
         """
         with np.errstate(invalid="ignore"):
             grown = np.sqrt(np.fmax(self.whole, self.core))
         return np.where(self.fits, 1.0, np.maximum(grown, 1.0))
 
     def reshaped(self, spots: int) -> FitStates:
-        """(S, C) from S states of C spots each.
+        """Return the arrays with shape (S, C), for S states of C spots each.
 
         Parameters
         ----------
         spots : int
-            C.
+            Number of spots C.
         """
         return FitStates(*(values.reshape(-1, spots) for values in vars(self).values()))
 
 
 def fit_states(positions: SpotPositions) -> FitStates:
-    """Judge B fits.
+    """Test the goodness of fit of B spots.
 
     Parameters
     ----------
     positions : SpotPositions
-        As measured.
+        Measured positions.
     """
     count = positions.row.size
     if positions.degrees is None or positions.core_chi_square is None:
@@ -450,14 +456,14 @@ def fit_states(positions: SpotPositions) -> FitStates:
 
 
 def widened(positions: SpotPositions, factor: Array) -> SpotPositions:
-    """Positions whose sigmas hold what their fits say.
+    """Return the positions with their sigmas scaled by the Birge ratio of their fits.
 
     Parameters
     ----------
     positions : SpotPositions
-        B of them.
-    factor : Array
-        Of the sigmas, (B,), as `FitStates.widening`.
+        B positions.
+    factor : (B,) ndarray
+        Factors of the sigmas, as `FitStates.widening`.
     """
     if np.all(factor == 1.0):
         return positions
@@ -470,14 +476,14 @@ def widened(positions: SpotPositions, factor: Array) -> SpotPositions:
     )
 
 
-def require_rest(positions: SpotPositions) -> SpotPositions:
-    """Return the positions; raise SpotError for spots whose fit has not come to rest.
+def require_convergence(positions: SpotPositions) -> SpotPositions:
+    """Return the positions; raise SpotError for spots whose fit has not converged.
 
     Parameters
     ----------
     positions : SpotPositions
-        As measured.
+        Measured positions.
     """
     if not np.all(positions.converged):
-        raise SpotError({int(n): UNRESTED for n in np.flatnonzero(~positions.converged)})
+        raise SpotError({int(n): NOT_CONVERGED for n in np.flatnonzero(~positions.converged)})
     return positions

@@ -1,12 +1,12 @@
-"""Gain and noise of a detector from frames in the dark and in even light (EMVA Standard 1288, release 3.1, sections 6
-and 8), and the correction of frames by these.
+"""Photon-transfer measurement of a detector's gain and noise, and correction of frames by dark and flat frames.
 
-Temporal variance is taken over the frames of a stack, so that neither fixed pattern nor an uneven light is in it; the
-mean of each frame is taken off first, so that a lamp that drifts is not noise. Non-uniformities are spatial variances
-of the mean frames without what is left of temporal noise; a quadratic surface is the light's and is taken off first.
+The method is that of EMVA Standard 1288, release 3.1, sections 6 and 8. Temporal variance is taken over the frames of a
+stack, so that neither the fixed pattern nor uneven light contributes; the mean of each frame is subtracted first, so
+that a drifting lamp does not count as noise. Non-uniformities are spatial variances of the mean frames minus the
+remaining temporal noise; a quadratic surface is attributed to the light and subtracted first.
 
-Rounding to grey values is taken off as `noise` has it. Where noise is less than about half a grey value, what it
-does depends on where between two steps the pixels stand, which stands in the sigmas.
+Rounding to grey values is subtracted as modelled in `noise`. Where noise is less than about half a grey value, the
+effect of rounding depends on the pixels' level between two steps; this uncertainty is included in the sigmas.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from numpy.typing import NDArray
 
 from analysis.arrays import Array, Mask
 from analysis.spots.frame_screening import FramesError
-from analysis.spots.noise import WHOLE, NoiseModel, noise_range, systematic_variance, temporal_part
+from analysis.spots.noise import ROUNDING_VARIANCE, NoiseModel, noise_range, systematic_variance, temporal_part
 from analysis.statistics import robust_sigma
 
 _HOT_SIGMAS = 10.0
 _RESPONSE = (0.5, 1.5)
 """Range of the response of a usable pixel, relative to that of the others."""
 _NOTHING = 1e-12
-"""DN^2 that rounding may hide and nobody would see."""
+"""Variance of rounding, DN^2, below which its uncertainty is neglected."""
 _LEAST_LIGHT = 10.0
-"""Flat over dark level, in sigmas of a pixel of one dark frame, below which there is no light in a flat frame."""
+"""Least level of flat over dark frames, in sigmas of a pixel of one dark frame, that counts as light."""
 
 
 @dataclass(frozen=True)
 class PhotonTransfer:
-    """What dark and flat frames say of a detector; <name>_sigma its standard deviation.
+    """Gain, noise and non-uniformities of a detector from dark and flat frames; <name>_sigma is the standard deviation.
 
     Attributes
     ----------
     gain_dn_per_e : float
-        System gain K.
+        System gain K, DN per electron.
     dark_noise_e : float
-        Temporal noise in the dark, dark current's included, electrons rms.
+        Temporal noise in the dark, including that of the dark current, electrons rms.
     dark_level_dn : float
         Mean grey value in the dark.
     prnu : float
-        Photo response non-uniformity, rms share.
+        Photo-response non-uniformity, rms fraction.
     dsnu_e : float
-        Dark signal non-uniformity, electrons rms.
+        Dark-signal non-uniformity, electrons rms.
     """
 
     gain_dn_per_e: float
@@ -61,12 +61,12 @@ class PhotonTransfer:
     dsnu_sigma: float
 
     def noise_model(self, sheet: NoiseModel) -> NoiseModel:
-        """The detector's noise by these numbers; saturation is the data sheet's.
+        """Return the detector's noise model with these values and the data sheet's saturation.
 
         Parameters
         ----------
         sheet : NoiseModel
-            By the data sheet.
+            Noise model of the data sheet.
         """
         return replace(
             sheet,
@@ -82,18 +82,18 @@ class PhotonTransfer:
 
 @dataclass(frozen=True, eq=False)
 class PixelCorrection:
-    """How grey values of single pixels are made those of an even detector.
+    """Correction of single pixels by dark level and response.
 
     Attributes
     ----------
-    dark : Array
-        (H, W) DN, taken off; its mean is kept.
-    response : Array
-        (H, W) share of the mean response, divided by.
-    bad : Mask
-        (H, W) pixels that are not corrected but left out.
+    dark : (H, W) ndarray
+        Dark level that is subtracted, DN; its mean is kept.
+    response : (H, W) ndarray
+        Relative response that is divided by; its mean is 1.
+    bad : (H, W) ndarray of bool
+        Pixels that are excluded instead of corrected.
     noise : NoiseModel
-        Of a corrected detector: its pattern is what the corrections leave.
+        Noise of a corrected detector: its fixed pattern is the residual of the corrections.
     """
 
     dark: Array
@@ -102,12 +102,12 @@ class PixelCorrection:
     noise: NoiseModel
 
     def corrected(self, mean: Array) -> Array:
-        """Mean frame (H, W), DN, of an even detector.
+        """Return the corrected mean frame, (H, W) DN.
 
         Parameters
         ----------
-        mean : Array
-            As recorded, (H, W) DN.
+        mean : (H, W) ndarray
+            Mean frame as recorded, DN.
         """
         level = self.noise.dark_level_dn
         return np.asarray(level + (mean - self.dark) / self.response)
@@ -117,33 +117,33 @@ def _stack(frames: NDArray[Any], what: str) -> Array:
     values = np.asarray(frames, dtype=np.float64)
     if values.ndim != 3 or len(values) < 2:
         raise FramesError(
-            f"{len(values) if values.ndim == 3 else 1} {what} frame: its noise cannot be told",
+            f"{len(values) if values.ndim == 3 else 1} {what} frame: its noise cannot be measured",
             f"two or more {what} frames of one level",
         )
     if not np.all(np.isfinite(values)):
         raise FramesError(
-            f"{what} frames hold values that are not finite", f"{what} frames with a value in every pixel"
+            f"{what} frames contain values that are not finite", f"{what} frames with a value in every pixel"
         )
     return values
 
 
 def _temporal(values: Array) -> float:
-    """Variance of a pixel over frames, DN^2."""
+    """Return the variance of a pixel over the frames, DN^2."""
     even = values - values.mean(axis=(1, 2), keepdims=True)
     return float(np.square(even - even.mean(axis=0)).sum() / ((len(values) - 1) * values[0].size))
 
 
 def _surface(image: Array, good: Mask) -> Array:
-    """The quadratic surface through an image, (H, W)."""
+    """Return the quadratic surface fitted to an image, (H, W)."""
     v, u = np.meshgrid(np.linspace(-1, 1, image.shape[0]), np.linspace(-1, 1, image.shape[1]), indexing="ij")
     basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v]).reshape(6, -1)
     use = good.ravel()
-    found = np.linalg.lstsq(basis[:, use].T, image.ravel()[use], rcond=None)[0]
-    return np.asarray((found @ basis).reshape(image.shape))
+    coefficients = np.linalg.lstsq(basis[:, use].T, image.ravel()[use], rcond=None)[0]
+    return np.asarray((coefficients @ basis).reshape(image.shape))
 
 
 def _usable(dark: Array, flat: Array) -> Mask:
-    """Pixels without those that are far off in either."""
+    """Return the pixels (H, W) that are no outliers in the dark or in the flat frame."""
     good = np.ones(dark.shape, dtype=bool)
     for image in (dark, flat):
         away = np.abs(image - np.median(image))
@@ -152,26 +152,26 @@ def _usable(dark: Array, flat: Array) -> Mask:
 
 
 def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
-    """Gain, noise and non-uniformities.
+    """Measure gain, noise and non-uniformities of a detector.
 
     Parameters
     ----------
-    dark : NDArray[Any]
-        (N, H, W) grey values without light, N >= 2.
-    flat : NDArray[Any]
-        (M, H, W) of even light well above the dark, M >= 2.
+    dark : (N, H, W) ndarray
+        Grey values without light, N >= 2.
+    flat : (M, H, W) ndarray
+        Grey values in even light well above the dark level, M >= 2.
 
     Raises
     ------
     FramesError
-        Too few frames, frames of different size, or no light in the flat ones.
+        There are too few frames, the frames differ in size, or the flat frames show no light.
     """
     night, day = _stack(dark, "dark"), _stack(flat, "flat")
     if night.shape[1:] != day.shape[1:]:
         raise FramesError("dark and flat frames have different sizes", "frames of one size")
     level, light = night.mean(axis=0), day.mean(axis=0)
     good = _usable(level, light)
-    night, day = (np.where(good, one, np.median(one, axis=(1, 2), keepdims=True)) for one in (night, day))
+    night, day = (np.where(good, stack, np.median(stack, axis=(1, 2), keepdims=True)) for stack in (night, day))
     level, light = night.mean(axis=0), day.mean(axis=0)
     pixels = int(np.count_nonzero(good))
     share = good.size / pixels
@@ -183,7 +183,7 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
         )
     dark_steps, steps = temporal_part(dark_variance), temporal_part(variance)
     shot = variance - dark_variance + (dark_steps - steps)
-    own = max(dark_variance - dark_steps, 0.0)
+    dark_rest = max(dark_variance - dark_steps, 0.0)
     dark_spread = dark_variance * math.sqrt(2.0 / (pixels * (len(night) - 1)))
     spread = math.hypot(variance * math.sqrt(2.0 / (pixels * (len(day) - 1))), dark_spread)
     if shot < 5.0 * spread:
@@ -191,24 +191,24 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
             "the flat frames are not noisier than the dark ones",
             "raw frames, neither averaged, smoothed nor compressed",
         )
-    # of few changes of a grey value another number might have been seen; frames of even light have pixels at all places
+    # few changes of a grey value give an uncertain variance; in even light the pixels lie at all levels between steps
     low, high = noise_range(dark_variance, 5.0 * dark_spread + 5.0 / (pixels * (len(night) - 1)))
-    dark_doubt = max(high - own, own - low)
+    dark_doubt = max(high - dark_rest, dark_rest - low)
     if dark_doubt > 0.0:
         spread = math.hypot(spread, dark_doubt)
     if shot < 5.0 * spread:
         raise FramesError(
-            f"the dark frames have noise of {math.sqrt(own):.2g} DN, so little that rounding to whole grey values "
-            "hides the gain",
-            "`photon_transfer: stated`, or frames with more grey values for an electron",
+            f"the dark frames have noise of {math.sqrt(dark_rest):.2g} DN, so little that rounding to whole grey "
+            "values hides the gain",
+            "`photon_transfer: stated`, or frames with more grey values per electron",
         )
     gain = shot / signal
-    noise = math.sqrt(own) / gain
+    noise = math.sqrt(dark_rest) / gain
     noise_sigma = noise * math.hypot(spread / shot, 0.5 * math.sqrt(2.0 / (pixels * (len(night) - 1))))
     if dark_doubt > 0.0:
-        noise_sigma = math.hypot(noise_sigma, _square_root_sigma(own, dark_doubt) / gain)
+        noise_sigma = math.hypot(noise_sigma, _square_root_sigma(dark_rest, dark_doubt) / gain)
     left, dark_left = variance / len(day), dark_variance / len(night)
-    stays, dark_stays = WHOLE - steps, WHOLE - dark_steps
+    stays, dark_stays = ROUNDING_VARIANCE - steps, ROUNDING_VARIANCE - dark_steps
     hidden = float(systematic_variance(0.0, low, 1.0))
     dsnu, dsnu_sigma = _pattern(level, good, (dark_left, dark_stays), hidden)
     prnu, prnu_sigma = _pattern(light - level, good, (left, dark_left, stays + dark_stays), hidden)
@@ -231,8 +231,9 @@ def _pattern_square(image: Array, good: Mask) -> float:
 
 
 def _pattern(image: Array, good: Mask, noise: tuple[float, ...], hidden: float) -> tuple[float, float]:
-    """Standard deviation of a pattern without the variance of noise, and its own; rounding may have made some of the
-    pattern's variance, or hidden some.
+    """Return the standard deviation of a fixed pattern corrected for noise, and its uncertainty.
+
+    ``hidden`` is the variance that rounding may have added to the pattern, or hidden of it.
     """
     square = whole = _pattern_square(image, good)
     for part in noise:
@@ -248,24 +249,24 @@ def _square_root_sigma(square: float, spread: float) -> float:
 
 
 def pixel_correction(noise: NoiseModel, dark: NDArray[Any] | None, flat: NDArray[Any] | None) -> PixelCorrection:
-    """Correction of every pixel by dark and flat frames.
+    """Compute the correction of every pixel from dark and flat frames.
 
-    What is left of the pattern is the noise of the correction, which is the same in all frames that are corrected: it
-    takes the place of the detector's own pattern.
+    The residual pattern is the noise of the correction, which is the same in all corrected frames: it takes the place
+    of the detector's own pattern.
 
     Parameters
     ----------
     noise : NoiseModel
-        Of the detector.
-    dark : NDArray[Any] | None
-        (N, H, W) frames without light, of the exposure of those to be corrected.
-    flat : NDArray[Any] | None
-        (M, H, W) of even light; None to leave the response as it is.
+        Noise of the detector.
+    dark : (N, H, W) ndarray or None
+        Frames without light, with the exposure of those to be corrected.
+    flat : (M, H, W) ndarray or None
+        Frames in even light; None to leave the response uncorrected.
 
     Raises
     ------
     FramesError
-        Too few frames, or no light in the flat ones.
+        There are too few frames, or the flat frames show no light.
     """
     night = _stack(dark if dark is not None else np.zeros((0,)), "dark")
     level = night.mean(axis=0)

@@ -1,13 +1,12 @@
-"""Fit of the calibrated shape to a mean image of which pixels may be missing, beside what else is in the light: an
-uneven background, further spots (reflections), and smear by vibration.
+"""Fit of the calibrated spot shape to a mean image with missing pixels, uneven background, further spots or smear.
 
 Pixels that are not good have no weight; one that is the mean of fewer frames has more noise. The model is
 
     background + slopes + sum over spots of flux x (shape convolved with a normal distribution)
 
-fitted by Fisher scoring as `likelihood` does, whose result it is for a clean image. All parameters are fitted together,
-so that what is not known of the others stands in the covariance of the place. Reflections have the shape of the spot:
-they are seen by the same optics; interference with it is not modelled.
+It is fitted by Fisher scoring as in `likelihood`, with the same result for a clean image. All parameters are fitted
+together, so that the uncertainty of the others is contained in the covariance of the position. Reflections are assumed
+to have the shape of the spot, since the same optics form them; their interference with it is not modelled.
 
 Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 """
@@ -31,31 +30,30 @@ from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRan
 
 _REST_PX, _MOST_STEPS = 1e-6, 60
 _REST_SIGMAS = 1e-4
-"""Largest last step of other spots, in sigmas. They may be so faint that their positions are uncertain by part of a
-pixel.
-"""
+"""Largest last step of further spots, in sigmas: they may be so faint that their positions are uncertain by part of a
+pixel."""
 _FLUX_SIGMAS = 5.0
 _MOST_SMEAR = 25.0
-"""Px^2; a spot that is smeared by more is another one."""
+"""Largest second moment of a smear, px^2; a spot that is smeared by more is rejected as another one."""
 CORE_SHARE = 0.02
-"""Share of the peak above which the shape of the spot is judged."""
+"""Fraction of the peak above which the shape of the spot is tested."""
 
 
 @dataclass(frozen=True)
 class FitTerms:
-    """What is fitted beside place, flux and level.
+    """Terms that are fitted beside position, flux and level.
 
     Attributes
     ----------
     background : int
-        0 for an even background, 1 with slopes, 2 with curvature.
-    others : tuple[tuple[float, float], ...]
-        (row, column) where further spots are looked for, px.
+        0 for an even background, 1 for slopes, 2 for slopes and curvature.
+    others : tuple of (float, float)
+        Row and column of the start positions of further spots, px.
     smear : bool
-        Whether the shape is convolved with a normal distribution.
+        True if the shape is convolved with a normal distribution.
     learnt : bool
-        Whether the shape was learnt from frames of the spot, and may have been smeared more itself: a smear that is
-        negative makes the shape sharper. Else the shape is the sharpest, and what is negative is noise.
+        True if the shape was learnt from frames of the spot, which may have been smeared more: a negative smear makes
+        the shape sharper. Otherwise the shape is the sharpest possible, and a negative smear is noise.
     """
 
     background: int = 0
@@ -66,37 +64,36 @@ class FitTerms:
 
 @dataclass(frozen=True, eq=False)
 class ScreenedFit:
-    """A spot and what was fitted beside it.
+    """Fitted spot with everything fitted beside it.
 
     Attributes
     ----------
     positions : SpotPositions
-        Of the one spot.
+        Position of the one spot.
     terms : FitTerms
-        That were fitted.
-    others : Array
-        (G, 3) row, column (px) and flux over that of the spot.
-    others_sigma : Array
-        (G, 3) their standard deviations.
-    smear : Array
-        (2, 2) px^2, second moments of the smear; zeros where none was fitted.
-    level : Array
-        (H, W) DN, the fitted image.
-    variance : Array
-        (H, W) DN^2 of the mean, also where a pixel is not used.
-    used : Mask
-        (H, W) pixels.
-    core : tuple[float, int]
+        Terms that were fitted.
+    others : (G, 3) ndarray
+        Row, column (px) and relative flux of the further spots.
+    others_sigma : (G, 3) ndarray
+        Standard deviations of these.
+    smear : (2, 2) ndarray
+        Second moments of the smear, px^2; zeros where none was fitted.
+    level : (H, W) ndarray
+        Fitted image, DN.
+    variance : (H, W) ndarray
+        Variance of the mean, DN^2, also where a pixel is not used.
+    used : (H, W) ndarray of bool
+        Pixels used by the fit.
+    core : tuple of (float, int)
         Reduced chi-square of the pixels in the spot's core, and their number.
     cost : float
-        Sigma of the place over what it would be if nothing were missing, nothing else were fitted and the spot stood
-        still, minus 1.
+        Relative increase of the position's sigma over that without missing pixels, further terms and movement.
     missing : float
-        The same without what movement between frames does.
-    theta : Array
-        (K,) all parameters: row, column, flux, level, then those of what else is fitted; px, DN, px^2.
-    inverse : Array
-        (K, K) inverse of their information.
+        The same increase without the effect of movement between frames.
+    theta : (K,) ndarray
+        Parameters: row, column, flux, level, then those of the further terms; px, DN, px^2.
+    inverse : (K, K) ndarray
+        Inverse of their information matrix.
     """
 
     positions: SpotPositions
@@ -114,80 +111,81 @@ class ScreenedFit:
     inverse: Array
 
     def residual(self, mean: Array) -> Array:
-        """(H, W) what the image has more than the model, in standard deviations; 0 where a pixel is not used.
+        """Return the image minus the model in standard deviations, (H, W); 0 where a pixel is not used.
 
         Parameters
         ----------
-        mean : Array
-            The image, (H, W) DN.
+        mean : (H, W) ndarray
+            Image, DN.
         """
         return np.asarray(np.where(self.used, (mean - self.level) / np.sqrt(self.variance), 0.0))
 
-    def explains(self, mean: Array) -> float:
-        """Chi-square of the image.
+    def image_chi_square(self, mean: Array) -> float:
+        """Return the chi-square of the image.
 
         Parameters
         ----------
-        mean : Array
-            The image, (H, W) DN.
+        mean : (H, W) ndarray
+            Image, DN.
         """
         return float(np.square(self.residual(mean)).sum())
 
     def core_fits(self, learnt_from: ScreenedFit | None = None, noisier: float = 1.0) -> bool:
-        """Whether the core has the calibrated shape, at a false-alarm rate of 1e-6.
+        """Return True if the core has the calibrated shape, at a false-alarm rate of 1e-6.
 
         Parameters
         ----------
-        learnt_from : ScreenedFit | None
-            The fit to the image that the shape was learnt from, whose noise is in the shape, too; None for a shape
-            without noise.
+        learnt_from : ScreenedFit or None
+            Fit to the image that the shape was learnt from, whose noise is in the shape as well; None for a noise-free
+            shape.
         noisier : float
-            By which factor the noise of the frames makes the variance in the core more than stated.
+            Ratio of the variance in the core, by the noise of the frames, to the specified one.
         """
         return self.core_widening(learnt_from, noisier) == 1.0
 
     def core_widening(self, learnt_from: ScreenedFit | None = None, noisier: float = 1.0) -> float:
-        """Factor of sigma: 1 where the core has the calibrated shape, else the root of its reduced chi-square (as
-        `analysis.spots.likelihood.FitStates.widening`).
+        """Return the factor of sigma: 1 if the core has the calibrated shape, else the root of its reduced chi-square.
+
+        The factor is that of `analysis.spots.likelihood.FitStates.widening`.
 
         Parameters
         ----------
-        learnt_from : ScreenedFit | None
-            As of `core_fits`.
+        learnt_from : ScreenedFit or None
+            Fit to the image that the shape was learnt from, as in `core_fits`.
         noisier : float
-            likewise.
+            Ratio of variances, as in `core_fits`.
         """
         value, count = self.core
         spread = 1.0
         if learnt_from is not None:
             # at the peak, where the noise is that of the light
-            first, own = (float(one.variance.flat[int(np.argmax(one.level))]) for one in (learnt_from, self))
-            spread += first / own * float(self.positions.flux[0] / learnt_from.positions.flux[0]) ** 2
+            first, second = (float(fit.variance.flat[int(np.argmax(fit.level))]) for fit in (learnt_from, self))
+            spread += first / second * float(self.positions.flux[0] / learnt_from.positions.flux[0]) ** 2
         if value / (noisier * spread) * count <= chi2.isf(1e-6, max(count - 4, 1)):
             return 1.0
         return float(max(np.sqrt(value / (noisier * spread)), 1.0 + 1e-9))
 
 
 def one_shape(template: SpotTemplate, index: int, shape: tuple[int, int]) -> SpotTemplate:
-    """One of the shapes of a template, for images of another size.
+    """Return one of the shapes of a template, for images of another size.
 
     Parameters
     ----------
     template : SpotTemplate
-        T shapes.
+        Template of T shapes.
     index : int
-        which.
-    shape : tuple[int, int]
-        (H, W) of the images.
+        Index of the shape.
+    shape : tuple of int
+        Rows and columns (H, W) of the images.
     """
-    own = slice(index, index + 1)
-    rows, columns = template.row_factors[own], template.column_factors[own]
-    return replace(template, row_factors=rows, column_factors=columns, centre=template.centre[own], shape=shape)
+    selected = slice(index, index + 1)
+    rows, columns = template.row_factors[selected], template.column_factors[selected]
+    return replace(template, row_factors=rows, column_factors=columns, centre=template.centre[selected], shape=shape)
 
 
 @contextmanager
-def _errors_of_the_spot() -> Iterator[None]:
-    """Say of the spot why it cannot be fitted."""
+def _spot_errors() -> Iterator[None]:
+    """Turn errors of the template and of the linear algebra into a SpotError with its reason."""
     try:
         yield
     except TemplateRangeError as error:
@@ -196,7 +194,7 @@ def _errors_of_the_spot() -> Iterator[None]:
         raise SpotError({0: "too few good pixels are left to fit the spot"}) from error
 
 
-@_errors_of_the_spot()
+@_spot_errors()
 def fit_screened(
     mean: Array,
     counts: Array,
@@ -208,37 +206,37 @@ def fit_screened(
     jitter: Array | None = None,
     recorded: int | None = None,
 ) -> ScreenedFit:
-    """Fit one spot.
+    """Fit one spot, with further terms, to a mean image with missing pixels.
 
     Parameters
     ----------
-    mean : Array
-        (H, W) DN.
-    counts : Array
-        (H, W) frames that each pixel is the mean of.
-    good : Mask
-        (H, W) pixels that are used.
+    mean : (H, W) ndarray
+        Mean image, DN.
+    counts : (H, W) ndarray
+        Number of frames averaged in each pixel.
+    good : (H, W) ndarray of bool
+        Usable pixels.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     template : SpotTemplate
-        The spot's one shape.
-    terms : FitTerms | None
-        What else is fitted; None for nothing.
-    near : ScreenedFit | None
-        a fit to begin at; None to look for the brightest spot.
-    jitter : Array | None
-        (2, 2) px^2, covariance of the place over the frames; its share in the mean is added to sigma.
-    recorded : int | None
-        Frames that there are, against which the cost is counted; None for the most that a pixel has.
+        Template with the spot's one shape.
+    terms : FitTerms or None
+        Further terms of the fit; None for none.
+    near : ScreenedFit or None
+        Fit to start from; None to search for the brightest spot.
+    jitter : (2, 2) ndarray or None
+        Covariance of the position over the frames, px^2; its contribution to the mean is included in the covariance.
+    recorded : int or None
+        Number of recorded frames, the reference of `cost`; None for the largest number of frames in a pixel.
 
     Raises
     ------
     SpotError
-        No spot, or it cannot be fitted.
+        There is no spot, or it cannot be fitted.
     """
     terms = FitTerms() if terms is None else terms
     model = _Model(template, terms, mean.shape[0], mean.shape[1])
-    theta = _start(mean, counts, good, noise, model) if near is None else model.begun(near)
+    theta = _start(mean, counts, good, noise, model) if near is None else model.started_from(near)
     spot_image.check_edge(theta[None, :2], *template.shape, EDGE_PX)
     flat, use, many = mean.ravel(), good.ravel(), counts.ravel()
     if near is not None and terms.learnt:
@@ -304,15 +302,17 @@ def fit_screened(
 
 
 def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array, Array]:
-    """Parts of the fitted image: its derivatives (K, P) by all parameters; the part (P,), DN, that is neither the spot
-    nor its level; and the derivatives (K, P) of that part.
+    """Return the parts of the fitted image: design, light beside the spot, and the design of that light.
+
+    They are the derivatives (K, P) with respect to all parameters; the part (P,), DN, that is neither the spot nor its
+    level; and the derivatives (K, P) of that part.
 
     Parameters
     ----------
     fit : ScreenedFit
-        Of a spot.
+        Fit of a spot.
     template : SpotTemplate
-        The spot's one shape.
+        Template with the spot's one shape.
     """
     model = _Model(template, fit.terms, *fit.level.shape)
     design, _ = model.design(fit.theta)
@@ -328,17 +328,17 @@ def _variance(level: Array, counts: Array, noise: NoiseModel) -> Array:
 
 
 def _cost(design: Array, level: Array, frames: float, noise: NoiseModel, covariance: Array) -> float:
-    """Sigma of the place over that of an image with nothing missing and nothing else in it, minus 1."""
+    """Return the relative increase of the position's sigma over that of an undisturbed image."""
     weighted = design / _variance(level, np.full_like(level, frames), noise)
     ideal = np.linalg.inv(weighted @ design.T)[:2, :2]
     return float(np.sqrt(np.trace(covariance) / np.trace(ideal)) - 1.0)
 
 
 def _start(mean: Array, counts: Array, good: Mask, noise: NoiseModel, model: _Model) -> Array:
-    """Place of the brightest spot, then flux and level, in which the model is linear."""
+    """Return start parameters: position of the brightest spot, then flux and level, in which the model is linear."""
     filled = spot_image.filled(mean, good)
     frames = max(int(np.median(counts)), 1)
-    # what is saturated has been left out
+    # saturated pixels have been excluded
     whole = replace(noise, saturation_dn=1e300)
     row, column, background, _, _ = spot_image.coarse(filled[None], frames, whole)
     flux = max(float((filled - background[0]).sum()), 1.0)
@@ -347,8 +347,10 @@ def _start(mean: Array, counts: Array, good: Mask, noise: NoiseModel, model: _Mo
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Parameters: row, column, flux, level; slopes and curvature of the background; row, column and flux of each other
-    spot; second moments of the smear (rows, across, columns).
+    """Model of an image by its parameters.
+
+    The parameters are row, column, flux, level; slopes and curvature of the background; row, column and flux of each
+    further spot; second moments of the smear (rows, across, columns).
     """
 
     template: SpotTemplate
@@ -362,7 +364,7 @@ class _Model:
 
     @property
     def _others(self) -> int:
-        """Where the other spots begin."""
+        """Index of the first parameter of the further spots."""
         return 4 + self._slopes
 
     @property
@@ -376,8 +378,8 @@ class _Model:
             theta[self._others + 3 * k : self._others + 3 * k + 3] = row, column, 0.01 * flux
         return theta
 
-    def begun(self, near: ScreenedFit) -> Array:
-        """Where another fit has ended; what it had not is begun anew."""
+    def started_from(self, near: ScreenedFit) -> Array:
+        """Return start parameters from another fit; terms that it lacks start anew."""
         p = near.positions
         theta = self.first((float(p.row[0]), float(p.column[0])), float(p.flux[0]), float(p.background[0]))
         for k, (row, column, share) in enumerate(near.others[: len(self.terms.others)]):
@@ -387,7 +389,7 @@ class _Model:
         return theta
 
     def signed(self, theta: Array, flat: Array, use: Mask, known: int) -> Array:
-        """With the light of other spots after the first ``known`` as it is in the image, where it may be missing."""
+        """Return the parameters with the light of all but the first ``known`` further spots estimated."""
         for light in range(self._others + 3 * known + 2, self._smear, 3):
             theta[light] = 0.0
             design, level = self.design(theta)
@@ -398,7 +400,7 @@ class _Model:
         return theta
 
     def moved(self, theta: Array, step: Array) -> Array:
-        """The next parameters: no place by more than a pixel, and the spot's flux stays positive."""
+        """Return the next parameters: no position moves by more than a pixel, and the spot's flux stays positive."""
         length = max(float(np.abs(step[self._places]).max()), 1e-300)
         short = min(1.0, 1.0 / length)
         if step[2] < -0.9 * theta[2]:
@@ -408,20 +410,20 @@ class _Model:
             # not more than the shape itself in one step
             change = np.clip(step[self._smear :], -2.0, 2.0)
             out[self._smear :] = np.clip(theta[self._smear :] + short * change, -_MOST_SMEAR, _MOST_SMEAR)
-        # another spot stays where the shape is known
+        # further spots stay within the range of the template
         for k in range(len(self.terms.others)):
             for axis, (low, high) in enumerate(self.template.supported()):
-                at = self._others + 3 * k + axis
-                out[at] = min(max(out[at], low + 1.0), high - 1.0)
+                index = self._others + 3 * k + axis
+                out[index] = min(max(out[index], low + 1.0), high - 1.0)
         return out
 
     @cached_property
     def _places(self) -> list[int]:
-        """Numbers of the parameters that are places: the spot's, then the others'."""
+        """Indices of the parameters that are positions: the spot's, then the further spots'."""
         return [0, 1, *(self._others + 3 * k + axis for k in range(len(self.terms.others)) for axis in (0, 1))]
 
     def rests(self, change: Array, inverse: Array) -> bool:
-        """Whether places have changed by nothing that matters."""
+        """Return True if the positions have changed by less than their tolerance."""
         others = self._places[2:]
         sigma = np.sqrt(np.maximum(np.diag(inverse)[others], 0.0))
         return bool(
@@ -430,7 +432,7 @@ class _Model:
         )
 
     def _spread(self, theta: Array) -> Array:
-        """Smear that the shape is convolved with, (2, 2) px^2: the positive part, unless the shape may be sharper."""
+        """Return the smear of the shape, (2, 2) px^2: its positive part, unless the shape may be sharpened."""
         rows, across, columns = theta[self._smear :]
         if self.terms.learnt:
             return np.array([[rows, across], [across, columns]])
@@ -438,13 +440,13 @@ class _Model:
         return np.asarray((vector * np.maximum(value, 0.0)) @ vector.T)
 
     def _spots(self, theta: Array) -> list[tuple[int, int, int]]:
-        """Numbers of the parameters row, column and flux of every spot."""
+        """Return the indices of the parameters row, column and flux of every spot."""
         first = [0, *(self._others + 3 * k for k in range(len(self.terms.others)))]
         return [(k, k + 1, k + 2) for k in first]
 
     @cached_property
     def _bends(self) -> Array:
-        """(5, P) slopes and curvature of the background."""
+        """Slopes and curvature of the background, (5, P)."""
         v, u = np.meshgrid(np.linspace(-1, 1, self.height), np.linspace(-1, 1, self.width), indexing="ij")
         return np.stack([v, u, v * v - 1.0 / 3.0, u * v, u * u - 1.0 / 3.0]).reshape(5, -1)
 
@@ -453,7 +455,7 @@ class _Model:
         return SmearedShape(self.template)
 
     def design(self, theta: Array) -> tuple[Array, Array]:
-        """Derivatives (K, P) and level (P,)."""
+        """Return the derivatives (K, P) and the level (P,)."""
         pixels = self.height * self.width
         design = np.zeros((len(theta), pixels))
         level = np.full(pixels, theta[3])
@@ -476,19 +478,19 @@ class _Model:
             design[row], design[column] = theta[flux] * shape[1], theta[flux] * shape[2]
             level += theta[flux] * shape[0]
         if spread is not None:
-            # the part that is no smear, by its first order: noise may make a moment negative
+            # the negative part of the smear enters to first order: noise may make a moment negative
             rest = theta[self._smear :] - (spread[0, 0], spread[0, 1], spread[1, 1])
             level += rest @ design[self._smear :]
         return design, level
 
     def other(self, theta: Array, inverse: Array, k: int) -> tuple[Array, Array]:
-        """Row, column and share of another spot's light, and their standard deviations."""
-        own = slice(self._others + 3 * k, self._others + 3 * k + 3)
+        """Return row, column and relative light of a further spot, and their standard deviations."""
+        indices = slice(self._others + 3 * k, self._others + 3 * k + 3)
         scale = np.array([1.0, 1.0, 1.0 / theta[2]])
-        return theta[own] * scale, np.sqrt(np.diag(inverse)[own]) * scale
+        return theta[indices] * scale, np.sqrt(np.diag(inverse)[indices]) * scale
 
     def smear_of(self, theta: Array) -> Array:
-        """Second moments, (2, 2), px^2."""
+        """Return the second moments of the smear, (2, 2) px^2."""
         if not self.terms.smear:
             return np.zeros((2, 2))
         a = theta[self._smear :]

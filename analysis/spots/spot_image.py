@@ -1,7 +1,8 @@
-"""What the spot estimators of `centroid` share: checks, a first guess, windows, models with their derivatives, noise
-propagation.
+"""Functions shared by the spot estimators of `centroid`.
 
-Shapes: images (B, H, W) in DN; places (B, 2) as (row, column) in px, the centre of the first pixel being (0, 0).
+They are checks, a first guess, windows, models with their derivatives, and the propagation of noise.
+
+Shapes: images (B, H, W) in DN; positions (B, 2) as (row, column) in px, the centre of the first pixel being (0, 0).
 """
 
 from __future__ import annotations
@@ -29,7 +30,13 @@ _PIECE = 16
 
 
 def as_images(mean: ArrayLike) -> Array:
-    """(B, H, W) float64 from (B, H, W) or (H, W); ValueError if not finite or smaller than 24 x 24 px."""
+    """Return mean images as float64, (B, H, W), from (B, H, W) or (H, W).
+
+    Raises
+    ------
+    ValueError
+        An image is not finite, or smaller than 24 x 24 px.
+    """
     image = np.asarray(mean, dtype=np.float64)
     if image.ndim == 2:
         image = image[None]
@@ -41,7 +48,7 @@ def as_images(mean: ArrayLike) -> Array:
 
 
 def in_pieces(measure: Callable[[slice], SpotPositions], count: int, threads: int = 1) -> SpotPositions:
-    """Measure `count` spots a few at a time and join the results; SpotError then names the bad spots of all pieces."""
+    """Measure `count` spots a few at a time and join the results; a SpotError names the bad spots of all pieces."""
     reasons: dict[int, str] = {}
 
     def tried(start: int, end: int) -> SpotPositions | None:
@@ -54,12 +61,12 @@ def in_pieces(measure: Callable[[slice], SpotPositions], count: int, threads: in
     # two functions, since one that called itself would keep all images until Python looks for what refers to itself
     def piece(start: int) -> SpotPositions | None:
         end = min(start + _PIECE, count)
-        found = tried(start, end)
-        if found is None and end > start + 1:
+        result = tried(start, end)
+        if result is None and end > start + 1:
             # spots that are bad for another reason are not named yet
             for n in range(start, end):
                 tried(n, n + 1)
-        return found
+        return result
 
     starts = range(0, count, _PIECE)
     if threads == 1:
@@ -80,24 +87,24 @@ def in_pieces(measure: Callable[[slice], SpotPositions], count: int, threads: in
 
 
 def reject(bad: NDArray[np.bool_], reason: str) -> None:
-    """Raise SpotError with one reason for all spots that are marked in `bad` (B,)."""
+    """Raise SpotError with one reason for all spots that are marked in `bad`, (B,)."""
     if np.any(bad):
         raise SpotError({int(n): reason for n in np.flatnonzero(bad)})
 
 
 def check_edge(place: Array, height: int, width: int, distance: float) -> None:
-    """Raise SpotError for centres nearer than `distance` px to the outermost pixel centres.
+    """Raise SpotError for centres nearer than `distance` to the outermost pixel centres.
 
     Parameters
     ----------
-    place : Array
-        Row and column, (B, 2), px.
+    place : (B, 2) ndarray
+        Row and column of the centres, px.
     height : int
-        H, px.
+        Number of rows H.
     width : int
-        W, px.
+        Number of columns W.
     distance : float
-        Least, px.
+        Least distance, px.
     """
     high = np.array([height, width]) - 1 - distance
     bad = ~np.all((place >= distance) & (place <= high), axis=1)
@@ -114,20 +121,24 @@ def check_edge(place: Array, height: int, width: int, distance: float) -> None:
 
 
 def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, Array, Array, Array]:
-    """First guess: row, column (px, good to about 0.5), background (DN), peak (DN above it), area above half peak
-    (px^2).
+    """Return a first guess of each spot: row, column, background, peak and area above half peak, (B,) each.
 
-    Works on 4 x 4 bins, so that one hot pixel does not make a spot. Raises SpotError for saturated and for absent
-    spots.
+    Row and column are in px, good to about 0.5; background and peak above it in DN; the area in px^2. The guess works
+    on 4 x 4 bins, so that one hot pixel does not make a spot.
 
     Parameters
     ----------
-    image : Array
-        Mean frames, (B, H, W), DN.
+    image : (B, H, W) ndarray
+        Mean frames, DN.
     frames : int
-        Of each mean.
+        Number of frames averaged into each image.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
+
+    Raises
+    ------
+    SpotError
+        A spot is saturated or absent.
     """
     count, height, width = image.shape
     rows, columns = height // _BIN, width // _BIN
@@ -169,16 +180,16 @@ def coarse(image: Array, frames: int, noise: NoiseModel) -> tuple[Array, Array, 
 
 
 def arms(place: Array, height: int, width: int) -> Array:
-    """(B, 2, H, W) px, each pixel's row and column minus the centre's.
+    """Return each pixel's row and column minus the centre's, (B, 2, H, W) px.
 
     Parameters
     ----------
-    place : Array
-        Row and column, (B, 2), px.
+    place : (B, 2) ndarray
+        Row and column of the centres, px.
     height : int
-        H, px.
+        Number of rows H.
     width : int
-        W, px.
+        Number of columns W.
     """
     out = np.empty((place.shape[0], 2, height, width))
     out[:, 0] = (np.arange(height) - place[:, :1])[:, :, None]
@@ -187,19 +198,20 @@ def arms(place: Array, height: int, width: int) -> Array:
 
 
 def soft_window(place: Array, height: int, width: int, radius: float) -> tuple[Array, Array]:
-    """Window about each centre, falling from 1 to 0 over one pixel at `radius`: (B, H, W), and d window / d centre (B,
-    2, H, W).
+    """Return a circular window about each centre and its derivatives with respect to the centre.
+
+    The window, (B, H, W), falls from 1 to 0 over one pixel at `radius`; the derivatives have the shape (B, 2, H, W).
 
     Parameters
     ----------
-    place : Array
-        Row and column, (B, 2), px.
+    place : (B, 2) ndarray
+        Row and column of the centres, px.
     height : int
-        H, px.
+        Number of rows H.
     width : int
-        W, px.
+        Number of columns W.
     radius : float
-        Of the circle, px.
+        Radius of the circle, px.
     """
     arm = arms(place, height, width)
     distance = np.hypot(arm[:, 0], arm[:, 1])
@@ -209,7 +221,7 @@ def soft_window(place: Array, height: int, width: int, radius: float) -> tuple[A
 
 
 def sane(theta: Array) -> NDArray[np.bool_]:
-    """Which Gaussians (see `gaussian`) are finite, bright, and of positive size in every direction."""
+    """Return the mask of the Gaussians (see `gaussian`) that are finite, positive and of finite size."""
     good = np.all(np.isfinite(theta), axis=1) & (theta[:, 2] > 0) & (theta[:, 4] > 0)
     if theta.shape[1] > 5:
         good &= theta[:, 4] * theta[:, 6] > theta[:, 5] ** 2
@@ -219,25 +231,25 @@ def sane(theta: Array) -> NDArray[np.bool_]:
 def gaussian(
     theta: Array, height: int, width: int, radius: float, noise: NoiseModel, frames: int
 ) -> tuple[Array, Array, Array]:
-    """Gaussian of parameters row, column, amplitude, background, a[, b, c]: design (B, K, P), design * weight, model
-    (B, P).
+    """Return design (B, K, P), weighted design and model (B, P) of Gaussians.
 
-    The weight is the soft circular window over the model's total variance.
+    The parameters are row, column, amplitude, background, a[, b, c]. The weight is the soft circular window over the
+    model's total variance.
 
     Parameters
     ----------
-    theta : Array
-        The parameters, (B, 5) or (B, 7), px and DN.
+    theta : (B, 5) or (B, 7) ndarray
+        Parameters, px and DN.
     height : int
-        H, px.
+        Number of rows H.
     width : int
-        W, px.
+        Number of columns W.
     radius : float
-        Of the window, px.
+        Radius of the window, px.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     frames : int
-        Of which an image is the mean.
+        Number of frames averaged into an image.
     """
     count, size = theta.shape
     arm = arms(theta[:, :2], height, width).reshape(count, 2, -1)
@@ -257,16 +269,16 @@ def gaussian(
 
 
 def variance(level: Array, noise: NoiseModel, frames: int) -> Array:
-    """Variance of a mean of frames at grey value `level`, temporal and of the fixed pattern, DN^2.
+    """Return the variance of a mean of frames at a grey value, temporal and of the fixed pattern, DN^2.
 
     Parameters
     ----------
-    level : Array
-        Grey values, any shape, DN.
+    level : ndarray
+        Grey values, of any shape, DN.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     frames : int
-        Of which an image is the mean.
+        Number of frames averaged into an image.
     """
     out: Array = noise.temporal_variance_dn2(level, frames)
     out += noise.fixed_variance_dn2(level)
@@ -274,18 +286,18 @@ def variance(level: Array, noise: NoiseModel, frames: int) -> Array:
 
 
 def excess(level: Array, weight: Array, noise: NoiseModel, frames: int) -> Array:
-    """Excess kurtosis of the noise of a mean of frames by its shot noise, without unit; 0 for a normal distribution.
+    """Return the excess kurtosis of the noise of a mean of frames by its shot noise; 0 for a normal distribution.
 
     Parameters
     ----------
-    level : Array
-        Grey values, any shape, DN.
-    weight : Array
-        1 / variance, likewise, 1/DN^2.
+    level : ndarray
+        Grey values, of any shape, DN.
+    weight : ndarray
+        Reciprocal of the variance, of that shape, 1/DN^2.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     frames : int
-        Of which an image is the mean.
+        Number of frames averaged into an image.
     """
     # the fourth cumulant of Poisson numbers is their mean, of a mean of n of them 1/n^3 of it
     fourth = noise.gain_dn_per_e**3 * noise.light_signal_dn(level) / float(frames) ** 3
@@ -299,20 +311,20 @@ def template_model(
     part: tuple[NDArray[np.intp], tuple[int, int]] | None = None,
     out: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Model of row, column, flux, background (B, 4): its design (B, 4, P) and grey values (B, P).
+    """Return the design (B, 4, P) and the grey values (B, P) of the template's model.
 
     Parameters
     ----------
-    theta : Array
-        Row, column (px), flux and background (DN), (B, 4).
-    which : NDArray[np.intp]
-        Shape of each spot, (B,).
+    theta : (B, 4) ndarray
+        Row, column (px), flux and background (DN).
+    which : (B,) ndarray of int
+        Index of each spot's shape.
     template : SpotTemplate
-        The shapes.
-    part : tuple[NDArray[np.intp], tuple[int, int]] | None
-        As for `SpotTemplate.evaluate`.
-    out : Array | None
-        Where the design goes, if given.
+        Shapes of the spots.
+    part : tuple or None
+        Part of the detector, as in `SpotTemplate.evaluate`.
+    out : ndarray or None
+        Array that receives the design.
     """
     count, (height, width) = theta.shape[0], template.shape if part is None else part[1]
     design = np.empty((count, 4, height * width)) if out is None else out
@@ -323,19 +335,18 @@ def template_model(
 
 
 def propagate(maps: Array, level: Array, noise: NoiseModel, frames: int) -> tuple[Array, Array]:
-    """Temporal and fixed covariance (B, 2, 2) px^2 of estimators with influence `maps` (B, 2, P) at grey values
-    `level` (B, P).
+    """Return the temporal and the fixed-pattern covariance of estimators by their influence maps, (B, 2, 2) px^2 each.
 
     Parameters
     ----------
-    maps : Array
-        Derivative of row and column by each pixel, (B, 2, P), px/DN.
-    level : Array
-        Grey values, (B, P), DN.
+    maps : (B, 2, P) ndarray
+        Derivatives of row and column with respect to each pixel, px/DN.
+    level : (B, P) ndarray
+        Grey values, DN.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     frames : int
-        Of which an image is the mean.
+        Number of frames averaged into an image.
     """
     turned = maps.transpose(0, 2, 1)
     temporal = (maps * noise.temporal_variance_dn2(level, frames)[:, None]) @ turned
@@ -356,35 +367,35 @@ def positions(
     iterations: int,
     chi: Array,
 ) -> SpotPositions:
-    """SpotPositions of an estimator without a model of the light.
+    """Return the SpotPositions of an estimator without a model of the light.
 
-    The noise is taken at the measured image itself: the variance is nearly linear in the grey value, so pixel noise
-    averages out, while smoothing would fill the dark rings, where a Gaussian fit puts much weight.
+    The noise is that at the measured image itself: the variance is nearly linear in the grey value, so pixel noise
+    averages out, while smoothing would fill the dark rings, where a Gaussian fit has much weight.
 
     Parameters
     ----------
-    place : Array
-        Row and column, (B, 2), px.
-    maps : Array
-        Derivative of the place by each pixel, (B, 2, P), px/DN.
-    image : Array
-        Mean frames, (B, H, W), DN.
+    place : (B, 2) ndarray
+        Row and column, px.
+    maps : (B, 2, H, W) ndarray
+        Derivatives of the position with respect to each pixel, px/DN.
+    image : (B, H, W) ndarray
+        Mean frames, DN.
     frames : int
-        Of each mean.
+        Number of frames averaged into each image.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     keep_maps : bool
         Keep `maps` in the result.
-    flux : Array
-        (B,), DN.
-    background : Array
-        (B,), DN.
-    converged : NDArray[np.bool_]
-        (B,).
+    flux : (B,) ndarray
+        Flux of each spot, DN.
+    background : (B,) ndarray
+        Background of each spot, DN.
+    converged : (B,) ndarray of bool
+        Mask of the spots that converged.
     iterations : int
-        Of the slowest spot.
-    chi : Array
-        Reduced chi-square of each fit, (B,).
+        Number of iterations of the slowest spot.
+    chi : (B,) ndarray
+        Reduced chi-square of each fit.
     """
     count = place.shape[0]
     temporal, fixed = propagate(maps.reshape(count, 2, -1), image.reshape(count, -1), noise, frames)
@@ -404,14 +415,14 @@ def positions(
 
 
 def filled(mean: Array, good: NDArray[np.bool_]) -> Array:
-    """An image (H, W) in which pixels that are not good have the value of those around them.
+    """Return an image (H, W) with unusable pixels filled from their surroundings.
 
     Parameters
     ----------
-    mean : Array
-        Grey values, (H, W), DN.
-    good : NDArray[np.bool_]
-        Which of them can be used, (H, W).
+    mean : (H, W) ndarray
+        Grey values, DN.
+    good : (H, W) ndarray of bool
+        Usable pixels.
     """
     if np.all(good):
         return mean
@@ -422,8 +433,8 @@ def filled(mean: Array, good: NDArray[np.bool_]) -> Array:
     # wider and wider, until every hole is bridged
     while np.any(left) and width < max(mean.shape):
         near = ndimage.gaussian_filter(weight, width, mode="nearest")
-        some = left & (near > 1e-3)
-        value[some] = ndimage.gaussian_filter(out, width, mode="nearest")[some] / near[some]
-        left &= ~some
+        bridged = left & (near > 1e-3)
+        value[bridged] = ndimage.gaussian_filter(out, width, mode="nearest")[bridged] / near[bridged]
+        left &= ~bridged
         width *= 2.0
     return np.asarray(np.where(left, np.median(mean[good]) if np.any(good) else 0.0, value))

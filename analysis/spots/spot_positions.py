@@ -26,7 +26,13 @@ from analysis.spots.noise import NoiseModel
 
 
 class SpotError(MeasurementError, ValueError):
-    """Spots that cannot be measured. `reasons` maps the index of each bad spot in the batch to a sentence."""
+    """Error raised for spots that cannot be measured.
+
+    Attributes
+    ----------
+    reasons : dict of int to str
+        Reason for each bad spot, by its index in the batch.
+    """
 
     def __init__(self, reasons: dict[int, str]) -> None:
         self.reasons = dict(reasons)
@@ -40,20 +46,35 @@ class SpotError(MeasurementError, ValueError):
 class SpotPositions:
     """Positions of B spots.
 
-    row, column: (B,) px. flux: (B,) DN summed over the spot. background: (B,) DN, level under the spot, black level
-        included.
-    temporal_covariance, fixed_covariance: (B, 2, 2) px^2 in order (row, column): from noise that is new in each frame,
-        and from the detector's fixed pattern.
-    converged: (B,) whether the iteration ended below its tolerance. iterations: the number of steps of the slowest
-        spot.
-    reduced_chi_square: (B,) sum of squared residuals over variance and degrees of freedom, near 1 when the spot has
-        the shape that was assumed; NaN for an estimator without a shape.
-    core_chi_square: (B,) the same of the spot's core alone; None where no calibrated shape was fitted.
-    degrees: (B, 2) degrees of freedom of both, fewer than pixels where the noise is that of few electrons; likewise.
-    median_square: (B,) median of the squared residuals over variance, over that of a normal distribution: the noise of
-        the frames over the stated one, squared, whatever stands in a few pixels; likewise.
-    gain_maps: (B, 2, H, W) px per DN, influence of each pixel on (row, column), or None when not kept.
-    light_dn: (B, H, W) expected light signal, DN, that scales PRNU, or None when not kept.
+    Attributes
+    ----------
+    row, column : (B,) ndarray
+        Position, px.
+    temporal_covariance, fixed_covariance : (B, 2, 2) ndarray
+        Covariances in order (row, column), px^2: by noise that is new in each frame, and by the detector's fixed
+        pattern.
+    flux : (B,) ndarray
+        Signal summed over the spot, DN.
+    background : (B,) ndarray
+        Level under the spot, black level included, DN.
+    converged : (B,) ndarray of bool
+        True where the iteration ended below its tolerance.
+    iterations : int
+        Number of steps of the slowest spot.
+    reduced_chi_square : (B,) ndarray
+        Sum of squared residuals over variance and degrees of freedom, near 1 when the spot has the assumed shape; NaN
+        for an estimator without a shape.
+    gain_maps : (B, 2, H, W) ndarray or None
+        Influence of each pixel on (row, column), px per DN; None when not kept.
+    light_dn : (B, H, W) ndarray or None
+        Expected light signal that scales PRNU, DN; None when not kept.
+    core_chi_square : (B,) ndarray or None
+        Reduced chi-square of the spot's core alone; None where no calibrated shape was fitted.
+    degrees : (B, 2) ndarray or None
+        Degrees of freedom of both chi-squares, fewer than pixels where the noise is that of few electrons.
+    median_square : (B,) ndarray or None
+        Median of the squared residuals over variance, relative to that of a normal distribution: the squared ratio of
+        the frames' noise to the specified one, insensitive to a few outlying pixels.
     """
 
     row: Array
@@ -73,40 +94,44 @@ class SpotPositions:
 
     @property
     def covariance(self) -> Array:
-        """(B, 2, 2) px^2, temporal and fixed pattern together: the uncertainty of one position by itself."""
+        """Total covariance of one position, temporal and fixed pattern, (B, 2, 2) px^2."""
         return self.temporal_covariance + self.fixed_covariance
 
     @property
     def position(self) -> Array:
-        """(B, 2) px, (row, column)."""
+        """Position (row, column), (B, 2) px."""
         return np.stack([self.row, self.column], axis=-1)
 
     @property
     def sigma_row(self) -> Array:
-        """(B,) px, standard deviation of row."""
+        """Standard deviation of the row, (B,) px."""
         return np.sqrt(self.covariance[:, 0, 0])
 
     @property
     def sigma_column(self) -> Array:
-        """(B,) px, standard deviation of column."""
+        """Standard deviation of the column, (B,) px."""
         return np.sqrt(self.covariance[:, 1, 1])
 
 
 def difference_covariance(before: SpotPositions, after: SpotPositions, noise: NoiseModel) -> Array:
-    """Covariance (B, 2, 2) px^2 of after - before for spots on the same pixels of the same detector.
+    """Return the covariance of after - before for spots on the same pixels of the same detector, (B, 2, 2) px^2.
 
-    `before` may hold fewer spots, B0 with B = S * B0: it is then taken once for each of S states (spot b against b
+    `before` may hold fewer spots, B0 with B = S * B0: it is then used once for each of S states (spot b against b
     modulo B0). Each result is for one difference; differences that share a `before` are correlated with one another.
-    Raises ValueError when the maps were not kept, or the batches do not fit.
 
     Parameters
     ----------
     before : SpotPositions
-        Measured with maps.
+        Positions before, measured with maps.
     after : SpotPositions
-        likewise.
+        Positions after, measured with maps.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
+
+    Raises
+    ------
+    ValueError
+        The maps were not kept, or the batches do not fit.
     """
     if before.gain_maps is None or after.gain_maps is None or before.light_dn is None or after.light_dn is None:
         raise ValueError("difference covariance: both positions need their gain maps; measure with keep_maps=True")
@@ -132,15 +157,15 @@ def difference_covariance(before: SpotPositions, after: SpotPositions, noise: No
 
 @dataclass(frozen=True, eq=False)
 class NoiseParts:
-    """What makes positions of B spots wrong, apart by what is new in every image and what is not.
+    """Noise of the positions of B spots, separated into the part that is new in every image and the fixed pattern.
 
     Attributes
     ----------
-    temporal : Array
-        (B, 2, 2) px^2.
-    pattern : NDArray[np.float32]
-        (B, 2, Q) px by one standard deviation of each pixel's response and dark signal: products of two images' are the
-        covariance of their positions by the pattern. Single precision, for there are many.
+    temporal : (B, 2, 2) ndarray
+        Covariance by temporal noise, px^2.
+    pattern : (B, 2, Q) ndarray of float32
+        Shift by one standard deviation of each pixel's response and dark signal, px. The products of two images' maps
+        are the covariance of their positions by the pattern. Single precision saves memory.
     """
 
     temporal: Array
@@ -148,14 +173,19 @@ class NoiseParts:
 
 
 def noise_parts(positions: SpotPositions, noise: NoiseModel) -> NoiseParts:
-    """Noise of measured positions. Raises ValueError when their maps were not kept.
+    """Return the noise of measured positions, separated into its parts.
 
     Parameters
     ----------
     positions : SpotPositions
-        Measured with maps.
+        Positions measured with maps.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
+
+    Raises
+    ------
+    ValueError
+        The maps were not kept.
     """
     if positions.gain_maps is None or positions.light_dn is None:
         raise ValueError("noise parts: positions need their gain maps; measure with keep_maps=True")
@@ -170,15 +200,14 @@ def noise_parts(positions: SpotPositions, noise: NoiseModel) -> NoiseParts:
 
 
 class SeriesNoise:
-    """Covariance of the differences to one "before" over a series of images of C spots, which are added one after the
-    other.
+    """Covariance of the differences to one "before" over a series of images of C spots, added one after the other.
 
     Parameters
     ----------
-    before
-        C spots.
-    reach
-        How many images apart two differences may be for their covariance to be kept, which bounds memory.
+    before : NoiseParts
+        Noise of the C spots before.
+    reach : int
+        Greatest separation, in images, of two differences for which a covariance is kept, which bounds memory.
     """
 
     def __init__(self, before: NoiseParts, reach: int) -> None:
@@ -192,31 +221,43 @@ class SeriesNoise:
         return len(self._rows)
 
     def add(self, after: NoiseParts) -> None:
-        """Append images. Raises ValueError for another number of spots.
+        """Append images.
 
         Parameters
         ----------
         after : NoiseParts
-            Of S times C spots, image by image.
+            Noise of S times C spots, image by image.
+
+        Raises
+        ------
+        ValueError
+            The number of spots differs.
         """
         count = len(self._before.temporal)
         if len(after.temporal) % count:
             raise ValueError(f"series noise: {len(after.temporal)} positions of {count} spots")
         for start in range(0, len(after.temporal), count):
-            own = after.pattern[start : start + count] - self._before.pattern
-            self._maps = [*self._maps, own][-1 - self._reach :]
-            row = np.stack([own @ earlier.transpose(0, 2, 1) for earlier in self._maps]).astype(np.float64)
+            pattern = after.pattern[start : start + count] - self._before.pattern
+            self._maps = [*self._maps, pattern][-1 - self._reach :]
+            row = np.stack([pattern @ earlier.transpose(0, 2, 1) for earlier in self._maps]).astype(np.float64)
             row += self._before.temporal
             row[-1] += after.temporal[start : start + count]
             self._rows.append(row)
 
     def covariance(self, images: NDArray[np.int_]) -> Array:
-        """(n 2 C, n 2 C) px^2 of some images' differences, image by image, spot by spot, row before column.
+        """Return the covariance of some images' differences, (n 2 C, n 2 C) px^2.
+
+        The order is image by image, spot by spot, row before column.
 
         Parameters
         ----------
-        images : NDArray[np.int_]
-            (n,) their numbers, each once. Raises ValueError for images farther apart than the reach.
+        images : (n,) ndarray of int
+            Indices of the images, each once.
+
+        Raises
+        ------
+        ValueError
+            Images are farther apart than the kept separation.
         """
         if np.ptp(images) > self._reach:
             raise ValueError(f"series noise: images {np.ptp(images)} apart, {self._reach} are kept")

@@ -1,14 +1,14 @@
-"""The calibrated shape of a spot, evaluated at any sub-pixel position with its analytic gradient.
+"""Calibrated shape of a spot, evaluated at any sub-pixel position with its analytic gradient.
 
-The shape is given as an image (noise-free, or of high signal-to-noise) on a grid of the detector's pixel pitch, or of
-that pitch divided by an integer; each sample is the flux in one *whole pixel* centred there, so pixel integration is
-already inside and interpolation only has to shift. A diffraction-limited spot is band-limited, and the interpolation
-is a quintic B-spline (Unser, Aldroubi, Eden, IEEE Trans. Signal Process. 41, 821 (1993)): fifth order in (frequency *
-sample).
+The shape is given as an image (noise-free, or of high signal-to-noise ratio) on a grid of the detector's pixel pitch,
+or of that pitch divided by an integer; each sample is the flux in one *whole pixel* centred there, so pixel integration
+is already included and interpolation only has to shift. A diffraction-limited spot is band-limited, and the
+interpolation is a quintic B-spline (Unser, Aldroubi, Eden, IEEE Trans. Signal Process. 41, 821 (1993)): fifth order in
+(frequency * sample).
 
 For speed the spline coefficients are factored once by a singular value decomposition, C = sum_k u_k v_k^T. The spline
 is separable, so a shifted spot is sum_k (shifted u_k) (shifted v_k)^T, and a round spot needs only some ten to thirty
-terms: the two dimensional interpolation becomes a small matrix product.
+terms: the two-dimensional interpolation becomes a small matrix product.
 
 Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 """
@@ -30,11 +30,17 @@ from analysis.arrays import Array, MeasurementError, UndeterminedError
 _DEGREE = 5
 _TAPS = _DEGREE + 1
 SHARPEST = 4.0
-"""Most by which a frequency is raised where a shape is made sharper."""
+"""Greatest factor by which a frequency is amplified where a shape is made sharper."""
 
 
 class TemplateRangeError(MeasurementError, ValueError):
-    """A spot position for which the detector would look beyond the template's grid. `indices` lists the spots."""
+    """Error raised for a spot position at which the detector extends beyond the template's grid.
+
+    Attributes
+    ----------
+    indices : list of int
+        Indices of these spots.
+    """
 
     def __init__(self, message: str, indices: list[int]) -> None:
         super().__init__(message)
@@ -42,7 +48,7 @@ class TemplateRangeError(MeasurementError, ValueError):
 
 
 def _tap_polynomials() -> Array:
-    """Weights of the six taps as polynomials of the fraction t in [0, 1): (power, tap)."""
+    """Return the weights of the six taps as polynomials of the fraction t in [0, 1), (power, tap)."""
     nodes = np.linspace(0.0, 1.0, _TAPS)
     basis = BSpline.basis_element(np.arange(_TAPS + 1) - _TAPS / 2.0)
     taps = np.arange(_TAPS) - (_TAPS // 2 - 1)
@@ -57,11 +63,18 @@ _VALUE = _tap_polynomials()
 class SpotTemplate:
     """One or several (T) calibrated spot shapes of unit flux. Make it with `from_image` or `stack`.
 
-    row_factors: (T, M, R), column_factors: (T, N, R): factors of the quintic spline coefficients.
-    centre: (T, 2) the spot's centre (row, column) in template samples.
-    shape: (H, W) of the detector images that it is compared with.
-    oversampling: template samples per detector pixel, integer >= 1.
-    truncation: bound on what the factorisation drops, relative to the peak.
+    Attributes
+    ----------
+    row_factors, column_factors : (T, M, R) and (T, N, R) ndarray
+        Factors of the quintic spline coefficients.
+    centre : (T, 2) ndarray
+        Centre (row, column) of the spot in template samples.
+    shape : tuple of int
+        Rows and columns (H, W) of the detector images that the template is compared with.
+    oversampling : int
+        Template samples per detector pixel, >= 1.
+    truncation : float
+        Bound on the truncation error of the factorisation, relative to the peak.
     """
 
     row_factors: Array
@@ -82,27 +95,31 @@ class SpotTemplate:
         background: float = 0.0,
         tolerance: float = 1e-8,
     ) -> SpotTemplate:
-        """Calibrate from one image.
-
-        Raises ValueError for an image that is not finite, not larger than the detector, or holds no flux.
+        """Calibrate a shape from one image.
 
         Parameters
         ----------
-        image : ArrayLike
-            (M, N) samples at the detector's pitch / oversampling, larger than the detector by a margin on every side
-            that covers the shifts to be measured (16 to 32 px).
+        image : (M, N) array_like
+            Samples at the detector's pitch / oversampling, larger than the detector by a margin on every side that
+            covers the shifts to be measured (16 to 32 px).
         row : float
-            Of the spot's centre in samples of `image`, as the user defines "centre"; shifts do not depend on it.
+            Row of the spot's centre in samples of `image`, as the user defines "centre"; shifts do not depend on it.
         column : float
-            Of the centre, likewise.
-        shape : tuple[int, int]
-            (H, W) of the detector.
+            Column of the centre in samples of `image`.
+        shape : tuple of int
+            Rows and columns (H, W) of the detector.
         oversampling : int
             Samples of `image` per pixel of the detector.
         background : float
-            Constant level to be taken off the image.
+            Constant level to be subtracted from the image.
         tolerance : float
-            What the factorisation may drop, relative to the peak. For a measured image choose its relative noise.
+            Allowed truncation error of the factorisation, relative to the peak. For a measured image choose its
+            relative noise.
+
+        Raises
+        ------
+        ValueError
+            The image is not finite, not larger than the detector, or has no flux.
         """
         data = np.asarray(image, dtype=np.float64)
         if data.ndim != 2 or not np.all(np.isfinite(data)):
@@ -178,11 +195,14 @@ class SpotTemplate:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """(M, N) samples of the calibrated image."""
+        """Rows and columns (M, N) of the calibrated image, in samples."""
         return int(self.row_factors.shape[1]), int(self.column_factors.shape[1])
 
     def supported(self, index: int = 0) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Supported positions of shape `index`: ((row low, row high), (column low, column high)) in detector pixels."""
+        """Return the range of positions of shape `index` in detector pixels.
+
+        The result is ((row low, row high), (column low, column high)).
+        """
         margin = _TAPS // 2 - 1
         limits = []
         for size, pixels, centre in zip(self.grid, self.shape, self.centre[index], strict=True):
@@ -198,22 +218,27 @@ class SpotTemplate:
         index: NDArray[np.intp] | None = None,
         part: tuple[NDArray[np.intp], tuple[int, int]] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """The spot at (row, column), with its derivatives.
+        """Return the spot at a position and its derivatives with respect to row and column.
 
-        Returns value, d value / d row, d value / d column, each (B, H, W) or (B, h, w); value is the fraction of the
-        flux per pixel. Raises TemplateRangeError, naming the spots, for positions outside `supported`.
+        The three arrays are value, d value / d row and d value / d column, each (B, H, W) or (B, h, w); value is the
+        fraction of the flux per pixel.
 
         Parameters
         ----------
-        row : ArrayLike
-            Of the spots' centres, (B,), detector pixels.
-        column : ArrayLike
-            likewise.
-        index : NDArray[np.intp] | None
-            (B,) which of the T shapes; default: spot b has shape b modulo T.
-        part : tuple[NDArray[np.intp], tuple[int, int]] | None
-            First pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector that is wanted;
-            default: all of it.
+        row : (B,) array_like
+            Row of the spots' centres, detector pixels.
+        column : (B,) array_like
+            Column of the spots' centres, detector pixels.
+        index : (B,) ndarray of int or None
+            Index of each spot's shape; default: spot b has shape b modulo T.
+        part : tuple or None
+            First pixels (B, 2), one for each spot, and shape (h, w) of the part of the detector to evaluate; default:
+            all of it.
+
+        Raises
+        ------
+        TemplateRangeError
+            A position is outside `supported`; the error names the spots.
         """
         rows = np.atleast_1d(np.asarray(row, dtype=np.float64))
         columns = np.atleast_1d(np.asarray(column, dtype=np.float64))
@@ -235,20 +260,24 @@ class SpotTemplate:
         index: NDArray[np.intp],
         part: tuple[NDArray[np.intp], tuple[int, int]] | None = None,
     ) -> None:
-        """Fill ``out`` (B, 4, H, W) with the derivatives of a spot over a background by row, column, flux, background.
-
-        Raises TemplateRangeError as `evaluate` does.
+        """Fill ``out`` with the derivatives of a spot with respect to row, column, flux and background.
 
         Parameters
         ----------
-        out : Array
-            What is filled, (B, 4, H, W), or (B, 4, h, w) of a part; per px, without unit, and 1.
-        theta : Array
-            Row, column (px), flux and background (DN), (B, 4).
-        index : NDArray[np.intp]
-            As for `evaluate`.
-        part : tuple[NDArray[np.intp], tuple[int, int]] | None
-            As for `evaluate`.
+        out : (B, 4, H, W) ndarray
+            Array to fill, or (B, 4, h, w) for a part; derivatives by position are per px, those by flux and background
+            have no unit.
+        theta : (B, 4) ndarray
+            Row, column (px), flux and background (DN).
+        index : (B,) ndarray of int
+            Index of each spot's shape, as in `evaluate`.
+        part : tuple or None
+            Part of the detector, as in `evaluate`.
+
+        Raises
+        ------
+        TemplateRangeError
+            A position is outside `supported`.
         """
         self.check_range(theta[:, 0], theta[:, 1], index)
         place = theta[:, :2] - (0 if part is None else part[0])
@@ -258,7 +287,7 @@ class SpotTemplate:
     def _fill(
         self, slopes: Array, value: Array, rows: Array, columns: Array, which: NDArray[np.intp], flux: Array
     ) -> None:
-        """Values (B, H, W), and slopes by row and column (2, B, H, W) times flux (B,), for checked places."""
+        """Write values (B, H, W), and slopes by row and column (2, B, H, W) times flux (B,), for checked positions."""
         height, width = value.shape[1:]
         a = self._shift(self._polynomials[0], self.centre[which, 0], rows, which, height, flux)
         b = self._shift(self._polynomials[1], self.centre[which, 1], columns, which, width, flux).swapaxes(2, 3)
@@ -279,7 +308,9 @@ class SpotTemplate:
     def _shift(
         self, polynomials: Array, centre: Array, position: Array, which: NDArray[np.intp], pixels: int, flux: Array
     ) -> Array:
-        """Spline along one axis: (B, 2, pixels, R), values at the detector's pixels and derivatives for the position
+        """Evaluate the spline along one axis: (B, 2, pixels, R).
+
+        The second axis holds the values at the detector's pixels, and the derivatives with respect to the position
         times flux (B,).
         """
         step = self.oversampling
@@ -303,12 +334,12 @@ class SpotTemplate:
 
         Parameters
         ----------
-        rows : Array
-            Of the spots' centres, (B,), detector pixels.
-        columns : Array
-            likewise.
-        which : NDArray[np.intp]
-            Shape of each, (B,).
+        rows : (B,) ndarray
+            Row of the spots' centres, detector pixels.
+        columns : (B,) ndarray
+            Column of the spots' centres, detector pixels.
+        which : (B,) ndarray of int
+            Index of each spot's shape.
         """
         limits = np.array([self.supported(t) for t in range(self.count)])[which]
         place = np.stack([rows, columns], axis=1)
@@ -327,15 +358,15 @@ class SpotTemplate:
 
 
 class SmearedShape:
-    """One shape of a template convolved with a normal distribution, with its first and second derivatives.
+    """Shape of a template convolved with a normal distribution, with its first and second derivatives.
 
-    The convolution multiplies the spectrum of the spline's coefficients, which is exact for a shape that is
-    band-limited; the template's grid counts as one period, which its dark margins allow.
+    The convolution multiplies the spectrum of the spline's coefficients, which is exact for a band-limited shape; the
+    template's grid counts as one period, which its dark margins allow.
 
     Parameters
     ----------
-    template
-        The shapes.
+    template : SpotTemplate
+        Template whose first shape is smeared.
     """
 
     def __init__(self, template: SpotTemplate) -> None:
@@ -347,13 +378,13 @@ class SmearedShape:
         self._columns = turns * np.fft.rfftfreq(template.grid[1])[None, :]
 
     def smeared(self, covariance: Array) -> Array:
-        """Spline coefficients (M, N) of the smeared shape, for `evaluate`.
+        """Return the spline coefficients (M, N) of the smeared shape, for `evaluate`.
 
         Parameters
         ----------
-        covariance : Array
-            (2, 2) px^2 of the normal distribution, (row, column). Where it is negative the shape is made sharper, by
-            less than `SHARPEST` at any frequency.
+        covariance : (2, 2) ndarray
+            Covariance of the normal distribution, (row, column), px^2. Where it is negative the shape is made sharper,
+            by less than `SHARPEST` at any frequency.
         """
         return np.asarray(fft.irfft2(self._spectrum * self._kernel(covariance), self._template.grid))
 
@@ -363,17 +394,24 @@ class SmearedShape:
         return np.asarray(np.exp(np.minimum(-0.5 * power, math.log(SHARPEST))))
 
     def evaluate(self, coefficients: Array, row: float, column: float) -> Array:
-        """The smeared shape at one place, (6, H, W): value, derivatives by row and by column (1/px), by row twice, by
-        row and column, by column twice (1/px^2). Raises TemplateRangeError for places outside `supported`.
+        """Return the smeared shape at one position with its first and second derivatives, (6, H, W).
+
+        The order is value; derivatives by row and by column (1/px); by row twice, by row and column, by column twice
+        (1/px^2).
 
         Parameters
         ----------
-        coefficients : Array
-            As `smeared` has made them.
+        coefficients : (M, N) ndarray
+            Spline coefficients from `smeared`.
         row : float
-            Of the centre, detector pixels.
+            Row of the centre, detector pixels.
         column : float
-            likewise.
+            Column of the centre, detector pixels.
+
+        Raises
+        ------
+        TemplateRangeError
+            The position is outside `supported`.
         """
         template = self._template
         template.check_range(np.array([row]), np.array([column]), np.zeros(1, np.intp))
@@ -388,19 +426,20 @@ class SmearedShape:
         return out
 
     def returned(self, maps: Array, row: float, column: float, covariance: Array) -> Array:
-        """What samples of the shape's image do to numbers that its pixels make at one place: the transpose of smearing,
-        interpolating and evaluating, (n, M, N), the samples being those that the template was made of.
+        """Return the derivatives with respect to the samples of the shape's image, (n, M, N).
+
+        This is the transpose of smearing, interpolating and evaluating at one position.
 
         Parameters
         ----------
-        maps : Array
-            (n, H, W) derivatives of the numbers by the pixels.
+        maps : (n, H, W) ndarray
+            Derivatives of n quantities with respect to the pixels.
         row : float
-            Of the centre, detector pixels.
+            Row of the centre, detector pixels.
         column : float
-            likewise.
-        covariance : Array
-            As of `smeared`.
+            Column of the centre, detector pixels.
+        covariance : (2, 2) ndarray
+            Covariance of the smear, as in `smeared`, px^2.
         """
         centre, (height, width) = self._template.centre[0], self._template.shape
         by_row, rows = self._splines(centre[0], row, height)
@@ -414,9 +453,7 @@ class SmearedShape:
         return np.asarray(along[0].T @ out @ along[1])
 
     def _splines(self, centre: float, place: float, pixels: int) -> tuple[Array, slice]:
-        """Weights of the samples in every pixel, and of their first and second derivatives by the place, (3, pixels,
-        samples); and which samples.
-        """
+        """Return the samples' weights in every pixel with two derivatives, and the range of samples."""
         step = self._template.oversampling
         start = centre - step * place
         base = int(np.floor(start))

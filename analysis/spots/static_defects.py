@@ -1,19 +1,17 @@
-"""What is the same in all frames of a spot and is not the spot, and images in which it is repaired.
+"""Detection of defects that are the same in all frames of a spot, and centroids of images in which they are repaired.
 
 The repaired image is c = u d + (1 - u) m(q) - e(q), with the image d, the mask u of the pixels that are used, the
-fitted model m and what of it is not the spot and its level, e. The parameters q are fitted to d themselves, so that a
-change n of the image moves a centroid of influence g to first order by
+fitted model m and the part e of it that is neither the spot nor its level. The parameters q are fitted to d itself, so
+that a change n of the image moves a centroid of influence g to first order by
 
     g u n + g ((1 - u) dm/dq - de/dq) Q n,     Q = (D' W D)^-1 D' W
 
-with the design D and the weights W of the fit: the covariance holds what the repair costs.
+with the design D and the weights W of the fit: the covariance contains the cost of the repair.
 
-Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
-
-Everything is looked for in the residuals of the fitted shape. A pixel is bad when it differs from what the pixels about
-it predict: light comes through the optics and has no detail of one pixel. Whether an uneven background or a reflection
-is there is decided by what it explains of chi-square. Each test finds something in one of 1 / FALSE_ALARM clean images;
-where something was found, pixels are then left out from `CLOSER` sigmas on.
+All defects are detected in the residuals of the fitted shape. A pixel is bad when it differs from the prediction of the
+pixels about it: light that passes the optics has no detail of one pixel. An uneven background or a reflection is
+accepted if it reduces chi-square significantly. Each test has the false-alarm probability FALSE_ALARM in a clean image;
+where a defect was found, pixels are then excluded from `CLOSER` sigmas on.
 """
 
 from __future__ import annotations
@@ -44,85 +42,84 @@ def repaired_centroid(
     template: SpotTemplate,
     measure: Callable[[Array, NoiseModel], SpotPositions],
 ) -> tuple[SpotPositions, float]:
-    """Measure the centre of a spot in the repaired image, and what the repair costs: sigma over what it would be if
-    nothing had been repaired and all frames were used, minus 1. Less than 0 where what was put in has less noise than
-    what was taken out, as at the edge of a window.
+    """Return the position of a spot in the repaired image, and the relative cost of the repair.
+
+    The cost is the relative increase of sigma over that without repair and with all frames used. It is negative where
+    the inserted values have less noise than those they replace, as at the edge of a window.
 
     Parameters
     ----------
     screened : ScreenedFrames
         Frames of one state.
     fit : ScreenedFit
-        Of the spot in these.
+        Fit of the spot in these.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     template : SpotTemplate
-        The spot's one shape.
-    measure : Callable[[Array, NoiseModel], SpotPositions]
-        a centroid with its maps, of images (1, H, W) and their noise.
+        Template with the spot's one shape.
+    measure : callable
+        Centroid method with maps: function of images (1, H, W) and their noise model.
 
     Raises
     ------
     SpotError
-        Of ``measure``.
+        ``measure`` fails.
     """
     shape = screened.mean.shape
     design, extra, beside = model_parts(fit, template)
     level, used, counts = fit.level.ravel(), fit.used.ravel(), screened.counts.ravel()
     image = np.where(used, screened.mean.ravel(), level) - extra
-    # what is saturated has been put in
-    found = measure(image.reshape(1, *shape), replace(noise, saturation_dn=1e300))
-    assert found.gain_maps is not None
-    own = found.gain_maps.reshape(2, -1)
+    # saturated pixels have been replaced
+    centroid = measure(image.reshape(1, *shape), replace(noise, saturation_dn=1e300))
+    assert centroid.gain_maps is not None
+    maps = centroid.gain_maps.reshape(2, -1)
     temporal, fixed = noise.temporal_variance_dn2(level, 1), noise.fixed_variance_dn2(level)
     weighted = design * (used / (temporal / counts + fixed))
-    influence = own * used + own @ (~used * design - beside).T @ fit.inverse @ weighted
-    new = (influence * (temporal / counts)) @ influence.T + screened.jitter / float(np.median(counts))
-    old = (influence * fixed) @ influence.T
-    ideal = (own * (temporal / screened.recorded + fixed)) @ own.T
+    influence = maps * used + maps @ (~used * design - beside).T @ fit.inverse @ weighted
+    temporal_part = (influence * (temporal / counts)) @ influence.T + screened.jitter / float(np.median(counts))
+    fixed_part = (influence * fixed) @ influence.T
+    ideal = (maps * (temporal / screened.recorded + fixed)) @ maps.T
     positions = replace(
-        found,
-        temporal_covariance=new[None],
-        fixed_covariance=old[None],
+        centroid,
+        temporal_covariance=temporal_part[None],
+        fixed_covariance=fixed_part[None],
         gain_maps=influence.reshape(1, 2, *shape),
         light_dn=noise.light_signal_dn(level).reshape(1, *shape),
     )
-    return positions, float(np.sqrt(np.trace(new + old) / np.trace(ideal)) - 1.0)
+    return positions, float(np.sqrt(np.trace(temporal_part + fixed_part) / np.trace(ideal)) - 1.0)
 
 
 CLOSER = 4.5
-"""Sigmas of a pixel from which it is left out of an image that is known to hold defects."""
+"""Residual, in sigmas of a pixel, above which it is excluded from an image that is known to contain defects."""
 MOST_OTHERS = 3
-"""Reflections that are fitted."""
+"""Greatest number of reflections that are fitted."""
 NEAREST_PX = 4.0
-"""Nearer lights are not told from the spot."""
+"""Distance, px, below which a further light is not distinguished from the spot."""
 _REACH = 2
 _MISFIT = 0.05
-"""Share of the residual around a pixel by which its prediction may be wrong."""
+"""Relative error allowed for the prediction of a residual from those around it."""
 _ROUGH_SIGMAS, _ROUGH_PX = 12.0, 6.0
 _BESIDE = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6.0
-"""Weights by which a line is predicted from those beside it: a parabola through them."""
+"""Weights by which a line is predicted from its neighbours: a parabola through them."""
 _NEAR_SPOT_PX = 15.0
-"""Pixels of a line so near to the spot do not judge it."""
+"""Distance from the spot, px, within which a line's pixels do not count for the test of the line."""
 _LINE_SHARE = 0.4
-"""Share of bad pixels of a column or row from which all its pixels count as bad."""
+"""Fraction of bad pixels of a column or row from which all its pixels count as bad."""
 _ABOVE_RING = 6.0
-"""Smallest height of a reflection over the other residuals at the same distance from the spot, in units of their
-scatter.
-"""
+"""Least height of a reflection over the other residuals at its distance from the spot, in units of their scatter."""
 _EDGE_LIGHT_PX = 12.0
-"""Radius of what is left out about a light that the shape cannot be fitted to."""
+"""Radius, px, of the area that is excluded about a light to which the shape cannot be fitted."""
 _LEAST_SHARE = 5.0
-"""Sigmas of a further spot's light below which it is none."""
+"""Significance, in sigmas, below which a further spot is dropped."""
 _ROUNDS = 8
 _GROSS = 4.0
-"""Times the limit for a pixel while smear is not fitted yet."""
+"""Factor of a pixel's limit while smear is not fitted yet."""
 _STEEP = 0.15
-"""Share of the rise about a pixel by which it may be off where no shape is known."""
+"""Fraction of the range of grey values about a pixel by which it may deviate where no shape is known."""
 
 
 def _prediction() -> Array:
-    """(5, 5) weights by which a pixel is predicted from those about it, by a quadratic surface through them."""
+    """Return the weights (5, 5) that predict a pixel from those about it by a quadratic surface."""
     row, column = np.mgrid[-_REACH : _REACH + 1, -_REACH : _REACH + 1].reshape(2, -1).astype(np.float64)
     around = (row != 0) | (column != 0)
     design = np.stack([np.ones_like(row), row, column, row * row, row * column, column * column])[:, around]
@@ -137,20 +134,20 @@ _ALONE = 0.4 * float(np.abs(_PREDICTION).sum())
 
 @dataclass(frozen=True, eq=False)
 class Examined:
-    """A spot in one state.
+    """Spot in one state, with its fit and its defects.
 
     Attributes
     ----------
     screened : ScreenedFrames
-        Its frames.
-    good : Mask
-        (H, W) pixels that are used.
-    static : Mask
-        (H, W) pixels that were found bad here, which are bad in all states.
+        Screened frames of the spot.
+    good : (H, W) ndarray of bool
+        Pixels that are used.
+    static : (H, W) ndarray of bool
+        Pixels found bad here, which are bad in all states.
     fit : ScreenedFit
-        Of the spot.
-    findings : tuple[Finding, ...]
-        Of the frames and here.
+        Fit of the spot.
+    findings : tuple of Finding
+        Defects of the frames and of the mean image.
     """
 
     screened: ScreenedFrames
@@ -161,7 +158,7 @@ class Examined:
 
     @property
     def clean(self) -> bool:
-        """Whether the measurement is that of clean frames."""
+        """True if no defect changed the measurement."""
         return not any(finding.corrects for finding in self.findings)
 
 
@@ -175,32 +172,32 @@ def examine(
     first: tuple[int, int] = (0, 0),
     learnt: bool = False,
 ) -> Examined:
-    """Find what is in an image beside the spot.
+    """Detect defects in a mean image: bad pixels and lines, uneven background, further spots and smear.
 
     Parameters
     ----------
     screened : ScreenedFrames
         Frames of one state.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     template : SpotTemplate
-        The spot's one shape.
+        Template with the spot's one shape.
     vibration : bool
-        Whether smear is fitted.
+        True to fit smear.
     own : bool
-        Whether the shape was learnt from this very image, so that residuals of it say nothing.
+        True if the shape was learnt from this very image, so that its residuals show nothing.
     searched : bool
-        Whether anything is looked for; else what is known already is left out and fitted.
-    first : tuple[int, int]
-        Row and column of the detector at which the image begins; findings tell places on the detector.
+        True to search for defects; otherwise only known ones are excluded or fitted.
+    first : tuple of int
+        Row and column of the detector at which the image begins; findings give positions on the detector.
     learnt : bool
-        Whether the shape was learnt from frames of this spot in another state: it may have been smeared more there, and
-        have held a reflection, which then is missing here.
+        True if the shape was learnt from frames of this spot in another state, where it may have been smeared more and
+        have had a reflection that is missing here.
 
     Raises
     ------
     SpotError
-        No spot, or it cannot be measured.
+        There is no spot, or it cannot be measured.
     """
     mean = screened.mean
     rough = _rough(mean, screened, noise) if searched else np.zeros_like(screened.good)
@@ -212,7 +209,7 @@ def examine(
     dirty = not screened.clean
     fitted = _fit_of(screened, noise, template)
     fit = fitted(good, terms, None)
-    # what is gross first, lest it is taken for smear or for another spot
+    # gross defects first, so that they are not taken for smear or for a further spot
     for gross in (True, False):
         if not gross and smeared:
             terms = replace(terms, smear=True)
@@ -220,13 +217,13 @@ def examine(
         for _ in range(_ROUNDS if searched else 0):
             before = good, terms
             least = (_GROSS if smeared else 1.0) * limit if gross else CLOSER if dirty else limit
-            # found anew every time: an earlier fit may have been wrong, and so may the coarse look before there was one
+            # search anew every time: an earlier fit, or the coarse search before the first fit, may have been wrong
             start = screened.good & ~(rough & (np.abs(mean - fit.level) > least * np.sqrt(fit.variance)))
-            found = _off(mean - fit.level, fit.variance, start, least)
-            place = float(fit.positions.row[0]), float(fit.positions.column[0])
+            bad_pixels = _off(mean - fit.level, fit.variance, start, least)
+            position = float(fit.positions.row[0]), float(fit.positions.column[0])
             z = (mean - fit.level) / np.sqrt(fit.variance)
-            lines = _lines(z, place, start & ~found, screened.good & (~start | found))
-            good = start & ~found & ~lines & ~edges
+            lines = _lines(z, position, start & ~bad_pixels, screened.good & (~start | bad_pixels))
+            good = start & ~bad_pixels & ~lines & ~edges
             dirty = dirty or not np.array_equal(good | edges, screened.good)
             if not np.array_equal(good, before[0]):
                 fit = fitted(good, terms, fit)
@@ -238,48 +235,48 @@ def examine(
             if np.array_equal(good, before[0]) and terms == before[1]:
                 break
     bad = screened.good & ~good & ~edges
-    return Examined(screened, good, bad, fit, (*screened.findings, *_told(bad, edges, fit, first)))
+    return Examined(screened, good, bad, fit, (*screened.findings, *_static_findings(bad, edges, fit, first)))
 
 
-def lone_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
-    """Pixels (H, W) that are not as those about them say, where no shape is known that they could be held against.
+def outlier_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
+    """Return the pixels (H, W) that deviate from their surroundings, for spots without a known shape.
 
     Parameters
     ----------
     screened : ScreenedFrames
         Frames of one state.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     """
     mean, good = screened.mean, screened.good & ~_rough(screened.mean, screened, noise)
     smooth = ndimage.median_filter(spot_image.filled(mean, good), 5)
     steep = ndimage.maximum_filter(smooth, 5) - ndimage.minimum_filter(smooth, 5)
     variance = noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
-    found = _off(mean, variance + (_STEEP * steep / limit) ** 2, good, limit)
+    bad = _off(mean, variance + (_STEEP * steep / limit) ** 2, good, limit)
     top = np.unravel_index(int(np.argmax(ndimage.uniform_filter(smooth, 5))), smooth.shape)
     residual = (mean - smooth) / np.sqrt(variance + (_STEEP * steep) ** 2)
-    lines = _lines(residual, (float(top[0]), float(top[1])), good & ~found, screened.good & (~good | found))
-    return np.asarray(screened.good & (~good | found | lines))
+    lines = _lines(residual, (float(top[0]), float(top[1])), good & ~bad, screened.good & (~good | bad))
+    return np.asarray(screened.good & (~good | bad | lines))
 
 
 def refit(
-    examined: Examined, static: Mask, noise: NoiseModel, template: SpotTemplate, told: tuple[Finding, ...] = ()
+    examined: Examined, static: Mask, noise: NoiseModel, template: SpotTemplate, findings: tuple[Finding, ...] = ()
 ) -> Examined:
-    """The fit with further pixels left out, which are bad in another state.
+    """Fit a spot again with further pixels excluded that are bad in another state.
 
     Parameters
     ----------
     examined : Examined
-        a spot.
-    static : Mask
-        (H, W) pixels that are bad.
+        Spot with its fit.
+    static : (H, W) ndarray of bool
+        Pixels that are bad.
     noise : NoiseModel
-        Of the detector.
+        Noise of the detector.
     template : SpotTemplate
-        The spot's one shape.
-    told : tuple[Finding, ...]
-        What is to be said of it.
+        Template with the spot's one shape.
+    told : tuple of Finding
+        Findings to add.
 
     Raises
     ------
@@ -289,11 +286,11 @@ def refit(
     good = examined.good & ~static
     terms = replace(examined.fit.terms, others=tuple((float(r), float(c)) for r, c, _ in examined.fit.others))
     fit = _fit_of(examined.screened, noise, template)(good, terms, examined.fit)
-    return Examined(examined.screened, good, examined.static | static, fit, (*examined.findings, *told))
+    return Examined(examined.screened, good, examined.static | static, fit, (*examined.findings, *findings))
 
 
 _Fit = Callable[[Mask, FitTerms, ScreenedFit | None], ScreenedFit]
-"""Fits terms to the good pixels of one image, from an earlier fit on."""
+"""Function that fits terms to the good pixels of one image, starting from an earlier fit."""
 
 
 def _fit_of(screened: ScreenedFrames, noise: NoiseModel, template: SpotTemplate) -> _Fit:
@@ -306,7 +303,7 @@ def _fit_of(screened: ScreenedFrames, noise: NoiseModel, template: SpotTemplate)
 
 
 def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
-    """Gross defects away from the spot, which would draw the first fit."""
+    """Return gross defects away from the spot, which would bias the first fit, (H, W)."""
     filled = spot_image.filled(mean, screened.good)
     smooth = ndimage.median_filter(filled, 5)
     sigma = np.sqrt(noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth))
@@ -319,36 +316,36 @@ def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
 
 
 def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
-    """Pixels that are off by more than ``limit`` sigmas, the worst of each neighbourhood first."""
+    """Return the pixels that deviate by more than ``limit`` sigmas, found in order of their deviation."""
     use = good.copy()
-    found = np.zeros_like(good)
+    bad = np.zeros_like(good)
     for _ in range(50):
         image = spot_image.filled(residual, use)
         around = ndimage.convolve(image, _PREDICTION, mode="nearest")
         spread = variance + ndimage.convolve(np.where(use, variance, 0.0), _PREDICTION**2, mode="nearest")
         spread += (_MISFIT * around) ** 2
         z = np.where(use, np.abs(image - around) / np.sqrt(np.maximum(spread, 1e-300)), 0.0)
-        # where most neighbours are missing themselves they predict nothing
+        # where most neighbours are missing there is no prediction
         alone = ndimage.convolve((~use).astype(np.float64), np.abs(_PREDICTION), mode="nearest") > _ALONE
         z[alone] = 0.0
         new = (z > limit) & (z >= ndimage.maximum_filter(z, 2 * _REACH + 1))
         if not np.any(new):
             break
-        found |= new
+        bad |= new
         use &= ~new
-    return found
+    return bad
 
 
-def _lines(residual: Array, place: tuple[float, float], good: Mask, bad: Mask) -> Mask:
-    """Columns and rows of which all pixels are off together, or so many bad that none can be trusted, by residuals in
-    standard deviations.
+def _lines(residual: Array, position: tuple[float, float], good: Mask, bad: Mask) -> Mask:
+    """Return the pixels of columns and rows that deviate as a whole, or have so many bad pixels that all are excluded.
 
-    A line is held against its neighbours, in the median of its pixels away from the spot.
+    ``residual`` is in standard deviations. A line is compared with its neighbours by the median of its pixels away from
+    the spot.
     """
     out = np.zeros_like(good)
     for axis in (0, 1):
         size, lines = good.shape[axis], good.shape[1 - axis]
-        far = np.abs(np.arange(size) - place[axis]) > _NEAR_SPOT_PX
+        far = np.abs(np.arange(size) - position[axis]) > _NEAR_SPOT_PX
         z = np.moveaxis(residual, axis, 0)[far]
         used = np.moveaxis(good, axis, 0)[far]
         count = np.count_nonzero(used, axis=0)
@@ -374,26 +371,26 @@ def _lines(residual: Array, place: tuple[float, float], good: Mask, bad: Mask) -
 
 
 def _medians(values: Array, used: Mask, count: NDArray[np.intp]) -> Array:
-    """Median of the used values of every column; 0 where there are none."""
+    """Return the median of the used values of every column; 0 where there are none."""
     ordered = np.sort(np.where(used, values, np.inf), axis=0)
     low, high = (np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1))
     column = np.arange(values.shape[1])
     middle = np.zeros(values.shape[1])
-    some = count > 0
-    middle[some] = 0.5 * (ordered[low, column] + ordered[high, column])[some]
+    present = count > 0
+    middle[present] = 0.5 * (ordered[low, column] + ordered[high, column])[present]
     return middle
 
 
 def _uneven(fitted: _Fit, mean: Array, good: Mask, terms: FitTerms, fit: ScreenedFit) -> tuple[FitTerms, ScreenedFit]:
-    """Slopes and curvature of the background, where they explain more than chance does."""
+    """Fit slopes and curvature of the background where they are significant."""
     for order, more in ((1, 2), (2, 3)):
         if terms.background >= order:
             continue
         wider = replace(terms, background=order)
         tried = fitted(good, wider, fit)
-        gain = (fit.explains(mean) - tried.explains(mean)) / _spread(terms)
+        gain = (fit.image_chi_square(mean) - tried.image_chi_square(mean)) / _spread(terms)
         if gain <= chi2.isf(FALSE_ALARM, more):
-            # a bend without a slope is tried as well
+            # curvature without slopes is tried as well
             if order == 1:
                 continue
             break
@@ -403,35 +400,33 @@ def _uneven(fitted: _Fit, mean: Array, good: Mask, terms: FitTerms, fit: Screene
 
 
 def _spread(terms: FitTerms) -> float:
-    """Variance of what a smooth term explains, over that by the noise of the image: a shape that was learnt has the
-    noise of an image of its own.
-    """
+    """Return the factor of the noise in what a smooth term explains: a learnt shape has the noise of another image."""
     return 2.0 if terms.learnt else 1.0
 
 
 def _others(
     fitted: _Fit, mean: Array, template: SpotTemplate, good: Mask, terms: FitTerms, fit: ScreenedFit
 ) -> tuple[FitTerms, ScreenedFit, Mask]:
-    """Further spots, the brightest first, where they explain more than chance does; those at the edge are left out."""
+    """Fit significant further spots, the brightest first; those at the edge are excluded."""
     edges = np.zeros_like(good)
-    terms, fit = _kept(fitted, good, terms, fit)
+    terms, fit = _needed_spots(fitted, good, terms, fit)
     while len(terms.others) < MOST_OTHERS:
-        place = _second_light(mean, fit, good & ~edges, template, terms.learnt)
-        if place is None:
+        position = _second_light(mean, fit, good & ~edges, template, terms.learnt)
+        if position is None:
             break
-        if any(not low + 1.0 < at < high - 1.0 for at, (low, high) in zip(place, template.supported(), strict=True)):
+        if any(not low + 1.0 < at < high - 1.0 for at, (low, high) in zip(position, template.supported(), strict=True)):
             row, column = np.indices(good.shape)
-            edges = edges | (good & (np.hypot(row - place[0], column - place[1]) <= _EDGE_LIGHT_PX))
+            edges = edges | (good & (np.hypot(row - position[0], column - position[1]) <= _EDGE_LIGHT_PX))
             fit = fitted(good & ~edges, terms, fit)
             continue
-        wider = replace(terms, others=(*((float(r), float(c)) for r, c, _ in fit.others), place))
+        wider = replace(terms, others=(*((float(r), float(c)) for r, c, _ in fit.others), position))
         try:
             tried = fitted(good & ~edges, wider, fit)
         except SpotError:
             break
         row, column, share = tried.others[-1]
         away = math.hypot(row - tried.positions.row[0], column - tried.positions.column[0])
-        gain = (fit.explains(mean) - tried.explains(mean)) / _spread(terms)
+        gain = (fit.image_chi_square(mean) - tried.image_chi_square(mean)) / _spread(terms)
         if (share <= 0.0 and not terms.learnt) or away < NEAREST_PX or gain <= chi2.isf(FALSE_ALARM / good.size, 3):
             break
         terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in tried.others))
@@ -439,8 +434,8 @@ def _others(
     return terms, fit, edges
 
 
-def _kept(fitted: _Fit, good: Mask, terms: FitTerms, fit: ScreenedFit) -> tuple[FitTerms, ScreenedFit]:
-    """Leave out further spots that are no longer needed."""
+def _needed_spots(fitted: _Fit, good: Mask, terms: FitTerms, fit: ScreenedFit) -> tuple[FitTerms, ScreenedFit]:
+    """Drop further spots that are no longer significant."""
     share = np.abs(fit.others[:, 2]) if terms.learnt else fit.others[:, 2]
     bright = share > _LEAST_SHARE * fit.others_sigma[:, 2]
     if np.all(bright):
@@ -453,7 +448,7 @@ def _kept(fitted: _Fit, good: Mask, terms: FitTerms, fit: ScreenedFit) -> tuple[
 def _second_light(
     mean: Array, fit: ScreenedFit, good: Mask, template: SpotTemplate, missing: bool
 ) -> tuple[float, float] | None:
-    """Where the residuals look most like another spot, or like one that is missing; None where they do not."""
+    """Return the position where the residuals match a further spot, or a missing one, best; None if not significant."""
     height, width = mean.shape
     middle = (height // 2, width // 2)
     stamp = template.evaluate(float(middle[0]), float(middle[1]))[0][0]
@@ -472,7 +467,7 @@ def _second_light(
         top = np.unravel_index(int(np.argmax(score)), score.shape)
         if score[top] <= limit:
             return None
-        # what a spot of another shape leaves over lies all around it
+        # residuals of a spot of another shape lie all around it
         ring = (np.abs(away - away[top]) < 3.0) & (np.hypot(row - top[0], column - top[1]) > 8.0)
         rest = robust_sigma(score[ring]) if np.count_nonzero(ring) > 20 else 1.0
         if score[top] > _ABOVE_RING * max(rest, 1.0):
@@ -481,8 +476,8 @@ def _second_light(
     return None
 
 
-def _told(bad: Mask, edges: Mask, fit: ScreenedFit, first: tuple[int, int]) -> list[Finding]:
-    """What was found, in words; places count on the detector."""
+def _static_findings(bad: Mask, edges: Mask, fit: ScreenedFit, first: tuple[int, int]) -> list[Finding]:
+    """Return the findings of an image in words; positions count on the detector."""
     out = []
     full = [np.flatnonzero(bad.sum(axis=axis) > 0.5 * bad.shape[axis]) for axis in (0, 1)]
     along = np.zeros_like(bad)
@@ -492,30 +487,30 @@ def _told(bad: Mask, edges: Mask, fit: ScreenedFit, first: tuple[int, int]) -> l
         where = np.argwhere(bad & ~along)[:3] + first
         shown = ", ".join(f"({r}, {c})" for r, c in where)
         more = ", ..." if single > 3 else ""
-        out.append(Finding("bad pixels", f"{single} hot, dead or otherwise off are left out: {shown}{more}"))
+        out.append(Finding("bad pixels", f"{single} hot, dead or otherwise deviating are excluded: {shown}{more}"))
     for numbers, begin, name in zip(full, first[::-1], ("columns", "rows"), strict=True):
         if numbers.size:
             shown = ", ".join(map(str, numbers[:5] + begin))
-            out.append(Finding(f"bad {name}", f"{shown}{', ...' * (numbers.size > 5)} are left out"))
+            out.append(Finding(f"bad {name}", f"{shown}{', ...' * (numbers.size > 5)} are excluded"))
     if fit.terms.background:
-        what = "slopes" if fit.terms.background == 1 else "slopes and curvature"
+        description = "slopes" if fit.terms.background == 1 else "slopes and curvature"
         rise = float(np.ptp(fit.level[[0, 0, -1, -1], [0, -1, 0, -1]]))
-        out.append(Finding("uneven background", f"its {what} are fitted, {rise:.2g} DN between the corners"))
+        out.append(Finding("uneven background", f"{description} fitted, {rise:.2g} DN between the corners"))
     for (row, column, share), (_, _, sigma) in zip(fit.others, fit.others_sigma, strict=True):
         place = f"at row {row + first[0]:.1f}, column {column + first[1]:.1f}"
         light = f"{100.0 * abs(share):.2g} ± {100.0 * sigma:.1g} % of the light"
-        what = "; it is fitted" if share > 0.0 else " is in the frames before and not here; it is fitted"
-        out.append(Finding("second light", f"{place} with {light}{what}"))
+        description = "; fitted" if share > 0.0 else ", in the frames before but not here; fitted"
+        out.append(Finding("second spot", f"{place} with {light}{description}"))
     if np.any(edges):
-        out.append(Finding("second light", "near the edge of the frames; what surrounds it is left out"))
+        out.append(Finding("second spot", "near the edge of the frames; its surroundings are excluded"))
     if fit.terms.smear:
-        kept = not fit.terms.learnt
-        rows, columns = (max(moment, 0.0) if kept else moment for moment in np.diagonal(fit.smear))
-        text = f"{_rms(rows)} px in row and {_rms(columns)} px in column, rms, is fitted"
-        out.append(Finding("smear", text if kept else f"{text}, against that before"))
+        absolute = not fit.terms.learnt
+        rows, columns = (max(moment, 0.0) if absolute else moment for moment in np.diagonal(fit.smear))
+        text = f"{_rms(rows)} px rms in row and {_rms(columns)} px rms in column, fitted"
+        out.append(Finding("smear", text if absolute else f"{text}, relative to the frames before"))
     return out
 
 
 def _rms(moment: float) -> str:
-    """RMS width of a smear from its second moment, px^2; negative for a smear that is smaller than another."""
+    """Return the rms width of a smear from its second moment, px^2, as text; negative for a negative moment."""
     return f"{math.copysign(math.sqrt(abs(moment)), moment):.2f}"

@@ -8,7 +8,7 @@ import pytest
 from analysis.monitor.recovery import AFTER, BEFORE, NOISE, SpotEvidence
 from analysis.spots import likelihood
 from analysis.spots.centroid import energy_centroid, gaussian_fit
-from analysis.spots.likelihood import fit_states, maximum_likelihood_fit, require_rest, widened
+from analysis.spots.likelihood import fit_states, maximum_likelihood_fit, require_convergence, widened
 from analysis.spots.spot_positions import SpotError
 from analysis.spots.spot_template import SpotTemplate
 from analysis.statistics import limit_of
@@ -129,7 +129,7 @@ def test_a_shape_of_several_lobes_ends_where_it_is(monkeypatch) -> None:
     places = PLACES[:12]
     light = np.stack([spots.PEAK_E * comb(r, c) + spots.SKY_E for r, c in places])
     mean = record(light, pattern(len(places), 41), 42)
-    found = require_rest(maximum_likelihood_fit(mean, FRAMES, spots.NOISE, template))
+    found = require_convergence(maximum_likelihood_fit(mean, FRAMES, spots.NOISE, template))
     off = (found.position - places) / np.stack([found.sigma_row, found.sigma_column], axis=1)
     assert np.abs(off).max() < 5.0
     assert fit_states(found).fits.all()
@@ -142,7 +142,7 @@ def test_two_places_that_fit_alike_are_refused() -> None:
     """Twins 24 px apart of which the template has one: both are as good."""
     template = SpotTemplate.from_image(airy(87.7, 87.2, (176, 176)), 87.7, 87.2, SHAPE)
     light = np.stack([spots.PEAK_E * (airy(47, 35) + airy(47, 59)) + spots.SKY_E])
-    with pytest.raises(SpotError, match="fits alike in two places"):
+    with pytest.raises(SpotError, match="fits equally well at two positions"):
         maximum_likelihood_fit(GAIN * light + OFFSET, FRAMES, spots.NOISE, template, edge_px=5.0)
 
 
@@ -152,4 +152,4 @@ def test_a_fit_that_does_not_come_to_rest_is_started_anew_then_refused(template,
     monkeypatch.setattr(likelihood, "_MOST_DAMPED", 1)
     found = maximum_likelihood_fit(clean[:1], FRAMES, spots.NOISE, template, max_iterations=1)
     assert not found.converged.any()
-    refuses(SpotError, "does not come to rest", require_rest, found)
+    refuses(SpotError, "does not converge", require_convergence, found)

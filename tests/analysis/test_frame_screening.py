@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.spots import frame_screening
-from analysis.spots.frame_screening import noise_ratio, screen_frames, shown_noise
+from analysis.spots.frame_screening import noise_ratio, screen_frames, observed_noise
 from analysis.spots.noise import NoiseModel
 from tests.tiers import quick
 
@@ -41,7 +41,7 @@ def test_pieces_change_nothing(count: int, moving: float, real: bool, monkeypatc
         screened = screen_frames(frames, NOISE, bad, lambda some: told.append(len(some)))
         ratio = noise_ratio(noisy, NOISE, bad)
         assert ratio is not None
-        return *astuple(screened), ratio, shown_noise(noisy, NOISE, ratio, bad).dark_noise_e
+        return *astuple(screened), ratio, observed_noise(noisy, NOISE, ratio, bad).dark_noise_e
 
     whole, passes = found(), len(told)
     assert any(finding.kind == "cosmic rays" for finding in screen_frames(frames, NOISE, bad).findings)

@@ -10,7 +10,7 @@ from analysis.spots.frame_screening import noise_ratio, screen_frames
 from analysis.spots.photon_transfer import pixel_correction
 from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import SpotError
-from analysis.spots.static_defects import examine, lone_pixels
+from analysis.spots.static_defects import examine, outlier_pixels
 from optics.numerics.backend import one_blas_thread
 from scenes.models.disturbances import state_of
 from scenes.specs.job import AnalysisSpec, JobSpec
@@ -30,7 +30,7 @@ TOLD = {
     "background": ("uneven background",),
     "other light": (),
     "saturation": ("saturation",),
-    "reflection": ("second light",),
+    "reflection": ("second spot",),
     "vibration": ("smear",),
     "movement": ("movement between frames",),
     "missing frames": ("missing light",),
@@ -177,7 +177,7 @@ def test_a_spot_that_moves_far_is_no_spoilt_frame(bench, rms, monkeypatch):
         for spot in spots:
             kinds = [finding.kind for finding in spot.findings]
             assert "movement between frames" in kinds
-            assert not {"spoilt frames", "missing light"} & set(kinds)
+            assert not {"corrupted frames", "missing light"} & set(kinds)
             size = float(re.search(r"[0-9.]+", spot.findings[kinds.index("movement between frames")].text)[0])
             # both directions together, of nine frames, some larger as so few say
             assert 0.5 * rms < size < 3.5 * rms
@@ -201,7 +201,7 @@ def test_findings_tell_places_on_the_ccd(bench):
     for texts in told:
         assert "(30, 21)" in texts["bad pixels"]
         assert texts["bad columns"].startswith("62 ")
-        assert "at row 60.3, column 37.6" in texts["second light"]
+        assert "at row 60.3, column 37.6" in texts["second spot"]
 
 
 @pytest.mark.parametrize("seed", quick(0, [18, 139, 154]))
@@ -212,7 +212,7 @@ def test_dark_rings_of_a_brighter_spot_are_not_taken_for_dead_pixels(bench, seed
     _, told = squares(bench, ("other light",), [seed])
     assert all(spot.clean and spot.used.all() for spots in told for spot in spots)
     drawn = draw(bench[0], bench[1], ("other light",), seed)
-    assert not lone_pixels(screen_frames(drawn.after, bench[2]), bench[2]).any()
+    assert not outlier_pixels(screen_frames(drawn.after, bench[2]), bench[2]).any()
 
 
 @pytest.mark.second
@@ -260,9 +260,9 @@ def test_what_the_frames_before_hold_stands_in_the_sigma_of_a_learnt_shape(bench
     assert all(spot.fits for spots in told for spot in spots)
     for before, after in told:
         if kind == "reflection":
-            assert any("is in the frames before and not here" in one.text for one in after.findings)
+            assert any("in the frames before but not here" in one.text for one in after.findings)
         if kind == "vibration":
-            assert any(one.text.endswith("against that before") for one in after.findings)
+            assert any(one.text.endswith("relative to the frames before") for one in after.findings)
             assert not any(one.kind == "smear" for one in before.findings)
 
 
@@ -323,7 +323,7 @@ def test_four_times_the_noise_is_noise(bench, learnt):
                 # of all noise, of which that of the light and the converter is as stated
                 assert 3.4 < spot.noise_ratio < 4.0
                 assert spot.fits
-                assert not {finding.kind for finding in spot.findings} & {"cosmic rays", "spoilt frames", "bad pixels"}
+                assert not {finding.kind for finding in spot.findings} & {"cosmic rays", "corrupted frames", "bad pixels"}
             error = (work.positions[1].position - work.positions[0].position)[0] - drawn.shift
             total += float(error @ np.linalg.solve(work.shift_covariance(1)[0], error))
             widened.append(work.shift_covariance(1)[0, 0, 0])

@@ -14,7 +14,7 @@ from analysis.spots.frame_screening import (
     ScreenedFrames,
     noise_ratio,
     screen_frames,
-    shown_noise,
+    observed_noise,
     subtracted_level,
 )
 from analysis.spots.learnt_template import (
@@ -31,7 +31,7 @@ from analysis.spots.photon_transfer import PixelCorrection
 from analysis.spots.screened_fit import CORE_SHARE, ScreenedFit, one_shape
 from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
-from analysis.spots.static_defects import Examined, examine, lone_pixels, refit, repaired_centroid
+from analysis.spots.static_defects import Examined, examine, outlier_pixels, refit, repaired_centroid
 from scenes.specs.monitor_frames import MeasurementSpec
 from scenes.yaml.errors import Issue
 from twin.framework.frame_store import let_go, mean_of
@@ -240,7 +240,7 @@ class ChannelMeasurement:
             bad = state.bad_part(channel.bad)
             ratio = noise_ratio(state.frames, channel.raw_noise, bad, released=let_go)
             self._noise_ratios.append(ratio)
-            shown.append(shown_noise(state.frames, channel.raw_noise, ratio, bad, let_go).dark_noise_e)
+            shown.append(observed_noise(state.frames, channel.raw_noise, ratio, bad, let_go).dark_noise_e)
         most = max(shown)
         if most > channel.raw_noise.dark_noise_e:
             raw, corrected = (replace(one, dark_noise_e=most) for one in (channel.raw_noise, channel.noise))
@@ -276,16 +276,16 @@ class ChannelMeasurement:
         )
         worse = np.count_nonzero(part.bad & screened.good)
         if worse:
-            told += (Finding("bad pixels", f"{worse} that dark and flat frames show are left out"),)
+            told += (Finding("bad pixels", f"{worse} found in dark and flat frames are excluded"),)
         good = screened.good & ~part.bad
         return replace(screened, mean=part.corrected(screened.mean), good=good, findings=(*screened.findings, *told))
 
     def _learn(self, screened: ScreenedFrames) -> tuple[ScreenedFrames, LearntTemplate]:
         """The shape of the spot before, without the pixels that no shape could have."""
         if self._searches:
-            lone = lone_pixels(screened, self.channel.noise)
+            lone = outlier_pixels(screened, self.channel.noise)
             if np.any(lone):
-                told = Finding("bad pixels", f"{np.count_nonzero(lone)} hot, dead or otherwise off are left out")
+                told = Finding("bad pixels", f"{np.count_nonzero(lone)} hot, dead or otherwise deviating are excluded")
                 screened = replace(screened, good=screened.good & ~lone, findings=(*screened.findings, told))
             screened = without_slopes(screened, self.channel.noise)
         return screened, learn_template(screened, self.channel.noise)
@@ -322,7 +322,7 @@ class ChannelMeasurement:
         examined, screened = self._examined[number], self._screened[number]
         if examined is not None and np.any(static & examined.good):
             more = np.count_nonzero(static & examined.good)
-            told = Finding("bad pixels", f"{more} that are bad in another state are left out here as well")
+            told = Finding("bad pixels", f"{more} pixels that are bad in another state are excluded here as well")
             examined = refit(examined, static, self.channel.noise, self._template(state), (told,))
             self._examined[number] = examined
         if examined is None or examined.clean:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
-from analysis.spots.noise import COARSE, FEW, WHOLE, FurtherNoise, NoiseModel
+from analysis.spots.noise import COARSE, FEW, ROUNDING_VARIANCE, FurtherNoise, NoiseModel
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.backend import cores
 from optics.numerics.extension_table import ExtensionTable
@@ -484,7 +484,7 @@ def told_of_steps(noise: NoiseModel, whose: str) -> tuple[str, ...]:
     whose : str
         How a reader knows it.
     """
-    few = float(noise.frame_variance_dn2(noise.dark_level_dn + FEW)) - WHOLE
+    few = float(noise.frame_variance_dn2(noise.dark_level_dn + FEW)) - ROUNDING_VARIANCE
     if few >= COARSE**2:
         return ()
     return (
