@@ -106,12 +106,14 @@ def modules() -> dict[str, Path]:
 
 @cache
 def project_imports() -> tuple[tuple[str, str], ...]:
-    """(importer, imported) for modules of the project, wherever in the file the import stands."""
+    """(importer, imported) for modules of the project, wherever in the file the import stands; but for the packages
+    themselves, whose public names are imported from all their rooms when they are used.
+    """
     return tuple(
         (importer, name)
         for importer, path in modules().items()
         for name in _finest(imported_modules(ROOT / path))
-        if name != importer
+        if name != importer and importer not in PACKAGES
     )
 
 

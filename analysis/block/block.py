@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array, Indices
 from analysis.block.error_processes import BlockError, Law
@@ -324,3 +324,72 @@ class Block:
                 if one is not None and one.covariance.shape != (4 * len(names), 4 * len(names)):
                     shape = one.covariance.shape
                     raise BlockError(f"block: camera {name!r}: covariance {shape} of {len(names)} passes")
+
+
+def make_block(
+    images: Mapping[tuple[str, str], Rays],
+    cameras: Mapping[str, LineModel],
+    points: ArrayLike,
+    *,
+    control_sigma: ArrayLike | None = None,
+    image_sigma: float,
+    attitude_sigma: float,
+    station_sigma: float,
+    camera_sigma: ArrayLike,
+) -> Block:
+    """Return a block of line-camera images whose attitude and station errors are constant in each pass.
+
+    Other laws of errors, laser footprints, terrain models and monitors are fields of `Block`.
+
+    Parameters
+    ----------
+    images : mapping of (pass, camera) to Rays
+        Image points of each image, with times; `Rays.point` counts the rows of `points`.
+    cameras : mapping of str to LineModel
+        Calibrated cameras.
+    points : (m, 3) array_like
+        Given coordinates of control points and first guesses of tie points, ITRS, in metres.
+    control_sigma : (m,) array_like, optional
+        Standard deviation of each given coordinate, in metres; inf for tie points. By default all are tie points.
+    image_sigma : float
+        Standard deviation of each image coordinate, in metres.
+    attitude_sigma : float
+        Standard deviation of the attitude about each axis, in radians; one error for each pass.
+    station_sigma : float
+        Standard deviation of each coordinate of the station, in metres; one error for each pass.
+    camera_sigma : (4,) array_like
+        Standard deviations of each camera's d_alpha, d_beta, d_gamma (radians) and d_f (metres), the same change in all
+        passes.
+
+    Returns
+    -------
+    Block
+        The block, for `adjust_block`.
+
+    Raises
+    ------
+    ValueError
+        Arrays of other shapes, or sigmas that are not positive.
+    """
+    start, spread = np.array(points, np.float64), np.asarray(camera_sigma, np.float64)
+    if start.ndim != 2 or start.shape[1] != 3 or spread.shape != (4,):
+        raise BlockError(f"block: need points (m, 3) and camera_sigma (4,), found {start.shape} and {spread.shape}")
+    given = np.full(len(start), np.inf) if control_sigma is None else np.asarray(control_sigma, np.float64)
+    if given.shape != (len(start),) or not np.all(given > 0):
+        raise BlockError(f"block: control_sigma must be {len(start)} positive sigmas, inf for tie points")
+    role = np.where(np.isfinite(given), "control", "tie").astype(object)
+    covariance = np.where(np.isfinite(given), given, 1.0)[:, None, None] ** 2 * np.eye(3)
+    passes = tuple(dict.fromkeys(name for name, _ in images))
+    same = np.asarray(np.kron(np.ones((len(passes),) * 2), np.diag(spread**2)), np.float64)
+    known = CameraKnowledge(np.zeros((len(passes), 4)), same)
+    ids = np.array([str(k) for k in range(len(start))], object)
+    return Block(
+        passes=tuple(Pass(name) for name in passes),
+        scenes=tuple(Scene(f"{of} {camera}", of, camera, rays) for (of, camera), rays in images.items()),
+        cameras=cameras,
+        known=dict.fromkeys(cameras, known),
+        attitude=(Term(Law("attitude", "constant", (attitude_sigma,) * 3)),),
+        station=(Term(Law("station", "constant", (station_sigma,) * 3)),),
+        image=image_sigma,
+        points=Points(ids, start, role, covariance),
+    )

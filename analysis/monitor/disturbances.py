@@ -178,6 +178,46 @@ class Disturbances:
         if not all(len(getattr(self, name)) == count for name in ("bodies", "causes", "units", "laws")):
             raise ValueError(f"disturbances: {count} motions need as many bodies, causes, units and laws")
 
+    @classmethod
+    def of(
+        cls,
+        spots: ArrayLike,
+        parameters: ArrayLike,
+        laws: Sequence[TimeLaw],
+        *,
+        labels: Sequence[str] = (),
+        correlation: ArrayLike | None = None,
+        jump_false_alarm: float = FALSE_ALARM,
+    ) -> Disturbances:
+        """Return disturbances from plain arrays, each motion of a body of its own.
+
+        Parameters
+        ----------
+        spots : (D, M) array_like
+            Change of each measured value for one standard deviation of each motion.
+        parameters : (P, M) array_like
+            Change of each wanted parameter for one standard deviation of each motion.
+        laws : sequence of M TimeLaw
+            Covariance of each motion in time.
+        labels : sequence of M str, optional
+            Names of the motions.
+        correlation : (M, M) array_like, optional
+            Correlation of the motions; by default they are independent.
+        jump_false_alarm : float
+            Probability of detecting a step in a series without one.
+
+        Raises
+        ------
+        ValueError
+            Arrays whose shapes do not match.
+        """
+        effect = np.array(spots, np.float64)
+        count = len(laws)
+        names = tuple(labels) or tuple(f"motion {k + 1}" for k in range(count))
+        together = np.eye(count) if correlation is None else np.array(correlation, np.float64)
+        rest = ("",) * count, effect, np.array(parameters, np.float64), together, tuple(laws), jump_false_alarm
+        return cls("prior", names, names, names, np.ones(count), *rest)
+
     @cached_property
     def root(self) -> Array:
         """(M, M) with root root' = correlation: what independent numbers of unit variance make of the motions."""

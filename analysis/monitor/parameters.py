@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from analysis.arrays import ARCSEC, UM_PER_M, Array, shows
-from analysis.monitor.monitor_formulas import GroundGeometry, MonitorGeometry
+from analysis.monitor.monitor_formulas import GroundGeometry, MonitorGeometry, coefficients
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_template import SpotTemplate
 from optics.numerics.extension_table import ExtensionTable
@@ -45,6 +45,21 @@ class CameraCalibration:
     parameter_jacobian: Array
     motions: tuple[str, ...]
     channels: tuple[str, ...] = PAIR
+
+    @classmethod
+    def from_geometry(cls, geometry: MonitorGeometry, look_rad: float = 0.0) -> CameraCalibration:
+        """Return the calibration of a camera with a left and a right spot, by the derived formulas.
+
+        Parameters
+        ----------
+        geometry : MonitorGeometry
+            Principal distance, distance of the spots and pixel pitch.
+        look_rad : float
+            Nominal look angle of the camera about the base's Y, in radians, positive forward.
+        """
+        motions = ("rotation about Y", "rotation about X", "rotation about Z", "principal distance")
+        spots = np.asarray(np.linalg.inv(coefficients("derived", geometry)), np.float64)
+        return cls(geometry, look_rad, spots, np.eye(4), motions)
 
     @property
     def pair(self) -> tuple[int, int] | None:

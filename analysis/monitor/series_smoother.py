@@ -117,6 +117,41 @@ class SmoothedSeries:
     jumps: tuple[Jump, ...] | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class WhiteNoise:
+    """Noise that is independent from measurement to measurement.
+
+    Attributes
+    ----------
+    each : (D, D) ndarray
+        Covariance of one measurement, px^2.
+    """
+
+    each: Array
+
+    def covariance(self, images: Numbers) -> Array:
+        """Return the (n D, n D) covariance of n measurements, px^2."""
+        return np.asarray(np.kron(np.eye(len(images)), self.each), np.float64)
+
+
+def _series(
+    disturbances: Disturbances, measured: ArrayLike, shifts: ArrayLike, noise: ShiftNoise | Array
+) -> tuple[Array, Numbers, Array, ShiftNoise]:
+    """Return the ascending times of a series, their order, its values and its noise, checked."""
+    when, values = np.asarray(measured, np.float64), np.asarray(shifts, np.float64)
+    size = len(disturbances.spots)
+    if when.ndim != 1 or values.shape != (len(when), size) or not len(when):
+        raise ValueError(f"series: {when.shape} times need values ({when.size}, {size}), found {values.shape}")
+    if not (np.all(np.isfinite(when)) and np.all(np.isfinite(values))):
+        raise ValueError("series: times and values must be finite; leave out what was not measured")
+    if isinstance(noise, np.ndarray):
+        if noise.shape != (size, size):
+            raise ValueError(f"series: noise must be the covariance ({size}, {size}) of one time, found {noise.shape}")
+        noise = WhiteNoise(noise)
+    order = np.argsort(when, kind="stable")
+    return when[order], order, values, noise
+
+
 def window_of(values: int) -> int:
     """Measurements that are worked on at once.
 
@@ -129,10 +164,10 @@ def window_of(values: int) -> int:
 
 
 def smooth_series(
-    stated: Disturbances,
+    disturbances: Disturbances,
     measured: ArrayLike,
-    shifts: Array,
-    noise: ShiftNoise,
+    shifts: ArrayLike,
+    noise: ShiftNoise | Array,
     times: ArrayLike,
     reference: float | None = None,
 ) -> SmoothedSeries:
@@ -158,14 +193,13 @@ def smooth_series(
     ValueError
         Motions of different laws are correlated, or the shifts have no noise and say the same twice.
     """
-    when, wanted = np.asarray(measured, np.float64), np.asarray(times, np.float64)
-    order = np.argsort(when, kind="stable")
-    when = when[order]
+    wanted = np.asarray(times, np.float64)
+    when, order, shifts, noise = _series(disturbances, measured, shifts, noise)
     jumps = None
-    if any(law.jump for law in stated.laws):
-        jumps, stated = _Search(stated, when, shifts, noise, order, reference).jumps()
-    model = _Process(stated, reference)
-    width, count = len(stated.parameters), len(wanted)
+    if any(law.jump for law in disturbances.laws):
+        jumps, disturbances = _Search(disturbances, when, shifts, noise, order, reference).jumps()
+    model = _Process(disturbances, reference)
+    width, count = len(disturbances.parameters), len(wanted)
     found = {
         which: SeriesChanges(np.empty((count, width)), np.empty((count, width, width)), np.empty((count, width, width)))
         for which in ("filtered", "smoothed")
@@ -185,6 +219,49 @@ def smooth_series(
     degrees = shifts.size
     whole = Consistency(float(squares.sum()), degrees, float(limit_of(FALSE_ALARM, degrees)))
     return SmoothedSeries(found["filtered"], found["smoothed"], squares, whole, jumps)
+
+
+def detect_jumps(
+    disturbances: Disturbances,
+    measured: ArrayLike,
+    shifts: ArrayLike,
+    noise: ShiftNoise | Array,
+    reference: float | None = None,
+) -> tuple[Jump, ...]:
+    """Detect steps at unknown times in a series of measurements by generalised likelihood ratios.
+
+    Parameters
+    ----------
+    disturbances : Disturbances
+        Motions and their laws in time; those with ``TimeLaw(jump=True)`` may step. `jump_false_alarm` is the
+        probability of detecting any step in a series without one.
+    measured : (M,) array_like
+        Times of the measurements, in seconds, in any order.
+    shifts : (M, D) array_like
+        Measured values, in the units of ``disturbances.spots``.
+    noise : (D, D) ndarray or ShiftNoise
+        Covariance of one measurement, independent from time to time, or an object with the covariance of all.
+    reference : float, optional
+        Time from which changes are counted, in seconds; by default they are counted from the calibration.
+
+    Returns
+    -------
+    tuple of Jump
+        Detected steps in the order of time, each with `body`, `sizes`, `sigmas`, and the times `after` and `until`
+        between which it is most likely.
+
+    Raises
+    ------
+    ValueError
+        Arrays of other shapes, values that are not finite, or correlated motions with different laws.
+
+    Notes
+    -----
+    Willsky and Jones, IEEE Trans. Automat. Contr. 21, 108 (1976); the false-alarm rate is bounded by Boole's inequality
+    over all times and motions.
+    """
+    when, order, values, errors = _series(disturbances, measured, shifts, noise)
+    return _Search(disturbances, when, values, errors, order, reference).jumps()[0]
 
 
 class _Search:

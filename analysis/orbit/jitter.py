@@ -811,6 +811,65 @@ def search(
     return JitterSearch(lines, before, current, used, factors, current.threshold(false_alarm), alias_band[1])
 
 
+def find_jitter(
+    time: ArrayLike,
+    angle: ArrayLike,
+    sigma: float,
+    lowest: float,
+    highest: float,
+    *,
+    lag: float | None = None,
+    false_alarm: float = 1e-3,
+) -> Lines:
+    """Find the oscillations of an attitude in a series of angles, at any times, with a bounded false-alarm rate.
+
+    Parameters
+    ----------
+    time : (n,) array_like
+        Times of the observations, in seconds, in any order.
+    angle : (n,) or (n, A) array_like
+        Angles about A axes, in radians; with `lag`, angle at ``time + lag`` minus angle at ``time``, as two bands or
+        two rows of chips show it.
+    sigma : float
+        Standard deviation of the noise of each angle, in radians. The search estimates a factor on it.
+    lowest, highest : float
+        Range of the search, in hertz.
+    lag : float, optional
+        Time between the two moments that each observation compares, in seconds; None for angles themselves.
+    false_alarm : float
+        Probability of finding any oscillation in noise alone.
+
+    Returns
+    -------
+    Lines
+        `frequency` (K,), `amplitude` and `phase` (K, A) with `frequency_sigma` and `amplitude_sigma`, strongest first.
+
+    Raises
+    ------
+    ValueError
+        Arrays of other shapes, values that are not finite, or too few observations.
+
+    Notes
+    -----
+    Sine, cosine, a constant and a drift about every axis are fitted together at each frequency. The false-alarm rate
+    bounds the maximum of the periodogram (Davies, Biometrika 74, 33 (1987)).
+    """
+    moments, values = np.asarray(time, np.float64), np.asarray(angle, np.float64)
+    values = values[:, None] if values.ndim == 1 else values
+    if moments.ndim != 1 or values.ndim != 2 or len(values) != len(moments) or not (np.isfinite(sigma) and sigma > 0):
+        raise JitterError(
+            f"jitter: need times (n,), angles (n,) or (n, axes) and a positive sigma, found {moments.shape},"
+            f" {np.shape(angle)}, {sigma}"
+        )
+    axes = values.shape[1]
+    signs, shifts = ((1.0,), (0.0,)) if lag is None else ((-1.0, 1.0), (0.0, lag))
+    weight = np.tile(np.array(signs)[:, None, None] * np.eye(axes), (len(moments), 1, 1, 1)).transpose(0, 2, 1, 3)
+    drift = np.stack([np.ones_like(moments), moments - np.mean(moments)], axis=1)
+    rows = values.ravel() / sigma, np.repeat(np.arange(len(moments)), axes), moments[:, None] + np.array(shifts)
+    weights = weight.reshape(-1, len(signs), axes) / sigma
+    return search(Observations.of(*rows, weights, np.kron(drift, np.eye(axes))), lowest, highest, false_alarm).lines
+
+
 def _unaliased(
     observations: Observations, lines: Lines | None, fitted: Lines, band: tuple[float, float], false_alarm: float
 ) -> tuple[Lines, tuple[float, ...]]:

@@ -399,7 +399,7 @@ def _off(points: Array, circle: tuple[float, float, float]) -> Array:
     return np.abs(np.hypot(points[:, 0] - circle[0], points[:, 1] - circle[1]) - circle[2])
 
 
-def fit_zernikes(values: ArrayLike, terms: Sequence[int], pupil: Pupil | None = None) -> MapFit:
+def fit_wavefront_map(values: ArrayLike, terms: Sequence[int], pupil: Pupil | None = None) -> MapFit:
     """Least squares of Zernike terms over the lit pixels of a pupil, all of the same weight.
 
     Parameters

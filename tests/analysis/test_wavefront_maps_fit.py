@@ -16,7 +16,7 @@ from analysis.wavefront_maps.pupil_fit import (
     Orientation,
     Pupil,
     find_pupil,
-    fit_zernikes,
+    fit_wavefront_map,
     tellable,
 )
 from analysis.wavefront_maps.zernike_table import circle_terms
@@ -79,7 +79,7 @@ def test_coefficients_come_back_exactly(light):
     truth = np.random.default_rng(1).normal(size=28) * 1e-7
     values = np.full(x.shape, np.nan)
     values[lit] = circle_terms(terms, x[lit], y[lit]) @ truth
-    found = fit_zernikes(values, terms, Pupil(44.3, 45.1, 40.0))
+    found = fit_wavefront_map(values, terms, Pupil(44.3, 45.1, 40.0))
     np.testing.assert_allclose(found.coefficients, truth, rtol=0, atol=1e-19)
     # parts are shares of the rms over the light
     assert np.sum(found.parts[1:] ** 2) == pytest.approx(np.var(values[lit]), rel=1e-12)
@@ -89,10 +89,10 @@ def test_terms_that_the_light_does_not_tell_apart():
     x, y = disk(100, 50.0, 50.0, 45.0)
     values = np.where((np.abs(y) < 1e-9) & (np.abs(x) <= 1.0), 0.0, np.nan)
     with pytest.raises(UndeterminedError, match="Z3 cannot be told from the terms before it"):
-        fit_zernikes(values, range(1, 5), Pupil(50.0, 50.0, 45.0))
+        fit_wavefront_map(values, range(1, 5), Pupil(50.0, 50.0, 45.0))
     with pytest.raises(UndeterminedError, match="0 lit pixels lie within the pupil"):
-        fit_zernikes(values, range(1, 5), Pupil(500.0, 50.0, 45.0))
-    refuses(MapError, "ascending order", fit_zernikes, values, [1, 4, 2], Pupil(50.0, 50.0, 45.0))
+        fit_wavefront_map(values, range(1, 5), Pupil(500.0, 50.0, 45.0))
+    refuses(MapError, "ascending order", fit_wavefront_map, values, [1, 4, 2], Pupil(50.0, 50.0, 45.0))
 
 
 # --- wavefront maps orientation ---------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from scipy.interpolate import BarycentricInterpolator
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from twin.orbit.export.rational_polynomial import RationalPolynomial
+from analysis.orbit.rational_polynomial import RationalPolynomial
 
 MU, OMEGA = 3.986004418e14, 7.292115e-5
 A, F = 6378137.0, 1.0 / 298.257223563

@@ -19,6 +19,7 @@ from rasterio.transform import from_origin
 
 import twin.orbit.__main__ as command
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError
+from analysis.orbit.rational_polynomial import fit_rpc
 from analysis.orbit.three_line_model import LineModel
 from analysis.spots.spot_positions import SpotError
 from optics.numerics.array_math import UnphysicalError
@@ -65,7 +66,7 @@ from twin.orbit.conventions.check_run import run_check
 from twin.orbit.export.export_run import read_exportable, run_export
 from twin.orbit.export.ground_accuracy import ground_rows
 from twin.orbit.export.quality_run import read_polynomial_source
-from twin.orbit.export.rational_polynomial import RationalPolynomial, controlled, read_rpc
+from twin.orbit.export.rational_polynomial import controlled, read_rpc, sensor_polynomial
 from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
@@ -155,7 +156,7 @@ def scene_files(folder: Path) -> None:
 def rpc_files(folder: Path) -> None:
     scene = dimap_bench.Scene()
     sensor = read_scene(dimap_bench.write(folder, scene)).sensor
-    model = RationalPolynomial.fit(sensor, 0, scene.pixels, (0.0, 2000.0))
+    model = sensor_polynomial(sensor, 0, scene.pixels, (0.0, 2000.0))
     (folder / "a_RPC.TXT").write_text(model.text())
     (folder / "RPC.XML").write_text(dimap_bench.rpc(model))
     (folder / "plain.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts()))
@@ -362,7 +363,7 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
         "lines look past",
     ),
     (lambda: angle_camera(UNMADE, None), ValueError, "an instrument's lines need a backend"),
-    (lambda: RationalPolynomial.through(PLACES, PLACES), ValueError, "the 180th meridian or a pole"),
+    (lambda: fit_rpc(PLACES[:, :2], PLACES[:, 2:]), ValueError, "the 180th meridian or a pole"),
     (lambda: sights_of(UNMADE, {}, ("blue",), None, None), SightsError, "no image points of blue"),
     (
         lambda: MonitorSeries.smoothed(Ns(experiment=Ns(disturbances=None)), Ns(noise=1), 1.0),

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.orbit.rational_polynomial import RationalPolynomial
 from twin.orbit.export.quality_run import compared
-from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.export.rational_polynomial import sensor_polynomial
 from twin.orbit.measured.platform_files import read_scene
 
 REAL = Path(os.environ.get("TWIN_REAL", Path(__file__).parents[3] / "shared" / "real"))
@@ -37,7 +38,7 @@ def test_spot_6_lies_where_its_file_says() -> None:
     ground = scene.sensor.ground(row - 1.0, column - 1.0, 840.0)
     told = scene.sensor.earth.ecef(np.radians(longitude), np.radians(latitude), 840.0)
     assert np.linalg.norm(ground - told, axis=1).max() < 1.0
-    model = RationalPolynomial.fit(scene.sensor, 0, scene.read.pixels, (500.0, 1200.0))
+    model = sensor_polynomial(scene.sensor, 0, scene.read.pixels, (500.0, 1200.0))
     assert max(model.error_px) < 2.5e-3
     assert not scene.read.inertial_velocity
 

@@ -8,15 +8,16 @@ import pytest
 import rasterio
 
 from analysis.orbit.image_correction import Kind, image_correction
+from analysis.orbit.rational_polynomial import RationalPolynomial
 from tests.tiers import quick
 from tests.twin.dimap_bench import Scene, rpc, write
 from twin.framework.data_files import FrameFacts, tiff
 from twin.orbit.export.rational_polynomial import (
-    RationalPolynomial,
     controlled,
     image_slope,
     polynomial_correction,
     read_rpc,
+    sensor_polynomial,
 )
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.measured.platform_files import read_scene
@@ -32,7 +33,7 @@ def sensor(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture(scope="module")
 def model(sensor) -> RationalPolynomial:
-    return RationalPolynomial.fit(sensor, 0, SCENE.pixels, HEIGHTS)
+    return sensor_polynomial(sensor, 0, SCENE.pixels, HEIGHTS)
 
 
 def parts(model: RationalPolynomial) -> np.ndarray:

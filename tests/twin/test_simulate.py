@@ -12,6 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 import twin.orbit.__main__ as command
+from analysis.orbit.rational_polynomial import RationalPolynomial
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.setup import SimulateSetup
 from tests.twin.commands import edited_copy, invoke, refused
@@ -20,7 +21,7 @@ from tests.twin.study_bench import REFUSED
 from twin.framework.data_files import FrameFacts, tiff
 from twin.orbit.export import line_scanner as line_scanning
 from twin.orbit.export.line_scanner import line_scanner
-from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.export.rational_polynomial import sensor_polynomial
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.images.simulate_run import fly_simulation
@@ -206,7 +207,7 @@ def test_a_window_is_a_part_of_the_line(flight) -> None:
     there = model.image(ground)
     np.testing.assert_allclose(there[0] - 0.5, line, atol=2e-5)
     np.testing.assert_allclose(there[1] - 0.5, pixel, atol=2e-5)
-    rpc = RationalPolynomial.fit(part, 7000, 400, (0.0, 2000.0))
+    rpc = sensor_polynomial(part, 7000, 400, (0.0, 2000.0))
     longitude, latitude, height = part.earth.geodetic(ground)
     there = rpc.image(np.degrees(latitude), np.degrees(longitude), height)
     np.testing.assert_allclose(there[0], line, atol=1e-3)
@@ -232,7 +233,7 @@ def _gdal(rpc: RationalPolynomial, shape: tuple[int, int], points: np.ndarray) -
 @pytest.mark.parametrize("name", ["forward", "nadir"])
 def test_gdal_finds_what_the_rigorous_sensor_finds(flight, name: str) -> None:
     sensor = _sensor(flight, name, LightEffects(), lines=1000)
-    rpc = RationalPolynomial.fit(sensor, 0, sensor.camera.pixels, (0.0, 2000.0))
+    rpc = sensor_polynomial(sensor, 0, sensor.camera.pixels, (0.0, 2000.0))
     line, pixel = _places(sensor, 300)
     height = np.random.default_rng(4).uniform(0.0, 2000.0, 300)
     longitude, latitude, _ = sensor.earth.geodetic(sensor.ground(line, pixel, height))
@@ -246,7 +247,7 @@ def test_gdal_finds_what_the_rigorous_sensor_finds(flight, name: str) -> None:
 @pytest.mark.second
 def test_polynomials_say_how_far_jitter_is_from_them(flight) -> None:
     sensor = _sensor(flight, "nadir", LightEffects(), measured=True)
-    rpc = RationalPolynomial.fit(sensor, 0, sensor.camera.pixels, (0.0, 2000.0))
+    rpc = sensor_polynomial(sensor, 0, sensor.camera.pixels, (0.0, 2000.0))
     line, pixel = _places(sensor, 400)
     longitude, latitude, height = sensor.earth.geodetic(sensor.ground(line, pixel, 800.0))
     there = np.stack(rpc.image(np.degrees(latitude), np.degrees(longitude), height), axis=-1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from analysis.arrays import MeasurementError
 from analysis.wavefront_maps.map_files import MapError, WavefrontMap, read_map
-from analysis.wavefront_maps.pupil_fit import Orientation, fit_zernikes
+from analysis.wavefront_maps.pupil_fit import Orientation, fit_wavefront_map
 from analysis.wavefront_maps.zernike_table import read_zernikes
 from scenes.yaml.errors import InputError
 from twin.camera.varied_beams import VariedBeams
@@ -106,7 +106,7 @@ def _of_map(one: NamesWavefronts, number: int, name: str, lies: Orientation) -> 
         if spec.reference is not None and Path(spec.reference).suffix.lower() not in TABLES:
             measured = _less(measured, read_map(one.file("reference", spec.reference, "a map")), one)
         last = spec.numbers[-1]
-        fitted = fit_zernikes(lies.apply(measured).values, tuple(range(1, last + 1)))
+        fitted = fit_wavefront_map(lies.apply(measured).values, tuple(range(1, last + 1)))
     except MeasurementError as error:
         raise one.wrong(f"map {number + 1}: {error}", "maps") from error
     return np.asarray(fitted.parts[spec.numbers[0] - 1 :])

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
+from analysis.orbit.rational_polynomial import RationalPolynomial
 from twin.framework import svg
 from twin.framework.artefact import Cell, SvgFigure, Table, significant
 from twin.framework.data_files import FrameFacts, tiff
@@ -19,7 +20,7 @@ from twin.framework.report import Report, Section, answer
 from twin.orbit.export.export_run import Controlled, Export, ExportedLine, ProductPolynomial, Quality, SceneSource
 from twin.orbit.export.ground_accuracy import TOGETHER, AccuracyMap, GroundSigma
 from twin.orbit.export.line_scanner import ModelError
-from twin.orbit.export.rational_polynomial import RationalPolynomial, residual_sigma
+from twin.orbit.export.rational_polynomial import residual_sigma
 
 _UNLIKELY = 1e-3
 """Chance of a chi-square below which covariances of control points cannot be true."""

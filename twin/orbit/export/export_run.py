@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from analysis.orbit.forward_intersection import CalibratedLine
 from analysis.orbit.image_correction import ImageCorrection, Kind
+from analysis.orbit.rational_polynomial import RationalPolynomial
 from optics.numerics.number_tree import FrozenMap
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.file_kinds import kind_of
@@ -35,7 +36,7 @@ from twin.framework.run_folder import read_manifest
 from twin.orbit.angle.angle_flight import angle_camera, fly
 from twin.orbit.export.ground_accuracy import AccuracyMap, EstimatedChange, GroundSigma, ground_sigma
 from twin.orbit.export.line_scanner import LineScanner, line_scanner
-from twin.orbit.export.rational_polynomial import RationalPolynomial
+from twin.orbit.export.rational_polynomial import sensor_polynomial
 from twin.orbit.flight.line_camera import LineCamera, calibrated_lines, corrected_line
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory
@@ -564,7 +565,7 @@ def _exported(
         raise BenchError(f"{window.name}: {error}", ("orbit",), "an orbit over ground that every line sees") from error
     try:
         ends = heights[0], heights[2]
-        polynomial = RationalPolynomial.fit(window.sensor, window.first_pixel, window.pixels, ends)
+        polynomial = sensor_polynomial(window.sensor, window.first_pixel, window.pixels, ends)
     except ValueError as error:
         return ExportedLine(window, scanner, None, str(error), ground)
     if ground is not None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from analysis.orbit.image_correction import LEAST_POINTS
+from analysis.orbit.rational_polynomial import RationalPolynomial
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text
 from scenes.yaml.yaml_file import dump_yaml
@@ -31,13 +32,7 @@ from twin.orbit.export.export_run import (
     no_bands,
 )
 from twin.orbit.export.ground_accuracy import AccuracyMap, CameraUncertainty, maps_of
-from twin.orbit.export.rational_polynomial import (
-    RationalPolynomial,
-    controlled,
-    is_rpc,
-    polynomial_correction,
-    read_rpc,
-)
+from twin.orbit.export.rational_polynomial import controlled, is_rpc, polynomial_correction, read_rpc
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.platform_files import DimapScene
 

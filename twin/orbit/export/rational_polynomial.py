@@ -18,183 +18,48 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from analysis.arrays import Array
 from analysis.orbit.image_correction import ImageCorrection, Kind, image_correction
-from optics.numerics.backend import one_blas_thread
+from analysis.orbit.rational_polynomial import TERMS, RationalPolynomial, fit_rpc
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.input_file import why_unreadable
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.xml_file import Element, first_lines, numbers, read_xml, text_lines
 
-TERMS = 20
-_POWERS = np.array(
-    [
-        *((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2)),
-        *((1, 1, 1), (3, 0, 0), (1, 2, 0), (1, 0, 2), (2, 1, 0), (0, 3, 0), (0, 1, 2), (2, 0, 1), (0, 2, 1), (0, 0, 3)),
-    ]
-)
-"""Powers of longitude, latitude and height in the order of RPC00B."""
 _GRID = (24, 24, 9)
 """Lines, pixels and heights that are fitted; the checks lie between them."""
-_ROUNDS = 6
-_RANK = 1e-11
-"""Smallest singular value that counts, relative to the largest. A cubic ratio has more coefficients than an image has
-shape, and the rest stay small."""
-_DAMPING = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
-"""Damping of the denominators that is tried; the last leaves polynomials."""
 
 
-@dataclass(frozen=True, eq=False)
-class RationalPolynomial:
-    """The model, and how well it agrees.
+def sensor_polynomial(
+    sensor: Sensor, first_pixel: int, pixels: int, heights: tuple[float, float]
+) -> RationalPolynomial:
+    """Fit rational polynomials to the image of a sensor, or to a window of it.
 
-    Attributes
+    Parameters
     ----------
-    offset : Array
-        Of line, sample, latitude, longitude (degrees) and height (metres), (5,).
-    scale : Array
-        likewise.
-    line_numerator, line_denominator, sample_numerator, sample_denominator : Array
-        (20,) each.
-    error_px : tuple[float, float]
-        Largest difference from the rigorous sensor at places that were not fitted, lines and samples; NaN of
-        polynomials that were read.
-    rms_px : tuple[float, float]
-        Root mean square of them.
-    bias_m : float | None
-        ERR_BIAS, metres: root mean square error on the ground of each horizontal axis that does not go with time, so
-        that points and images have it in common (GDAL's RFC 22; 68 % in STDI-0002); None where nobody states it.
-    random_m : float | None
-        ERR_RAND, likewise of what goes with time and is another in every image or point.
+    sensor : Sensor
+        The line on its trajectory; its lines are those of the window.
+    first_pixel : int
+        First pixel of the window on the line.
+    pixels : int
+        Number of pixels of the window.
+    heights : tuple[float, float]
+        Lowest and highest ground above the ellipsoid, metres.
+
+    Raises
+    ------
+    ValueError
+        A line of sight misses the Earth, or the ground crosses a pole or the 180th meridian.
     """
-
-    offset: Array
-    scale: Array
-    line_numerator: Array
-    line_denominator: Array
-    sample_numerator: Array
-    sample_denominator: Array
-    error_px: tuple[float, float] = (np.nan, np.nan)
-    rms_px: tuple[float, float] = (np.nan, np.nan)
-    bias_m: float | None = None
-    random_m: float | None = None
-
-    @classmethod
-    def fit(cls, sensor: Sensor, first_pixel: int, pixels: int, heights: tuple[float, float]) -> RationalPolynomial:
-        """Rational polynomials of an image, or of a window of it.
-
-        Parameters
-        ----------
-        sensor : Sensor
-            The line on its trajectory; its lines are those of the window.
-        first_pixel : int
-            Of the window on the line.
-        pixels : int
-            Of the window.
-        heights : tuple[float, float]
-            Lowest and highest ground above the ellipsoid, metres.
-
-        Raises
-        ------
-        ValueError
-            a look misses the Earth, or the ground crosses a pole or the 180th meridian.
-        """
-        fitted = _seen(sensor, first_pixel, pixels, heights, _GRID, at_ends=True)
-        others = tuple(count - 1 for count in _GRID)
-        return cls.through(fitted, _seen(sensor, first_pixel, pixels, heights, others, at_ends=False))
-
-    @classmethod
-    def through(cls, fitted: Array, checked: Array) -> RationalPolynomial:
-        """Rational polynomials through places of an image and of the ground.
-
-        Parameters
-        ----------
-        fitted : Array
-            (N, 5) line, sample, latitude, longitude (degrees) and height (metres).
-        checked : Array
-            (M, 5) of the same, between them.
-
-        Raises
-        ------
-        ValueError
-            The ground crosses a pole or the 180th meridian.
-        """
-        ends = np.stack([np.min(fitted, axis=0), np.max(fitted, axis=0)])
-        if ends[1, 3] - ends[0, 3] > _WIDEST:
-            raise ValueError("the ground lies on the 180th meridian or a pole, where longitudes jump")
-        offset, scale = np.mean(ends, axis=0), 0.5 * (ends[1] - ends[0])
-        sides = [(_monomials((seen[:, 2:] - offset[2:]) / scale[2:]), seen) for seen in (fitted, checked)]
-        best = [_best(sides, k, offset[k], scale[k]) for k in range(2)]
-        (line, line_most, line_rms), (sample, sample_most, sample_rms) = best
-        return cls(offset, scale, *line, *sample, (line_most, sample_most), (line_rms, sample_rms))
-
-    def ground(self, line: ArrayLike, sample: ArrayLike, height: ArrayLike) -> tuple[Array, Array]:
-        """Latitude and longitude (N,), degrees, that a line and a sample (N,) see at a height, metres (N,).
-
-        Newton steps from the middle of the ground; NaN where they do not arrive.
-        """
-        wanted = np.stack(np.broadcast_arrays(line, sample), axis=-1).astype(np.float64)
-        at = np.broadcast_to(np.asarray(height, np.float64), wanted.shape[:-1])
-        place = np.tile(self.offset[2:4], (len(wanted), 1))
-        step = _STEP * self.scale[2:4]
-        for _ in range(_MOST_STEPS):
-            here, north, east = (
-                np.stack(self.image(place[:, 0] + up, place[:, 1] + aside, at), axis=-1)
-                for up, aside in ((0.0, 0.0), (step[0], 0.0), (0.0, step[1]))
-            )
-            slope = np.stack([(north - here) / step[0], (east - here) / step[1]], axis=-1)
-            move = np.linalg.solve(slope, (wanted - here)[..., None])[..., 0]
-            # a step over the whole ground leaves where the polynomials say anything
-            place = place + np.clip(move, -self.scale[2:4], self.scale[2:4])
-            if np.all(np.abs(move) < _ARRIVED * self.scale[2:4]):
-                break
-        arrived = np.all(np.abs(move) < _ARRIVED * self.scale[2:4], axis=-1)
-        found = np.where(arrived[:, None], place, np.nan)
-        return found[:, 0], found[:, 1]
-
-    def image(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> tuple[Array, Array]:
-        """Line and sample (N,) of ground points: degrees (N,), degrees, metres above the ellipsoid."""
-        unit = (np.stack([latitude, longitude, height], axis=-1) - self.offset[2:]) / self.scale[2:]
-        basis = _monomials(unit)
-        line = basis @ self.line_numerator / (basis @ self.line_denominator)
-        sample = basis @ self.sample_numerator / (basis @ self.sample_denominator)
-        return self.offset[0] + self.scale[0] * line, self.offset[1] + self.scale[1] * sample
-
-    def text(self) -> str:
-        """Contents of NAME_RPC.TXT, as GDAL reads it beside NAME.tif."""
-        names = (("LINE", "pixels"), ("SAMP", "pixels"), ("LAT", "degrees"), ("LONG", "degrees"), ("HEIGHT", "meters"))
-        errors = (("ERR_BIAS", self.bias_m), ("ERR_RAND", self.random_m))
-        rows = [f"{name}: {value!r} meters" for name, value in errors if value is not None]
-        rows += [
-            f"{name}_{what}: {value!r} {unit}"
-            for what, values in (("OFF", self.offset), ("SCALE", self.scale))
-            for (name, unit), value in zip(names, values.tolist(), strict=True)
-        ]
-        parts = {
-            "LINE_NUM": self.line_numerator,
-            "LINE_DEN": self.line_denominator,
-            "SAMP_NUM": self.sample_numerator,
-            "SAMP_DEN": self.sample_denominator,
-        }
-        rows += [f"{name}_COEFF_{k + 1}: {v!r}" for name, part in parts.items() for k, v in enumerate(part.tolist())]
-        return "\n".join(rows) + "\n"
-
-    def tags(self) -> list[tuple[Any, ...]]:
-        """The tag of a GeoTIFF that holds them (RPCCoefficientTag): errors, -1 where nobody states them, offsets,
-        scales and coefficients, in the order of RPC00B.
-        """
-        parts = (self.line_numerator, self.line_denominator, self.sample_numerator, self.sample_denominator)
-        errors = (_UNSTATED if error is None else error for error in (self.bias_m, self.random_m))
-        values = (*errors, *self.offset.tolist(), *self.scale.tolist(), *np.concatenate(parts).tolist())
-        return [(_COEFFICIENTS, "d", len(values), values, True)]
+    places = _seen(sensor, first_pixel, pixels, heights, _GRID, at_ends=True)
+    others = _seen(sensor, first_pixel, pixels, heights, tuple(count - 1 for count in _GRID), at_ends=False)
+    return fit_rpc(places[:, :2], places[:, 2:], check=(others[:, :2], others[:, 2:]))
 
 
 def axis_sigma(covariance: Array) -> float:
@@ -206,17 +71,6 @@ def axis_sigma(covariance: Array) -> float:
         (N, 2, 2) to the east and to the north over an image, m^2.
     """
     return float(np.sqrt(0.5 * np.mean(np.trace(covariance, axis1=-2, axis2=-1))))
-
-
-_STEP = 1e-6
-_ARRIVED = 1e-9
-_MOST_STEPS = 30
-"""Of the ground's size: of a derivative, of the last step to the ground; and how many."""
-_COEFFICIENTS = 50844
-_UNSTATED = -1.0
-"""Of an error, metres."""
-_WIDEST = 90.0
-"""Degrees of longitude."""
 
 
 def _seen(
@@ -245,51 +99,6 @@ def _places(middle: Array, half: Array, counts: tuple[int, ...], at_ends: bool) 
     angles = (np.linspace(0.0, np.pi, n) if at_ends else (np.arange(n) + 0.5) * np.pi / n for n in counts)
     axes = (m - h * np.cos(angle) for m, h, angle in zip(middle, half, angles, strict=True))
     return [v.ravel() for v in np.meshgrid(*axes, indexing="ij")]
-
-
-def _monomials(unit: Array) -> Array:
-    """(N, 20) terms of latitude, longitude and height (N, 3), scaled."""
-    powers = [np.stack([np.ones_like(one), one, one**2, one**3]) for one in (unit[:, 1], unit[:, 0], unit[:, 2])]
-    return np.stack([powers[0][a] * powers[1][b] * powers[2][c] for a, b, c in _POWERS], axis=-1)
-
-
-def _best(
-    sides: list[tuple[Array, Array]], k: int, offset: float, scale: float
-) -> tuple[tuple[Array, Array], float, float]:
-    """Numerator and denominator of one image coordinate, largest and root mean square error where it was not fitted.
-
-    Attitudes that jitter are no cubics: coefficients that follow the jitter at the fitted places go astray between
-    them. Of several degrees of smoothness the one with the least error there is taken.
-    """
-    (basis, fitted), (others, checked) = sides
-    found: list[tuple[float, float, tuple[Array, Array]]] = []
-    for damping in _DAMPING:
-        ratio = _ratio(basis, (fitted[:, k] - offset) / scale, damping)
-        below = others @ ratio[1]
-        if not np.all(below > 0.0):  # a pole on the ground
-            continue
-        away = offset + scale * (others @ ratio[0]) / below - checked[:, k]
-        found.append((float(np.sqrt(np.mean(away**2))), float(np.max(np.abs(away))), ratio))
-    rms, most, ratio = min(found, key=lambda one: one[0])
-    return ratio, most, rms
-
-
-@one_blas_thread()
-def _ratio(basis: Array, value: Array, damping: float) -> tuple[Array, Array]:
-    """Coefficients (20,) and (20,), the second's first being 1, whose ratio is a value (N,): least squares of the
-    ratio itself, by weights from the denominator of the round before; ``damping`` of the denominator's coefficients.
-    """
-    weight = np.ones(len(value))
-    held = np.concatenate([np.zeros(TERMS), np.full(TERMS - 1, damping * np.sqrt(len(value)))])
-    found = np.zeros(2 * TERMS - 1)
-    for _ in range(_ROUNDS):
-        rows = np.concatenate([basis, -value[:, None] * basis[:, 1:]], axis=1) * weight[:, None]
-        rows, right = np.concatenate([rows, np.diag(held)]), np.concatenate([value * weight, np.zeros(len(held))])
-        found = np.linalg.lstsq(rows, right, rcond=_RANK)[0]
-        weight = 1.0 / (1.0 + basis[:, 1:] @ found[TERMS:])
-        if not np.all(np.isfinite(weight) & (weight > 0.0)):
-            break
-    return found[:TERMS], np.concatenate([[1.0], found[TERMS:]])
 
 
 _AXES = ("LINE", "SAMP", "LAT", "LONG", "HEIGHT")
@@ -509,11 +318,12 @@ def controlled(polynomial: RationalPolynomial, correction: ImageCorrection) -> R
         line, sample, height = _places(polynomial.offset[kept], polynomial.scale[kept], counts, at_ends)
         latitude, longitude = polynomial.ground(line, sample, height)
         moved = np.stack([line, sample], axis=-1) + correction.at(line, sample)
-        grids.append(np.stack([*moved.T, latitude, longitude, height], axis=-1)[np.isfinite(latitude)])
-    if min(map(len, grids)) < np.prod(_CORRECTED_GRID) // 2:
+        ground = np.stack([latitude, longitude, height], axis=-1)
+        grids.append((moved[np.isfinite(latitude)], ground[np.isfinite(latitude)]))
+    if min(len(moved) for moved, _ in grids) < np.prod(_CORRECTED_GRID) // 2:
         raise ValueError("the polynomials do not lead back to the ground over the image that they state")
     bias, random = _on_the_ground(polynomial, correction)
-    return replace(RationalPolynomial.through(*grids), bias_m=bias, random_m=random)
+    return replace(fit_rpc(*grids[0], check=grids[1]), bias_m=bias, random_m=random)
 
 
 def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) -> tuple[float, float]:
