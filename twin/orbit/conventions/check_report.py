@@ -1,6 +1,6 @@
-"""Report of a check of conventions: what stands, what does not, what the points cannot tell.
+"""Report and result records of a check of conventions: confirmed, wrong or undetermined conventions of a pass.
 
-The quantities of a check of conventions, as check.json has them.
+The records define the quantities of check.json.
 """
 
 from __future__ import annotations
@@ -18,17 +18,20 @@ from twin.orbit.conventions.pass_readings import QUESTIONS, Changes, Fit, change
 from twin.orbit.flight.earth import Earth, east_north_up
 
 Ranked = tuple[Check, Tried]
+"""A check with one of its readings."""
 Placed = tuple[Check, Changes]
+"""A check with the changes of one of its readings."""
 
 
 def changes_text(changes: Changes) -> str:
-    """What a reading takes otherwise than stated, for readers."""
+    """Return the conventions in which a reading differs from the stated one, for readers."""
     if not changes:
         return "as stated"
     return "; ".join(f"{QUESTIONS[name].title} {QUESTIONS[name].text(value)}" for name, value in changes)
 
 
 def _of_fit(get: Callable[[Fit], Any]) -> Callable[[Ranked], Any]:
+    """Return a function that gets a quantity of a reading's fit; None for an impossible reading."""
     return lambda of: None if of[1].fit is None else get(of[1].fit)
 
 
@@ -71,7 +74,10 @@ QUESTION: Record[tuple[Answer, ...]] = Record(
 
 
 def places_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
-    """Where one reading puts the first points, a row for each: longitude, latitude, distance from the ground point."""
+    """Return the first points of a reading on the ground, a row for each.
+
+    A row has longitude, latitude and the distance from the ground point, east and north in metres.
+    """
     found = run.places[changes]
     if isinstance(found, str):
         return []
@@ -102,6 +108,7 @@ PLACE: Record[Placed] = Record(
 
 
 def _best(run: Check) -> dict[str, Any]:
+    """Return every convention of the best reading."""
     reading = changed(run.stated, run.best.changes)
     return {name: QUESTIONS[name].get(reading) for name in run.answers}
 
@@ -129,14 +136,15 @@ CHECK: Record[Check] = Record(
 
 
 ANOTHER, NONE = 3, 4
-"""Exit codes: another reading than the stated one stands; none explains the points."""
+"""Exit codes if another reading than the stated one explains the points, and if none does."""
 _LISTED = 12
+"""Number of readings in the table of the report."""
 _NAMED = 6
-"""Gross errors of a line that are named in a warning; check.json has all."""
+"""Number of gross errors of a line that a warning names; check.json has all."""
 
 
 def check_report(run: Check) -> Report:
-    """Report of a check."""
+    """Return the report of a check."""
     code = {"stands": 0, "another": ANOTHER, "none": NONE}[run.verdict]
     verdict, more = _verdict(run)
     return Report(
@@ -152,6 +160,7 @@ def check_report(run: Check) -> Report:
 
 
 def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
+    """Return the verdict and the sentences after it."""
     best, stated = run.best.fit, run.stated_fit
     if run.verdict == "none" or best is None:
         left = "no reading can have imaged the points" if best is None else (
@@ -176,14 +185,17 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
 
 
 def _open(answers: tuple[Answer, ...]) -> bool:
+    """Return whether more than one value of a convention is possible."""
     return sum(one.possible for one in answers) > 1
 
 
 def _metres(value: float) -> str:
+    """Return a distance in metres or kilometres as text."""
     return f"{value / 1e3:.4g} km" if value >= 1e4 else f"{value:.3g} m"
 
 
 def _lead(run: Check) -> tuple[str, ...]:
+    """Return sentences on wrong and undetermined conventions."""
     lines = [f"Fits alike: {changes_text(one)}." for one in run.alike]
     for name, answers in run.answers.items():
         question = QUESTIONS[name]
@@ -202,6 +214,7 @@ def _lead(run: Check) -> tuple[str, ...]:
 
 
 def _facts(run: Check) -> tuple[tuple[str, str], ...]:
+    """Return the input quantities listed in the report."""
     size, images = run.setup.test.uncertainty, run.readings.images
     return (
         ("Camera", run.setup.camera.name),
@@ -214,6 +227,7 @@ def _facts(run: Check) -> tuple[tuple[str, str], ...]:
 
 
 def _row(one: Tried, run: Check) -> tuple[Cell, ...]:
+    """Return the table row of a reading."""
     if one.fit is None:
         return changes_text(one.changes), None, None, None, None, one.why
     excess = run.excess(one)
@@ -223,6 +237,7 @@ def _row(one: Tried, run: Check) -> tuple[Cell, ...]:
 
 
 def _ranking(run: Check) -> Table:
+    """Return the table of the likeliest readings."""
     stated, single = run.stated_fit, [one for one in run.tried if len(one.changes) <= 1 and one is not run.best]
     first = [run.best, *(one for one in run.tried if one.changes in run.alike)]
     first += [stated] if stated not in first else []
@@ -241,6 +256,7 @@ def _ranking(run: Check) -> Table:
 
 
 def _questions(run: Check) -> Section:
+    """Return the report section on each convention by itself."""
     rows: list[tuple[Cell, ...]] = []
     for name, answers in run.answers.items():
         question = QUESTIONS[name]
@@ -265,6 +281,7 @@ def _questions(run: Check) -> Section:
 
 
 def _places(run: Check) -> Section:
+    """Return the report section on the ground positions of the first points."""
     rows: list[tuple[Cell, ...]] = []
     for changes, found in run.places.items():
         if isinstance(found, str):
@@ -285,6 +302,7 @@ def _places(run: Check) -> Section:
 
 
 def _warnings(run: Check) -> tuple[str, ...]:
+    """Return warnings on gross errors, underestimated sigmas, datum and Earth orientation."""
     found = []
     for name, points in run.wrong.items():
         if points:

@@ -1,4 +1,7 @@
-"""Which readings of a pass explain its ground points: ``python -m twin.orbit check``."""
+"""Search for the conventions of a pass that explain its ground points: ``python -m twin.orbit check``.
+
+A reading is one interpretation of the files' numbers under one set of conventions.
+"""
 
 from __future__ import annotations
 
@@ -41,31 +44,37 @@ if TYPE_CHECKING:
 
 Verdict = Literal["stands", "another", "none"]
 DECIDED = 20.0
-"""Two readings are separated if one is exp(-10) = 1/22 000 as likely as the other: a few hundred are tried, so that
-one in a hundred checks is wrong at most."""
+"""Difference of cost from which two readings are separated.
+
+One is then exp(-10) = 1/22 000 as likely as the other: a few hundred are tried, so that one in a hundred checks is
+wrong at most.
+"""
 _FITS = 9.0
-"""Chi-square over its freedom up to which a reading explains the points: sigmas three times too small."""
+"""Chi-square per degree of freedom up to which a reading explains the points: sigmas three times too small."""
 _ROUGH_POINTS = 8
+"""Number of points of each line in the first, rough comparison."""
 _CANDIDATES = 40
+"""Number of readings that are fitted after the rough comparison."""
 _ROUNDS = 3
-"""Each adds two questions that may be wrong."""
+"""Number of search rounds; each adds two conventions that may be wrong."""
 _WRONG_SHARE = 1e-6
-"""False alarm for a point that is taken for a gross error."""
+"""False-alarm rate of a point that is rejected as a gross error."""
 _MOST_WRONG = 0.3
+"""Largest share of points that may be rejected as gross errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A reading and what came of it.
+    """Reading that was tried, with its fit.
 
     Attributes
     ----------
     changes : Changes
-        From the stated one.
-    fit : Fit | None
-        None if the points cannot have been imaged so.
+        Changes from the stated reading.
+    fit : Fit or None
+        Fit to the points; None if they cannot have been imaged under this reading.
     why : str
-        That is.
+        Reason why the reading is impossible.
     """
 
     changes: Changes
@@ -74,27 +83,26 @@ class Tried:
 
     @property
     def cost(self) -> float:
-        """Minus twice the log likelihood; infinite for one that is impossible."""
+        """Minus twice the log likelihood; infinite for an impossible reading."""
         return np.inf if self.fit is None else self.fit.cost
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What the points say of one value of a question, the others as in the best reading.
+    """Test of one value of a convention, with the others as in the best reading.
 
     Attributes
     ----------
-    value : Any
-        Of the question.
+    value : object
+        Value of the convention.
     stated, best : bool
-        Whether it is the stated one, and that of the best reading.
+        True for the stated value, and for that of the best reading.
     excess : float
-        Cost beyond that of the best reading, over the factor of the sigmas.
-    moved : float | None
-        By how much the points lie elsewhere than in the best reading, root mean square, metres; None if they lie
-        nowhere.
+        Cost beyond that of the best reading, divided by the factor of the variances.
+    moved : float or None
+        RMS displacement of the points from the best reading, metres; None if they have no position on the ground.
     why : str
-        It is impossible; empty if it is not.
+        Reason why the value is impossible; empty if it is not.
     """
 
     value: Any
@@ -106,40 +114,41 @@ class Answer:
 
     @property
     def possible(self) -> bool:
-        """Whether the points leave it open."""
+        """True where the points do not exclude the value."""
         return self.excess < DECIDED
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What a check found.
+    """Result of a check of conventions.
 
     Attributes
     ----------
     setup : CheckSetup
-        What its file says.
+        Test file with the camera.
     readings : PassReadings
-        Of the files.
+        Numbers of the files.
     stated : PassConventions
-        reading.
-    tried : tuple[Tried, ...]
+        Stated reading.
+    tried : tuple of Tried
         Readings with a fit, the likeliest first, then those that are impossible.
     best : Tried
-        Of those that explain the points as well as any, the one with the fewest changes.
+        Reading with the fewest changes among those that explain the points as well as any.
     verdict : Verdict
-        The stated reading stands, another one does, or none explains the points.
+        "confirmed" if the stated reading explains the points, "another" if another one does, or "none".
     factor : float
-        Chi-square of the best reading over its freedom, at least 1: by how much the sigmas' squares are too small.
-    answers : dict[str, tuple[Answer, ...]]
-        Question -> its values.
-    first_points : dict[str, np.ndarray]
-        Line -> rows of the ground points whose places are listed.
-    places : dict[Changes, dict[str, np.ndarray] | str]
-        Changes of one question -> where the first points of each line fall, ITRS, metres, or why nowhere.
+        Factor by which the variances are too small: chi-square per degree of freedom of the best reading, at least 1.
+    answers : dict of str to tuple of Answer
+        Tested values of each convention.
+    first_points : dict of str to ndarray
+        Rows of the ground points whose positions are listed, by line.
+    places : dict
+        Ground positions of the first points of each line, ITRS, metres, by changes of one convention; a text says why
+        there are none.
     count : int
-        How many readings were tried.
-    wrong : dict[str, tuple[str, ...]]
-        Line -> names of points that were left out as gross errors.
+        Number of readings that were tried.
+    wrong : dict of str to tuple of str
+        Names of points that were rejected as gross errors, by line.
     """
 
     setup: CheckSetup
@@ -156,12 +165,15 @@ class Check:
     wrong: dict[str, tuple[str, ...]]
 
     def excess(self, one: Tried) -> float:
-        """Cost of a reading beyond that of the best one, over the factor of the sigmas; infinite for an impossible."""
+        """Return the cost of a reading beyond that of the best one, divided by the factor of the variances.
+
+        It is infinite for an impossible reading.
+        """
         return (one.cost - self.best.cost) / self.factor
 
     @property
     def alike(self) -> tuple[Changes, ...]:
-        """Other readings with no more changes than the best one, as likely: the points cannot tell which it is."""
+        """Equally likely readings with no more changes than the best one, which the points do not separate."""
         return tuple(
             one.changes
             for one in self.tried
@@ -170,17 +182,17 @@ class Check:
 
     @property
     def stated_fit(self) -> Tried:
-        """The stated reading."""
+        """Stated reading with its fit."""
         return next(one for one in self.tried if not one.changes)
 
 
 def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Check:
-    """Try every reading; nothing is traced or drawn.
+    """Try the readings of a pass; nothing is traced or drawn at random.
 
     Raises
     ------
     InputError
-        Files that cannot be read, or fewer than three points.
+        Files cannot be read, or there are fewer than three points.
     """
     advance("readings", 0, 3)
     readings, stated = pass_readings.read_pass(setup.test, setup.camera, Path())
@@ -211,6 +223,7 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -> PassBench:
+    """Return the bench on which readings are tried, with the image points reduced to the test's number."""
     cameras = line_cameras(setup.camera)
     images = {}
     for name, raw in readings.images.items():
@@ -231,7 +244,7 @@ def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -
 def _searched(
     bench: PassBench, stated: PassConventions, others: dict[str, tuple[Any, ...]]
 ) -> tuple[Tried, list[Tried], int]:
-    """The best reading, those that were fitted, and how many were looked at."""
+    """Return the best reading, those that were fitted, and the number of those that were compared."""
     start: Changes = ()
     fitted: dict[frozenset[str], Tried] = {}
     seen: set[frozenset[str]] = set()
@@ -256,11 +269,12 @@ def _searched(
 
 
 def _key(changes: Changes) -> frozenset[str]:
+    """Return a key of changes that does not depend on their order."""
     return frozenset(f"{name}={value}" for name, value in changes)
 
 
 def _rough(bench: PassBench, meant: PassConventions) -> float:
-    """Root mean square of a few residuals, metres; infinite where there are none."""
+    """Return the root of the median squared residual of a few points, in metres; infinite if they have no position."""
     try:
         return float(np.sqrt(np.median(np.sum(bench.residuals(meant, _ROUGH_POINTS) ** 2, axis=1))))
     except ImpossibleError:
@@ -268,6 +282,7 @@ def _rough(bench: PassBench, meant: PassConventions) -> float:
 
 
 def _tried(bench: PassBench, stated: PassConventions, changes: Changes) -> Tried:
+    """Fit a reading to the points."""
     try:
         return Tried(changes, bench.fit(changed(stated, changes)))
     except ImpossibleError as error:
@@ -275,7 +290,7 @@ def _tried(bench: PassBench, stated: PassConventions, changes: Changes) -> Tried
 
 
 def _best(tried: Sequence[Tried]) -> Tried:
-    """The fewest changes among those that are as likely as any."""
+    """Return the reading with the fewest changes among those that are as likely as any."""
     least = min(tried, key=lambda one: one.cost)
     if least.fit is None:
         return next(one for one in tried if not one.changes)
@@ -285,7 +300,7 @@ def _best(tried: Sequence[Tried]) -> Tried:
 
 
 def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
-    """Line -> which of its points are gross errors under a reading: far beyond noise and the others' scatter."""
+    """Return the masks of gross errors by line: residuals far beyond noise and the others' scatter."""
     square = np.einsum("ni,nij,nj->n", fit.left, np.linalg.inv(fit.noise), fit.left)
     scale = max(float(np.median(square)) / float(chi2.median(2)), 1.0)
     bad = square > scale * chi2.isf(_WRONG_SHARE, 2)
@@ -299,6 +314,7 @@ def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
 def _answers(
     bench: PassBench, stated: PassConventions, best: Tried, name: str, values: tuple[Any, ...], factor: float
 ) -> tuple[Answer, ...]:
+    """Test every value of a convention, with the others as in the best reading."""
     question, reading = QUESTIONS[name], changed(stated, best.changes)
     said, here = question.get(stated), question.get(reading)
     found = []
@@ -318,7 +334,7 @@ def _answers(
 
 
 def _shown(others: dict[str, tuple[Any, ...]], best: Tried) -> list[Changes]:
-    """Readings whose places are listed: as stated, as found, and with one change each."""
+    """Return the readings whose ground positions are listed: stated, best, and those with one change."""
     singles = [((name, value),) for name, values in others.items() for value in values]
     return list(dict.fromkeys([(), best.changes, *singles]))
 
@@ -326,6 +342,7 @@ def _shown(others: dict[str, tuple[Any, ...]], best: Tried) -> list[Changes]:
 def _first_places(
     bench: PassBench, stated: PassConventions, changes: Changes, count: int
 ) -> dict[str, np.ndarray] | str:
+    """Return the ground positions of the first points of each line, or why there are none."""
     try:
         return {name: at[:count] for name, at in bench.places(changed(stated, changes)).items()}
     except ImpossibleError as error:
@@ -333,12 +350,12 @@ def _first_places(
 
 
 def exported(run: Check) -> dict[str, str]:
-    """Path -> text of a folder of measurements, in the project's own conventions.
+    """Return a folder of measurements in the project's own conventions, text by path.
 
     Raises
     ------
     InputError
-        The stated conventions do not stand.
+        The stated conventions were not confirmed.
     """
     if run.verdict != "stands":
         problem = "nothing is exported of a pass whose stated conventions do not stand"
@@ -347,7 +364,7 @@ def exported(run: Check) -> dict[str, str]:
 
 
 def measurements(run: Check) -> PassMeasurements:
-    """The pass in the project's own conventions, read as it is stated."""
+    """Return the pass in the project's own conventions, under the stated reading."""
     readings, meant = run.readings, run.stated
     table = platform_table(readings.platform, meant.platform)
     times, images = {}, {}

@@ -1,12 +1,10 @@
-"""A pass in files before anything is read into its numbers, and every reading of it in other conventions.
+"""Files of a pass, their interpretation under any conventions, and the fit of a reading to ground points.
 
-How well a reading of a pass explains its ground points.
-
-Every image point is followed down to the height of its ground point, and what is left between the two in plan is the
-residual. It may come from the image point, from the ground point, and from camera and platform, which are wrong by
-what is stated of them: a turn and a shift of the platform and a shift of the times that all points share, a shift and
-a scale of each line. So the residuals have a covariance with large common parts; a convention whose mistake looks like
-one of those cannot be told by them, and one that no such error can make is told at once.
+Every image point is followed down to the height of its ground point, and the difference of the two in plan is the
+residual. It may come from the image point, from the ground point, and from camera and platform, whose errors are within
+their stated uncertainty: a rotation and a shift of the platform and a shift of the times that all points share, a shift
+and a scale of each line. So the residuals have a covariance with large common parts. A wrong convention whose effect
+looks like one of these errors cannot be detected by the points; one with any other effect is detected at once.
 """
 
 from __future__ import annotations
@@ -51,19 +49,19 @@ _LINES = (
     Column("date_time", text=True, needed=False),
 )
 _AROUND = 120.0
-"""Seconds of orbit and attitude before and after the lines that are kept: time scales differ by 70 s."""
+"""Duration of orbit and attitude kept before and after the lines, in seconds: time scales differ by 70 s."""
 _LEAST_AROUND = 12
-"""Readings that are kept there at least."""
+"""Least number of readings kept before and after the lines."""
 
 
 @dataclass(frozen=True, eq=False)
 class LineClock:
-    """When lines were exposed, as a clock showed it.
+    """Exposure times of lines as clock readings.
 
     Attributes
     ----------
-    line : np.ndarray
-        (K,) numbers of lines, rising.
+    line : (K,) ndarray
+        Numbers of lines, increasing.
     clock : Readings
         K readings.
     """
@@ -74,26 +72,26 @@ class LineClock:
 
 @dataclass(frozen=True)
 class PassConventions:
-    """What the numbers of a pass mean.
+    """Conventions of a pass: one reading of its files.
 
     Attributes
     ----------
     platform : Conventions
-        Orbit and attitude.
+        Conventions of orbit and attitude.
     line_scale : str
         Time scale of the lines.
     line_offset : float
-        Seconds to be added to their times.
+        Seconds to be added to the lines' times.
     moment : str
-        Which moment of its exposure a line's time is: start, middle or end.
+        Moment of the exposure to which a line's time refers: start, middle or end.
     line_origin : float
         Image coordinate of the middle of the line that the table of times calls 0.
     pixel_origin : float
         Image coordinate of the middle of the first pixel.
     sees : str
-        To which side of the track the first pixel looks.
+        Side of the track to which the first pixel looks, right or left.
     backward : bool
-        Whether lines are counted from the last.
+        True if lines are counted from the last.
     """
 
     platform: Conventions
@@ -108,18 +106,18 @@ class PassConventions:
 
 @dataclass(frozen=True, eq=False)
 class PassReadings:
-    """What the files of a pass hold.
+    """Numbers of a pass's files before interpretation.
 
     Attributes
     ----------
     platform : PlatformReadings
         Orbit and attitude about the lines' times.
-    lines : Mapping[str, LineClock]
-        Camera -> line times.
+    lines : mapping of str to LineClock
+        Line times by camera.
     ground : GroundFile
-        Points on the ground.
-    images : Mapping[str, ImagePoints]
-        Camera -> image points, line and pixel as they are written.
+        Ground points.
+    images : mapping of str to ImagePoints
+        Image points by camera, with the line and pixel numbers of the file.
     """
 
     platform: PlatformReadings
@@ -129,21 +127,21 @@ class PassReadings:
 
 
 def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -> tuple[PassReadings, PassConventions]:
-    """What the files of a pass hold, and what is stated of it.
+    """Read the files of a pass, with their stated conventions.
 
     Parameters
     ----------
     spec : OrbitCheckSpec
         The files.
     camera : ThreeLineCameraSpec
-        Its lines.
+        Payload with the lines.
     folder : Path
-        That relative paths start from.
+        Folder to which relative paths refer.
 
     Raises
     ------
     InputError
-        a file that cannot be read, or names in one that another does not have.
+        A file cannot be read, or has names that another file does not have.
     """
     platform, meant = read_platform(spec.platform, folder)
     lines = read_line_clocks(spec.lines, tuple(camera.lines), folder)
@@ -166,21 +164,21 @@ def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -
 
 
 def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path) -> dict[str, LineClock]:
-    """Line times of every camera that the table has.
+    """Read the line times of every camera in the table.
 
     Parameters
     ----------
     spec : LineTimesFileSpec
-        The table, and what it does not say itself.
-    cameras : tuple[str, ...]
-        Names that may stand in it.
+        Path of the table, and what the table itself does not specify.
+    cameras : tuple of str
+        Allowed names of cameras.
     folder : Path
-        That relative paths start from.
+        Folder to which relative paths refer.
 
     Raises
     ------
     InputError
-        The table cannot be read, a camera that is none, fewer than two lines of one, lines or times that do not rise.
+        The table cannot be read, a camera is unknown or has fewer than two lines, or lines or times do not increase.
     """
     if is_dimap(list(first_lines(folder / spec.file, "line times: CSV, or DIMAP"))):
         return _scene_lines(spec, cameras, folder)
@@ -204,7 +202,7 @@ def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: 
 
 
 def _scene_lines(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path) -> dict[str, LineClock]:
-    """Line times of a DIMAP file, which has one line; its lines count from 0."""
+    """Return the line times of a DIMAP file, which has one line camera; its lines count from 0."""
     if len(cameras) != 1:
         allowed = "a camera of one line, or a table"
         raise spec.error("a scene has the times of one line", ("file",), found=names_text(cameras), allowed=allowed)
@@ -221,6 +219,7 @@ def _scene_lines(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path
 def _image_points(
     spec: ImagePointsFileSpec, ground: GroundFile, lines: Mapping[str, LineClock], folder: Path
 ) -> Mapping[str, ImagePoints]:
+    """Read the table of image points."""
     table = read_table(folder / spec.file, COLUMNS["image_points"])
     known = {str(name): k for k, name in enumerate(ground.points.ids)}
     names, cameras = table["point"].astype(str), table["camera"].astype(str)
@@ -244,7 +243,7 @@ def _image_points(
 def _gcp_points(
     spec: OrbitCheckSpec, ground: GroundFile, lines: Mapping[str, LineClock], folder: Path
 ) -> Mapping[str, ImagePoints]:
-    """Image points of the .gcp file that holds the ground points; an image is that of the line of its name."""
+    """Return the image points of the .gcp file of the ground points; an image belongs to the line of its name."""
     file = spec.image_points.file
     if (folder / file) != (folder / spec.ground.file):
         allowed = "the file of `ground`, or a table"
@@ -267,7 +266,7 @@ def _gcp_points(
 
 
 def _around(platform: PlatformReadings, lines: Mapping[str, LineClock]) -> PlatformReadings:
-    """The part of orbit and attitude that any reading of the line times can need."""
+    """Return the part of orbit and attitude that any reading of the line times can need."""
     ends = [(c.clock.day[k], c.clock.second[k]) for c in lines.values() for k in (0, -1)]
     day, second = min(ends)
     last = max((d - day) * 86400.0 + s - second for d, s in ends)
@@ -291,20 +290,20 @@ _TURNED = {"forward": "back", "back": "forward", "right": "left", "left": "right
 
 @dataclass(frozen=True)
 class Question:
-    """A convention and what it may be.
+    """Convention with its possible values.
 
     Attributes
     ----------
     title : str
-        For readers.
-    get : Callable[[PassConventions], Any]
-        Of a reading.
-    put : Callable[[PassConventions, Any], PassConventions]
-        a reading with another value of it.
-    values : Callable[[PassConventions], tuple[Any, ...]]
-        That it may have, for a stated reading.
-    text : Callable[[Any], str]
-        Of a value, for readers.
+        Name for readers.
+    get : callable
+        Function that returns its value in a reading.
+    put : callable
+        Function that returns a reading with another value.
+    values : callable
+        Function that returns its possible values, for a stated reading.
+    text : callable
+        Function that returns a value as text for readers.
     """
 
     title: str
@@ -327,13 +326,14 @@ def _question(title: str, key: str, values: tuple[Any, ...], text: Callable[[Any
 
 
 def _turned(c: PassConventions) -> tuple[tuple[str, str, str], ...]:
-    """The body's axes as stated, and turned by half a turn about each of them."""
+    """Return the body's axes as stated, and rotated by 180 degrees about each of them."""
     a = c.platform.body_axes
     x, y, z = (_TURNED[v] for v in a)
     return a, (a[0], y, z), (x, a[1], z), (x, y, a[2])
 
 
 def _seconds(value: float) -> str:
+    """Return an offset in seconds as text."""
     return f"{value:+g} s" if value else "none"
 
 
@@ -370,18 +370,18 @@ QUESTIONS: Mapping[str, Question] = FrozenMap(
         ),
     }
 )
-"""Name -> what is asked of a reading."""
+"""Conventions that a check tests, by name."""
 
 
 def asked(stated: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ...]]:
-    """Question -> values that it may have beside the stated one; those that do not arise are left out.
+    """Return the values of each convention other than the stated one; conventions that do not apply are left out.
 
     Parameters
     ----------
     stated : PassConventions
-        The reading that the file states.
+        Stated reading.
     quaternions : bool
-        Whether the attitude is one of quaternions, and not of angles.
+        True if the attitude is quaternions, False if it is angles.
     """
     without = {"angle_sequence"} if quaternions else {"quaternion_scalar", "quaternion_turns"}
     found = {}
@@ -394,16 +394,16 @@ def asked(stated: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ..
 
 
 Changes = tuple[tuple[str, Any], ...]
-"""Questions with another value than the stated one."""
+"""Conventions with another value than the stated one."""
 
 
 def singles_and_pairs(others: Mapping[str, tuple[Any, ...]], start: Changes = ()) -> Iterator[Changes]:
-    """Changes of one or two questions, beside those of `start`, which comes first.
+    """Yield changes of one or two conventions in addition to those of `start`, which comes first.
 
     Parameters
     ----------
-    others : Mapping[str, tuple[Any, ...]]
-        Question -> values beside the stated one.
+    others : mapping of str to tuple
+        Values of each convention other than the stated one.
     start : Changes
         Changes that all of them have.
     """
@@ -419,25 +419,25 @@ def singles_and_pairs(others: Mapping[str, tuple[Any, ...]], start: Changes = ()
 
 
 def changed(stated: PassConventions, changes: Changes) -> PassConventions:
-    """The reading with these changes."""
+    """Return the reading with these changes."""
     for name, value in changes:
         stated = QUESTIONS[name].put(stated, value)
     return stated
 
 
 _TURN, _SHIFT, _DELAY, _RISE = 1e-5, 10.0, 1e-3, 10.0
-"""Steps of the derivatives: radians, metres, seconds, metres."""
+"""Steps of the numerical derivatives: radians, metres, seconds, metres."""
 _TICKS = 1000
-"""The sensor's lines, which only cut its time."""
+"""Number of lines of the sensor, which only divide its time."""
 
 
 class ImpossibleError(ValueError):
-    """A reading under which the points cannot have been imaged; the text says why."""
+    """Error of a reading under which the points cannot have been imaged; the text says why."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Turned:
-    """A platform that is turned and shifted a little, for each of some times by itself."""
+    """Platform with a small rotation and shift for each of some times."""
 
     path: TabulatedTrajectory
     turn: np.ndarray | None = None
@@ -458,26 +458,26 @@ class _Turned:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What a reading leaves of the points.
+    """Fit of a reading to the ground points.
 
     Attributes
     ----------
-    residual : np.ndarray
-        (n, 2) east and north, metres.
+    residual : (n, 2) ndarray
+        Residuals east and north, metres.
     rms : float
-        Of both together, root mean square, metres.
+        RMS of both together, metres.
     rms_pixels : float
-        Root mean square along the lines' own axes, pixels.
-    left : np.ndarray
-        (n, 2) of the residuals when the likeliest errors of camera and platform are taken out, metres.
-    noise : np.ndarray
-        (n, 2, 2) covariance of each point's residual without what it shares with others, m^2.
+        RMS along the lines' own axes, pixels.
+    left : (n, 2) ndarray
+        Residuals after removal of the likeliest errors of camera and platform, metres.
+    noise : (n, 2, 2) ndarray
+        Covariance of each point's residual without the part shared with others, m^2.
     chi_square : float
-        Of the residuals by their covariance.
+        Chi-square of the residuals under their covariance.
     cost : float
-        Chi-square and the logarithm of the covariance's determinant: minus twice the log likelihood.
+        Chi-square plus the logarithm of the covariance's determinant: minus twice the log likelihood.
     freedom : int
-        Number of residuals.
+        Degrees of freedom: number of residuals.
     """
 
     residual: np.ndarray
@@ -492,20 +492,20 @@ class Fit:
 
 @dataclass(eq=False)
 class PassBench:
-    """Tries readings on a pass.
+    """Bench that tries readings on a pass.
 
     Attributes
     ----------
     readings : PassReadings
-        Of its files.
-    cameras : Mapping[str, LineCamera]
-        Line -> what its pixels look along.
+        Numbers of the files.
+    cameras : mapping of str to LineCamera
+        Geometry of each line.
     uncertainty : UncertaintySpec
-        Of camera and platform.
+        Uncertainty of camera and platform.
     effects : LightEffects
-        On the light.
+        Effects on the light.
     epoch : str
-        From which times count.
+        Zero of the times, UTC.
     """
 
     readings: PassReadings
@@ -516,13 +516,13 @@ class PassBench:
     _paths: dict[Conventions, TabulatedTrajectory | ImpossibleError] = field(default_factory=dict)
 
     def without(self, wrong: Mapping[str, np.ndarray]) -> PassBench:
-        """The bench without image points that are wrong: line -> mask (n,)."""
+        """Return the bench without wrong image points, given as a mask (n,) for each line."""
         images = {name: raw.taken(~wrong[name]) for name, raw in self.readings.images.items()}
         kept = {name: raw for name, raw in images.items() if len(raw.line)}
         return replace(self, readings=replace(self.readings, images=kept), _paths=self._paths)
 
     def path(self, meant: Conventions) -> TabulatedTrajectory:
-        """The trajectory in one reading. Raises ImpossibleError."""
+        """Return the trajectory under the conventions of a platform, or raise ImpossibleError."""
         if meant not in self._paths:
             self._paths[meant] = self._made(meant)
         found = self._paths[meant]
@@ -531,6 +531,7 @@ class PassBench:
         return found
 
     def _made(self, meant: Conventions) -> TabulatedTrajectory | ImpossibleError:
+        """Return the trajectory under the conventions of a platform, or the error that prevents it."""
         platform = self.readings.platform
         if platform.earth is None:
             # UT1 - UTC is below a second, some hundred metres; no reading of an inertial frame is as near
@@ -541,19 +542,19 @@ class PassBench:
             return ImpossibleError(error.issues[0].problem)
 
     def places(self, meant: PassConventions, most: int | None = None) -> dict[str, np.ndarray]:
-        """Line -> where image points lie on the ground, ITRS, (n, 3), metres.
+        """Return the ground positions of image points by line, ITRS, (n, 3), in metres.
 
         Parameters
         ----------
         meant : PassConventions
             The reading.
-        most : int | None
-            Points of each line, spread over them; None for all.
+        most : int or None
+            Largest number of points of each line, spread over them; None for all.
 
         Raises
         ------
         ImpossibleError
-            They cannot lie anywhere.
+            The points have no position on the ground.
         """
         found = {}
         for name, raw in self.readings.images.items():
@@ -562,7 +563,7 @@ class PassBench:
         return found
 
     def residuals(self, meant: PassConventions, most: int | None = None) -> np.ndarray:
-        """(n, 2) of all lines, east and north, metres; arguments and errors as `places`."""
+        """Return the residuals of all lines, east and north, (n, 2), in metres; arguments and errors as `places`."""
         known, found = self.readings.ground.points.itrs, []
         for name, at in self.places(meant, most).items():
             point = self.readings.images[name].point
@@ -570,7 +571,7 @@ class PassBench:
         return np.concatenate(found)
 
     def fit(self, meant: PassConventions) -> Fit:
-        """How well a reading explains the points. Raises ImpossibleError."""
+        """Fit a reading to the ground points, or raise ImpossibleError."""
         path, rows, common, noise, sizes = self.path(meant.platform), [], [], [], []
         size = self.uncertainty
         own: list[np.ndarray] = []
@@ -611,7 +612,10 @@ class PassBench:
     def _steps(
         self, name: str, meant: PassConventions, raw: ImagePoints, path: TabulatedTrajectory
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """Places as read, with turns, shifts, a delay, the next pixel and a height; pixels' steps and line times."""
+        """Return ground positions for finite differences, the pixels' steps, and line times.
+
+        The positions are those as read, with rotations, shifts, a delay, the next pixel and a height.
+        """
         n, pixels = len(raw.line), self.cameras[name].pixels
         turn, shift = np.broadcast_to(np.eye(3), (10, n, 3, 3)).copy(), np.zeros((10, n, 3))
         turn[1:4] = rotation_matrix(_TURN * np.eye(3))[:, None]
@@ -634,7 +638,7 @@ class PassBench:
         step: np.ndarray | float = 0.0,
         rise: np.ndarray | float = 0.0,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Places (n, 3) at the heights of the ground points, ITRS, metres, and the line time at each, seconds."""
+        """Return ITRS positions (n, 3), in metres, at the ground points' heights, and the line times, in seconds."""
         clock = self.readings.lines[name]
         number = line_of(meant, raw, clock)
         for worst in number[~in_span(number, clock.line[0] - 1.0, clock.line[-1] + 1.0)][:1]:
@@ -662,7 +666,7 @@ class PassBench:
 
 
 def line_times(clock: LineClock, meant: PassConventions, epoch: str, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Middles of the exposures of lines and time from one line to the next, seconds, (n,) each.
+    """Return middles of the exposures of lines and the time from one line to the next, in seconds, (n,) each.
 
     Parameters
     ----------
@@ -671,14 +675,14 @@ def line_times(clock: LineClock, meant: PassConventions, epoch: str, line: np.nd
     meant : PassConventions
         The reading.
     epoch : str
-        From which times count.
-    line : np.ndarray
-        (n,) as the table of times numbers them.
+        Zero of the times, UTC.
+    line : (n,) ndarray
+        Line numbers of the table of times.
 
     Raises
     ------
     ImpossibleError
-        The clock cannot show what it shows.
+        The clock cannot have shown its readings in this time scale.
     """
     try:
         seconds = clock.clock.instants(meant.line_scale).since(epoch) + meant.line_offset
@@ -691,31 +695,34 @@ def line_times(clock: LineClock, meant: PassConventions, epoch: str, line: np.nd
 
 
 def spread(count: int, most: int) -> np.ndarray:
-    """Indices of so many of `count`, evenly."""
+    """Return at most `most` evenly spread indices of `count`."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
 def line_of(meant: PassConventions, raw: ImagePoints, clock: LineClock) -> np.ndarray:
-    """Lines of image points (n,) in the numbering of the table of times."""
+    """Return lines of image points (n,) in the numbering of the table of times."""
     number = raw.line - meant.line_origin
     return clock.line[0] + clock.line[-1] - number if meant.backward else number
 
 
 def pixel_of(meant: PassConventions, raw: ImagePoints, pixels: int) -> np.ndarray:
-    """Pixels of image points (n,), the middle of the one that looks farthest to the right of the track being 0."""
+    """Return pixels of image points (n,), counted from the one that looks farthest to the right of the track."""
     number = raw.pixel - meant.pixel_origin
     return number if meant.sees == "right" else pixels - 1.0 - number
 
 
 def _plan(known: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """East and north (n, 2) from known places to found ones, metres."""
+    """Return east and north (n, 2) from known to computed points, in metres."""
     lon, lat, _ = Earth().geodetic(known)
     axes = east_north_up(lon, lat)[:, :2]
     return np.asarray(np.einsum("nij,nj->ni", axes, found - known))
 
 
 def _ground_noise(known: Any, point: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """(n, 2, 2) of residuals from ground points' covariances; rise: (n, 2) by which a metre of height moves them."""
+    """Return covariances (n, 2, 2) of residuals from those of the ground points.
+
+    `rise` (n, 2) is the displacement by a metre of height.
+    """
     lon, lat, _ = Earth().geodetic(known.itrs[point])
     axes = east_north_up(lon, lat)
     level = axes @ known.covariance[point] @ np.swapaxes(axes, 1, 2)
@@ -726,7 +733,7 @@ def _ground_noise(known: Any, point: np.ndarray, rise: np.ndarray) -> np.ndarray
 def _covariance(
     noise: list[np.ndarray], common: list[np.ndarray], own: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance of all residuals, and the part of it that they share, (2n, 2n) each, m^2."""
+    """Return the covariance of all residuals, and the part of it that they share, (2n, 2n) each, in m^2."""
     every = np.concatenate(common).reshape(-1, common[0].shape[-1])
     shared = every @ every.T
     start = 0

@@ -30,18 +30,21 @@ if TYPE_CHECKING:
 
 
 DAY = 86400.0
-"""Seconds."""
+"""Length of a day of 86 400 SI seconds, in seconds."""
 RATE = 2.0 * np.pi * 1.00273781191135448 / DAY
-"""The Earth's rate of rotation, rad/s (IERS Conventions 2010, eq. 5.15)."""
+"""Rotation rate of the Earth, in rad/s (IERS Conventions 2010, eq. 5.15)."""
 
 _NODE_STEP = 3600.0
+"""Interval of the interpolation nodes of the celestial pole, in seconds."""
 _NODES_AROUND = 3
+"""Number of interpolation nodes beyond each end of the span."""
 _DIFFERENCE_STEP = 600.0
+"""Half step of the central difference of the celestial pole, in seconds."""
 
 
 @contextmanager
 def years_without_announced_leap_seconds() -> Iterator[None]:
-    """Around calls of ERFA that convert UTC."""
+    """Suppress ERFA's warning about UTC years for which leap seconds are not announced yet."""
     # ERFA calls a year dubious for which leap seconds have not been announced yet; it then takes none, and so do we.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
@@ -49,17 +52,17 @@ def years_without_announced_leap_seconds() -> Iterator[None]:
 
 
 def tai_of(epoch: str) -> tuple[float, float]:
-    """TAI of an instant given in UTC, as a Julian date in two parts, days.
+    """Return TAI of an instant given in UTC, as a Julian date in two parts, in days.
 
     Parameters
     ----------
     epoch : str
-        ISO 8601 text with its zone, "2011-03-05T03:05:00Z".
+        ISO 8601 text with its time zone, "2011-03-05T03:05:00Z".
 
     Raises
     ------
     ValueError
-        Not such a text, or without its zone.
+        The text is not ISO 8601 or has no time zone.
     """
     time = datetime.fromisoformat(epoch)
     if time.tzinfo is None:
@@ -73,12 +76,12 @@ def tai_of(epoch: str) -> tuple[float, float]:
 
 
 def ut1_of(epoch: str, dut1: float) -> tuple[float, float]:
-    """UT1 of an instant given in UTC, as a Julian date in two parts, days.
+    """Return UT1 of an instant given in UTC, as a Julian date in two parts, in days.
 
     Parameters
     ----------
     epoch : str
-        As for `tai_of`.
+        ISO 8601 text with its time zone; see `tai_of`.
     dut1 : float
         UT1 - UTC, seconds.
     """
@@ -89,15 +92,15 @@ def ut1_of(epoch: str, dut1: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class EarthRotation:
-    """Rotation GCRS -> ITRS around an epoch; made by `Earth.rotation`. Seconds are SI seconds of atomic time.
+    """Rotation GCRS -> ITRS around an epoch, made by `Earth.rotation`; times are SI seconds of atomic time.
 
     Attributes
     ----------
-    pole : Any
+    pole : callable
         Spline of the celestial pole's X and Y and of the locator s, radians, over seconds.
     angle : float
         Earth rotation angle at the epoch, radians.
-    polar : np.ndarray
+    polar : ndarray
         Polar motion, TIRS -> ITRS, shape (3, 3).
     """
 
@@ -106,19 +109,19 @@ class EarthRotation:
     polar: np.ndarray
 
     def celestial(self, seconds: Any) -> np.ndarray:
-        """Rotation GCRS -> CIRS, the frame of the celestial pole and origin of that moment; (...) -> (..., 3, 3)."""
+        """Return the rotation GCRS -> CIRS, the frame of the celestial pole and origin of date; (...) -> (..., 3, 3)."""
         x, y, s = np.moveaxis(self.pole(np.asarray(seconds, dtype=np.float64)), -1, 0)
         return np.asarray(erfa.c2ixys(x, y, s))
 
     def matrix(self, seconds: Any) -> np.ndarray:
-        """Rotation GCRS -> ITRS: x_itrs = matrix @ x_gcrs; (...) -> (..., 3, 3)."""
+        """Return the rotation GCRS -> ITRS: x_itrs = matrix @ x_gcrs; (...) -> (..., 3, 3)."""
         t = np.asarray(seconds, dtype=np.float64)
         return np.asarray(erfa.c2tcio(self.celestial(t), self.angle + RATE * t, self.polar))
 
     def rate(self, seconds: Any) -> np.ndarray:
-        """Angular velocity of the ITRS against the GCRS in axes of the ITRS, rad/s; (...) -> (..., 3).
+        """Return the angular velocity of the ITRS relative to the GCRS in ITRS axes, in rad/s; (...) -> (..., 3).
 
-        The pole's own motion (some 1e-11 rad/s) is part of it, so that velocities are the exact derivatives of
+        The motion of the pole (some 1e-11 rad/s) is part of it, so that velocities are the exact derivatives of
         positions.
         """
         t = np.asarray(seconds, dtype=np.float64)
@@ -134,16 +137,16 @@ class EarthRotation:
 
 
 def celestial_pole(epoch: str, first: float, last: float) -> CubicSpline:
-    """Spline over time of the celestial pole's X and Y and of the locator s by IAU 2006/2000A, radians.
+    """Return a spline over time of the celestial pole's X and Y and of the locator s (IAU 2006/2000A), in radians.
 
     Parameters
     ----------
     epoch : str
         UTC, ISO 8601 text.
     first : float
-        Begin of the span, seconds; nodes stand some hours beyond it on either side.
+        Start of the span, in seconds from the epoch; the nodes extend some hours beyond it on either side.
     last : float
-        Its end, seconds.
+        End of the span, in seconds from the epoch.
     """
     one, two = tai_of(epoch)
     around = np.ceil(0.5 * (last - first) / _NODE_STEP) + _NODES_AROUND
@@ -153,13 +156,14 @@ def celestial_pole(epoch: str, first: float, last: float) -> CubicSpline:
 
 _WGS84 = pyproj.Geod(ellps="WGS84")
 EQUATORIAL_RADIUS = float(_WGS84.a)
-"""WGS84, metres."""
+"""Semi-major axis of the WGS84 ellipsoid, in metres."""
 FLATTENING = float(_WGS84.f)
-"""WGS84."""
+"""Flattening of the WGS84 ellipsoid."""
 _E2 = FLATTENING * (2.0 - FLATTENING)
+"""Squared first eccentricity of the WGS84 ellipsoid."""
 _NEWTON_STEPS = 30
 _HEIGHT_TOLERANCE = 2e-8
-"""Metres; rounding of a point 7000 km from the centre is 1e-9 m."""
+"""Largest height error of an intersection, in metres; rounding of a point 7000 km from the centre is 1e-9 m."""
 
 
 @cache
@@ -168,7 +172,7 @@ def _cartesian() -> pyproj.Transformer:
 
 
 def east_north_up(lon: Any, lat: Any) -> np.ndarray:
-    """Axes of the local level frame: rows east, north and up (the ellipsoid's normal), shape (..., 3, 3)."""
+    """Return the axes of the local level frame, shape (..., 3, 3): rows east, north and up (the ellipsoid's normal)."""
     lon, lat = np.broadcast_arrays(np.asarray(lon, dtype=np.float64), np.asarray(lat, dtype=np.float64))
     sl, cl, sp, cp = np.sin(lon), np.cos(lon), np.sin(lat), np.cos(lat)
     rows = [-sl, cl, np.zeros_like(sl), -sp * cl, -sp * sl, cp, cp * cl, cp * sl, sp]
@@ -176,20 +180,20 @@ def east_north_up(lon: Any, lat: Any) -> np.ndarray:
 
 
 def curvature_radii(lat: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Radii of curvature of the ellipsoid along the meridian (M) and across it (N), metres; (...) -> (...)."""
+    """Return the ellipsoid's radii of curvature along the meridian (M) and across it (N), in metres; (...) -> (...)."""
     square = 1.0 - _E2 * np.sin(lat) ** 2
     return EQUATORIAL_RADIUS * (1.0 - _E2) / square**1.5, EQUATORIAL_RADIUS / np.sqrt(square)
 
 
 @dataclass(frozen=True)
 class Earth:
-    """The Earth.
+    """WGS84 ellipsoid with its orientation at an epoch: UT1 and polar motion.
 
     Attributes
     ----------
     dut1 : float
         UT1 - UTC at the epoch, seconds.
-    polar_motion : tuple[float, float]
+    polar_motion : tuple of float
         x and y of the pole, radians (x toward Greenwich, y toward 90 degrees west).
     """
 
@@ -198,11 +202,11 @@ class Earth:
 
     @classmethod
     def from_spec(cls, spec: EarthSpec) -> Earth:
-        """From what the file says."""
+        """Make the Earth from the `earth` section of an input file."""
         return cls(spec.ut1_utc, spec.polar_motion)
 
     def rotation(self, epoch: str, first: float, last: float) -> EarthRotation:
-        """The Earth's rotation from `first` to `last`, seconds from the epoch, for many look-ups.
+        """Compute the Earth's rotation from `first` to `last`, for many look-ups.
 
         UT1 runs on evenly from the epoch, also over a leap second.
 
@@ -211,9 +215,9 @@ class Earth:
         epoch : str
             UTC, ISO 8601 text.
         first : float
-            Begin of the span, seconds.
+            Start of the span, in seconds from the epoch.
         last : float
-            Its end, seconds.
+            End of the span, in seconds from the epoch.
         """
         one, two = tai_of(epoch)
         polar = np.asarray(erfa.pom00(*self.polar_motion, erfa.sp00(one, two + erfa.TTMTAI / DAY)))
@@ -222,38 +226,38 @@ class Earth:
         return EarthRotation(celestial_pole(epoch, first, last), angle, polar)
 
     def to_itrs(self, seconds: Any, epoch: str) -> np.ndarray:
-        """Rotation GCRS -> ITRS.
+        """Return the rotation GCRS -> ITRS at times counted from an epoch.
 
         Parameters
         ----------
-        seconds : Any
+        seconds : array_like
             SI seconds from the epoch, shape (...).
         epoch : str
             UTC, ISO 8601 text.
 
         Returns
         -------
-        np.ndarray
+        ndarray
             Shape (..., 3, 3); x_itrs = matrix @ x_gcrs.
         """
         t = np.asarray(seconds, dtype=np.float64)
         return self.rotation(epoch, float(np.min(t)), float(np.max(t))).matrix(t)
 
     def ecef(self, lon: Any, lat: Any, height: Any = 0.0) -> np.ndarray:
-        """Points on and above the ellipsoid.
+        """Return the Earth-fixed coordinates of points on or above the ellipsoid.
 
         Parameters
         ----------
-        lon : Any
-            Radians, shape (...).
-        lat : Any
-            Radians, shape (...).
-        height : Any
-            Above the ellipsoid, metres.
+        lon : array_like
+            Longitude, radians east, shape (...).
+        lat : array_like
+            Geodetic latitude, radians, shape (...).
+        height : array_like
+            Height above the ellipsoid, metres.
 
         Returns
         -------
-        np.ndarray
+        ndarray
             Shape (..., 3), ITRS, metres.
         """
         lon, lat, h = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (lon, lat, height)))
@@ -262,7 +266,7 @@ class Earth:
         return np.stack([across * np.cos(lon), across * np.sin(lon), (normal * (1.0 - _E2) + h) * np.sin(lat)], axis=-1)
 
     def geodetic(self, ecef: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Longitude, latitude (radians) and height (metres) of points (..., 3) in the ITRS; NaN stays NaN.
+        """Return longitude, latitude (radians) and height (metres) of points (..., 3) in the ITRS; NaN stays NaN.
 
         PROJ's inverse is one step of Bowring's method: right to a micrometre near the ground, but 2 mm off at 500 km.
         One Newton step with the exact forward formula, in the local level frame, leaves rounding.
@@ -275,23 +279,23 @@ class Earth:
         return lon, lat + rest[..., 1] / (curvature_radii(lat)[0] + h), h + rest[..., 2]
 
     def intersect(self, origin: Any, direction: Any, height: Any = 0.0) -> np.ndarray:
-        """Where rays first come down to a geodetic height.
+        """Return the first points at which descending rays reach a geodetic height.
 
-        The surface of equal height is no ellipsoid; it is met by Newton steps on the geodetic height along the ray,
-        begun at the ellipsoid with both axes longer by the height.
+        The surface of equal height is not an ellipsoid; the intersection is found by Newton steps on the geodetic
+        height along the ray, starting at the ellipsoid with both axes longer by the height.
 
         Parameters
         ----------
-        origin : Any
-            Above that height, ITRS, metres, shape (..., 3).
-        direction : Any
-            Of the ray, any length, shape (..., 3).
-        height : Any
-            Above the ellipsoid, metres, shape (...).
+        origin : array_like
+            Origins of the rays above that height, ITRS, metres, shape (..., 3).
+        direction : array_like
+            Directions of the rays, of any length, shape (..., 3).
+        height : array_like
+            Height above the ellipsoid, metres, shape (...).
 
         Returns
         -------
-        np.ndarray
+        ndarray
             Shape (..., 3), ITRS, metres; NaN where the ray misses, or meets the surface only behind its origin.
         """
         o, d, h = (np.asarray(a, dtype=np.float64) for a in (origin, direction, height))
@@ -313,8 +317,10 @@ class Earth:
 
 
 def _nearer_root(o: np.ndarray, d: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Distance (...) along the rays to the ellipsoid with axes longer by h; NaN where it is missed clearly, the nearest
-    point where by less than the two surfaces can differ.
+    """Return the distance (...) along the rays to the ellipsoid with axes longer by h.
+
+    It is NaN where a ray misses clearly, and that of the nearest point where it misses by less than the two surfaces
+    can differ.
     """
     axes = EQUATORIAL_RADIUS * np.array([1.0, 1.0, 1.0 - FLATTENING]) + h[..., None]
     p, q = o / axes, d / axes

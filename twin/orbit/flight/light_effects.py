@@ -1,6 +1,6 @@
-"""What happens to light between the ground and a moving camera: light time, stellar aberration, refraction.
+"""Light between the ground and a moving camera: light time, stellar aberration, refraction.
 
-Each has a sign and a size in orbit at 500 km: the Earth turns by 0.8 m (equator) while the light is under way;
+Each effect has a sign and a size in orbit at 500 km: the Earth rotates by 0.8 m (equator) during the light time;
 aberration is v/c = 25 urad (5.2 arcsec), 12.7 m on the ground along the track; refraction moves the point of a look at
 25 degrees by 1.5 m toward the satellite.
 """
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.angle import EffectsSpec, LightEffectsSpec
 
 SPEED_OF_LIGHT = 299_792_458.0
-"""m/s."""
+"""Speed of light in vacuum, in m/s."""
 EARTH_RATE = 7.292115146706979e-5
 """Rotation of the Earth, rad/s: derivative of the Earth rotation angle (IERS Conventions 2010, eq. 5.15)."""
 _FIXED_POINT_STEPS = 3
 
 
 def carried_with_earth(place: np.ndarray) -> np.ndarray:
-    """Return the velocity of places that turn with the Earth, against the stars in axes of the ITRS, m/s.
+    """Return the inertial velocity of points that rotate with the Earth, in axes of the ITRS, in m/s.
 
-    The Earth's axis is taken as Z: polar motion (1e-6 rad) changes it by 1 mm/s.
+    The Earth's axis is taken as Z: polar motion (1e-6 rad) changes the velocity by 1 mm/s.
 
     Parameters
     ----------
-    place : np.ndarray
-        ITRS, (..., 3), metres.
+    place : ndarray
+        Positions in the ITRS, metres, (..., 3).
     """
     return EARTH_RATE * np.stack([-place[..., 1], place[..., 0], np.zeros(place.shape[:-1])], axis=-1)
 
@@ -48,16 +48,16 @@ _LAGUERRE = np.polynomial.laguerre.laggauss(12)
 
 @dataclass(frozen=True)
 class LightEffects:
-    """Which effects are on.
+    """Choice of the effects on light that a model includes.
 
     Attributes
     ----------
     light_time : bool
-        The Earth turns while the light is under way.
+        Include the rotation of the Earth during the light time.
     aberration : bool
-        The satellite's inertial velocity tilts what it sees.
+        Include the aberration by the satellite's inertial velocity.
     refraction : bool
-        The standard atmosphere bends the light.
+        Include refraction in the standard atmosphere.
     wavelength : float
         Vacuum wavelength for the refraction, metres.
     """
@@ -69,35 +69,36 @@ class LightEffects:
 
     @classmethod
     def of(cls, spec: EffectsSpec | LightEffectsSpec) -> LightEffects:
-        """The effects that a test's file switches on."""
+        """Return the effects that a test's file switches on."""
         return cls(spec.light_time, spec.aberration, spec.refraction, spec.wavelength)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The effects that are on, in words."""
+        """Names of the effects that are on, for reports."""
         on = {"light time": self.light_time, "aberration": self.aberration, "refraction": self.refraction}
         return tuple(name for name, is_on in on.items() if is_on)
 
 
 NO_EFFECTS = LightEffects(light_time=False, aberration=False, refraction=False)
+"""Straight light at infinite speed: no light time, no aberration, no refraction."""
 
 
 def aberrated(direction: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Where a source appears to an observer who moves.
+    """Return the apparent directions of sources for a moving observer.
 
     The Lorentz transformation of a direction, exact (Klioner, AJ 125, 1580 (2003), eq. 10, without gravitation). The
-    source appears displaced toward the velocity. With ``-velocity`` it is its own inverse.
+    source appears displaced toward the velocity. With ``-velocity`` the function is its own inverse.
 
     Parameters
     ----------
-    direction : np.ndarray
+    direction : ndarray
         Unit vectors from the observer toward the source in the frame at rest, (N, 3).
-    velocity : np.ndarray
-        Of the observer in that frame, m/s, broadcastable to (N, 3).
+    velocity : ndarray
+        Velocity of the observer in that frame, m/s, broadcastable to (N, 3).
 
     Returns
     -------
-    np.ndarray
+    ndarray
         Unit vectors toward the source in the observer's frame, (N, 3).
     """
     beta = np.broadcast_to(velocity, direction.shape) / SPEED_OF_LIGHT
@@ -109,20 +110,20 @@ def aberrated(direction: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 
 
 def turned_with_earth(vectors: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """Vectors in Earth-fixed axes, after they have turned eastward with the Earth for a time.
+    """Rotate vectors in Earth-fixed axes eastward with the Earth for a time.
 
     Parameters
     ----------
-    vectors : np.ndarray
-        (N, 3).
-    seconds : np.ndarray
-        (N,); negative turns back, westward.
+    vectors : ndarray
+        Vectors in the ITRS, (N, 3).
+    seconds : ndarray
+        Duration, seconds, (N,); negative values rotate westward.
 
     Returns
     -------
-    np.ndarray
-        (N, 3). A point that is fixed in space moves by ``-seconds`` in Earth-fixed axes. The axis is Z: polar motion
-        (1e-6 rad) changes the turn of a light time by 1e-13 rad, below a micrometre.
+    ndarray
+        Rotated vectors, (N, 3). A point that is fixed in space moves by ``-seconds`` in Earth-fixed axes. The axis is
+        Z: polar motion (1e-6 rad) changes the rotation in a light time by 1e-13 rad, below a micrometre.
     """
     angle = EARTH_RATE * seconds
     c, s = np.cos(angle), np.sin(angle)
@@ -131,19 +132,21 @@ def turned_with_earth(vectors: np.ndarray, seconds: np.ndarray) -> np.ndarray:
 
 
 def standard_refractivity(wavelength: float) -> float:
-    """Refractivity n - 1 of dry air at 15 degC and 1013.25 hPa (Peck and Reeder, JOSA 62, 958 (1972), eq. 2).
+    """Return the refractivity n - 1 of dry air at 15 degC and 1013.25 hPa (Peck and Reeder 1972, eq. 2).
+
+    The source is JOSA 62, 958 (1972).
 
     Parameters
     ----------
     wavelength : float
-        In vacuum, metres; the formula holds from 230 nm to 1690 nm.
+        Vacuum wavelength, metres; the formula holds from 230 nm to 1690 nm.
     """
     square = (1e-6 / wavelength) ** 2
     return 1e-8 * (8060.51 + 2480990.0 / (132.274 - square) + 17455.7 / (39.32957 - square))
 
 
 def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray, wavelength: float) -> np.ndarray:
-    """How far refraction moves the point where a look from space meets the ground, toward the satellite's nadir.
+    """Return the shift by refraction of the ground point of a look from space, toward the satellite's nadir.
 
     In a spherically layered atmosphere n r sin z = p is constant along the ray (Bouguer's invariant; Noerdlinger, ISPRS
     J. 54, 360 (1999)), and in space p belongs to the straight line. The angle at the Earth's centre between satellite
@@ -153,24 +156,24 @@ def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray,
         r0 integral_{r0}^{inf} (p/r) [1/sqrt(r^2 - p^2) - 1/sqrt(n^2 r^2 - p^2)] dr  ~  tan z sec^2 z integral (n-1) dh.
 
     n - 1 falls off exponentially above the point, with density and scale height (R T/(M g)) of the standard atmosphere
-    at its height, so that the whole column, which alone counts for small z, is the one that the pressure there holds
-    up (2.33 m at sea level). The integral is Gauss-Laguerre's of 12 points.
+    at the point's height. The column of air, which alone counts for small z, is therefore the one whose weight is the
+    pressure there (2.33 m at sea level). The integral is evaluated by 12-point Gauss-Laguerre quadrature.
 
     Parameters
     ----------
-    zenith : np.ndarray
+    zenith : ndarray
         Angle z of the straight line at the ground from the vertical, radians, (N,), at most 80 degrees.
-    height : np.ndarray
-        Of the point above sea level, metres, broadcastable to (N,).
-    radius : np.ndarray
-        Of curvature of the ellipsoid, metres, broadcastable to (N,).
+    height : ndarray
+        Height of the point above sea level, metres, broadcastable to (N,).
+    radius : ndarray
+        Radius of curvature of the ellipsoid, metres, broadcastable to (N,).
     wavelength : float
-        metres.
+        Vacuum wavelength, metres.
 
     Returns
     -------
-    np.ndarray
-        (N,), metres along the surface.
+    ndarray
+        Shift along the surface, metres, (N,).
     """
     temperature = _TEMPERATURE - _LAPSE * np.minimum(height, _TROPOPAUSE)
     scale_height = _HEIGHT_PER_KELVIN * temperature
@@ -190,23 +193,23 @@ def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray,
 
 
 def refracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: float) -> np.ndarray:
-    """Where a look really meets the ground.
+    """Return the points at which refracted looks meet the ground.
 
     Parameters
     ----------
-    point : np.ndarray
-        Where its straight continuation from space meets a height, ITRS, metres, (N, 3).
-    station : np.ndarray
-        The satellite when the light left, ITRS, metres, (N, 3).
+    point : ndarray
+        Points at which the straight continuation of the look from space meets a height, ITRS, metres, (N, 3).
+    station : ndarray
+        Positions of the satellite when the light left the ground, ITRS, metres, (N, 3).
     earth : Earth
-        For the vertical at the point; the atmosphere is layered about the ellipsoid's mean sphere there.
+        Ellipsoid that gives the vertical at the point; the atmosphere is layered about its mean sphere there.
     wavelength : float
-        metres.
+        Vacuum wavelength, metres.
 
     Returns
     -------
-    np.ndarray
-        (N, 3), at the same height, nearer to the point below the satellite.
+    ndarray
+        Points at the same height, nearer to the point below the satellite, ITRS, metres, (N, 3).
     """
     lon, lat, height = earth.geodetic(point)
     vertical = east_north_up(lon, lat)[..., 2, :]
@@ -222,9 +225,9 @@ def refracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: 
 
 
 def unrefracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: float) -> np.ndarray:
-    """The inverse of `refracted`: where the straight continuation of the look that really meets ``point`` would arrive.
+    """Return the points that straight looks would reach if refracted looks meet `point`.
 
-    Fixed-point steps; each makes the error smaller by the shift over the distance, 3e-6 at 500 km.
+    The inverse of `refracted`, by fixed-point steps; each makes the error smaller by the shift over the distance, 3e-6 at 500 km.
     """
     straight = point
     for _ in range(_FIXED_POINT_STEPS):

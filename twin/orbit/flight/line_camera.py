@@ -1,14 +1,13 @@
-"""Line cameras in orbit: what every pixel looks along in the body frame, when lines are exposed, what drifts.
+"""Line cameras in orbit: looks of pixels in the body frame, exposure times of lines, changes of geometry.
 
 Body frame (the instrument's base): X forward, Z toward the scene, Y = Z x X. A pixel's ray has an origin as well as a
 direction, because the chief rays of a mirror camera do not meet in one exact point. Both are smooth functions of the
 pixel and are kept as Chebyshev series over the line: exact for an ideal projection with distortion, which is a
 polynomial, and for a traced line as good as the trace.
 
-Lines of an instrument after changes that its on-board monitor has estimated.
-
-What a change does to the looks of a line is `analysis.orbit.forward_intersection.CalibratedLine.corrected`, which also
-corrects lines that are intersected; here the corrected looks go back into the line that a sensor flies with.
+The module also corrects the lines of an instrument for changes that its on-board monitor has estimated. The effect of a
+change on the looks of a line is `analysis.orbit.forward_intersection.CalibratedLine.corrected`, which also corrects
+lines that are intersected; here the corrected looks go back into the line of a flying sensor.
 """
 
 from __future__ import annotations
@@ -45,14 +44,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class LineTimes:
-    """Times at lines of an image, linear between them and as far as half a line beyond the first and the last.
+    """Exposure times at lines of an image, linear between them and up to half a line beyond the first and the last.
 
     Attributes
     ----------
-    line : Array
-        (K,) image coordinates, increasing; the middle of the first line is 0.
-    time : Array
-        (K,) middle of the exposure, seconds of the trajectory, increasing.
+    line : (K,) ndarray
+        Image coordinates of lines, increasing; the middle of the first line is 0.
+    time : (K,) ndarray
+        Middle of the exposure, seconds of the trajectory, increasing.
     """
 
     line: Array
@@ -60,19 +59,19 @@ class LineTimes:
 
     @classmethod
     def of(cls, line: ArrayLike, time: ArrayLike) -> LineTimes:
-        """The table, checked.
+        """Make the table of line times from rows, with checks.
 
         Parameters
         ----------
-        line : ArrayLike
-            (K,), at least two.
-        time : ArrayLike
-            (K,), seconds.
+        line : (K,) array_like
+            Image coordinates of at least two lines.
+        time : (K,) array_like
+            Middle of the exposure of each line, seconds.
 
         Raises
         ------
         ValueError
-            Shapes that do not match, fewer than two rows, values that are not finite or do not increase.
+            Shapes do not match, there are fewer than two rows, or values are not finite or do not increase.
         """
         at, moment = np.array(line, np.float64), np.array(time, np.float64)
         if at.ndim != 1 or at.shape != moment.shape or len(at) < 2:
@@ -85,7 +84,7 @@ class LineTimes:
 
     @classmethod
     def even(cls, first_time: float, line_time: float, lines: int) -> LineTimes:
-        """Times of lines that follow one another evenly, from line 0 on, seconds."""
+        """Return the times of lines at a constant interval, from line 0 on, in seconds."""
         last = float(max(lines - 1, 1))
         return cls.of([0.0, last], [first_time, first_time + last * line_time])
 
@@ -95,7 +94,7 @@ class LineTimes:
         return float((self.time[-1] - self.time[0]) / (self.line[-1] - self.line[0]))
 
     def at(self, line: ArrayLike) -> np.ndarray:
-        """Times of lines (...), seconds; beyond the ends by the slope there."""
+        """Return the times of lines (...), in seconds; beyond the ends by the slope there."""
         x = np.asarray(line, dtype=np.float64)
         k = np.clip(np.searchsorted(self.line, x, side="right") - 1, 0, len(self.line) - 2)
         slope = (self.time[k + 1] - self.time[k]) / (self.line[k + 1] - self.line[k])
@@ -105,14 +104,14 @@ class LineTimes:
 def changed_payload(
     spec: OrbitCalibrationSpec | OrbitSimulateSpec, payload: ThreeLineCameraSpec
 ) -> ThreeLineCameraSpec:
-    """The camera as it is after launch.
+    """Return the payload after launch, with the changes of interior orientation of a test's `perturb`.
 
     Parameters
     ----------
-    spec : OrbitCalibrationSpec | OrbitSimulateSpec
-        a test, whose ``perturb`` names lines.
+    spec : OrbitCalibrationSpec or OrbitSimulateSpec
+        Test whose `perturb` names lines.
     payload : ThreeLineCameraSpec
-        As the laboratory has measured it.
+        Payload as measured in the laboratory.
     """
     lines = {}
     for name, line in payload.lines.items():
@@ -126,14 +125,16 @@ def changed_payload(
 
 
 def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray]) -> ThreeLineCameraSpec:
-    """The camera with each line turned in its own axes, Rx(d_beta) Ry(d_alpha) Rz(d_gamma), and with f + d_f.
+    """Return the payload with each line rotated in its own axes and its principal distance changed.
+
+    The rotation is Rx(d_beta) Ry(d_alpha) Rz(d_gamma), the principal distance f + d_f.
 
     Parameters
     ----------
     payload : ThreeLineCameraSpec
-        The camera.
-    drift : Mapping[str, np.ndarray]
-        Line -> (4,) d_alpha, d_beta, d_gamma (radians) and d_f (metres).
+        Payload before the drift.
+    drift : mapping of str to (4,) ndarray
+        Changes d_alpha, d_beta, d_gamma (radians) and d_f (metres) by name of the line.
     """
     lines = dict(payload.lines)
     for name, (alpha, beta, gamma, longer) in drift.items():
@@ -149,24 +150,28 @@ def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray
 
 
 TRACED_POINTS = 49
-"""Points of a traced line. An unperturbed line needs nine terms; the rest is for figure errors."""
+"""Number of traced points of a line; an unperturbed line needs nine terms, the rest is for figure errors."""
 _NOISE = 1e-14
-"""Terms of a traced series below this share are rounding and are dropped (one pixel is 1e-6 rad)."""
+"""Relative size below which terms of a traced series are rounding and are dropped (one pixel is 1e-6 rad)."""
 _PLANE_POINTS = 1001
+"""Number of pixels to which the plane of a whole line is fitted."""
 _LOOK_TERMS = 12
-"""Terms for the tangent of a look angle within 30 deg over one CCD. They fall off by a thousandfold every few terms."""
+"""Number of Chebyshev terms for the tangent of a look angle within 30 deg over one CCD.
+
+The terms fall off by a thousandfold every few terms.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class LinePiece:
-    """One CCD of a line.
+    """One CCD of a line with its looks.
 
     Attributes
     ----------
     first, last : int
-        Its pixels.
-    directions : np.ndarray
-        As those of `LineCamera`, over its own pixels.
+        First and last pixel of the CCD, counted over the line.
+    directions : (K, 3) ndarray
+        Chebyshev coefficients of the looks over the CCD's pixels; see `LineCamera`.
     """
 
     first: int
@@ -176,24 +181,24 @@ class LinePiece:
 
 @dataclass(frozen=True, eq=False)
 class LineCamera:
-    """One line of pixels and what it sees.
+    """Line of pixels with their rays in the body frame.
 
     Pixels are counted along +Y' of the real focal plane, the centre of the first is 0, so they see the scene from +Y to
-    -Y of the body. A place on the line is any real number from -0.5 to pixels - 0.5.
+    -Y of the body. A position on the line is any real number from -0.5 to pixels - 0.5.
 
     Attributes
     ----------
     name : str
-        Of the line.
+        Name of the line.
     pixels : int
-        How many.
-    directions : np.ndarray
-        Chebyshev coefficients over the line of a vector along the look, body frame, (K, 3); its length does not matter.
-    origins : np.ndarray
-        Those of a point on the ray, body frame, (J, 3), metres.
-    pieces : tuple[LinePiece, ...]
-        Of a line of several CCDs, from its first pixel on, in place of ``directions``, which then are those without
-        offsets.
+        Number of pixels.
+    directions : (K, 3) ndarray
+        Chebyshev coefficients over the line of a vector along the look, body frame; its length does not matter.
+    origins : (J, 3) ndarray
+        Chebyshev coefficients over the line of a point on the ray, body frame, metres.
+    pieces : tuple of LinePiece
+        CCDs of a line of several, from its first pixel on; their looks replace `directions`, which then are those of a
+        line without offsets.
     """
 
     name: str
@@ -203,28 +208,25 @@ class LineCamera:
     pieces: tuple[LinePiece, ...] = ()
 
     def turned(self, turn: np.ndarray) -> LineCamera:
-        """The line with its looks turned in body axes, look @ turn, (3, 3)."""
+        """Return the line with its looks rotated in body axes, look @ turn, (3, 3)."""
         pieces = tuple(replace(piece, directions=piece.directions @ turn) for piece in self.pieces)
         return replace(self, directions=self.directions @ turn, pieces=pieces)
 
     def look(self, pixel: np.ndarray) -> np.ndarray:
-        """Unit directions toward the scene, body frame: pixels (N,) -> (N, 3).
+        """Return unit directions toward the scene, body frame: pixels (N,) -> (N, 3).
 
         Raises
         ------
         ValueError
-            a pixel outside the line.
+            A pixel lies outside the line.
         """
         vector = self._vector(pixel)[0]
         return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
     def look_and_slope(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`look` and its derivative by the pixel, radians per pixel, both (N, 3); the derivative is square to the look.
+        """Return `look` and its derivative by the pixel, in radians per pixel, both (N, 3).
 
-        Raises
-        ------
-        ValueError
-            a pixel outside the line.
+        The derivative is perpendicular to the look.
         """
         vector, change = self._vector(pixel)
         length = np.linalg.norm(vector, axis=-1, keepdims=True)
@@ -232,33 +234,33 @@ class LineCamera:
         return look, (change - look * np.sum(look * change, axis=-1, keepdims=True)) / length
 
     def relative_illumination(self, pixel: np.ndarray) -> np.ndarray:
-        """Return the light on pixels (N,) over that on the line's middle, (N,), of ground of one radiance.
+        """Return the irradiance on pixels (N,) relative to the line's middle, (N,), for ground of uniform radiance.
 
-        An entrance pupil of one size is seen foreshortened, by cos w of the field angle w, from a pixel that looks over
-        a solid angle of its angle along the line by its angle across, pitch x cos w / f. That is cos^4 w of a
-        projection without distortion, and follows the distortion of another.
+        The entrance pupil is foreshortened by cos w at the field angle w, and a pixel sees the solid angle of its angle
+        along the line times its angle across, pitch x cos w / f. The product is cos^4 w for a projection without
+        distortion, and follows the distortion otherwise.
 
         Raises
         ------
         ValueError
-            a pixel outside the line.
+            A pixel lies outside the line.
         """
         look, slope = self.look_and_slope(np.concatenate([[0.5 * (self.pixels - 1)], np.asarray(pixel, np.float64)]))
         rate = np.linalg.norm(slope, axis=-1)
         return np.asarray((look[1:] @ look[0]) ** 2 * rate[1:] / rate[0])
 
     def origin(self, pixel: np.ndarray) -> np.ndarray:
-        """Points on the rays, body frame: pixels (N,) -> (N, 3), metres.
+        """Return points on the rays, body frame: pixels (N,) -> (N, 3), in metres.
 
         Raises
         ------
         ValueError
-            a pixel outside the line.
+            A pixel lies outside the line.
         """
         return self._series(self.origins, self._checked(pixel))
 
     def _vector(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A vector along the look and its derivative by the pixel, both (N, 3)."""
+        """Return a vector along the look and its derivative by the pixel, both (N, 3)."""
         at = self._checked(pixel)
         change = self._series(chebyshev.chebder(self.directions), at) * (2.0 / self.pixels)
         vector = self._series(self.directions, at)
@@ -272,36 +274,37 @@ class LineCamera:
         return vector, change
 
     def _checked(self, pixel: np.ndarray) -> np.ndarray:
-        """Return pixels on the line; those outside it by rounding lie at its end, on the piece that ends there."""
+        """Return pixels on the line; those outside it by rounding are clipped to its end."""
         if not np.all(in_span(pixel, -0.5, self.pixels - 0.5)):
             raise ValueError(f"a pixel outside the line {self.name!r}: it reaches from -0.5 to {self.pixels - 0.5}")
         return np.clip(pixel, -0.5, self.pixels - 0.5)
 
     def _series(self, coefficients: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        """Evaluate a Chebyshev series over the line at pixels."""
         place = (2.0 * pixel + 1.0) / self.pixels - 1.0
         return np.moveaxis(chebyshev.chebval(place, coefficients), 0, -1)
 
 
 def line_cameras(spec: ThreeLineCameraSpec) -> dict[str, LineCamera]:
-    """The lines of a payload of ideal projections with distortion, by name (no approximation)."""
+    """Return the lines of a payload of ideal projections with distortion, by name (no approximation)."""
     return {
         name: _ideal_line(name, line, spec.pixels_of(name), spec.pitch_of(name)) for name, line in spec.lines.items()
     }
 
 
 def polynomial_line(name: str, pixels: int, forward: ArrayLike, right: ArrayLike) -> LineCamera:
-    """A line whose looks have polynomials of the pixel as tangents (no approximation).
+    """Return a line whose looks have polynomials of the pixel as tangents (no approximation).
 
     Parameters
     ----------
     name : str
-        Of the line.
+        Name of the line.
     pixels : int
-        How many.
-    forward : ArrayLike
-        Coefficients (K,) of the tangent of a look's angle forward, ascending powers of the pixel.
-    right : ArrayLike
-        Likewise to the right.
+        Number of pixels.
+    forward : (K,) array_like
+        Coefficients of the tangent of the look's angle forward, ascending powers of the pixel.
+    right : (K,) array_like
+        Coefficients of the tangent of the look's angle to the right, likewise.
     """
     ahead, aside = np.atleast_1d(forward), np.atleast_1d(right)
 
@@ -314,6 +317,7 @@ def polynomial_line(name: str, pixels: int, forward: ArrayLike, right: ArrayLike
 
 
 def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> LineCamera:
+    """Return a line of an ideal projection with radial distortion and offsets of its CCDs."""
     to_body = about_axis(1, line.look) @ rotation_matrix(np.array(line.rotate))
     degree = 5 if line.k2 else 3
 
@@ -334,23 +338,23 @@ def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> L
 
 
 def pixel_places(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
-    """Where pixels of a line lie in its focal plane, x (flight) and y (along the line) from the line's centre, metres.
+    """Return focal-plane positions of a line's pixels, x (flight) and y (along the line) from its centre, in metres.
 
     Parameters
     ----------
     line : LineCameraSpec
-        Of a payload.
-    pixel : np.ndarray
-        Places on the line, (N,).
+        Line of a payload.
+    pixel : (N,) ndarray
+        Positions on the line, pixels.
     pixels : int
-        How many it has.
+        Number of pixels of the line.
     pitch : float
-        Of its pixels, metres.
+        Pixel pitch, metres.
 
     Returns
     -------
-    np.ndarray
-        (N, 2).
+    (N, 2) ndarray
+        Positions x and y, metres.
     """
     at = np.asarray(pixel, dtype=np.float64)
     found = _ccd_places(line, None, at, pixels, pitch)
@@ -361,7 +365,7 @@ def pixel_places(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch: fl
 
 
 def _ccd_places(line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
-    """Places of pixels of one CCD, or of a straight line without CCDs; see `pixel_places`."""
+    """Return positions of pixels of one CCD, or of a straight line if `ccd` is None; see `pixel_places`."""
     straight = (pixel - 0.5 * (pixels - 1)) * pitch
     if ccd is None:
         return np.stack([np.zeros_like(straight), straight], axis=-1)
@@ -374,21 +378,21 @@ def _ccd_places(line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pi
 
 
 def traced_line_cameras(instrument: Instrument, backend: Backend, state: State | None = None) -> dict[str, LineCamera]:
-    """The lines of an instrument of mirror cameras, by exact chief rays of their pixels.
+    """Return the lines of an instrument of mirror cameras, by exact chief rays of their pixels.
 
     Parameters
     ----------
     instrument : Instrument
         Cameras on their base, which is the satellite's body frame.
     backend : Backend
-        Where to trace.
-    state : State | None
-        What is perturbed; None for nothing.
+        Array backend that traces the rays.
+    state : State or None
+        Perturbation of the instrument; None for the nominal state.
 
     Returns
     -------
-    dict[str, LineCamera]
-        Camera -> its line. The origins are the points of the chief rays nearest to the camera's nominal origin.
+    dict of str to LineCamera
+        Line of each camera. The origins are the points of the chief rays nearest to the camera's nominal origin.
 
     Raises
     ------
@@ -420,16 +424,17 @@ def traced_line_cameras(instrument: Instrument, backend: Backend, state: State |
 
 
 def look_angle(a: LineCamera, b: LineCamera) -> float:
-    """Angle between the looks of the middles of two lines, radians, 0 to pi."""
+    """Return the angle between the looks of the middles of two lines, in radians, 0 to pi."""
     first, second = (camera.look(np.array([0.5 * (camera.pixels - 1)]))[0] for camera in (a, b))
     return _angle(first, second)
 
 
 def along_track_angle(a: LineCamera, b: LineCamera) -> float:
-    """Turn about the lines' mean direction that takes the middle of b to that of a, radians; + where a looks ahead.
+    """Return the angle along the track from the middle of line b to that of line a, in radians.
 
-    The part of `look_angle` that makes heights: it has a sign, and lines that look the same way but side by side have
-    none. A line's direction is square to the look of its middle, in its plane.
+    It is a rotation about the lines' mean direction, positive where a looks ahead of b: the part of `look_angle` that
+    makes heights. Lines that look the same way but side by side have none. A line's direction is perpendicular to the
+    look of its middle, in its plane.
     """
     first, second = (camera.look(np.array([0.5 * (camera.pixels - 1)]))[0] for camera in (a, b))
     sides = [np.cross(look, line_normal(camera)) for look, camera in ((first, a), (second, b))]
@@ -441,11 +446,11 @@ def along_track_angle(a: LineCamera, b: LineCamera) -> float:
 def dihedral_angle(
     a: LineCamera, b: LineCamera, places: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
 ) -> float:
-    """Angle between the planes of two lines, radians, 0 to pi/2.
+    """Return the angle between the planes of two lines, in radians, 0 to pi/2.
 
     A line's plane is the one through the station that its looks depart from least (total least squares over the whole
-    line, or over the pixels `places`, each (N,)). It is what ground points of the strips give (paper 000, eqs. 1 to 7),
-    and differs from `look_angle` when the lines are not parallel.
+    line, or over the pixels `places`, each (N,)). Ground points of the strips give this angle (paper 000, eqs. 1 to 7).
+    It differs from `look_angle` when the lines are not parallel.
     """
     angle = _angle(*(line_normal(camera, place) for camera, place in zip((a, b), places, strict=True)))
     return min(angle, np.pi - angle)
@@ -457,12 +462,12 @@ class LineAngles:
 
     Attributes
     ----------
-    cameras : Mapping[str, LineCamera]
-        Line -> camera.
-    pairs : Mapping[str, tuple[str, str]]
-        Angle -> the two lines that it lies between.
-    pixel : Mapping[str, np.ndarray]
-        Line -> places of its points, (n,), of the lines that angles are measured of.
+    cameras : mapping of str to LineCamera
+        Camera of each line.
+    pairs : mapping of str to tuple of str
+        The two lines of each angle.
+    pixel : mapping of str to (n,) ndarray
+        Positions of the ground points on each line whose angles are measured, pixels.
     """
 
     cameras: Mapping[str, LineCamera]
@@ -481,7 +486,7 @@ class LineAngles:
 
     @property
     def dihedral(self) -> dict[str, float]:
-        """Angles between the planes of the lines where the points are; see `dihedral_angle`."""
+        """Angles between the planes of the lines, fitted at the ground points' pixels; see `dihedral_angle`."""
         return {
             name: dihedral_angle(self.cameras[a], self.cameras[b], (self.pixel[a], self.pixel[b]))
             for name, (a, b) in self.pairs.items()
@@ -489,9 +494,14 @@ class LineAngles:
 
 
 def line_normal(camera: LineCamera, pixel: np.ndarray | None = None) -> np.ndarray:
-    """Unit normal of a line's best plane through the station, body frame, (3,), on the forward side (+X).
+    """Return the unit normal of a line's best plane through the station, body frame, (3,), on the forward side (+X).
 
-    pixel: (N,) places that the plane is fitted to; None for the whole line.
+    Parameters
+    ----------
+    camera : LineCamera
+        The line.
+    pixel : (N,) ndarray or None
+        Pixels to which the plane is fitted; None for the whole line.
     """
     looks = camera.look(np.linspace(0.0, camera.pixels - 1.0, _PLANE_POINTS) if pixel is None else pixel)
     # the singular vector itself, not that of the normal equations: half of the digits would be lost there
@@ -500,16 +510,17 @@ def line_normal(camera: LineCamera, pixel: np.ndarray | None = None) -> np.ndarr
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the angle between two vectors, in radians."""
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
 def _nodes(pixels: int, count: int) -> np.ndarray:
-    """Chebyshev points of the line, (count,), in pixels."""
+    """Return the Chebyshev points of the line, (count,), in pixels."""
     return 0.5 * (chebyshev.chebpts1(count) + 1.0) * pixels - 0.5
 
 
 def _through(values: np.ndarray) -> np.ndarray:
-    """Coefficients (K, 3) of the series that has these values (K, 3) at the Chebyshev points."""
+    """Return coefficients (K, 3) of the series that has these values (K, 3) at the Chebyshev points."""
     count = len(values)
     basis = chebyshev.chebvander(chebyshev.chebpts1(count), count - 1)
     weight = np.full(count, 2.0 / count)
@@ -518,27 +529,28 @@ def _through(values: np.ndarray) -> np.ndarray:
 
 
 def _coefficients(function: Callable[[np.ndarray], np.ndarray], pixels: int, count: int) -> np.ndarray:
+    """Return the Chebyshev coefficients (count, 3) of a vector function of the pixel."""
     return _through(function(_nodes(pixels, count)))
 
 
 def _chopped(coefficients: np.ndarray) -> np.ndarray:
-    """The series without its last terms that are rounding."""
+    """Return the series without its last terms that are rounding."""
     size = np.max(np.abs(coefficients), axis=-1)
     used = np.flatnonzero(size > _NOISE * np.max(size))
     return coefficients[: used[-1] + 1]
 
 
 def calibrated_line(line: LineCamera, axes: np.ndarray, principal_distance: float) -> CalibratedLine:
-    """A traced line in the analysis's form.
+    """Return a traced line in the form that the analysis uses.
 
     Parameters
     ----------
     line : LineCamera
-        Of one CCD.
-    axes : np.ndarray
-        (3, 3) columns X, Y, Z of its camera in the body, about which changes count.
+        Line of one CCD.
+    axes : (3, 3) ndarray
+        Columns X, Y, Z of its camera in the body frame, about which changes are counted.
     principal_distance : float
-        Of it, metres.
+        Principal distance of the line, metres.
     """
     return CalibratedLine(line.pixels, line.directions, line.origins, axes, principal_distance)
 
@@ -546,16 +558,16 @@ def calibrated_line(line: LineCamera, axes: np.ndarray, principal_distance: floa
 def calibrated_lines(
     lines: Mapping[str, LineCamera], instrument: Instrument, backend: Backend
 ) -> dict[str, CalibratedLine]:
-    """Lines of an instrument as its calibration knows them, by camera.
+    """Return the lines of an instrument in the form that the analysis uses, by camera.
 
     Parameters
     ----------
-    lines : Mapping[str, LineCamera]
-        Of the unperturbed instrument, as `twin.orbit.flight.line_camera.traced_line_cameras` finds them.
+    lines : mapping of str to LineCamera
+        Lines of the unperturbed instrument, from `twin.orbit.flight.line_camera.traced_line_cameras`.
     instrument : Instrument
-        That is unperturbed.
+        The unperturbed instrument.
     backend : Backend
-        Where to trace.
+        Array backend that traces the rays.
     """
     sight = LineSight(instrument, backend)
     distance = sight.truth([{}]).principal_distance
@@ -563,20 +575,20 @@ def calibrated_lines(
 
 
 def corrected_line(line: LineCamera, calibrated: CalibratedLine, change: ArrayLike) -> LineCamera:
-    """A line after a change.
+    """Return a line corrected for a change of its camera.
 
     Parameters
     ----------
     line : LineCamera
-        As it was calibrated.
+        Line as it was calibrated.
     calibrated : CalibratedLine
         The same line, by `calibrated_lines`.
-    change : ArrayLike
-        (4,) d_alpha, d_beta, d_gamma (rad) and d_f (m) since then.
+    change : (4,) array_like
+        d_alpha, d_beta, d_gamma (rad) and d_f (m) since the calibration.
 
     Raises
     ------
     ValueError
-        Another shape, numbers that are not finite, no principal distance left.
+        The change has another shape, is not finite, or leaves no positive principal distance.
     """
     return replace(line, directions=calibrated.corrected(change).directions)

@@ -1,4 +1,4 @@
-"""Orbits: two-body motion and the Earth's flattening (J2), and what else is among the FORCES, integrated numerically.
+"""Satellite orbits, integrated numerically under gravity with the Earth's flattening (J2) and any other `FORCES`.
 
 The flattening's axis is the celestial pole of the epoch; within a day the pole moves by some 0.1 arcsec. Drag, other
 terms of the field, Sun and Moon are left out: over a pass they displace the orbit smoothly by metres, and change
@@ -23,25 +23,30 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.flight import ElementsSpec, OrbitSpec, PassingSpec
 
 GM = 3.986004415e14
-"""m^3/s^2 (EGM96)."""
+"""Gravitational parameter of the Earth, in m^3/s^2 (EGM96)."""
 J2 = 1.0826266835e-3
-"""EGM96: -sqrt(5) times the normalised C20, -484.165371736e-6."""
+"""Second zonal coefficient of the gravity field (EGM96): -sqrt(5) times the normalised C20, -484.165371736e-6."""
 FIELD_RADIUS = 6378136.3
 """Reference radius of the field's expansion, metres (EGM96)."""
 SUN_RATE = 2.0 * math.pi / (365.2421897 * DAY)
 """Mean motion of the mean Sun in right ascension, rad/s; tropical year."""
 TOLERANCE = 1e-12
-"""Relative error of one integration step."""
+"""Relative error tolerance of one integration step."""
 
 _ABSOLUTE = np.array([1.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3]) * 1e-5
+"""Weights of positions (m) and velocities (m/s) in the absolute error tolerance."""
 _LONGEST_STEP = 60.0
+"""Longest integration step, in seconds."""
 _MOST_KEPT = 1 << 14
-"""Times whose positions and velocities an orbit keeps until others are asked for."""
+"""Largest number of times whose positions and velocities an orbit caches until others are requested."""
 _POLAR_RADIUS = EQUATORIAL_RADIUS * (1.0 - FLATTENING)
 
 
 def acceleration(position: np.ndarray) -> np.ndarray:
-    """Acceleration of the two-body + J2 field, m/s^2; positions (..., 3) in axes with z along the pole, metres."""
+    """Return the acceleration of the two-body + J2 field, in m/s^2.
+
+    Positions (..., 3) are in metres, in axes with z along the pole.
+    """
     r2 = np.sum(position * position, axis=-1, keepdims=True)
     sine2 = position[..., 2:] ** 2 / r2
     flattening = 1.5 * J2 * FIELD_RADIUS**2 / r2
@@ -50,36 +55,42 @@ def acceleration(position: np.ndarray) -> np.ndarray:
 
 
 Force = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
-"""Seconds from the epoch, position (3,), metres, and velocity (3,), m/s -> acceleration (3,), m/s^2, all in the frame
-of integration: z along the celestial pole of the epoch, x toward its intermediate origin, not turning (the air turns
-with the Earth in it).
+"""Function from seconds since the epoch, position (3,), metres, and velocity (3,), m/s, to acceleration (3,), m/s^2.
+
+All are in the frame of integration: z along the celestial pole of the epoch, x toward its intermediate origin, without
+rotation (the air rotates with the Earth in it).
 """
 
 
 def _gravity(_: float, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Return the acceleration by the Earth's gravity, a `Force`."""
     return acceleration(position)
 
 
 FORCES = ExtensionTable[Force]("forces", {"gravity": _gravity})
-"""Every force on every satellite, by its name; the accelerations add. A new one is added here. Orbits that are called
-sun-synchronous follow the mean Sun by J2 alone.
+"""Forces on every satellite by name; the accelerations add.
+
+New forces are added here. Orbits that are called sun-synchronous follow the mean Sun by J2 alone.
 """
 
 
 def node_rate(semi_major_axis: float, eccentricity: float, inclination: float) -> float:
-    """Secular rate of the node by J2, rad/s, from mean elements: -3/2 J2 (R/p)^2 n cos i (Kaula 1966, eq. 3.74)."""
+    """Return the secular rate of the node by J2, in rad/s, from mean elements.
+
+    -3/2 J2 (R/p)^2 n cos i (Kaula 1966, eq. 3.74).
+    """
     n = math.sqrt(GM / semi_major_axis**3)
     p = semi_major_axis * (1.0 - eccentricity**2)
     return -1.5 * J2 * (FIELD_RADIUS / p) ** 2 * n * math.cos(inclination)
 
 
 def sun_synchronous_inclination(semi_major_axis: float, eccentricity: float = 0.0) -> float:
-    """Mean inclination at which the node follows the mean Sun, radians.
+    """Return the mean inclination at which the node follows the mean Sun, in radians.
 
     Raises
     ------
     ValueError
-        The orbit is too high.
+        The orbit is too high to be sun-synchronous.
     """
     cosine = SUN_RATE / node_rate(semi_major_axis, eccentricity, 0.0)
     if abs(cosine) > 1.0:
@@ -88,11 +99,11 @@ def sun_synchronous_inclination(semi_major_axis: float, eccentricity: float = 0.
 
 
 def _osculating_inclination(semi_major_axis: float, eccentricity: float, argument: float | None, z: float) -> float:
-    """Osculating inclination of a sun-synchronous orbit at one argument of latitude, from osculating elements.
+    """Return the osculating inclination of a sun-synchronous orbit at one argument of latitude.
 
-    The short-period terms of first order for a small eccentricity (Kozai 1959) lead to the mean elements:
-    a = a' + 3/2 J2 R^2/a sin^2 i cos 2u and i = i' + 3/8 J2 (R/p)^2 sin 2i cos 2u. Where u is not given, sin u follows
-    from z = sin i sin u.
+    The input elements are osculating. The short-period terms of first order for a small eccentricity (Kozai 1959) lead
+    to the mean elements: a = a' + 3/2 J2 R^2/a sin^2 i cos 2u and i = i' + 3/8 J2 (R/p)^2 sin 2i cos 2u. Where the
+    argument u is None, sin u follows from z = sin i sin u.
     """
     ratio = J2 * (FIELD_RADIUS / semi_major_axis) ** 2
     inclination = sun_synchronous_inclination(semi_major_axis, eccentricity)
@@ -107,21 +118,21 @@ def _osculating_inclination(semi_major_axis: float, eccentricity: float, argumen
 
 @dataclass(frozen=True, eq=False)
 class Orbit:
-    """An orbit over a span of time; made by `propagate`.
+    """Orbit over a span of time, made by `propagate`.
 
     Attributes
     ----------
     epoch : str
         UTC, ISO 8601 text; times are seconds from it.
     earth : Earth
-        On which it is seen.
+        Earth whose rotation gives the Earth-fixed positions.
     first, last : float
         Span of time, seconds.
-    to_gcrs : np.ndarray
+    to_gcrs : ndarray
         Rotation from the frame of integration (equator of the epoch) to the GCRS, shape (3, 3).
     rotation : EarthRotation
-        The Earth's, over the span.
-    backward, forward : Any
+        Rotation of the Earth over the span.
+    backward, forward : callable or None
         Dense solutions before and after the epoch, in the frame of integration; None if there is no such part.
     """
 
@@ -138,13 +149,15 @@ class Orbit:
     )
 
     def equatorial(self, seconds: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Position (..., 3), metres, and velocity (..., 3), m/s, in the frame of integration: z along the celestial
-        pole, x toward the celestial intermediate origin of the epoch, not turning.
+        """Return position, metres, and velocity, m/s, both (..., 3), in the frame of integration.
+
+        The frame has z along the celestial pole and x toward the celestial intermediate origin of the epoch, and does
+        not rotate.
 
         Raises
         ------
         ValueError
-            a time is not a number or outside the orbit.
+            A time is not a number or lies outside the orbit.
         """
         t = np.asarray(seconds, dtype=np.float64)
         if not np.all(in_span(t, self.first, self.last)):
@@ -161,13 +174,15 @@ class Orbit:
         return state[..., :3], state[..., 3:]
 
     def gcrs(self, seconds: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Position (..., 3), metres, and velocity (..., 3), m/s, in the GCRS; raises as `equatorial`."""
+        """Return position, metres, and velocity, m/s, both (..., 3), in the GCRS; raises as `equatorial`."""
         r, v = self.equatorial(seconds)
         return r @ self.to_gcrs.T, v @ self.to_gcrs.T
 
     def itrs(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Position, metres, velocity against the turning Earth and velocity against the stars, m/s, all (..., 3) in
-        axes of the ITRS, not to be written to; raises as `equatorial`.
+        """Return position (m), Earth-fixed velocity and inertial velocity (m/s), all (..., 3), in axes of the ITRS.
+
+        The first velocity is relative to the rotating Earth, the second relative to the stars. The arrays are
+        read-only. Raises as `equatorial`.
         """
         t = np.asarray(seconds, dtype=np.float64)
         # position, velocity and attitude are asked for one after the other at the same times
@@ -185,22 +200,22 @@ class Orbit:
 
 
 def propagate(spec: OrbitSpec, earth: Earth, tolerance: float = TOLERANCE) -> Orbit:
-    """Follow an orbit over its span (Dormand-Prince 8(5,3) with dense output).
+    """Integrate an orbit over its span (Dormand-Prince 8(5,3) with dense output).
 
     Parameters
     ----------
     spec : OrbitSpec
-        The orbit.
+        Orbit of the input file.
     earth : Earth
-        On which it is seen.
+        Earth whose rotation gives the Earth-fixed positions.
     tolerance : float
         Relative error of one step.
 
     Raises
     ------
     ValueError
-        No such orbit: the place lies beyond the inclination's latitudes, it is too high to be sun-synchronous, or it
-        runs into the Earth.
+        The orbit is impossible: the point passed lies beyond the latitudes that the inclination reaches, the orbit is
+        too high to be sun-synchronous, or it runs into the Earth.
     """
     rotation = earth.rotation(spec.epoch, -spec.before, spec.after)
     to_gcrs = rotation.celestial(0.0).T
@@ -216,13 +231,14 @@ def propagate(spec: OrbitSpec, earth: Earth, tolerance: float = TOLERANCE) -> Or
 
 
 def _local_time(right_ascension: float, angle: float, ut1: tuple[float, float]) -> float:
-    """UT1 plus the longitude of the meridian, seconds of the day."""
+    """Return UT1 plus the longitude of the meridian, in seconds of the day."""
     # a Julian day begins at noon
     noon = (ut1[0] % 1.0 + ut1[1] % 1.0 + 0.5) * DAY
     return (noon + (right_ascension - angle) / (2.0 * math.pi) * DAY) % DAY
 
 
 def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
+    """Integrate a state (6,) at the epoch to the time `end`, seconds, and return the dense solution."""
     forces = tuple(FORCES.values())
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
@@ -253,7 +269,7 @@ def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
 
 
 def _radial_and_along(inclination: float, node: float, argument: float) -> np.ndarray:
-    """Unit vectors away from the Earth and along the circular orbit, shape (2, 3), in the frame of integration."""
+    """Return unit vectors away from the Earth and along the circular orbit, (2, 3), in the frame of integration."""
     cu, su, cn, sn = math.cos(argument), math.sin(argument), math.cos(node), math.sin(node)
     ci, si = math.cos(inclination), math.sin(inclination)
     radial = [cn * cu - sn * su * ci, sn * cu + cn * su * ci, su * si]
@@ -262,6 +278,7 @@ def _radial_and_along(inclination: float, node: float, argument: float) -> np.nd
 
 
 def _element_state(spec: ElementsSpec, rotation: EarthRotation, ut1: tuple[float, float]) -> np.ndarray:
+    """Return position and velocity, (6,), at the epoch from osculating elements."""
     a, e = EQUATORIAL_RADIUS + spec.altitude, spec.eccentricity
     inclination = spec.inclination
     if inclination is None:
@@ -281,7 +298,7 @@ def _element_state(spec: ElementsSpec, rotation: EarthRotation, ut1: tuple[float
 
 
 def _passing_state(spec: PassingSpec, earth: Earth, from_itrs: np.ndarray) -> np.ndarray:
-    """State of the osculating circle through a place: from its declination follow argument and node."""
+    """Return the state, (6,), of the osculating circle through a point; its declination gives argument and node."""
     position = from_itrs @ earth.ecef(spec.longitude, spec.latitude, spec.altitude)
     a = float(np.linalg.norm(position))
     z = position[2] / a

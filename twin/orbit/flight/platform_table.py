@@ -1,4 +1,4 @@
-"""An orbit and an attitude that are known as tables of readings, and what lies between the readings.
+"""Tables of readings of orbit and attitude, and their interpolation between the readings.
 
 This is what a satellite sends down, and what an analysis has: of a simulated pass as of a real one.
 """
@@ -22,18 +22,19 @@ from twin.orbit.flight.trajectory import Attitude, Trajectory, readings
 Interpolation = Literal["spline", "lagrange"]
 
 _SPLINE_ERROR = 1e-3
-"""Metres: a cubic spline through the readings of a smooth orbit may be as wrong between them."""
+"""Largest error of a cubic spline between the readings of a smooth orbit, in metres."""
 _FOURTH_DERIVATIVE = 1.1e-5
-"""m/s^4, of a coordinate of a low circular orbit: r n^4 at 300 km, with the Earth's turn."""
+"""Fourth derivative of a coordinate of a low circular orbit, in m/s^4: r n^4 at 300 km, with the Earth's rotation."""
 _LAGRANGE_NODES = 10
+"""Number of readings through which Lagrange's polynomial goes."""
 _LEAST_ROWS = 12
-"""Readings from which on every fourth still makes a curve."""
+"""Least number of readings of which every fourth still defines a curve."""
 _GROWS = 4.0
-"""Factor on the error of twice the step that noise does not reach."""
+"""Growth of the interpolation error at twice the step from which on it is not the noise of the readings."""
 _SURELY = 1e3
-"""Metres; no noise is as large."""
+"""Interpolation error that no noise of readings reaches, in metres."""
 _GAP = 5.0
-"""Median intervals: readings that are farther apart leave a gap, in which nothing is known."""
+"""Interval between readings, in median intervals, above which it is a gap without interpolation."""
 _UNIT_TOLERANCE = 1e-3
 """Largest departure of a quaternion's norm from 1: four decimals pass, and a rotation vector does not."""
 
@@ -46,19 +47,19 @@ class PlatformTable:
     ----------
     epoch : str
         UTC, ISO 8601 ending in Z; all times are SI seconds from it, leap seconds counted.
-    orbit_time : Array
-        (N,) seconds, increasing.
-    position : Array
-        (N, 3) of the body's origin in the ITRS, metres.
-    velocity : Array | None
-        (N, 3) against the turning Earth in axes of the ITRS, m/s; None where it was not measured.
-    attitude_time : Array
-        (M,) seconds, increasing.
-    quaternion : Array
-        (M, 4) x, y, z, w (scalar last) of unit length, neighbours on one side; turns body axes into those of the ITRS,
+    orbit_time : (N,) ndarray
+        Times of the orbit readings, seconds, increasing.
+    position : (N, 3) ndarray
+        Position of the body's origin in the ITRS, metres.
+    velocity : (N, 3) ndarray or None
+        Velocity relative to the rotating Earth in axes of the ITRS, m/s; None where it was not measured.
+    attitude_time : (M,) ndarray
+        Times of the attitude readings, seconds, increasing.
+    quaternion : (M, 4) ndarray
+        x, y, z, w (scalar last) of unit length, neighbours on one side; rotates body axes into those of the ITRS,
         v_itrs = R(q) v_body.
-    usable : tuple[float, float]
-        Two times, seconds, between which the orbit may be used; readings beyond serve to join those within.
+    usable : tuple of float
+        Two times, seconds, between which the orbit may be used; readings beyond them only support the interpolation.
     """
 
     epoch: str
@@ -79,28 +80,28 @@ class PlatformTable:
         attitude_time: ArrayLike,
         quaternion: ArrayLike,
     ) -> PlatformTable:
-        """The table, checked; quaternions are made unit and brought to one side.
+        """Make the table from readings, with checks; quaternions are normalised and brought to one side.
 
         Parameters
         ----------
         epoch : str
             UTC, ISO 8601.
-        orbit_time : ArrayLike
-            (N,), seconds.
-        position : ArrayLike
-            (N, 3), ITRS, metres.
-        velocity : ArrayLike | None
-            (N, 3), of the Earth-fixed axes, m/s, or None.
-        attitude_time : ArrayLike
-            (M,), seconds.
-        quaternion : ArrayLike
-            (M, 4), x, y, z, w, body to ITRS, either sign.
+        orbit_time : (N,) array_like
+            Times of the orbit readings, seconds.
+        position : (N, 3) array_like
+            Positions in the ITRS, metres.
+        velocity : (N, 3) array_like or None
+            Velocities relative to the Earth-fixed axes, m/s, or None.
+        attitude_time : (M,) array_like
+            Times of the attitude readings, seconds.
+        quaternion : (M, 4) array_like
+            x, y, z, w, body to ITRS, either sign.
 
         Raises
         ------
         ValueError
-            Shapes that do not match, values that are not finite, times that do not increase, fewer than two readings,
-            or four numbers that are no rotation.
+            Shapes do not match, values are not finite, times do not increase, there are fewer than two readings, or
+            four numbers are not a rotation.
         """
         times, looks = (np.array(v, np.float64) for v in (orbit_time, attitude_time))
         place, turn = np.array(position, np.float64), np.array(quaternion, np.float64)
@@ -122,7 +123,7 @@ class PlatformTable:
 
     @classmethod
     def sampled(cls, trajectory: Trajectory, orbit_interval: float, attitude_interval: float) -> PlatformTable:
-        """Readings of a trajectory at whole multiples of the intervals, seconds, and at both ends of its span."""
+        """Sample a trajectory at whole multiples of the intervals, in seconds, and at both ends of its span."""
         fixes, looks = (_moments(trajectory, step) for step in (orbit_interval, attitude_interval))
         turn = Rotation.from_matrix(trajectory.body_to_itrs(looks)).as_quat(canonical=False)
         place, speed = trajectory.position(fixes), trajectory.velocity(fixes)
@@ -130,24 +131,27 @@ class PlatformTable:
 
 
 def joined_quaternions(quaternion: Array) -> Array:
-    """Quaternions of the same rotations whose neighbours lie on one side of the sphere, so that they interpolate.
+    """Return quaternions of the same rotations whose neighbours lie on one side of the sphere, for interpolation.
 
     Parameters
     ----------
-    quaternion : Array
-        (N, 4), of which q and -q are one rotation.
+    quaternion : (N, 4) ndarray
+        Quaternions, of which q and -q are the same rotation.
 
     Returns
     -------
-    Array
-        (N, 4); the first keeps its sign.
+    (N, 4) ndarray
+        Quaternions with consistent signs; the first keeps its sign.
     """
     flip = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0.0, -1.0, 1.0))
     return np.concatenate([quaternion[:1], quaternion[1:] * flip[:, None]])
 
 
 def _moments(trajectory: Trajectory, step: float) -> Array:
-    """Times of readings inside a trajectory and its ends; a reading that all but coincides with an end gives way."""
+    """Return times of readings inside a trajectory and its ends.
+
+    A reading that all but coincides with an end is dropped.
+    """
     first, last = trajectory.first, trajectory.last
     every = readings(first, last, step)
     inside = every[(every > first + 1e-3 * step) & (every < last - 1e-3 * step)]
@@ -158,19 +162,20 @@ def _moments(trajectory: Trajectory, step: float) -> Array:
 class TabulatedTrajectory:
     """Position and attitude between the readings of a table, seconds from its epoch; times have shape (...).
 
-    Positions are joined by a cubic spline (not-a-knot) where that is good to 1 mm on a smooth orbit, which it is up to
-    14 s between readings, and by Lagrange's polynomial of ten readings around each time where they stand farther apart;
-    velocities likewise, or are the derivative of the positions. Components of quaternions are joined by a cubic
-    spline and made unit: good to 1e-9 rad for a satellite that turns by 0.1 deg between readings.
+    Positions are interpolated by a cubic spline (not-a-knot) where that is good to 1 mm on a smooth orbit, which it is
+    up to 14 s between readings, and by Lagrange's polynomial of ten readings around each time where readings are
+    farther apart. Velocities are interpolated likewise, or are the derivative of the positions. Components of
+    quaternions are interpolated by a cubic spline and normalised: good to 1e-9 rad for a satellite that rotates by 0.1
+    deg between readings.
 
     Every method raises ValueError for a time outside the readings or in a gap of them.
 
     Attributes
     ----------
     table : PlatformTable
-        The readings.
+        Readings of orbit and attitude.
     law : Attitude
-        Orbital axes.
+        Definition of the orbital axes.
     """
 
     table: PlatformTable
@@ -178,7 +183,7 @@ class TabulatedTrajectory:
 
     @property
     def first(self) -> float:
-        """Begin of the span that both orbit and attitude cover, seconds."""
+        """Start of the span that both orbit and attitude cover, seconds."""
         return float(max(self.table.orbit_time[0], self.table.attitude_time[0], self.table.usable[0]))
 
     @property
@@ -188,7 +193,7 @@ class TabulatedTrajectory:
 
     @property
     def orbit_interval(self) -> float:
-        """Median time between fixes, seconds."""
+        """Median time between orbit readings, seconds."""
         return float(np.median(np.diff(self.table.orbit_time)))
 
     @property
@@ -198,12 +203,12 @@ class TabulatedTrajectory:
 
     @property
     def interpolation(self) -> Interpolation:
-        """How positions are joined."""
+        """Method by which positions are interpolated."""
         widest = float(np.max(np.diff(self.table.orbit_time)[~self._gaps(self.table.orbit_time)], initial=0.0))
         return "spline" if widest**4 * _FOURTH_DERIVATIVE / 384.0 <= _SPLINE_ERROR else "lagrange"
 
     def known(self, seconds: ArrayLike) -> np.ndarray:
-        """Whether orbit and attitude are known at times (...), which is not before, after, or in a gap of readings."""
+        """Return whether readings of orbit and attitude cover the times (...): not before, after, or in a gap of them."""
         t = np.asarray(seconds, dtype=np.float64)
         found = in_span(t, self.first, self.last)
         for time in (self.table.orbit_time, self.table.attitude_time):
@@ -214,25 +219,25 @@ class TabulatedTrajectory:
         return found
 
     def position(self, seconds: Any) -> np.ndarray:
-        """Position in the ITRS, metres; (...) -> (..., 3)."""
+        """Return the position in the ITRS, in metres; (...) -> (..., 3)."""
         return np.asarray(self._position(self._checked(seconds)))
 
     def velocity(self, seconds: Any) -> np.ndarray:
-        """Velocity against the turning Earth in axes of the ITRS, m/s; (...) -> (..., 3)."""
+        """Return the velocity relative to the rotating Earth in axes of the ITRS, in m/s; (...) -> (..., 3)."""
         return np.asarray(self._velocity(self._checked(seconds)))
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
-        """Velocity against the stars in axes of the ITRS, m/s; (...) -> (..., 3)."""
+        """Return the velocity relative to the stars in axes of the ITRS, in m/s; (...) -> (..., 3)."""
         return np.asarray(self.velocity(seconds) + carried_with_earth(self.position(seconds)))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
+        """Return the axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
         t = self._checked(seconds)
         turn = Rotation.from_quat(self._quaternion(np.ravel(t))).as_matrix()
         return np.asarray(turn).reshape(*t.shape, 3, 3)
 
     def orbital_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Axes of the orbital frame by the measured orbit as columns, (...) -> (..., 3, 3)."""
+        """Return the axes of the orbital frame by the measured orbit as columns, (...) -> (..., 3, 3)."""
         motion = self.position(seconds), self.velocity(seconds), self.inertial_velocity(seconds)
         return self.law.orbital_to_itrs(*motion)
 
@@ -252,11 +257,13 @@ class TabulatedTrajectory:
         return CubicSpline(self.table.attitude_time, self.table.quaternion)
 
     def _joined(self, values: Array) -> Any:
+        """Return an interpolation of values (N, 3) at the orbit readings."""
         if self.interpolation == "spline":
             return CubicSpline(self.table.orbit_time, values)
         return _Lagrange(self.table.orbit_time, values)
 
     def _checked(self, seconds: Any) -> np.ndarray:
+        """Return the times as an array, or raise UnphysicalError if one of them is not covered by readings."""
         t = np.asarray(seconds, dtype=np.float64)
         good = self.known(t)
         if not np.all(good):
@@ -268,10 +275,11 @@ class TabulatedTrajectory:
 
     @cached_property
     def interpolation_error(self) -> float:
-        """How wrong positions may be halfway between readings, metres, root mean square, by the table itself.
+        """RMS error of positions halfway between readings, metres, estimated from the table itself.
 
-        Every second reading is left out, and what it then deviates by is scaled to the full table by the order of the
-        interpolation, 4 or 10. Zero where that is the noise of the readings, which does not grow with the step.
+        Every second reading is left out, and its deviation from the interpolation of the others is scaled to the full
+        table by the order of the interpolation, 4 or 10. The error is zero where the deviation is the noise of the
+        readings, which does not grow with the step.
         """
         time, place = self.table.orbit_time, self.table.position
         step = np.diff(time)
@@ -293,13 +301,13 @@ class TabulatedTrajectory:
 
     @staticmethod
     def _gaps(time: Array) -> np.ndarray:
-        """(N - 1,) which intervals between readings are gaps."""
+        """Return which intervals between readings are gaps, (N - 1,) bool."""
         step = np.diff(time)
         return np.asarray(step > _GAP * np.median(step))
 
 
 class _Lagrange:
-    """Values (N, K) at times (N,), joined by the polynomial through the readings around each time."""
+    """Interpolation of values (N, K) at times (N,) by the polynomial through the readings around each time."""
 
     def __init__(self, time: Array, values: Array) -> None:
         self._time, self._values = time, values
@@ -309,10 +317,11 @@ class _Lagrange:
         return self._evaluated(seconds, 0)
 
     def slope(self, seconds: Any) -> np.ndarray:
-        """Derivative, per second."""
+        """Return the derivative, per second."""
         return self._evaluated(seconds, 1)
 
     def _evaluated(self, seconds: Any, order: int) -> np.ndarray:
+        """Return the interpolated values (order 0) or their derivatives (order 1)."""
         t = np.ravel(np.asarray(seconds, dtype=np.float64))
         at = np.searchsorted(self._time, t, side="right") - self._count // 2
         at = np.clip(at, 0, len(self._time) - self._count)

@@ -1,10 +1,10 @@
-"""A line sensor in orbit: from pixel and time to the ground and back.
+"""Line sensor in orbit: from pixel and time to the ground and back.
 
 Nothing is interpolated along the track, so that no smoothness of attitude or orbit is assumed.
 
-The two ways are written separately, each from the physics: `ground` follows a pixel's look down to a height, `image`
-looks for the line and the pixel on which the light from a point falls. They share no solution, so that the round trip
-tests both.
+The two directions are written separately, each from the physics: `ground` follows a pixel's look down to a height,
+`image` searches the line and the pixel on which the light from a point falls. They share no solution, so that the round
+trip tests both.
 """
 
 from __future__ import annotations
@@ -22,38 +22,42 @@ from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, LightEffects, aberra
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
 
 _MOST_STEPS = 30
+"""Largest number of Newton steps."""
 _ARRIVED = 1e-7
-"""Pixels and lines: the last Newton step. The steps shrink a thousandfold each, so far less than this is left."""
+"""Length of the last Newton step, in pixels and lines.
+
+The steps shrink a thousandfold each, so the error that remains is far smaller.
+"""
 
 
 class Platform(Protocol):
-    """What the model needs to know of a trajectory, Earth-fixed (ITRS axes), at times (N,) in seconds.
+    """Interface of a trajectory: Earth-fixed motion (ITRS axes) at times (N,) in seconds.
 
-    Each raises ValueError for a time outside of what is known.
+    Each method raises ValueError for a time that the trajectory does not cover.
     """
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Position of the body's origin, (N, 3), metres."""
+        """Return the position of the body's origin, (N, 3), in metres."""
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """Against the stars, (N, 3), m/s."""
+        """Return the velocity relative to the stars, (N, 3), in m/s."""
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """Columns = body axes X, Y, Z, (N, 3, 3)."""
+        """Return matrices whose columns are the body axes X, Y, Z, (N, 3, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class MovedPlatform:
-    """A platform that is elsewhere and holds itself otherwise.
+    """Platform with a constant offset of position and attitude.
 
     Attributes
     ----------
     base : Platform
-        without.
-    shift : np.ndarray
-        In body axes, metres.
-    turn : np.ndarray
-        Rotation vector in body axes, radians.
+        Platform without the offset.
+    shift : (3,) ndarray
+        Offset of position in body axes, metres.
+    turn : (3,) ndarray
+        Rotation vector of the offset of attitude in body axes, radians.
     """
 
     base: Platform
@@ -61,44 +65,44 @@ class MovedPlatform:
     turn: np.ndarray
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Positions, shifted."""
+        """Return the shifted positions, (N, 3), in metres."""
         at = self.base.position(seconds)
         return at + self.base.body_to_itrs(seconds) @ self.shift if np.any(self.shift) else at
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """Velocities against the stars, which stay as they are."""
+        """Return the velocities relative to the stars, which the offset leaves unchanged, (N, 3), in m/s."""
         return self.base.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """Axes, turned."""
+        """Return the rotated body axes as columns, (N, 3, 3)."""
         return np.asarray(self.base.body_to_itrs(seconds) @ rotation_matrix(self.turn))
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """A line camera on its way.
+    """Line camera on a trajectory, with the exposure times of its image's lines.
 
     Image coordinates are (line, pixel), real numbers; the centre of the first line's first pixel is (0, 0) and the
-    image reaches from -0.5 to lines - 0.5 and to pixels - 0.5.
+    image extends from -0.5 to lines - 0.5 and to pixels - 0.5.
 
     Attributes
     ----------
     camera : LineCamera
-        The line.
+        Geometry of the line.
     trajectory : Platform
         Position, velocity and attitude over time.
     earth : Earth
-        The ellipsoid.
+        Ellipsoid and its orientation.
     line_time : float
-        From one line to the next, seconds.
+        Time from one line to the next, seconds.
     first_line_time : float
         Middle of the exposure of line 0, seconds of the trajectory.
     lines : int
-        How many lines the image has.
+        Number of lines of the image.
     effects : LightEffects
-        Which of light time, aberration and refraction are on.
-    times : LineTimes | None
-        Of its lines, where they are given as a table; None where lines follow one another evenly.
+        Choice of light time, aberration and refraction.
+    times : LineTimes or None
+        Table of exposure times; None for lines at a constant interval.
 
     Raises
     ------
@@ -124,7 +128,7 @@ class Sensor:
     def of_lines(
         cls, camera: LineCamera, trajectory: Platform, earth: Earth, times: LineTimes, effects: LightEffects
     ) -> Sensor:
-        """The sensor whose lines, counted from 0, were exposed at the times of a table.
+        """Return the sensor whose lines, counted from 0, were exposed at the times of a table.
 
         Raises
         ------
@@ -135,32 +139,32 @@ class Sensor:
         return cls(camera, trajectory, earth, times.line_time, float(times.time[0]), lines, effects, times)
 
     def time(self, line: np.ndarray) -> np.ndarray:
-        """Time of exposure of lines (N,), seconds of the trajectory."""
+        """Return the time of exposure of lines (N,), in seconds of the trajectory."""
         if self.times is not None:
             return self.times.at(line)
         return self.first_line_time + np.asarray(line, dtype=np.float64) * self.line_time
 
     def ground(self, line: np.ndarray, pixel: np.ndarray, height: np.ndarray | float = 0.0) -> np.ndarray:
-        """Where pixels see the surface of a given height.
+        """Return the ground points that pixels see on the surface of a given height.
 
         Parameters
         ----------
-        line : np.ndarray
-            Image coordinate, broadcastable to (N,).
-        pixel : np.ndarray
-            likewise.
-        height : np.ndarray | float
-            Above the ellipsoid, metres, broadcastable to (N,).
+        line : ndarray
+            Line coordinate, broadcastable to (N,).
+        pixel : ndarray
+            Pixel coordinate, broadcastable to (N,).
+        height : ndarray or float
+            Height above the ellipsoid, metres, broadcastable to (N,).
 
         Returns
         -------
-        np.ndarray
-            Points in the ITRS, (N, 3), metres; NaN where the look misses the Earth.
+        (N, 3) ndarray
+            Points in the ITRS, metres; NaN where the look misses the Earth.
 
         Raises
         ------
         ValueError
-            a line or a pixel outside the image.
+            A line or a pixel lies outside the image.
         """
         line, pixel, height = (np.ravel(a) for a in np.broadcast_arrays(line, pixel, height))
         self._require_inside(line)
@@ -181,19 +185,20 @@ class Sensor:
         return point
 
     def image(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the image of ground points lies.
+        """Return the image coordinates of ground points.
 
-        Newton's method on line and pixel, on the two components of the light's direction square to the pixel's look.
+        Newton's method on line and pixel, on the two components of the light's direction perpendicular to the pixel's
+        look.
 
         Parameters
         ----------
-        point : np.ndarray
-            In the ITRS, (N, 3), metres.
+        point : (N, 3) ndarray
+            Points in the ITRS, metres.
 
         Returns
         -------
-        tuple[np.ndarray, np.ndarray]
-            Line and pixel, (N,) each; both NaN for a point that the image does not hold (its mask is
+        tuple of ndarray
+            Line and pixel, (N,) each; both NaN for a point outside the image (the mask of those inside is
             ``np.isfinite(line)``), for a NaN, and for a point that the body of the Earth hides.
         """
         point = np.asarray(point, dtype=np.float64).reshape(-1, 3)
@@ -218,7 +223,7 @@ class Sensor:
         return np.where(arrived, line, np.nan), np.where(arrived, pixel, np.nan)
 
     def _step(self, point: np.ndarray, line: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-        """Newton step (N, 2) of line and pixel."""
+        """Return the Newton step of line and pixel, (N, 2)."""
         look, slope = self.camera.look_and_slope(pixel)
         rate = np.linalg.norm(slope, axis=-1)
         along = slope / rate[:, None]
@@ -235,7 +240,7 @@ class Sensor:
         return np.stack([line_step, (here[:, 0] + by_line[:, 0] * line_step) / rate], axis=-1)
 
     def _arrival(self, point: np.ndarray, line: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-        """Unit directions, body frame, from which light of the points comes to the camera at a line, (N, 3)."""
+        """Return unit directions from which light of the points reaches the camera at a line, body frame, (N, 3)."""
         seconds = self.time(line)
         to_itrs = self.trajectory.body_to_itrs(seconds)
         station = self._station(seconds, to_itrs, pixel)
@@ -257,14 +262,16 @@ class Sensor:
         return np.einsum("nij,ni->nj", to_itrs, direction)
 
     def _station(self, seconds: np.ndarray, to_itrs: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        """Return the origins of the pixels' rays in the ITRS, (N, 3), in metres."""
         return self.trajectory.position(seconds) + np.einsum("nij,nj->ni", to_itrs, self.camera.origin(pixel))
 
     def _faces(self, point: np.ndarray, line: np.ndarray) -> np.ndarray:
-        """Whether the points see the satellite above their horizon, (N,)."""
+        """Return whether the points see the satellite above their horizon, (N,)."""
         lon, lat, _ = self.earth.geodetic(point)
         outward = east_north_up(lon, lat)[:, 2]
         return np.sum((self.trajectory.position(self.time(line)) - point) * outward, axis=-1) > 0.0
 
     def _require_inside(self, line: np.ndarray) -> None:
+        """Raise ValueError if a line lies outside the image."""
         if not np.all(in_span(line, -0.5, self.lines - 0.5)):
             raise ValueError(f"a line outside the image, which reaches from -0.5 to {self.lines - 0.5}")

@@ -1,20 +1,19 @@
-"""Where a satellite is, how it holds itself, and how both are measured.
+"""Position and attitude of a satellite, their measurement errors, and jitter.
 
 The orbital frame has Z down, X forward and Y = Z x X, which lies to the right of the track and against the orbit's
 angular momentum.
 
-Readings come at a fixed interval. What depends on chance is drawn for every reading of the span beforehand and joined
-by a cubic spline, as a user of the data would interpolate them: at a reading the error has the stated deviation,
-halfway between two it is somewhat smaller. Each term draws from a random stream of its own, so that leaving one out
-does not change the others.
+Readings come at a fixed interval. Random errors are drawn for every reading of the span beforehand and interpolated by
+a cubic spline, as a user of the data would do: at a reading the error has the specified standard deviation, halfway
+between two it is somewhat smaller. Each term draws from its own random stream, so that leaving one out does not change
+the others.
 
-Jitter: small fast turns of a body about its own axes, by frequency.
-
-It is a sum of sinusoids and is evaluated, never interpolated. The noise of a band consists of sinusoids, too: the band
-is cut into equal parts, each has one frequency drawn evenly within it, and two normal amplitudes whose variance is the
-level times the part's width. The motion is then Gaussian at every time with exactly the stated variance, its expected
-spectrum is exactly the stated one, and it does not repeat. Over longer than the inverse width of a part, some seconds,
-its spectrum shows as the lines that it consists of.
+Jitter is small fast rotations of the body about its own axes, specified by frequency. It is a sum of sinusoids and is
+evaluated, never interpolated. The noise of a band consists of sinusoids, too: the band is cut into equal parts, each
+has one frequency drawn uniformly within it, and two normal amplitudes whose variance is the level times the part's
+width. The motion is then Gaussian at every time with exactly the specified variance, its expected spectrum is exactly
+the specified one, and it does not repeat. Over longer than the inverse width of a part, some seconds, its spectrum
+shows as the lines that it consists of.
 """
 
 from __future__ import annotations
@@ -37,28 +36,29 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec, JitterSpec
 
 JITTER_STREAM = 2**31
-"""Number of the random stream of jitter among those of a pass; far from those that are counted."""
+"""Number of the random stream of jitter among those of a pass, far above the numbers of the other streams."""
 _RESOLVED = 10.0
-"""Seconds over which the noise of a band is to be told from lines."""
+"""Duration over which the noise of a band is distinguishable from lines, in seconds."""
 _LEAST, _MOST = 64, 4096
-"""Sinusoids of a band."""
+"""Smallest and largest number of sinusoids of a band."""
 _AT_ONCE = 4_000_000
-"""Phases that are held at a time."""
+"""Largest number of phases held in memory at a time."""
 _MOMENTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
+"""Numbers of moments within a collection that are tried in turn."""
 
 
 @dataclass(frozen=True, eq=False)
 class Jitter:
-    """Turns of a body over time: the sum of sine and cosine terms, seen at once or in the mean of a collection.
+    """Rotations of a body over time as a sum of sinusoids, instantaneous or averaged over a collection.
 
     Attributes
     ----------
-    frequency : np.ndarray
-        (K,) hertz.
-    sine, cosine : np.ndarray
-        (K, 3) rotation vectors about body X, Y and Z, radians.
-    collection : Collection | None
-        Over which it is meant; None for its values themselves.
+    frequency : (K,) ndarray
+        Frequencies, hertz.
+    sine, cosine : (K, 3) ndarray
+        Amplitudes as rotation vectors about body X, Y and Z, radians.
+    collection : Collection or None
+        Collection over which the rotation is averaged; None for instantaneous values.
     """
 
     frequency: np.ndarray
@@ -68,14 +68,14 @@ class Jitter:
 
     @classmethod
     def of(cls, spec: JitterSpec, seed: np.random.SeedSequence) -> Jitter | None:
-        """As a file states it; None where it states none.
+        """Make the jitter that an input file specifies; None where it specifies none.
 
         Parameters
         ----------
         spec : JitterSpec
-            Lines and bands.
-        seed : np.random.SeedSequence
-            Of random phases and of bands. Each has a stream of its own.
+            Lines and bands of the spectrum.
+        seed : SeedSequence
+            Seed of random phases and of bands. Each line and each band has its own stream.
         """
         if not spec.stated:
             return None
@@ -95,7 +95,7 @@ class Jitter:
         return cls(frequencies, sines, cosines)
 
     def __call__(self, seconds: np.ndarray) -> np.ndarray:
-        """Rotation vectors in body axes at times (...), seconds: (..., 3), radians."""
+        """Return rotation vectors in body axes at times (...), seconds: (..., 3), in radians."""
         t = np.asarray(seconds, np.float64)
         # image lines are asked for at many pixels
         moments, where = np.unique(t, return_inverse=True)
@@ -110,36 +110,36 @@ class Jitter:
 
     @property
     def amplitude(self) -> np.ndarray:
-        """(K,) of each sinusoid, about all axes together, radians."""
+        """Amplitude of each sinusoid, about all axes together, (K,), radians."""
         return np.sqrt(np.sum(self.sine**2 + self.cosine**2, axis=1))
 
     def later(self, seconds: float) -> Jitter:
-        """The jitter whose value at a time is that of this one so much later."""
+        """Return the jitter whose value at time t is the value of this one at t + seconds."""
         angle = 2.0 * np.pi * self.frequency[:, None] * seconds
         sine = self.sine * np.cos(angle) - self.cosine * np.sin(angle)
         cosine = self.sine * np.sin(angle) + self.cosine * np.cos(angle)
         return replace(self, sine=sine, cosine=cosine)
 
     def over(self, collection: Collection) -> Jitter:
-        """Its mean over a collection about each time: where the image of a TDI line lies."""
+        """Return the mean of the jitter over a collection about each time, which displaces the image of a TDI line."""
         return replace(self, collection=collection)
 
     def exposures(self, collection: Collection, pixel: float, tolerance: float) -> list[tuple[float, Jitter]]:
-        """Shares of the light of a collection, and the jitter that each saw; their mean is the image.
+        """Return shares of the light of a collection, each with the jitter of its moment; the image is their mean.
 
         Parameters
         ----------
         collection : Collection
-            Of the line.
+            Light collection of the line.
         pixel : float
-            Its angle, radians.
+            Angle of a pixel, radians.
         tolerance : float
-            Of the image's place and smear, pixels.
+            Tolerance of the image's position and smear, pixels.
 
         Raises
         ------
         ValueError
-            An oscillation so fast and large that no reasonable number of moments is enough.
+            An oscillation is so fast and large that no reasonable number of moments is enough.
         """
         own, size = replace(self, collection=None), self.amplitude / pixel
         exact = [collection.mean(k * self.frequency) for k in (1, 2)]
@@ -158,25 +158,26 @@ class Jitter:
         )
 
     def read(self, times: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """As one knows it who reads it at some times (K,) only and joins the readings by a cubic spline: what is faster
-        than half of the readings' rate is mistaken for something slower.
+        """Return the jitter as readings at times (K,), interpolated by a cubic spline, show it.
+
+        What is faster than half of the readings' rate is aliased to a lower frequency.
         """
         return CubicSpline(times, self(times))
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """A law of attitude.
+    """Attitude law of a satellite.
 
     Attributes
     ----------
     geodetic : bool
         Z points along the ellipsoid's normal through the satellite; else to the Earth's centre.
     yaw_steering : bool
-        X lies along the motion of the point below over the turning Earth, so that the image of that point moves square
-        to a line along Y; else along the velocity against the stars.
-    offset : tuple[float, float, float]
-        Rotation vector of the body against the orbital frame, radians.
+        X lies along the motion of the nadir point over the rotating Earth, so that the image of that point moves
+        perpendicular to a line along Y; else along the inertial velocity.
+    offset : tuple of float
+        Rotation vector of the body relative to the orbital frame, radians.
     """
 
     geodetic: bool = True
@@ -185,25 +186,25 @@ class Attitude:
 
     @classmethod
     def from_spec(cls, spec: AttitudeSpec) -> Attitude:
-        """From what the file says."""
+        """Make the attitude law of an input file."""
         return cls(spec.nadir == "geodetic", spec.steering == "yaw", spec.offset)
 
     def orbital_to_itrs(self, position: np.ndarray, velocity: np.ndarray, inertial_velocity: np.ndarray) -> np.ndarray:
-        """Axes of the orbital frame as columns: x_itrs = matrix @ x_orbital.
+        """Return the axes of the orbital frame as columns: x_itrs = matrix @ x_orbital.
 
         Parameters
         ----------
-        position : np.ndarray
-            ITRS, metres, shape (..., 3).
-        velocity : np.ndarray
-            Against the turning Earth, m/s, shape (..., 3).
-        inertial_velocity : np.ndarray
-            Against the stars, in axes of the ITRS, m/s, shape (..., 3).
+        position : (..., 3) ndarray
+            Position in the ITRS, metres.
+        velocity : (..., 3) ndarray
+            Velocity relative to the rotating Earth, m/s.
+        inertial_velocity : (..., 3) ndarray
+            Velocity relative to the stars, in axes of the ITRS, m/s.
 
         Returns
         -------
-        np.ndarray
-            Shape (..., 3, 3).
+        (..., 3, 3) ndarray
+            Rotation matrices.
         """
         chosen = velocity if self.yaw_steering else inertial_velocity
         if self.geodetic:
@@ -224,7 +225,9 @@ class Attitude:
         return np.stack([x, np.cross(-up, x), -up], axis=-1)
 
     def body_to_itrs(self, position: np.ndarray, velocity: np.ndarray, inertial_velocity: np.ndarray) -> np.ndarray:
-        """Axes of the body as columns, (..., 3, 3): x_itrs = matrix @ x_body; arguments as `orbital_to_itrs`."""
+        """Return the axes of the body as columns, (..., 3, 3): x_itrs = matrix @ x_body; arguments as
+        `orbital_to_itrs`.
+        """
         return self.orbital_to_itrs(position, velocity, inertial_velocity) @ rotation_matrix(self.offset)
 
 
@@ -239,33 +242,35 @@ TERMS = (
     "attitude_drift",
     "attitude_walk",
 )
-"""All that can be switched."""
+"""Names of the measurement errors that can be switched."""
 
 _SPARE_READINGS = 8
-"""Beyond either end of the span, so that the spline's ends do not matter."""
+"""Number of readings beyond either end of the span, so that the spline's ends do not matter."""
 
 Series = Callable[[np.ndarray], np.ndarray]
+"""Function from times (...), seconds, to vectors (..., 3)."""
 
 
 def readings(first: float, last: float, interval: float) -> np.ndarray:
-    """Times (K,) of readings, seconds: whole multiples of the interval that cover the span, with some to spare."""
+    """Return times (K,) of readings, in seconds: multiples of the interval over the span, with some to spare."""
     begin, end = np.floor(first / interval) - _SPARE_READINGS, np.ceil(last / interval) + _SPARE_READINGS
     return np.asarray(interval * np.arange(begin, end + 1.0))
 
 
 def _noise(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> Series:
+    """Return white noise of standard deviation sigma at each reading."""
     return CubicSpline(time, sigma * np.random.default_rng(seed).standard_normal((time.size, 3)))
 
 
 def _walk(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> Series:
-    """A random walk, zero at the time that is nearest to zero; sigma in a second."""
+    """Return a random walk, zero at the time nearest to zero; sigma is its standard deviation after one second."""
     steps = np.random.default_rng(seed).standard_normal((time.size, 3)) * np.sqrt(time[1] - time[0])
     course = np.cumsum(steps, axis=0)
     return CubicSpline(time, sigma * (course - course[int(np.argmin(np.abs(time)))]))
 
 
 def _drift(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence, correlation_time: float) -> Series:
-    """A stationary first-order Gauss-Markov process: correlation exp(-|dt| / correlation_time), exact at readings."""
+    """Return a stationary first-order Gauss-Markov process with correlation exp(-|dt| / correlation_time)."""
     draws = np.random.default_rng(seed).standard_normal((time.size, 3))
     kept = np.exp(-(time[1] - time[0]) / correlation_time)
     draws[1:] *= np.sqrt(1.0 - kept * kept)
@@ -274,24 +279,24 @@ def _drift(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence, co
 
 @dataclass(frozen=True, eq=False)
 class MeasurementErrors:
-    """Errors, measured minus true; made by `_draw_errors`.
+    """Errors of the measured orbit and attitude, measured minus true; made by `_draw_errors`.
 
     Attributes
     ----------
-    position_terms : tuple[Series, ...]
+    position_terms : tuple of Series
         Series of position errors in the orbital frame, metres.
-    velocity_terms : tuple[Series, ...]
+    velocity_terms : tuple of Series
         Series of velocity errors in the orbital frame, m/s.
-    attitude_terms : tuple[Series, ...]
+    attitude_terms : tuple of Series
         Series of rotation vectors in body axes, radians.
-    bias : np.ndarray
-        Constant rotation vector in body axes, radians, shape (3,).
-    thermal : np.ndarray
-        Amplitude of what changes with latitude, radians, shape (3,).
+    bias : (3,) ndarray
+        Constant rotation vector in body axes, radians.
+    thermal : (3,) ndarray
+        Amplitude of the error that changes with latitude, radians.
     reference : float
-        Latitude at which that vanishes, radians.
-    rate : np.ndarray
-        Of a drift that vanishes at time zero, radians per second, shape (3,).
+        Latitude at which the thermal error vanishes, radians.
+    rate : (3,) ndarray
+        Rate of a drift that vanishes at time zero, radians per second.
     """
 
     position_terms: tuple[Series, ...]
@@ -303,27 +308,27 @@ class MeasurementErrors:
     rate: np.ndarray
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Position errors along the orbital frame's axes, metres; (...) -> (..., 3)."""
+        """Return position errors along the orbital frame's axes, in metres; (...) -> (..., 3)."""
         return _sum(self.position_terms, seconds)
 
     def velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """Velocity errors along the orbital frame's axes, m/s; (...) -> (..., 3)."""
+        """Return velocity errors along the orbital frame's axes, in m/s; (...) -> (..., 3)."""
         return _sum(self.velocity_terms, seconds)
 
     def attitude(self, seconds: np.ndarray, latitude: np.ndarray) -> np.ndarray:
-        """Rotation vectors in body axes, radians: measured = true @ rotation_matrix(vector).
+        """Return rotation vectors in body axes, in radians: measured = true @ rotation_matrix(vector).
 
         Parameters
         ----------
-        seconds : np.ndarray
-            Shape (...).
-        latitude : np.ndarray
-            Geodetic, of the point below, radians, shape (...).
+        seconds : (...) ndarray
+            Times, seconds.
+        latitude : (...) ndarray
+            Geodetic latitude of the nadir point, radians.
 
         Returns
         -------
-        np.ndarray
-            Shape (..., 3).
+        (..., 3) ndarray
+            Rotation vectors.
         """
         shape = np.sin(np.asarray(latitude) - self.reference)
         drift = np.asarray(seconds, np.float64)[..., None] * self.rate
@@ -333,25 +338,25 @@ class MeasurementErrors:
 def _draw_errors(
     spec: ErrorsSpec, first: float, last: float, seed: int, terms: Sequence[str] = TERMS
 ) -> MeasurementErrors:
-    """Errors over a span of time.
+    """Draw measurement errors over a span of time.
 
     Parameters
     ----------
     spec : ErrorsSpec
-        How large they are.
+        Standard deviations and other parameters of the errors.
     first : float
-        Begin of the span, seconds.
+        Start of the span, seconds.
     last : float
-        Its end, seconds.
+        End of the span, seconds.
     seed : int
-        Of all random numbers.
-    terms : Sequence[str]
-        Which of `TERMS` are on; the others are zero.
+        Seed of all random numbers.
+    terms : sequence of str
+        Names, of `TERMS`, of the errors that are on; the others are zero.
 
     Raises
     ------
     ValueError
-        An unknown term.
+        A term is unknown.
     """
     unknown = sorted(set(terms) - set(TERMS))
     if unknown:
@@ -362,7 +367,7 @@ def _draw_errors(
     def drawn(
         name: str, sigma: Sequence[float], interval: float, make: Callable[..., Series] = _noise, *more: float
     ) -> tuple[Series, ...]:
-        """The series of a term; none where it is off."""
+        """Return the series of a term; none where it is off."""
         if name not in terms or not any(sigma):
             return ()
         return (make(readings(first, last, interval), np.array(sigma), streams[name], *more),)
@@ -384,6 +389,7 @@ def _draw_errors(
 
 
 def _sum(series: tuple[Series, ...], seconds: np.ndarray) -> np.ndarray:
+    """Return the sum of series at times, (..., 3)."""
     t = np.asarray(seconds, dtype=np.float64)
     return sum((one(t) for one in series), np.zeros((*t.shape, 3)))
 
@@ -400,11 +406,11 @@ class Trajectory:
         True orbit.
     attitude : Attitude
         Law that the true attitude follows.
-    errors : MeasurementErrors | None
-        Of the measured orbit and attitude; None for the truth.
-    jitter : Series | None
-        Rotation vectors (..., 3) about the body's own axes at times (...), seconds, in which the body departs from the
-        law; None for none. Of a measured trajectory it is what readings of the attitude show of it.
+    errors : MeasurementErrors or None
+        Errors of the measured orbit and attitude; None for the true trajectory.
+    jitter : Series or None
+        Departure of the body from the law: rotation vectors (..., 3) about the body's own axes at times (...), seconds;
+        None for none. Of a measured trajectory it is the jitter that the attitude readings show.
     """
 
     orbit: Orbit
@@ -414,25 +420,25 @@ class Trajectory:
 
     @classmethod
     def flown(cls, orbit: Orbit, spec: AttitudeSpec, seed: int | np.random.SeedSequence, *number: int) -> Trajectory:
-        """The true trajectory of an orbit.
+        """Return the true trajectory of an orbit.
 
         Parameters
         ----------
         orbit : Orbit
-            Where the satellite is.
+            True orbit.
         spec : AttitudeSpec
-            How it holds itself.
-        seed : int | np.random.SeedSequence
-            Of what is random in its jitter, in a stream of its own of this seed.
+            Attitude law and jitter.
+        seed : int or SeedSequence
+            Seed of the random part of the jitter, which has its own stream.
         number : int
-            Of the pass, where several share a seed.
+            Number of the pass, where several share a seed.
         """
         jitter = None if spec.jitter is None else Jitter.of(spec.jitter, stream(seed, JITTER_STREAM, *number))
         return cls(orbit, Attitude.from_spec(spec), jitter=jitter)
 
     @property
     def first(self) -> float:
-        """Begin of the span, seconds."""
+        """Start of the span, seconds."""
         return self.orbit.first
 
     @property
@@ -441,23 +447,23 @@ class Trajectory:
         return self.orbit.last
 
     def position(self, seconds: Any) -> np.ndarray:
-        """Position in the ITRS, metres; (...) -> (..., 3)."""
+        """Return the position in the ITRS, in metres; (...) -> (..., 3)."""
         return self._motion(seconds)[0]
 
     def velocity(self, seconds: Any) -> np.ndarray:
-        """Velocity against the turning Earth in axes of the ITRS, m/s; (...) -> (..., 3)."""
+        """Return the velocity relative to the rotating Earth in axes of the ITRS, in m/s; (...) -> (..., 3)."""
         return self._motion(seconds)[1]
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
-        """Velocity against the stars in axes of the ITRS, m/s; (...) -> (..., 3)."""
+        """Return the velocity relative to the stars in axes of the ITRS, in m/s; (...) -> (..., 3)."""
         return self._motion(seconds)[2]
 
     def orbital_to_itrs(self, seconds: Any) -> np.ndarray:
-        """True axes of the orbital frame as columns, (...) -> (..., 3, 3)."""
+        """Return the true axes of the orbital frame as columns, (...) -> (..., 3, 3)."""
         return self.attitude.orbital_to_itrs(*self.orbit.itrs(seconds))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
+        """Return the axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
         true = self.orbit.itrs(seconds)
         body = self.attitude.body_to_itrs(*true)
         if self.jitter is not None:
@@ -468,22 +474,23 @@ class Trajectory:
         return body @ rotation_matrix(self.errors.attitude(seconds, latitude))
 
     def with_errors(self, spec: ErrorsSpec, seed: int, terms: Sequence[str] = TERMS) -> Trajectory:
-        """The trajectory as the satellite measures it: this one with errors, in place of those it may have, and with
-        jitter as readings of the attitude show it.
+        """Return the trajectory as the satellite measures it.
+
+        Errors replace those that the trajectory may have, and jitter is what readings of the attitude show of it.
 
         Parameters
         ----------
         spec : ErrorsSpec
-            How large the errors are.
+            Standard deviations and other parameters of the errors.
         seed : int
-            Of all random numbers.
-        terms : Sequence[str]
-            Which errors are on, of `twin.orbit.flight.trajectory.TERMS`.
+            Seed of all random numbers.
+        terms : sequence of str
+            Names of the errors that are on, of `twin.orbit.flight.trajectory.TERMS`.
 
         Raises
         ------
         ValueError
-            An unknown term.
+            A term is unknown.
         """
         errors, jitter = _draw_errors(spec, self.first, self.last, seed, terms), self.jitter
         if isinstance(jitter, Jitter):
@@ -491,6 +498,7 @@ class Trajectory:
         return replace(self, errors=errors, jitter=jitter)
 
     def _motion(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return position, velocity and inertial velocity, (..., 3) each, in axes of the ITRS."""
         position, velocity, inertial = self.orbit.itrs(seconds)
         if self.errors is None:
             return position, velocity, inertial

@@ -1,10 +1,9 @@
-"""The ground's frame, random fields on a grid and splines through it.
+"""Plane ground coordinates, random fields and cubic splines on a grid, and the terrain of a patch.
 
-East and north are longitude and latitude times constant lengths, those of the ellipsoid at the patch's middle. The way
-to longitude, latitude and height and back is thus exact wherever one is; only the lengths are not quite true away from
-the middle (at 40 degrees of latitude an east metre is 1.3e-4 wrong 1 km to the north). Heights are above the ellipsoid.
-
-Heights of the ground over the coordinates of a patch.
+East and north are longitude and latitude times constant lengths, those of the ellipsoid at the patch's middle. The
+conversion to longitude, latitude and height and back is thus exact everywhere; only the lengths are not quite true away
+from the middle (at 40 degrees of latitude an east metre is 1.3e-4 wrong 1 km to the north). Heights are above the
+ellipsoid.
 """
 
 from __future__ import annotations
@@ -28,17 +27,17 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.scene import TerrainSpec
 
 _EARTH = Earth()
-"""Only the ellipsoid is used."""
+"""Ellipsoid; the orientation of this Earth is not used."""
 
 
 @dataclass(frozen=True)
 class GroundFrame:
-    """Coordinates about a place.
+    """Plane coordinates east and north about a point of the ellipsoid.
 
     Attributes
     ----------
     longitude, latitude : float
-        Of the place, geodetic, radians.
+        Geodetic coordinates of the point, radians.
     """
 
     longitude: float
@@ -51,53 +50,54 @@ class GroundFrame:
         return float(normal * np.cos(self.latitude)), float(meridian)
 
     def itrs(self, east: Any, north: Any, height: Any) -> np.ndarray:
-        """Points in the ITRS: coordinates (...), metres -> (..., 3), metres."""
+        """Return points in the ITRS: coordinates (...), metres -> (..., 3), metres."""
         return _EARTH.ecef(*self.geographic(east, north), height)
 
     def local(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """East, north and height, metres, (...) each, of points (..., 3) in the ITRS; NaN stays NaN."""
+        """Return east, north and height, in metres, (...) each, of points (..., 3) in the ITRS; NaN stays NaN."""
         longitude, latitude, height = _EARTH.geodetic(points)
         return *self.plane(longitude, latitude), height
 
     def geographic(self, east: Any, north: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Longitude and latitude (...), radians, of east and north (...), metres."""
+        """Return longitude and latitude (...), in radians, of east and north (...), in metres."""
         per_longitude, per_latitude = self.scale
         longitude = self.longitude + np.asarray(east, dtype=np.float64) / per_longitude
         return longitude, self.latitude + np.asarray(north, dtype=np.float64) / per_latitude
 
     def plane(self, longitude: np.ndarray, latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """East and north (...), metres, of longitude, any turn of it, and latitude (...), radians."""
+        """Return east and north (...), in metres, of longitude (in any range) and latitude (...), in radians."""
         per_longitude, per_latitude = self.scale
         turn = (longitude - self.longitude + np.pi) % (2.0 * np.pi) - np.pi
         return turn * per_longitude, (latitude - self.latitude) * per_latitude
 
 
 _CORRELATION_MARGIN = 4.0
-"""Correlation lengths by which a correlated field is drawn larger, so that opposite edges are independent."""
+"""Margin of a correlated field, in correlation lengths, that makes opposite edges independent."""
 
 
 def fractal_field(
     shape: tuple[int, int], spacing: float, exponent: float, longest: float, seed: np.random.SeedSequence
 ) -> np.ndarray:
-    """A field of zero mean and unit rms whose amplitude spectrum falls like frequency^-exponent.
+    """Draw a field of zero mean and unit rms whose amplitude spectrum falls like frequency^-exponent.
 
     Parameters
     ----------
-    shape : tuple[int, int]
+    shape : tuple of int
         Rows and columns.
     spacing : float
-        Of the grid, metres.
+        Grid spacing, metres.
     exponent : float
-        For a surface of fractal dimension D it is 4 - D, between 1 and 2; mountains have about 2.
+        Exponent of the amplitude spectrum: 4 - D for a surface of fractal dimension D, between 1 and 2; mountains have
+        about 2.
     longest : float
         Wavelength above which the spectrum stays level, metres.
-    seed : np.random.SeedSequence
-        Of the noise.
+    seed : SeedSequence
+        Seed of the noise.
 
     Returns
     -------
-    np.ndarray
-        float32, of the shape.
+    ndarray of float32
+        Field of the shape.
     """
     spectrum = _white_spectrum(shape, seed)
     along = fft.rfftfreq(shape[1], spacing) ** 2 + longest**-2.0
@@ -110,23 +110,23 @@ def fractal_field(
 
 
 def correlated_field(shape: tuple[int, int], spacing: float, length: float, seed: np.random.SeedSequence) -> np.ndarray:
-    """A field whose values have zero expectation, unit standard deviation and correlation exp(-(distance/length)^2/2).
+    """Draw a random field with zero mean, unit standard deviation and correlation exp(-(distance/length)^2/2).
 
     Parameters
     ----------
-    shape : tuple[int, int]
+    shape : tuple of int
         Rows and columns.
     spacing : float
-        Of the grid, metres.
+        Grid spacing, metres.
     length : float
-        Of the correlation, metres.
-    seed : np.random.SeedSequence
-        Of the noise.
+        Correlation length, metres.
+    seed : SeedSequence
+        Seed of the noise.
 
     Returns
     -------
-    np.ndarray
-        float32, of the shape.
+    ndarray of float32
+        Field of the shape.
     """
     spare = int(np.ceil(_CORRELATION_MARGIN * length / spacing))
     larger = (fft.next_fast_len(shape[0] + spare, True), fft.next_fast_len(shape[1] + spare, True))
@@ -138,34 +138,36 @@ def correlated_field(shape: tuple[int, int], spacing: float, length: float, seed
 
 
 def _root_of_covariance(count: int, step: float) -> np.ndarray:
-    """Square root of the transform of the covariance along one axis, whose grid closes to a ring, (count,)."""
+    """Return the square root of the spectrum of the covariance along one periodic axis, (count,)."""
     distance = step * np.minimum(np.arange(count), count - np.arange(count))
     # the covariance of a ring is not quite positive: what is below zero is rounding
     return np.sqrt(np.maximum(fft.fft(np.exp(-0.5 * distance**2)).real, 0.0)).astype(np.float32)
 
 
 def _white_spectrum(shape: tuple[int, int], seed: np.random.SeedSequence) -> np.ndarray:
+    """Return the spectrum of unit white noise on a grid."""
     noise = np.random.Generator(np.random.SFC64(seed)).standard_normal(shape, dtype=np.float32)
     return np.asarray(fft.rfft2(noise, workers=cores()))
 
 
 Beyond = Literal["mirror", "grid-wrap", "nothing"]
+"""Continuation of a spline outside its grid."""
 
 
 @dataclass(frozen=True, eq=False)
 class SplineGrid:
-    """A cubic B-spline over a grid.
+    """Cubic B-spline over a grid.
 
     Attributes
     ----------
-    coefficients : np.ndarray
-        Weights of the B-splines, (rows, columns); rows go north, columns east.
-    spacing : tuple[float, float]
-        Of the grid east and north, metres.
-    first : tuple[float, float]
+    coefficients : (rows, columns) ndarray
+        Weights of the B-splines; rows go north, columns east.
+    spacing : tuple of float
+        Grid spacing east and north, metres.
+    first : tuple of float
         East and north of the first row's first column, metres.
     beyond : Beyond
-        How it goes on outside: mirrored about the outer rows and columns, repeated, or not at all.
+        Continuation outside: mirrored about the outer rows and columns, repeated, or none.
     """
 
     coefficients: np.ndarray
@@ -175,7 +177,7 @@ class SplineGrid:
 
     @property
     def reach(self) -> tuple[float, float, float, float]:
-        """West, east, south and north end of where it is known, metres, if nothing is beyond."""
+        """West, east, south and north bound of its domain, metres, if it is not continued beyond the grid."""
         (rows, columns), (east, north) = self.coefficients.shape, self.first
         # a place needs one B-spline before its cell and two after
         return (
@@ -186,12 +188,12 @@ class SplineGrid:
         )
 
     def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """Values at places, metres, any equal shapes.
+        """Return values at positions, in metres, of any equal shapes.
 
         Raises
         ------
         ValueError
-            a place outside, where nothing is.
+            A position lies outside a grid without continuation.
         """
         if self.beyond == "nothing":
             self._require_inside(east, north)
@@ -203,21 +205,21 @@ class SplineGrid:
         )
 
     def on_grid(self, east: np.ndarray, north: np.ndarray, derivative: tuple[int, int] = (0, 0)) -> np.ndarray:
-        """Values, or first derivatives, on a regular grid: east (E,) and north (N,), metres -> (N, E).
+        """Return values, or first derivatives, on a regular grid: east (E,) and north (N,), metres -> (N, E).
 
         Parameters
         ----------
-        east : np.ndarray
-            Of the columns.
-        north : np.ndarray
-            Of the rows.
-        derivative : tuple[int, int]
-            How often by east and by north, 0 or 1.
+        east : (E,) ndarray
+            East of the columns, metres.
+        north : (N,) ndarray
+            North of the rows, metres.
+        derivative : tuple of int
+            Order of the derivative by east and by north, 0 or 1.
 
         Raises
         ------
         ValueError
-            a place outside, where nothing is.
+            A position lies outside a grid without continuation.
         """
         if self.beyond == "nothing":
             self._require_inside(east, north)
@@ -230,7 +232,7 @@ class SplineGrid:
         return np.asarray((along @ (across @ self.coefficients).T).T)
 
     def _weights(self, place: np.ndarray, count: int, derivative: int) -> csr_array:
-        """Matrix from the coefficients along one axis to values at places in cells, (places, count)."""
+        """Return the matrix from coefficients along one axis to values at positions in cells, (positions, count)."""
         cell = np.floor(place).astype(np.intp)
         t = (place - cell)[:, None]
         if derivative:
@@ -252,6 +254,7 @@ class SplineGrid:
         return csr_array((weight.ravel(), (row, column.ravel())), shape=(len(place), count))
 
     def _require_inside(self, east: np.ndarray, north: np.ndarray) -> None:
+        """Raise UnphysicalError if positions lie outside the domain."""
         west_end, east_end, south_end, north_end = self.reach
         low, high = (np.min(east), np.min(north)), (np.max(east), np.max(north))
         if not (low[0] >= west_end and high[0] <= east_end and low[1] >= south_end and high[1] <= north_end):
@@ -263,12 +266,12 @@ class SplineGrid:
 
 
 _MOST_POSTS = 4096
-"""Posts along a side of a fractal; it repeats beyond."""
+"""Largest number of posts along a side of a fractal; it repeats beyond."""
 
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights above the ellipsoid, the same function for the renderer, for true coordinates and for elevation models.
+    """Heights above the ellipsoid, the same function for renderer, true coordinates and elevation models.
 
     Attributes
     ----------
@@ -280,16 +283,16 @@ class Terrain:
 
     @classmethod
     def from_spec(cls, spec: TerrainSpec, side: float, seed: np.random.SeedSequence) -> Terrain:
-        """From what the file says.
+        """Make the terrain of an input file.
 
         Parameters
         ----------
         spec : TerrainSpec
-            terrain.
+            Terrain of the input file.
         side : float
-            Of the ground that is used, metres; a fractal repeats after half as much again, or later.
-        seed : np.random.SeedSequence
-            Of a fractal.
+            Side of the ground that is used, metres; a fractal repeats after one and a half times this, or later.
+        seed : SeedSequence
+            Seed of a fractal.
         """
         match spec.kind:
             case "real":
@@ -301,23 +304,24 @@ class Terrain:
 
     @classmethod
     def flat(cls, height: float) -> Terrain:
-        """Level ground."""
+        """Return level ground of a height, in metres."""
         return cls(SplineGrid(np.full((2, 2), float(height)), (1e3, 1e3), (0.0, 0.0), "mirror"))
 
     @classmethod
     def through(cls, posts: np.ndarray, spacing: tuple[float, float], first: tuple[float, float]) -> Terrain:
-        """A spline through posts (rows to the north, columns to the east), mirrored beyond them; spacing and first
-        place as in `SplineGrid`, metres.
+        """Return a spline through posts (rows to the north, columns to the east), mirrored beyond them.
+
+        Spacing and position of the first post are in metres, as in `SplineGrid`.
         """
         posts = np.asarray(posts, dtype=np.float64)
         return cls(SplineGrid(spline_filter(posts, order=3, mode="mirror"), spacing, first, "mirror"))
 
     @classmethod
     def real(cls, spec: TerrainSpec) -> Terrain:
-        """The model of the Jacksboro fault that matplotlib ships, moved so that its middle lies at minus the offset.
+        """Return the elevation model of the Jacksboro fault that matplotlib ships, shifted by the offset.
 
-        Its heights, above the geoid there, are taken as heights about their mean; its posts, 3 arc seconds, keep their
-        distance in metres.
+        Its middle lies at minus the offset. Its heights, above the geoid there, are taken as heights about their mean;
+        its posts, 3 arc seconds, keep their distance in metres.
         """
         posts, spacing = _jacksboro()
         about = posts - posts.mean()
@@ -328,7 +332,7 @@ class Terrain:
 
     @classmethod
     def fractal(cls, spec: TerrainSpec, side: float, seed: np.random.SeedSequence) -> Terrain:
-        """Drawn with a power law as its spectrum."""
+        """Draw a terrain with a power law as its spectrum."""
         count = 64
         while count * spec.post < 1.5 * side and count < _MOST_POSTS:
             count *= 2
@@ -339,27 +343,27 @@ class Terrain:
         return cls(SplineGrid(coefficients, (spec.post, spec.post), (corner, corner), "grid-wrap"))
 
     def height(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """Heights at places, metres, of the places' shape."""
+        """Return heights at positions, in metres, of the positions' shape."""
         return self.surface(east, north)
 
     def on_grid(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """Heights on a regular grid: (E,), (N,) -> (N, E), metres."""
+        """Return heights on a regular grid: (E,), (N,) -> (N, E), in metres."""
         return self.surface.on_grid(east, north)
 
     def slopes(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Exact slopes toward east and toward north on a regular grid, (N, E) each."""
+        """Return exact slopes toward east and toward north on a regular grid, (N, E) each."""
         return self.surface.on_grid(east, north, (1, 0)), self.surface.on_grid(east, north, (0, 1))
 
     @cached_property
     def limits(self) -> tuple[float, float]:
-        """Heights between which it lies, metres."""
+        """Bounds of its heights, metres."""
         # a B-spline lies between its coefficients
         return float(self.surface.coefficients.min()), float(self.surface.coefficients.max())
 
 
 @cache
 def _jacksboro() -> tuple[np.ndarray, tuple[float, float]]:
-    """Heights (rows to the north), metres, and the posts' distance east and north, metres."""
+    """Return heights (rows to the north), in metres, and the posts' distance east and north, in metres."""
     # found without importing matplotlib, which only draws
     found = find_spec("matplotlib")
     assert found is not None

@@ -1,13 +1,11 @@
-"""What is known of the ground before a pass: an orthophoto of another date and a reference elevation model.
+"""Simulated ground and its control: reflectance, orthophoto of another date, reference elevation model.
 
-Both carry the same error in plan, a constant shift and a smooth part: what the map shows at a place lies on the ground
-at that place minus the error.
+Orthophoto and elevation model carry the same error in plan, a constant shift and a smooth part: the ground shown at a
+position of the map lies at that position minus the error.
 
-Reflectance of the ground, and how bright it looks from above.
-
-The ground is drawn: a fractal for what grows wild, fields in blocks of one direction each, roads. It is kept in cells
-and used as the cubic B-spline of the cells' numbers, whose spectrum falls with sinc^4 of frequency times the cells'
-side: what a camera or an orthophoto samples is defined at every place, and has nothing left near the sampling
+The reflectance is drawn: a fractal for wild vegetation, fields in blocks of one direction each, roads. It is kept in
+cells and used as the cubic B-spline of the cells' numbers, whose spectrum falls with sinc^4 of frequency times the
+cells' side: what a camera or an orthophoto samples is defined at every position, and has nothing left near the sampling
 frequencies.
 """
 
@@ -29,26 +27,32 @@ if TYPE_CHECKING:
 
 _DARKEST, _BRIGHTEST = 0.02, 0.85
 _EXPONENT = 1.25
-"""Exponent of the fractal's amplitude spectrum. Images of land have power spectra near frequency^-2 to frequency^-3
-(Burton and Moorhead, Appl. Opt. 26, 157 (1987): natural scenes in general)."""
+"""Exponent of the fractal's amplitude spectrum.
+
+Images of land have power spectra near frequency^-2 to frequency^-3 (Burton and Moorhead, Appl. Opt. 26, 157 (1987):
+natural scenes in general).
+"""
 _WILD = 2.5
-"""Longest wavelength of what grows wild, in fields."""
+"""Longest wavelength of wild vegetation, in fields."""
 _BLOCK = 8.0
 """Side of a block of fields of one direction, in fields."""
 _LANE = 0.97
-"""Share of a field's side that is left between lanes."""
+"""Share of a field's side between the lanes that separate fields."""
 _ROAD_WIDTH = 8.0
+"""Width of a road, in metres."""
 _ROAD_BRIGHTNESS = 1.8
-"""Brightness of a road over the mean."""
+"""Reflectance of a road relative to the mean."""
 _SHIFT_BITS = 4
+"""Fractional bits of polygon coordinates in OpenCV."""
 _ROWS = 512
+"""Number of rows processed at a time, to bound memory."""
 _SPARE = 4
-"""Cells kept beyond the ground that is asked for."""
+"""Number of cells beyond the requested ground."""
 
 
 @dataclass(frozen=True)
 class Extent:
-    """A rectangle of ground: its ends, metres."""
+    """Rectangle of ground, by its bounds in metres east and north."""
 
     west: float
     east: float
@@ -57,15 +61,18 @@ class Extent:
 
     @property
     def side(self) -> float:
-        """The longer one, metres."""
+        """Longer side, metres."""
         return max(self.east - self.west, self.north - self.south)
 
     def grown(self, by: float) -> Extent:
-        """Larger by so much on every side, metres."""
+        """Return the extent enlarged by a margin on every side, in metres."""
         return Extent(self.west - by, self.east + by, self.south - by, self.north + by)
 
     def axes(self, spacing: float, spare: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """East of the columns and north of the rows of cells that cover it, metres; whole multiples of the spacing."""
+        """Return east of the columns and north of the rows of cells that cover it, in metres.
+
+        They are whole multiples of the spacing; `spare` is the number of additional cells on every side.
+        """
         (west, south), (east, north) = (
             [int(f(v / spacing)) for v in ends]
             for f, ends in ((np.floor, (self.west, self.south)), (np.ceil, (self.east, self.north)))
@@ -76,7 +83,7 @@ class Extent:
 
 
 def around(extents: Sequence[Extent]) -> Extent:
-    """The smallest extent that holds all of them."""
+    """Return the smallest extent that contains all of them."""
     return Extent(
         min(e.west for e in extents),
         max(e.east for e in extents),
@@ -86,18 +93,18 @@ def around(extents: Sequence[Extent]) -> Extent:
 
 
 def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence, changed: float = 0.0) -> SplineGrid:
-    """Reflectance over an extent.
+    """Draw the reflectance over an extent.
 
     Parameters
     ----------
     extent : Extent
-        Of the ground.
+        Extent of the ground.
     spec : TextureSpec
-        What the file says.
-    seed : np.random.SeedSequence
-        Of the ground; the same seed and extent give the same ground.
+        Texture of the input file.
+    seed : SeedSequence
+        Seed of the ground; the same seed and extent give the same ground.
     changed : float
-        Share of the fields that look different from those of 0; which, and how, is of the same seed.
+        Share of the fields that look different from those at 0; which fields, and how, depends on the same seed.
     """
     wild, plots, mask, ways = (stream(seed, k) for k in range(4))
     east, north = extent.axes(spec.spacing, _SPARE)
@@ -118,25 +125,25 @@ def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence,
 
 
 def apparent(ground: SplineGrid, terrain: Terrain, light: LightSpec) -> SplineGrid:
-    """What the ground looks like from above the air: the reflectance of level ground, without air, that looks so.
+    """Return the apparent reflectance: that of level ground without air that looks equally bright from above.
 
-    Lambert's law for the Sun on the slopes, even light from the sky, a transmission and a constant path radiance.
+    Lambert's law for the Sun on the slopes, uniform light from the sky, a transmission and a constant path radiance.
     Slopes throw no shadow on others.
 
     Parameters
     ----------
     ground : SplineGrid
-        reflectance.
+        Reflectance.
     terrain : Terrain
-        Under it.
+        Terrain under it.
     light : LightSpec
         Sun and air.
 
     Returns
     -------
     SplineGrid
-        Cells as the ground's. Level ground in a high sun of 90 degrees looks as bright as its reflectance times the
-        transmission, plus the path's share.
+        Apparent reflectance in the ground's cells. Level ground in a high sun of 90 degrees has its reflectance times
+        the transmission, plus the path's share.
     """
     rows, columns = ground.coefficients.shape
     east = ground.first[0] + ground.spacing[0] * np.arange(columns)
@@ -160,7 +167,7 @@ def _fields(
     seed: np.random.SeedSequence,
     changed: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fields' brightness, of zero mean and unit rms, and where there are any."""
+    """Return the fields' brightness, of zero mean and unit rms, and the mask of ground that fields cover."""
     random = np.random.default_rng(seed)
     fields, covered = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
     block = _BLOCK * spec.parcel_size
@@ -182,7 +189,7 @@ def _fields(
 
 
 def _split(half: float, size: float, random: np.random.Generator) -> Iterator[tuple[float, float, float, float]]:
-    """Rectangles about the origin (west, east, south, north), of mean area size^2, that fill a square."""
+    """Yield rectangles about the origin (west, east, south, north), of mean area size^2, that fill a square."""
     waiting = [(-half, half, -half, half)]
     while waiting:
         west, east, south, north = waiting.pop()
@@ -202,7 +209,7 @@ def _split(half: float, size: float, random: np.random.Generator) -> Iterator[tu
 def _draw_roads(
     level: np.ndarray, extent: Extent, spec: TextureSpec, first: tuple[float, float], seed: np.random.SeedSequence
 ) -> None:
-    """Wandering lines across the whole ground, one in each `roads` metres, either way."""
+    """Draw wandering lines across the whole ground, one in each `roads` metres, in both directions."""
     random = np.random.default_rng(seed)
     value = float(min(_ROAD_BRIGHTNESS * spec.mean, _BRIGHTEST))
     step = 0.1 * spec.roads
@@ -224,35 +231,35 @@ def _draw_roads(
 
 
 SCALE = 10_000.0
-"""Grey values of an orthophoto for a reflectance of 1."""
+"""Grey value of an orthophoto for an apparent reflectance of 1."""
 _PER_LENGTH = 8.0
-"""Cells of the smooth error in plan, in its correlation length."""
+"""Number of cells of the smooth error in plan in its correlation length."""
 _ROWS_AT_ONCE = 256
-"""Rows of control that are sampled at once, to bound memory."""
+"""Number of rows of control sampled at a time, to bound memory."""
 _MARGIN = 50.0
-"""Metres of true ground that are kept about the map, beside ten sigmas of its error in plan."""
+"""Margin of the smooth error's grid about the true ground, in metres."""
 
 
 class Map(Protocol):
-    """A raster whose places are known."""
+    """Interface of a georeferenced raster."""
 
     @property
     def values(self) -> np.ndarray:
-        """(rows, columns)."""
+        """Values, (rows, columns)."""
 
     @property
     def valid(self) -> np.ndarray | None:
-        """(rows, columns) bool: which values there are; None for all."""
+        """Mask of valid values, (rows, columns) bool; None if all are valid."""
 
     @property
     def spacing(self) -> float:
         """Distance of rows and columns on the ground, metres."""
 
     def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates of places (row, column), whole or not, metres, broadcast."""
+        """Return east and north, in metres, at real-valued (row, column), broadcast."""
 
     def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column (whole or not) of coordinates, metres, broadcast: the inverse of `east_north`."""
+        """Return real-valued row and column of coordinates, in metres, broadcast: the inverse of `east_north`."""
 
 
 M = TypeVar("M", bound=Map, covariant=True)
@@ -260,7 +267,7 @@ M = TypeVar("M", bound=Map, covariant=True)
 
 @dataclass(frozen=True, eq=False)
 class Maps(Generic[M]):
-    """What is known of the ground.
+    """Control of a piece of ground: orthophoto and elevation model.
 
     Attributes
     ----------
@@ -276,18 +283,18 @@ class Maps(Generic[M]):
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """A map on a regular grid of longitude and latitude.
+    """Map on a regular grid of longitude and latitude.
 
     Attributes
     ----------
-    values : np.ndarray
-        (rows, columns); rows go to the south, columns to the east.
+    values : (rows, columns) ndarray
+        Values; rows go to the south, columns to the east.
     frame : GroundFrame
-        Plane coordinates in which the grid is regular; exact longitude and latitude by `GroundFrame`.
+        Plane coordinates in which the grid is regular; gives exact longitude and latitude.
     west, north : float
-        Of the first row's first column, its middle, metres.
+        Centre of the first row's first column, metres.
     spacing : float
-        Of rows and columns, metres.
+        Spacing of rows and columns, metres.
     """
 
     values: np.ndarray
@@ -298,34 +305,34 @@ class Raster:
 
     @property
     def valid(self) -> None:
-        """Every value is there."""
+        """None: every value is valid."""
 
     def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates of places (row, column), whole or not, metres, broadcast."""
+        """Return east and north, in metres, at real-valued (row, column), broadcast."""
         return self.west + self.spacing * np.asarray(column), self.north - self.spacing * np.asarray(row)
 
     def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of coordinates: the inverse of `east_north`."""
+        """Return row and column of coordinates: the inverse of `east_north`."""
         return (self.north - np.asarray(north)) / self.spacing, (np.asarray(east) - self.west) / self.spacing
 
 
 @dataclass(frozen=True, eq=False)
 class Control(Maps[Raster]):
-    """The maps of a simulated patch, with their errors.
+    """Maps of a simulated patch, with their errors.
 
     Attributes
     ----------
-    shift : tuple[float, float]
+    shift : tuple of float
         Constant error in plan, map minus true, east and north, metres; belongs to the truth.
-    smooth : tuple[SplineGrid, SplineGrid]
-        The rest of the error in plan, east and north, metres, over true coordinates; belongs to the truth.
+    smooth : tuple of SplineGrid
+        Smooth error in plan, east and north, metres, over true coordinates; belongs to the truth.
     """
 
     shift: tuple[float, float]
     smooth: tuple[SplineGrid, SplineGrid]
 
     def error(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Error in plan at places of the map, map minus true, metres."""
+        """Return the error in plan at positions of the map, map minus true, in metres."""
         return self.shift[0] + self.smooth[0](east, north), self.shift[1] + self.smooth[1](east, north)
 
 
@@ -338,24 +345,24 @@ def make_control(
     ground: np.random.SeedSequence,
     seed: np.random.SeedSequence,
 ) -> Control:
-    """Control for a patch of ground.
+    """Make orthophoto and elevation model of a patch of ground, with their errors.
 
     Parameters
     ----------
     frame : GroundFrame
         Coordinates of the ground.
     extent : Extent
-        Of the true ground that is imaged; the map covers a little less.
+        Extent of the true ground that is imaged; the map covers a little less.
     terrain : Terrain
-        The true one.
+        True terrain.
     texture : TextureSpec
-        The true ground's.
+        Texture of the true ground.
     spec : ControlSpec
-        What the file says.
-    ground : np.random.SeedSequence
+        Control of the input file.
+    ground : SeedSequence
         Seed of the true ground.
-    seed : np.random.SeedSequence
-        Of all errors.
+    seed : SeedSequence
+        Seed of all errors.
     """
     plan_seed, noise_seed, dem_seed = (stream(seed, k) for k in range(3))
     worst = max(abs(v) for v in spec.shift) + 10.0 * spec.sigma + spec.spacing * 8.0
@@ -364,7 +371,7 @@ def make_control(
     full = apparent(reflectance(extent, texture, ground, spec.changed), terrain, spec.light)
 
     def sampled(ground: Callable[..., np.ndarray], spacing: float) -> Raster:
-        """The ground where the control says that it is, rows from the north."""
+        """Sample the ground at map positions displaced by the error in plan, rows from the north."""
         east, north = inside.axes(spacing)
         values = np.empty((len(north), len(east)), np.float32)
         for first in range(0, len(north), _ROWS_AT_ONCE):
@@ -386,7 +393,7 @@ def make_control(
 
 
 def _plan_error(extent: Extent, spec: ControlSpec, seed: np.random.SeedSequence) -> tuple[SplineGrid, SplineGrid]:
-    """The smooth error in plan, east and north."""
+    """Draw the smooth error in plan, east and north."""
     spacing = spec.correlation / _PER_LENGTH
     east, north = extent.grown(_MARGIN).axes(spacing, 3)
     grids = []

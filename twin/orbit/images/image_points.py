@@ -1,18 +1,14 @@
-"""Points measured in the images of a patch by matching.
+"""Measurement of control, check and tie points in images by matching.
 
-A template's samples are the pixels about the predicted place of its point, which is not a whole pixel. Each sample is
-followed by the measured sensor to the reference heights: over so few pixels the way to the ground is affine in row and
-column and linear in height, to a millimetre. What the measured sensor is wrong by moves the whole template and is left
+Control and check points are distinct points of the orthophoto with the reference height; tie points are distinct points
+of the nadir line's frame. Their templates are brought into each line's geometry and matched (`analysis.matching`), and
+matches that do not follow one smooth displacement per patch and line are rejected. The input is frames with the
+measured sensors, and a map with heights: a simulated patch, or a user's images with orthophoto and elevation model.
+
+A template's samples are the pixels about the predicted position of its point, which is not a whole pixel. Each sample
+is followed by the measured sensor to the reference heights: over so few pixels the mapping to the ground is affine in
+row and column and linear in height, to a millimetre. Errors of the measured sensor move the whole template and are left
 to the search.
-
-Control and check points are distinct places of the orthophoto with the reference height; tie points are distinct places
-of the nadir line's frame. Their templates are brought into each line's geometry
-(`twin.orbit.images.image_points`), matched (`analysis.matching`), and what does not follow one smooth displacement
-per patch and line is rejected.
-
-What measuring points in images needs: frames with the sensors that are known of them, and a map with heights.
-
-A simulated patch is one such piece of ground, and a user's images with his orthophoto and elevation model are another.
 """
 
 from __future__ import annotations
@@ -40,24 +36,27 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.scene import ImagePointsSpec
 
 BEYOND = 0.1
-"""Pixels: standard deviation added to what the matching claims, for what no fit shows: another season's light (RMS of
-matches 0.11 px where 0.06 is claimed), the attitude between its readings. A tie point has it where it was chosen."""
+"""Standard deviation, in pixels, added to the matching's own for errors that no fit shows.
+
+Such errors are another season's light (RMS of matches 0.11 px where 0.06 is predicted) and the attitude between its
+readings. A tie point has it in the frame it was chosen in.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class LineFrame:
-    """What a line recorded.
+    """Image of a line with the sensor by which the user knows it.
 
     Attributes
     ----------
-    frame : np.ndarray
-        Grey values, (lines, pixels), columns as pixels of the line.
+    frame : (lines, pixels) ndarray
+        Grey values, columns as pixels of the line.
     window : Window
-        Where it lies in the line's whole image.
+        Position of the frame in the line's whole image.
     measured : Sensor
         The line as the user knows it, on the measured trajectory.
-    sample : tuple[float, float]
-        Distance of two pixels along the line, and of two lines, on the ground in the window's middle, metres.
+    sample : tuple of float
+        Ground distance of two pixels along the line, and of two lines, in the window's middle, metres.
     """
 
     frame: np.ndarray
@@ -66,21 +65,21 @@ class LineFrame:
     sample: tuple[float, float]
 
     def image_point(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Line and pixel of places of the frame (row, column), whole or not."""
+        """Return line and pixel of real-valued positions (row, column) of the frame."""
         return self.window.first_line + np.asarray(row), self.window.first_pixel + np.asarray(column)
 
 
 @dataclass(frozen=True, eq=False)
 class ImagedGround:
-    """A piece of ground, imaged.
+    """Piece of ground with its images and control.
 
     Attributes
     ----------
     frame : GroundFrame
         Plane coordinates of the ground, metres east and north of the patch's middle.
-    images : Mapping[str, LineFrame]
-        Line -> what it recorded.
-    control : Maps[Map]
+    images : mapping of str to LineFrame
+        Image of each line.
+    control : Maps
         Orthophoto and elevation model.
     """
 
@@ -90,12 +89,18 @@ class ImagedGround:
 
 
 SOFTENING = 0.4
-"""Rms of the Gaussian low pass of an orthophoto over the distance of the image's pixels: what pixel, lens and motion of
-the line add to an orthophoto that is sharp itself. What is left the matching solves for."""
+"""Rms of the Gaussian low pass of an orthophoto, relative to the pixel distance of the image.
+
+It stands for what pixel, lens and motion of the line add to an orthophoto that is sharp itself; the matching solves for
+the rest.
+"""
 _STEP = 50.0
-"""Metres of height over which the way to the ground is taken as straight."""
+"""Height interval over which the mapping to the ground is taken as linear, in metres."""
 _FOLLOWED = 8
-"""Turns of looking up the height; each makes the error smaller by the terrain's slope times the look's, 0.2 or less."""
+"""Number of iterations of the height.
+
+Each makes the error smaller by the terrain's slope times the look's, 0.2 or less.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +110,9 @@ class ReferenceHeights:
     Attributes
     ----------
     raster : Map
-        Of the posts.
-    coefficients : np.ndarray
-        Of the spline.
+        Raster of the posts.
+    coefficients : ndarray
+        Coefficients of the spline.
     """
 
     raster: Map
@@ -115,7 +120,7 @@ class ReferenceHeights:
 
     @classmethod
     def of(cls, dem: Map) -> ReferenceHeights:
-        """Through a raster of heights, metres; where it has none, about those of the nearest posts."""
+        """Interpolate a raster of heights, in metres; missing posts are replaced by the nearest ones."""
         values = dem.values.astype(np.float64)
         if dem.valid is not None and not dem.valid.all():
             nearest = distance_transform_edt(~dem.valid, return_distances=False, return_indices=True)
@@ -123,7 +128,7 @@ class ReferenceHeights:
         return cls(dem, spline_filter(values, order=3, mode="mirror"))
 
     def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """Heights at places, metres; NaN beyond the posts, and where one of the next four is missing."""
+        """Return heights at positions, in metres; NaN beyond the posts, and where one of the next four is missing."""
         place = np.stack(self.raster.row_column(east, north))
         found = map_coordinates(self.coefficients, place, order=3, mode="mirror", prefilter=False)
         last = np.array(self.coefficients.shape).reshape(2, *(1,) * (place.ndim - 1)) - 1
@@ -143,13 +148,13 @@ class ReferenceHeights:
 
 
 def predicted(image: LineFrame, points: np.ndarray) -> np.ndarray:
-    """Row and column (n, 2) of the frame at which the measured sensor has points (n, 3), ITRS; NaN beyond its image."""
+    """Return row and column (n, 2) in the frame of ITRS points (n, 3) by the measured sensor; NaN outside."""
     line, pixel = image.measured.image(points)
     return np.stack([line - image.window.first_line, pixel - image.window.first_pixel], axis=-1)
 
 
 def fits(image: LineFrame, place: np.ndarray, border: float) -> np.ndarray:
-    """Which places (..., 2) lie in a frame, so far from its border; not a place that is NaN."""
+    """Return which positions (..., 2) lie in a frame at least `border` pixels from its border; False for NaN."""
     last = np.array(image.frame.shape) - 1.0 - border
     return np.asarray(np.all((place >= border) & (place <= last), axis=-1))
 
@@ -157,23 +162,23 @@ def fits(image: LineFrame, place: np.ndarray, border: float) -> np.ndarray:
 def _ground_of_samples(
     image: LineFrame, frame: GroundFrame, heights: ReferenceHeights, points: np.ndarray, place: np.ndarray, side: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """East, north and height (n, side, side) each, metres, of what the pixels about places see.
+    """Return east, north and height, (n, side, side) each, in metres, of the ground under the templates' pixels.
 
     Parameters
     ----------
     image : LineFrame
-        Whose pixels; its measured sensor is used.
+        Image of the templates; its measured sensor is used.
     frame : GroundFrame
         Coordinates of the ground.
     heights : ReferenceHeights
-        Of the ground.
-    points : np.ndarray
-        (n, 3) ITRS, metres, that the measured sensor has at the places: their height is kept, and the reference heights
-        count against theirs at the points.
-    place : np.ndarray
-        (n, 2) rows and columns of the frame.
+        Heights of the ground.
+    points : (n, 3) ndarray
+        Ground points of the templates' middles by the measured sensor, ITRS, metres. Their height is kept, and
+        reference heights are counted relative to those at the points.
+    place : (n, 2) ndarray
+        Rows and columns in the frame.
     side : int
-        Of a template, pixels.
+        Side of a template, pixels.
     """
     east, north, height = (v[:, None, None] for v in frame.local(points))
     half = side // 2
@@ -198,7 +203,17 @@ def _ground_of_samples(
 
 
 def _templates_of_map(photo: Map, samples: tuple[np.ndarray, np.ndarray, np.ndarray], sample: float) -> np.ndarray:
-    """Templates (n, k, k) from an orthophoto; sample: distance of the image's pixels on the ground, metres."""
+    """Return templates (n, k, k) from an orthophoto.
+
+    Parameters
+    ----------
+    photo : Map
+        The orthophoto.
+    samples : tuple of ndarray
+        Ground of the templates' pixels from `_ground_of_samples`.
+    sample : float
+        Ground distance of the image's pixels, metres.
+    """
     rows, columns = photo.row_column(samples[0], samples[1])
     return resampled(photo.values, rows, columns, smoothing=SOFTENING * sample / photo.spacing)
 
@@ -210,7 +225,7 @@ def _templates_of_image(
     points: np.ndarray,
     place: np.ndarray,
 ) -> np.ndarray:
-    """Templates (n, k, k) from another image.
+    """Return templates (n, k, k) from another image.
 
     Parameters
     ----------
@@ -218,12 +233,12 @@ def _templates_of_image(
         The other image.
     frame : GroundFrame
         Coordinates of the ground.
-    samples : tuple[np.ndarray, np.ndarray, np.ndarray]
-        Of the ground, as `_ground_of_samples` has them.
-    points : np.ndarray
-        (n, 3) ITRS, metres, of the templates' middles.
-    place : np.ndarray
-        (n, 2) where the source has them, row and column.
+    samples : tuple of ndarray
+        Ground of the templates' pixels from `_ground_of_samples`.
+    points : (n, 3) ndarray
+        Ground points of the templates' middles, ITRS, metres.
+    place : (n, 2) ndarray
+        Row and column of the points in the other image.
     """
     centre = np.stack(frame.local(points))
     base = predicted(source, points)
@@ -239,47 +254,48 @@ def _templates_of_image(
 CONSENSUS = 100
 """Status of a match that its neighbours contradict; others are codes of `analysis.matching.correlation.Reason`."""
 SOURCE = 101
-"""Status of a tie point in the frame it was chosen in: nothing was matched, its place is its definition."""
+"""Status of a tie point in the frame it was chosen in, where its position is its definition."""
 _MASK = 16
-"""Pixels of an orthophoto between places at which is asked whether every line sees it."""
+"""Grid step, in pixels of an orthophoto, of the test that every line sees a point."""
 _GROUND_TURNS = 12
+"""Number of iterations of a look's ground point."""
 _RISE = 10.0
-"""Metres over which the displacement by height is taken as linear."""
+"""Height difference over which the displacement by height is taken as linear, in metres."""
 Kind = Literal["map", "tie"]
 
 
 POINTS_REMEDY = "a larger patch, a smaller reach or template, or more points"
-"""For a PointsError."""
+"""Advice with a PointsError."""
 
 
 class PointsError(PhysicalError, ValueError):
-    """Points that cannot be measured."""
+    """Error of points that cannot be measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedLine:
-    """What one line's frame gave.
+    """Points matched in one line's frame.
 
     Attributes
     ----------
-    predicted : np.ndarray
-        (n, 2) row and column in the frame at which the measured sensor has the points.
-    place : np.ndarray
-        (n, 2) row and column found; NaN where matching gave none.
-    covariance : np.ndarray
-        (n, 2, 2) px^2.
-    correlation : np.ndarray
-        (n,) of image and fitted template.
-    status : np.ndarray
-        (n,) 0 accepted, `CONSENSUS`, `SOURCE`, or why it was not matched.
-    first : tuple[int, int]
+    predicted : (n, 2) ndarray
+        Row and column in the frame of the points by the measured sensor.
+    place : (n, 2) ndarray
+        Row and column measured; NaN where matching gave none.
+    covariance : (n, 2, 2) ndarray
+        Covariance of the measured positions, px^2.
+    correlation : (n,) ndarray
+        Correlation of image and fitted template.
+    status : (n,) ndarray of int
+        0 for accepted, `CONSENSUS`, `SOURCE`, or the reason of a failed match.
+    first : tuple of int
         Line and pixel of the frame's first pixel in the whole image.
     scatter : float
-        Px; of the displacements about the smooth one beyond the covariances.
+        Scatter of the displacements about the smooth one beyond their covariances, px.
     text : str
-        Of the consensus.
-    way : DisplacementField | None
-        Smooth displacement from predicted to found; None in the frame that ties were chosen in.
+        Result of the consensus in words.
+    way : DisplacementField or None
+        Smooth displacement from predicted to measured; None in the frame that ties were chosen in.
     """
 
     predicted: np.ndarray
@@ -294,50 +310,50 @@ class MatchedLine:
 
     @property
     def accepted(self) -> np.ndarray:
-        """(n,) bool: matched and not contradicted, or the place by definition."""
+        """Mask of points matched and not contradicted, or chosen in this frame, (n,) bool."""
         return np.asarray((self.status == 0) | (self.status == SOURCE))
 
     @property
     def matched(self) -> np.ndarray:
-        """(n,) bool: accepted by matching, whatever the neighbours say."""
+        """Mask of points accepted by matching, before consensus, (n,) bool."""
         return np.asarray((self.status == 0) | (self.status == CONSENSUS))
 
     @property
     def image(self) -> np.ndarray:
-        """(n, 2) line and pixel of the whole image."""
+        """Line and pixel in the whole image, (n, 2)."""
         return self.place + np.array(self.first)
 
     @property
     def moved(self) -> np.ndarray:
-        """(2,) from predicted to found, median of the accepted, lines and pixels."""
+        """Median displacement from predicted to measured of the accepted, lines and pixels, (2,)."""
         return np.asarray(np.median((self.place - self.predicted)[self.accepted], axis=0))
 
     @property
     def usual_sigma(self) -> np.ndarray:
-        """(2,) of lines and pixels, median of the accepted."""
+        """Median sigma of the accepted, lines and pixels, (2,)."""
         return np.asarray(np.median(np.sqrt(np.diagonal(self.covariance[self.accepted], axis1=1, axis2=2)), axis=0))
 
     def measured(self, rows: np.ndarray, point: np.ndarray) -> ImagePoints:
-        """Return image points of some places, by mask or index, with `BEYOND` in their covariances.
+        """Return the image points that a mask or index selects, with `BEYOND` in their covariances.
 
         Parameters
         ----------
-        rows : np.ndarray
-            Which places.
-        point : np.ndarray
-            The ground point of each.
+        rows : ndarray
+            Mask or index of the points.
+        point : ndarray of int
+            Index of the ground point of each.
         """
         image, spread = self.image[rows], self.covariance[rows] + BEYOND**2 * np.eye(2)
         return ImagePoints.of(point, image[:, 0], image[:, 1], spread)
 
     @property
     def lost(self) -> Mapping[str, int]:
-        """Why points were not accepted -> how many, the most frequent first."""
+        """Number of points not accepted by reason, the most frequent first."""
         count = Counter(int(code) for code in self.status[~self.accepted])
         return {status_text(code): number for code, number in count.most_common()}
 
     def displacement(self, place: np.ndarray, height: np.ndarray) -> np.ndarray:
-        """(n, 2) from predicted to found, as its matches say, at places (n, 2) and heights (n,), metres."""
+        """Return the smooth displacement (n, 2) from predicted to measured at positions (n, 2), heights (n,) in metres."""
         if self.way is None:
             return np.zeros_like(place)
         return self.way(place, None if self.way.heights is None else height)
@@ -345,20 +361,20 @@ class MatchedLine:
 
 @dataclass(frozen=True, eq=False)
 class MatchedPoints:
-    """Points and where the lines have them.
+    """Points of one kind with their matches in every line.
 
     Attributes
     ----------
     kind : Kind
-        Places of the orthophoto, or ties.
-    east, north, height : np.ndarray
-        (n,) of the map, metres; of ties where the nadir line's measured sensor meets the reference heights.
-    ground : np.ndarray
-        (n, 3) the same, ITRS, metres.
-    check : np.ndarray
-        (n,) bool: kept apart to test with.
-    lines : Mapping[str, MatchedLine]
-        Name -> what its frame gave.
+        "map" for points of the orthophoto, "tie" for tie points.
+    east, north, height : (n,) ndarray
+        Coordinates of the map, metres; of ties where the nadir line's measured sensor meets the reference heights.
+    ground : (n, 3) ndarray
+        The same points in the ITRS, metres.
+    check : (n,) ndarray of bool
+        Mask of check points.
+    lines : mapping of str to MatchedLine
+        Matches by name of the line.
     """
 
     kind: Kind
@@ -371,41 +387,41 @@ class MatchedPoints:
 
     @property
     def source(self) -> str | None:
-        """The line whose frame ties were chosen in."""
+        """Name of the line whose frame ties were chosen in; None for points of the map."""
         return next((name for name, line in self.lines.items() if line.way is None), None)
 
     @property
     def sought_in(self) -> Mapping[str, MatchedLine]:
-        """The lines that were searched for the points: without the source of ties."""
+        """Lines that were searched for the points: without the source of ties."""
         return {name: line for name, line in self.lines.items() if name != self.source}
 
     @property
     def in_all(self) -> np.ndarray:
-        """(n,) bool: accepted in every line."""
+        """Mask of points accepted in every line, (n,) bool."""
         return np.all([line.accepted for line in self.lines.values()], axis=0)
 
 
 @dataclass(frozen=True, eq=False)
 class PatchPoints:
-    """All points measured in a patch; None where none were asked for."""
+    """All points measured in a patch; None for kinds that were not requested."""
 
     control: MatchedPoints | None
     ties: MatchedPoints | None
 
     @property
     def sorts(self) -> Mapping[str, MatchedPoints]:
-        """``control`` (with the check points) and ``tie``, those that there are."""
+        """Measured points by kind: ``control`` (with the check points) and ``tie``, where present."""
         both = {"control": self.control, "tie": self.ties}
         return {name: points for name, points in both.items() if points is not None}
 
 
 def measure_points(patch: ImagedGround, spec: ImagePointsSpec) -> PatchPoints:
-    """Control, check and tie points.
+    """Measure control, check and tie points in the images of a patch.
 
     Raises
     ------
     PointsError
-        Too little room, nothing distinct, too few matches.
+        The images are too small, nothing in them is distinct, or there are too few matches.
     """
     if spec.tie and len(patch.images) < 2:
         raise PointsError("tie points need two lines")
@@ -415,18 +431,19 @@ def measure_points(patch: ImagedGround, spec: ImagePointsSpec) -> PatchPoints:
 
 
 def status_text(code: int) -> str:
-    """A status in words."""
+    """Return the status of a match in words."""
     extra = {CONSENSUS: "its neighbours contradict it", SOURCE: "chosen here"}
     return extra.get(code) or Reason(code).text
 
 
 def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
-    """Control and check points.
+    """Measure control and check points.
 
     Raises
     ------
     PointsError
-        a frame too small for template and reach, nothing distinct that every line sees, too few matches.
+        A frame is too small for template and search range, nothing distinct is seen by every line, or there are too few
+        matches.
     """
     border = spec.template // 2 + spec.reach
     _require_room(patch, spec)
@@ -451,24 +468,24 @@ def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
 def tie_points(
     patch: ImagedGround, spec: ImagePointsSpec, control: MatchedPoints | None = None, source: str = "nadir"
 ) -> MatchedPoints:
-    """Points of one line's frame, sought in the others.
+    """Measure points of one line's frame in the other lines.
 
     Parameters
     ----------
     patch : ImagedGround
-        Images and what is known of the ground.
+        Images and control of the ground.
     spec : ImagePointsSpec
-        How many, and how they are matched.
-    control : MatchedPoints | None
-        Of the patch; where they have lain is taken out of the prediction. Without them the heights of the reference are
-        read where the measured sensor looks, some 100 m off.
+        Number of points and options of the matching.
+    control : MatchedPoints or None
+        Control points of the patch; their displacement is taken out of the prediction. Without them the reference
+        heights are read where the measured sensor looks, some 100 m off.
     source : str
-        The line they are chosen in.
+        Name of the line in which the points are chosen.
 
     Raises
     ------
     PointsError
-        As `map_points`.
+        The conditions of `map_points`.
     """
     border = spec.template // 2 + spec.reach
     _require_room(patch, spec)
@@ -510,6 +527,7 @@ def tie_points(
 
 
 def _require_room(patch: ImagedGround, spec: ImagePointsSpec) -> None:
+    """Raise PointsError if a frame is too small for template and search range."""
     least = 2 * (spec.template // 2 + spec.reach) + 1
     for name, image in patch.images.items():
         if min(image.frame.shape) <= least:
@@ -523,7 +541,7 @@ def _require_room(patch: ImagedGround, spec: ImagePointsSpec) -> None:
 def _distinct_map(
     patch: ImagedGround, heights: ReferenceHeights, count: int, border: int, spec: ImagePointsSpec
 ) -> tuple[np.ndarray, np.ndarray]:
-    """East and north of distinct places of the orthophoto that every line sees within its border."""
+    """Return east and north of distinct points of the orthophoto that every line sees within its border."""
     photo = patch.control.orthophoto
     sides = [np.arange(0, n, _MASK) for n in photo.values.shape]
     row, column = np.meshgrid(*sides, indexing="ij")
@@ -553,9 +571,10 @@ def _distinct_map(
 def _followed(
     patch: ImagedGround, image: LineFrame, heights: ReferenceHeights, place: np.ndarray, known: MatchedLine | None
 ) -> np.ndarray:
-    """Where the measured sensor's looks meet the reference heights, ITRS, (n, 3), metres; NaN beyond them.
+    """Return the points at which the measured sensor's looks meet the reference heights, ITRS, (n, 3), in metres.
 
-    known: matches that tell where the measured sensor has what the frame has at a place.
+    They are NaN beyond the reference heights. `known` are matches from which the displacement of the measured sensor is
+    taken.
     """
     height = np.full(len(place), heights.mean)
     at = place
@@ -570,7 +589,7 @@ def _followed(
 
 
 def _rise(patch: ImagedGround, image: LineFrame, ground: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(n, 2) lines and pixels by which points that lie a metre higher have their image displaced."""
+    """Return the image displacement by a metre of height, (n, 2), in lines and pixels."""
     east, north, height = patch.frame.local(ground)
     return (predicted(image, patch.frame.itrs(east, north, height + _RISE)) - at) / _RISE
 
@@ -584,6 +603,7 @@ def _matched(
     height: np.ndarray,
     spec: ImagePointsSpec,
 ) -> MatchedLine:
+    """Match templates in one line's frame, and reject matches that contradict their neighbours."""
     options = MatchOptions(least_correlation=spec.least_correlation, largest_sigma=spec.largest_sigma)
     found = match_windows(image.frame, patterns, at, reach=spec.reach, options=options)
     status = found.reason.astype(np.int64)
@@ -620,7 +640,7 @@ def _matched(
 
 
 def _degree(count: int) -> int | None:
-    """Degree of the smooth displacement that so many matches carry, four for each term; None for too few."""
+    """Return the degree of the smooth displacement for a number of matches, four for each term; None for too few."""
     for degree, terms in ((2, 7), (1, 4), (0, 2)):
         if count >= 4 * terms:
             return degree

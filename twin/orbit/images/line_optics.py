@@ -1,19 +1,17 @@
-"""What the optics and the detector of a line do to its image.
+"""Image formation of a line: transfer function of optics and detector, motion of the image, and jitter.
 
-Frequencies are in cycles per pixel along the line and in cycles per line along the track. While the image of a place
+Frequencies are in cycles per pixel along the line and in cycles per line along the track. While the image of a point
 crosses the line it moves by `advance` pixels from one line to the next, less than one where the lens looks obliquely,
 and by `drift` pixels along it. With the focal plane's transfer function T(fx, fy) (cycles/m along the line and along
 the track) an image sampled at lines and pixels thus has
 
     H(pixel, line) = T(pixel/p, -(line + drift pixel)/(advance p)) x smear(line).
 
-What jitter does to a line's image: where the image lies, and what blurs it.
-
 The charge of a pixel follows the mean motion of the image. A pixel thus sees, all the while that its light is
-collected, the place of its line, moved by the jitter of each moment. The mean place is that of the line's sensor with
-the jitter in the mean of the collection; the image itself is the mean of images that are taken at the moments of a
-Gaussian rule. So every line is displaced and blurred by its own jitter, from slow oscillations to those that are faster
-than the collection.
+collected, the position of its line, moved by the jitter of each moment. The mean position is that of the line's sensor
+with the jitter averaged over the collection; the image itself is the mean of images at the nodes of a Gaussian rule. So
+every line is displaced and blurred by its own jitter, from slow oscillations to those that are faster than the
+collection.
 """
 
 from __future__ import annotations
@@ -47,12 +45,12 @@ if TYPE_CHECKING:
 def optics_of(
     camera: ThreeLineCameraSpec, lines: tuple[str, ...], line_time: float, detectors: Mapping[str, DetectorSpec]
 ) -> dict[str, LineOptics]:
-    """Lens and CCD of lines; lines that are made alike share them.
+    """Return lens and CCD of each line; lines of the same design share them.
 
     Raises
     ------
     ValueError
-        a line without an image section.
+        A line has no image section.
     """
     made: dict[tuple[object, ...], LineOptics] = {}
     out = {}
@@ -69,9 +67,9 @@ def optics_of(
 
 
 SUN_TEMPERATURE = 5772.0
-"""K (IAU 2015 Resolution B3, nominal effective temperature)."""
+"""Nominal effective temperature of the Sun, in K (IAU 2015 Resolution B3)."""
 SUN_RADIUS = 6.957e8
-"""Metres (IAU 2015 Resolution B3)."""
+"""Nominal radius of the Sun, in metres (IAU 2015 Resolution B3)."""
 
 _TAPER = 0.75
 """Share of the margin from which the point spread function is faded out to zero at the margin's end."""
@@ -79,14 +77,14 @@ _TAPER = 0.75
 
 @dataclass(frozen=True)
 class ImageMotion:
-    """How the image of the ground moves over the line, per line.
+    """Motion of the ground's image over the line, per line time.
 
     Attributes
     ----------
     advance : float
-        Across the line, pixels, positive.
+        Motion across the line, pixels, positive.
     drift : float
-        Along the line, pixels.
+        Motion along the line, pixels.
     """
 
     advance: float
@@ -94,8 +92,10 @@ class ImageMotion:
 
     @classmethod
     def of(cls, sensor: Sensor, line: float, pixel: float, height: float) -> ImageMotion:
-        """At a place of an image, for ground of a height (metres), by the directions of one ground point from before to
-        after its line. Light effects shift both alike and change nothing at 1e-5.
+        """Return the motion at a position of an image, for ground of a height in metres.
+
+        It is the change of direction of one ground point from before to after its line. Light effects shift both alike
+        and change nothing at 1e-5.
         """
         camera, step = sensor.camera, min(1.0, 0.5 * sensor.lines - 0.5)
         middle = float(np.clip(line, step - 0.5, sensor.lines - 0.5 - step))
@@ -115,18 +115,18 @@ class ImageMotion:
 
 @dataclass(frozen=True, eq=False)
 class LineOptics:
-    """A line's lens and CCD.
+    """Lens and CCD of a line.
 
     Attributes
     ----------
     ccd : LineCcd
-        The line CCD.
+        Line CCD.
     pupil : PupilFunction
-        Of the lens, the same all over the line.
+        Pupil of the lens, the same all over the line.
     f_number : float
-        Of the lens.
+        F-number of the lens.
     transmission : float
-        Of the lens.
+        Transmission of the lens.
     """
 
     ccd: LineCcd
@@ -138,20 +138,20 @@ class LineOptics:
     def from_specs(
         cls, image: LineImageSpec, pixels: int, pitch: float, line_time: float, sheet: DetectorSpec
     ) -> LineOptics:
-        """From what the files say.
+        """Make lens and CCD from the specifications of their files.
 
         Parameters
         ----------
         image : LineImageSpec
             Image side of the line.
         pixels : int
-            Of the line.
+            Number of pixels of the line.
         pitch : float
-            Of the pixels, metres.
+            Pixel pitch, metres.
         line_time : float
-            From one line to the next, seconds.
+            Time from one line to the next, seconds.
         sheet : DetectorSpec
-            Of the CCD.
+            Data sheet of the CCD.
         """
         band = BandSpec.model_construct(
             offset=0.0,
@@ -169,8 +169,10 @@ class LineOptics:
 
     @property
     def photons_per_reflectance(self) -> float:
-        """Photons on a pixel over all stages from ground of apparent reflectance 1: the Sun as a black body at 1 au, a
-        Lambertian ground, and pi/(4 F^2) of its radiance on the pixel, less what stands before the lens.
+        """Photons on a pixel, summed over all TDI stages, from ground of apparent reflectance 1.
+
+        The Sun is a black body at 1 au, the ground Lambertian, and pi/(4 F^2) of its radiance falls on the pixel, less
+        the obstruction of the pupil.
         """
         first, last = self.ccd.band.spectrum.ends
         wavelength, weight = band_wavelengths(self.ccd.band)
@@ -182,9 +184,10 @@ class LineOptics:
         return band * solid_angle * self.transmission * pitch**2 * seconds
 
     def transfer(self, pixel: np.ndarray, line: np.ndarray, motion: ImageMotion) -> np.ndarray:
-        """Transfer function at frequencies along the line, cycles/pixel, and along the track, cycles/line; shapes that
-        broadcast. It is real, since the pupil is even, but for what stands before the lens; a point is imaged where the
-        centroid of its image lies.
+        """Return the transfer function at frequencies along the line, cycles/pixel, and along the track, cycles/line.
+
+        The shapes broadcast. The function is real, since the pupil is even, unless the pupil is obstructed; a point is
+        imaged at the centroid of its image.
         """
         out: np.ndarray = np.ones(np.broadcast_shapes(np.shape(pixel), np.shape(line)))
         for factor in self.factors(pixel, line, motion).values():
@@ -192,9 +195,11 @@ class LineOptics:
         return out
 
     def factors(self, pixel: np.ndarray, line: np.ndarray, motion: ImageMotion) -> dict[str, np.ndarray]:
-        """The parts of `transfer`: ``lens``, ``pixel``, ``diffusion``; ``step``: the image moves on while the charge
-        stands; ``stages``: image and charge drift apart over the stages, by the rate's error and because the image does
-        not advance by a pixel in a line's time.
+        """Return the factors of `transfer` by name.
+
+        They are ``lens``, ``pixel``, ``diffusion``, ``step`` (the image moves on while the charge rests) and ``stages``
+        (image and charge drift apart over the stages, by the rate's error and because the image does not advance by a
+        pixel in a line's time).
         """
         band = self.ccd.band
         fx = pixel / band.pitch
@@ -211,15 +216,15 @@ class LineOptics:
         }
 
     def kernel(self, oversampling: int, margin: int, motion: ImageMotion) -> np.ndarray:
-        """Point spread function on `oversampling` samples per line and pixel, float64, of unit sum.
+        """Return the point spread function on `oversampling` samples per line and pixel, float64, of unit sum.
 
         It is zero from `margin` pixels and lines on, faded out before: so an image does not depend on how it is cut
-        into parts. What a diffraction pattern has farther out (0.3% at F/6 and 24 pixels) is left out.
+        into parts. The diffraction pattern farther out (0.3% at F/6 and 24 pixels) is left out.
 
         Returns
         -------
-        np.ndarray
-            Square, the middle sample is the pixel's centre.
+        ndarray
+            Square array whose middle sample is the pixel's centre.
         """
         half = margin * oversampling
         count = fft.next_fast_len(4 * half)
@@ -232,6 +237,7 @@ class LineOptics:
         return np.asarray(spread / spread.sum())
 
     def _lens(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
+        """Return the transfer function of the lens about the centroid of its image."""
         values = self._table(fx, fy)
         if self.pupil.shadow is None:
             return np.asarray(values.real)
@@ -240,19 +246,20 @@ class LineOptics:
 
     @cached_property
     def _table(self) -> TransferTable:
+        """Polychromatic transfer function of the lens, weighted by photons of the Sun."""
         wavelength, weight = band_wavelengths(self.ccd.band)
         return TransferTable.build(self.pupil, wavelength, weight * black_body_photons(wavelength, SUN_TEMPERATURE))
 
 
 def _shadow(outlines: tuple[tuple[tuple[float, float], ...], ...], harmonics: np.ndarray) -> PupilShadow:
-    """Shadow of outlines, in units of the pupil's radius, on one pupil."""
+    """Return the shadow of outlines, in units of the pupil's radius, on one pupil."""
     shapes = [np.array(outline, float)[None] for outline in outlines]
     pieces, _ = separate([s if area(s)[0] > 0.0 else s[:, ::-1] for s in shapes])
     return PupilShadow.within(pieces, harmonics[:, None])
 
 
 def _eikonal(terms: dict[int, float]) -> np.ndarray | None:
-    """Wavefront by Zernike terms as coefficients of products of Chebyshev's polynomials."""
+    """Return a wavefront by Zernike terms as coefficients of products of Chebyshev polynomials."""
     if not terms:
         return None
     monomials = [(a, b, size * c) for index, size in terms.items() for a, b, c in cartesian_terms(index)]
@@ -267,48 +274,51 @@ def _eikonal(terms: dict[int, float]) -> np.ndarray | None:
 
 
 def _mean_of_steps(cycles: np.ndarray, count: int) -> np.ndarray:
-    """Mean of exp(2 pi i k cycles) over `count` steps about their middle."""
+    """Return the mean of exp(2 pi i k cycles) over `count` steps about their middle."""
     near = np.sinc(cycles)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(np.abs(near) < 1e-9, 1.0, np.sinc(count * cycles) / near)
 
 
 JITTER_TOLERANCE = 1e-3
-"""Pixels: of place and smear by the moments that are taken."""
+"""Tolerance of position and smear of an image averaged over moments of the jitter, in pixels."""
 
 
 def _jitter(sensor: Sensor) -> Jitter | None:
+    """Return the jitter of a sensor's trajectory; None where it has none."""
     jitter = sensor.trajectory.jitter if isinstance(sensor.trajectory, Trajectory) else None
     return jitter if isinstance(jitter, Jitter) else None
 
 
 def _with(sensor: Sensor, jitter: Jitter | None) -> Sensor:
+    """Return the sensor with another jitter."""
     assert isinstance(sensor.trajectory, Trajectory)
     return replace(sensor, trajectory=replace(sensor.trajectory, jitter=jitter))
 
 
 def _collection(sensor: Sensor, optics: LineOptics) -> Collection:
+    """Return the light collection of a TDI line."""
     return Collection.of(optics.ccd.band.tdi, sensor.line_time)
 
 
 def collected(sensor: Sensor, optics: LineOptics) -> Sensor:
-    """The sensor of a line's image: a place is imaged where its light lies in the mean over its collection."""
+    """Return the sensor of a line's image, with jitter averaged over the collection of light."""
     jitter = _jitter(sensor)
     return sensor if jitter is None else _with(sensor, jitter.over(_collection(sensor, optics)))
 
 
 def steady(sensor: Sensor) -> Sensor:
-    """The sensor without its jitter."""
+    """Return the sensor without its jitter."""
     return sensor if _jitter(sensor) is None else _with(sensor, None)
 
 
 def exposures(sensor: Sensor, optics: LineOptics) -> list[tuple[float, Sensor]]:
-    """Shares of a pixel's light, which sum to 1, and the sensor at the moments that they stand for.
+    """Return shares of a pixel's light, which sum to 1, each with the sensor at its moment.
 
     Raises
     ------
     ValueError
-        Jitter that is too fast and too large.
+        The jitter is too fast and too large.
     """
     jitter = _jitter(sensor)
     if jitter is None:

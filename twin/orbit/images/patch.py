@@ -1,16 +1,13 @@
-"""Images of one patch of ground by the lines of a camera, with control: the way in for everybody who needs images.
+"""Images of one patch of ground by the lines of a camera, with control, and comparison with the truth.
 
-    lines = imaged_lines(sensors, measured, optics, seed)
-    patch = fly_patch(lines, place, (600, 600), ground, control, seed)
-    patch.images["nadir"].frame          # uint16, what the detector gave
+    lines = imaged_lines(sensors, measured, optics, seed) patch = fly_patch(lines, place, (600, 600), ground, control,
+    seed) patch.images["nadir"].frame          # uint16, grey values of the detector
     patch.images["nadir"].image_point(row, column)      # line and pixel of the whole image
     patch.images["nadir"].measured       # Sensor: the laboratory's camera on the measured trajectory
     patch.control.orthophoto, patch.control.dem
 
-An analysis may use `frame`, `window`, `measured` and the control's rasters. `sensor`, `terrain` and the control's
-errors are the truth.
-
-Measured points against the truth; nothing of it goes back into an analysis.
+An analysis may use `frame`, `window`, `measured` and the control's rasters. `sensor`, `terrain`, the control's errors
+and the comparison of points with the truth must not enter an analysis.
 """
 
 from __future__ import annotations
@@ -41,20 +38,20 @@ if TYPE_CHECKING:
     from scenes.yaml.errors import KeyPath
 
 LARGEST_GROUND = 40_000.0
-"""Metres: side of the ground of one patch; against input that asks for more than the memory holds."""
+"""Largest side of the ground of one patch, in metres; against input that asks for more than the memory holds."""
 _PIXEL, _SAMPLE = 150.0, 47.0
-"""Bytes per pixel of the image of a line, and per sample of the ground's texture."""
+"""Memory per pixel of the image of a line, and per sample of the ground's texture, in bytes."""
 
 
 class PatchError(PhysicalError, ValueError):
-    """A patch that cannot be imaged.
+    """Error of a patch that cannot be imaged.
 
     Attributes
     ----------
     part
-        What is to be changed: ``span`` of the pass, ``place``, ``size`` or ``terrain``.
+        Part of the input that must change: ``span`` of the pass, ``place``, ``size`` or ``terrain``.
     line
-        Of the camera that cannot image it; empty where it is not one line's fault.
+        Name of the line that cannot image the patch; empty where it is not one line's fault.
     """
 
     def __init__(self, problem: str, part: str, line: str = "") -> None:
@@ -64,18 +61,18 @@ class PatchError(PhysicalError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class ImagedLine:
-    """A line that records images.
+    """Line that records images.
 
     Attributes
     ----------
     sensor : Sensor
-        As it is.
+        True sensor.
     measured : Sensor
-        As the user knows it: the laboratory's camera on the measured trajectory.
+        Sensor as the user knows it: the laboratory's camera on the measured trajectory.
     optics : LineOptics
         Lens and CCD.
     pattern : FixedPattern
-        Its pixels' differences.
+        Fixed pattern of its pixels.
     """
 
     sensor: Sensor
@@ -86,20 +83,20 @@ class ImagedLine:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LineImage(LineFrame):
-    """What one line recorded of a patch, uint16, and what the truth knows of it.
+    """Image of a patch by one line, uint16, with its truth.
 
     Attributes
     ----------
     sensor : Sensor
-        The true one.
+        True sensor.
     motion : ImageMotion
-        Of the image over the line, in the window's middle.
-    nyquist : tuple[float, float]
+        Motion of the image over the line, in the window's middle.
+    nyquist : tuple of float
         Modulation transfer at half a cycle per pixel, and per line.
     saturated : int
-        Pixels at the end of the detector's range.
+        Number of saturated pixels.
     error : float
-        Of the renderer's interpolated geometry, pixels (see `RenderedPatch`).
+        Error of the renderer's interpolated geometry, pixels (see `RenderedPatch`).
     """
 
     sensor: Sensor
@@ -111,12 +108,12 @@ class LineImage(LineFrame):
 
 @dataclass(frozen=True, eq=False)
 class Patch(ImagedGround):
-    """A patch of simulated ground, imaged.
+    """Patch of simulated ground with its images.
 
     Attributes
     ----------
     terrain : Terrain
-        The true heights.
+        True heights.
     """
 
     images: Mapping[str, LineImage]
@@ -124,8 +121,9 @@ class Patch(ImagedGround):
     terrain: Terrain
 
     def true_point(self, name: str, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-        """The place on the true terrain that places of a line's frame see, ITRS, (N, 3), metres: the exact inverse of
-        `Sensor.image`. Rows and columns (N,) must lie on the frame.
+        """Return the points of the true terrain that positions of a line's frame see, ITRS, (N, 3), in metres.
+
+        It is the exact inverse of `Sensor.image`. Rows and columns (N,) must lie on the frame.
         """
         image = self.images[name]
         line, pixel = (np.ravel(v) for v in image.image_point(row, column))
@@ -157,27 +155,27 @@ def fly_patch(
 
     Parameters
     ----------
-    lines : Mapping[str, ImagedLine]
-        By name; see `imaged_lines`.
-    place : tuple[float, float]
+    lines : mapping of str to ImagedLine
+        Lines by name; see `imaged_lines`.
+    place : tuple of float
         Longitude and latitude of the patch's middle, radians.
-    size : tuple[int, int]
+    size : tuple of int
         Lines and pixels of every window.
     ground : GroundSpec
         Terrain, texture and light.
     control : ControlSpec
-        Of the orthophoto and the elevation model.
-    seed : np.random.SeedSequence
-        Of the ground, of the control's errors and of the frames' noise.
+        Orthophoto and elevation model.
+    seed : SeedSequence
+        Seed of the ground, of the control's errors and of the frames' noise.
     oversampling : int
-        Samples of the ground along each side of a pixel.
-    advance : Callable[[int], None]
-        Told of how many lines the images are made.
+        Number of ground samples along each side of a pixel.
+    advance : callable
+        Callback that receives the number of lines whose images are made.
 
     Raises
     ------
     PatchError
-        a line does not see the patch within its image, terrain that hides a part of itself, or a patch too large for
+        A line does not see the patch within its image, terrain hides a part of itself, or the patch is too large for
         the ground or the memory.
     """
     for_terrain, for_ground, for_control, for_frames = (stream(seed, k) for k in range(4))
@@ -210,14 +208,14 @@ def fly_patch(
 
 
 class _Size:
-    """The lines and pixels of a patch, which stand in a file that is not known here."""
+    """Size of a patch as an input that can be in error, whose file is not known here."""
 
     def error(self, problem: str, key: KeyPath, *, found: object, allowed: str) -> PatchError:
         return PatchError(f"{problem}; {found} lines or pixels, allowed: {allowed}", "size")
 
 
 def _require_memory(count: int, size: tuple[int, int], extent: Extent, spacing: float) -> None:
-    """See whether the images of so many lines, and the texture of the ground that they see, fit into the memory."""
+    """Raise an error if the images of so many lines, and the texture of their ground, do not fit into the memory."""
     lines, pixels = size
     texture = math.prod(len(axis) for axis in extent.axes(spacing))
     each = count * _PIXEL + texture / (lines * pixels) * _SAMPLE
@@ -234,18 +232,18 @@ def imaged_lines(
     optics: Mapping[str, LineOptics],
     seed: np.random.SeedSequence,
 ) -> dict[str, ImagedLine]:
-    """Lines that record images.
+    """Return lines that record images.
 
     Parameters
     ----------
-    sensors : Mapping[str, Sensor]
-        The true ones, by name.
-    measured : Mapping[str, Sensor]
-        As the user knows them.
-    optics : Mapping[str, LineOptics]
+    sensors : mapping of str to Sensor
+        True sensors, by name.
+    measured : mapping of str to Sensor
+        Sensors as the user knows them.
+    optics : mapping of str to LineOptics
         Lens and CCD.
-    seed : np.random.SeedSequence
-        Of the pixels' differences, which stay the same in all images of the line.
+    seed : SeedSequence
+        Seed of the fixed pattern, which stays the same in all images of the line.
     """
     return {
         name: ImagedLine(
@@ -256,12 +254,12 @@ def imaged_lines(
 
 
 def window_of(name: str, sensor: Sensor, frame: GroundFrame, height: float, size: tuple[int, int]) -> Window:
-    """The window of an image with the frame's origin, at a height (metres), in its middle.
+    """Return the window of an image with the frame's origin, at a height in metres, in its middle.
 
     Raises
     ------
     PatchError
-        It does not lie inside the image.
+        The window does not lie inside the image.
     """
     (line,), (pixel,) = sensor.image(frame.itrs(0.0, 0.0, height))
     if not np.isfinite(line):
@@ -281,7 +279,7 @@ def window_of(name: str, sensor: Sensor, frame: GroundFrame, height: float, size
 
 
 def _not_seen(name: str, sensor: Sensor, frame: GroundFrame, height: float) -> PatchError:
-    """What to say of a place outside an image: does the pass end before it, or does it lie beside the swath?"""
+    """Return the error of a patch outside an image, which lies before or after the pass or beside the swath."""
     ends, middle = np.array([0.0, sensor.lines - 1.0]), np.array([0.5 * (sensor.camera.pixels - 1)])
     begin, end = np.stack(frame.local(sensor.ground(ends, middle, height))[:2], axis=-1)
     track = end - begin
@@ -298,7 +296,7 @@ def _not_seen(name: str, sensor: Sensor, frame: GroundFrame, height: float) -> P
 
 
 def _side(sensor: Sensor, window: Window, frame: GroundFrame, height: float) -> float:
-    """Length of the longer side of what a window sees, metres."""
+    """Return the length of the longer side of the ground that a window sees, in metres."""
     lines = window.first_line + np.array([0.0, 0.0, 1.0, 1.0]) * (window.lines - 1)
     pixels = window.first_pixel + np.array([0.0, 1.0, 0.0, 1.0]) * (window.pixels - 1)
     east, north, _ = frame.local(sensor.ground(lines, pixels, height))
@@ -313,6 +311,7 @@ def _recorded(
     oversampling: int,
     seed: np.random.SeedSequence,
 ) -> LineImage:
+    """Return the image of one line, rendered and exposed."""
     done = pushbroom.render_patch(one.sensor, one.optics, scene, window, oversampling, looks)
     frame = one.optics.ccd.expose(done.photons[None], window.first_pixel, one.pattern, 1, seed)[0, 0]
     line, pixel = window.middle
@@ -333,35 +332,35 @@ def _recorded(
 
 
 WRONG_PIXELS, WRONG_SIGMAS, WRONG_FLOOR = 3.0, 5.0, 1.0
-"""A match is wrong that lies more than 3 pixels off, or more than 5 of its sigmas and 1 pixel."""
+"""Limits of the error of a right match: 3 pixels, and 5 of its sigmas plus 1 pixel."""
 WRONG = f"more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px"
-"""When a match is wrong, for readers."""
+"""Definition of a wrong match, for readers."""
 
 
 @dataclass(frozen=True, eq=False)
 class LineJudgement:
-    """One line's places against the truth.
+    """Points measured in one line compared with the truth.
 
     Attributes
     ----------
     found, matched, accepted : int
-        How many places there are, before any is rejected, how many matching and how many consensus let pass.
+        Number of measured positions, before any is rejected, after matching and after consensus.
     wrong_found, wrong_matched, wrong_accepted : int
-        How many of these are wrong.
+        Number of wrong ones among these.
     right_rejected_by_consensus : int
-        Right matches that consensus has rejected.
-    error : np.ndarray
-        (n, 2) found minus true, lines and pixels; NaN without a place.
-    wrong : np.ndarray
-        (n,) bool, of those with a place.
-    rms : np.ndarray
-        (2,) of accepted places that are not wrong, lines and pixels.
-    mean : np.ndarray
-        (2,) of them.
+        Number of right matches that consensus has rejected.
+    error : (n, 2) ndarray
+        Measured minus true, lines and pixels; NaN without a measurement.
+    wrong : (n,) ndarray of bool
+        Mask of wrong measurements.
+    rms : (2,) ndarray
+        RMS error of accepted positions that are not wrong, lines and pixels.
+    mean : (2,) ndarray
+        Their mean error.
     chi_square : float
-        Of them over their covariance.
+        Chi-square of their errors under their covariances.
     degrees_of_freedom : int
-        Two for each.
+        Degrees of freedom, two for each position.
     """
 
     found: int
@@ -380,13 +379,15 @@ class LineJudgement:
 
     @property
     def p_value(self) -> float:
-        """Chance of a chi-square as large or larger."""
+        """Probability of a chi-square as large or larger."""
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
 
 def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
-    """(n, 3) ITRS, metres: the true place of what the points show. A map shows at a place what lies at that place minus
-    its error; a tie is what its source's pixel truly sees.
+    """Return the true ground points that the measured points show, ITRS, (n, 3), in metres.
+
+    The ground shown at a position of a map lies at that position minus its error; a tie point is what its source's
+    pixel truly sees.
     """
     if points.kind == "map":
         east, north = patch.control.error(points.east, points.north)
@@ -401,7 +402,7 @@ def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
 
 
 def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineJudgement]:
-    """Line -> judgement; the frame that ties were chosen in is left out."""
+    """Compare measured points with the truth, by line; the frame that ties were chosen in is left out."""
     truth = true_ground(patch, points)
     found = {}
     for name, line in points.sought_in.items():

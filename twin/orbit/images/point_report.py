@@ -1,4 +1,4 @@
-"""Points measured in images as listing, tables and figures."""
+"""Report of points measured in images: listing, tables and figures."""
 
 from __future__ import annotations
 
@@ -57,21 +57,22 @@ HEADS = (
     "accepted",
     "status",
 )
+"""Column heads of the listing of points."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointListing(Data):
-    """Rows under `HEADS`, kept as CSV and named in the report."""
+    """Listing of points, rows under `HEADS`, saved as CSV and named in the report."""
 
     kind: ClassVar[str] = "csv"
 
     def content(self) -> bytes:
-        """The rows with all their digits; what there is not is empty."""
+        """Return the rows with all their digits; missing values are empty."""
         return csv_table([HEADS, *self.data])
 
 
 def listing(patch: ImagedGround, points: PatchPoints) -> list[list[Any]]:
-    """A row for each point and line."""
+    """Return a row for each point and line."""
     rows: list[list[Any]] = []
     for sort, one in points.sorts.items():
         degrees = np.degrees(patch.frame.geographic(one.east, one.north)).T
@@ -92,18 +93,20 @@ def listing(patch: ImagedGround, points: PatchPoints) -> list[list[Any]]:
 
 T = TypeVar("T")
 _DPI = 110
+"""Resolution of the figures, in dots per inch."""
 SORTS = {"control": "orthophoto", "tie": "tie"}
+"""Names of the kinds of points for readers."""
 
 
 def how_measured(spec: ImagePointsSpec, known: str) -> str:
-    """Return how points are measured in images, in sentences.
+    """Return a description of how points are measured in images.
 
     Parameters
     ----------
     spec : ImagePointsSpec
-        Of the points.
+        Options of the measurement.
     known : str
-        What brings them into each line's geometry.
+        Sensor that brings the points into each line's geometry.
     """
     return (
         "Distinct places of the orthophoto, with heights of the elevation model, and distinct places of one line's "
@@ -114,13 +117,13 @@ def how_measured(spec: ImagePointsSpec, known: str) -> str:
 
 
 def points_section(patch: Patch, points: PatchPoints, spec: ImagePointsSpec) -> Section:
-    """Numbers, figure and listing of a patch's points."""
+    """Return the report section on a patch's points: numbers, figures and listing."""
     shown = point_artefacts(patch, points, found_table(points), _true(patch, points))
     return Section("Measured points", (how_measured(spec, "the measured sensor"),), shown)
 
 
 def point_artefacts(patch: ImagedGround, points: PatchPoints, *tables: Table) -> tuple[Artefact, ...]:
-    """Return tables, figures, what was lost, and the listing of points that were measured in images of ground."""
+    """Return tables, figures, reasons of losses, and the listing of points measured in images of ground."""
     figures = [
         PngFigure(
             f"points-{sort}",
@@ -137,13 +140,13 @@ def point_artefacts(patch: ImagedGround, points: PatchPoints, *tables: Table) ->
 
 
 def flat(points: PatchPoints, below: Callable[[MatchedPoints], Mapping[str, T]]) -> dict[str, T]:
-    """Return what points have by line, under sort and line together."""
+    """Return results of points by line under a combined name of kind and line."""
     found = ((sort, below(one)) for sort, one in points.sorts.items())
     return {f"{SORTS[sort]}, {name}": line for sort, lines in found for name, line in lines.items()}
 
 
 def found_table(points: PatchPoints) -> Table:
-    """Return the table of the points that were matched, by sort and line."""
+    """Return the table of the points that were matched, by kind and line."""
     found = flat(points, lambda one: one.sought_in)
     rows = {name: MATCHED(line) for name, line in found.items() if line.accepted.any()}
     caption = (
@@ -155,6 +158,7 @@ def found_table(points: PatchPoints) -> Table:
 
 
 def _true(patch: Patch, points: PatchPoints) -> Table:
+    """Return the table of measured points compared with the truth."""
     rows = {name: JUDGED(line) for name, line in flat(points, lambda one: judged(patch, one)).items()}
     caption = (
         f"Wrong: {WRONG}; of all places that a fit gave, of those that matching let pass, of those that the neighbours "
@@ -165,7 +169,7 @@ def _true(patch: Patch, points: PatchPoints) -> Table:
 
 
 def _lost_table(points: PatchPoints) -> Table:
-    """Why points were not accepted."""
+    """Return the table of the reasons why points were not accepted."""
     rows: list[tuple[Cell, ...]] = []
     for sort, one in points.sorts.items():
         count = {name: line.lost for name, line in one.sought_in.items()}
@@ -178,7 +182,7 @@ def _lost_table(points: PatchPoints) -> Table:
 
 
 def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
-    """PNG: every line's frame with its points and their displacements."""
+    """Return a PNG of every line's frame with its points and their displacements."""
     with look(f"points-{points.kind}"):
         names = list(points.sought_in)
         figure = new_figure(4.3 if len(names) > 2 else 5.6)
@@ -195,6 +199,7 @@ def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
 
 
 def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> None:
+    """Draw one line's frame with its points and their displacements."""
     line = points.lines[name]
     low, high = np.percentile(image.frame, (0.5, 99.5))
     row, column = line.first
@@ -224,6 +229,6 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
 
 
 def _round(value: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is not above the value."""
+    """Return the largest of 1, 2 and 5 times a power of ten that is not above the value."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= value * (1.0 + 1e-9)))

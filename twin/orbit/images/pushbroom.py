@@ -1,10 +1,10 @@
-"""Pushbroom images: which place on the ground every pixel sees, and its light.
+"""Pushbroom images: the ground point that every pixel sees, and its light.
 
 The rigorous sensor is evaluated at Chebyshev nodes over lines, pixels and heights; between them east and north are
-analytic, and as many nodes are taken as keep the interpolation below a tolerance that is measured. The place on the
-terrain follows from the look's east and north over height, by secant steps between bounds.
+analytic, and as many nodes are taken as keep the interpolation below a tolerance that is measured. The intersection
+with the terrain follows from the look's east and north over height, by secant steps between bounds.
 
-Every sample of the ground, several for each pixel, is looked at by the rigorous sensor on the terrain; the transfer
+Every sample of the ground, several for each pixel, is located by the rigorous sensor on the terrain; the transfer
 function of lens, pixels and motion takes the samples to the pixels; the detector's model makes frames of them. All of
 it runs in strips of lines, and the result does not depend on how it is cut.
 """
@@ -27,37 +27,40 @@ from twin.orbit.ground.orthophoto import Extent
 from twin.orbit.images.line_optics import ImageMotion, LineOptics, exposures, steady
 
 TOLERANCE = 2e-4
-"""Metres: largest interpolation error of the look's place at given heights."""
+"""Largest interpolation error of the look's position at given heights, in metres."""
 _COUNTS = (4, 6, 8, 12, 16, 24, 32, 48)
+"""Numbers of nodes along lines and pixels that are tried in turn."""
 _JITTERING = (96, 192, 384, 768, 1536)
-"""Nodes along the lines where the attitude is rougher than the looks of a line are."""
+"""Numbers of nodes along the lines where the attitude is rougher than the looks of a line are."""
 _HEIGHTS = 4
-"""The look bends over the ellipsoid's curvature by 3 cm in 500 m of height, and by nothing more."""
+"""Number of nodes over height: the look bends over the ellipsoid's curvature by 3 cm in 500 m of height, and no more.
+"""
 _MET = 1e-4
-"""Metres of height between look and terrain."""
+"""Tolerance of the height between look and terrain, in metres."""
 _MOST_STEPS = 40
+"""Largest number of secant steps."""
 
 
 class SteepTerrainError(PhysicalError, ValueError):
-    """Terrain that is steeper than a look: a part of it is hidden."""
+    """Error of terrain that is steeper than a look, so that a part of it is hidden."""
 
 
 @dataclass(frozen=True, eq=False)
 class LookMap:
-    """The looks of a part of an image; made by `prepare`.
+    """Interpolated looks of a part of an image; made by `prepare`.
 
     Attributes
     ----------
     frame : GroundFrame
         Coordinates of the ground.
     terrain : Terrain
-        Of the ground.
-    span : np.ndarray
+        Terrain of the ground.
+    span : (3, 2) ndarray
         First and last line, first and last pixel, lowest and highest height (metres) of the nodes.
-    east, north : np.ndarray
-        Chebyshev coefficients over height, line and pixel, (heights, K, M), metres.
+    east, north : (heights, K, M) ndarray
+        Chebyshev coefficients over height, line and pixel, metres.
     error : float
-        Largest difference to the rigorous sensor that was found between the nodes, metres.
+        Largest measured difference to the rigorous sensor between the nodes, metres.
     """
 
     frame: GroundFrame
@@ -77,12 +80,12 @@ class LookMap:
         pixels: tuple[float, float],
         tolerance: float = TOLERANCE,
     ) -> LookMap:
-        """For the part of an image between given lines and pixels, both inclusive.
+        """Interpolate the looks of the part of an image between given lines and pixels, both inclusive.
 
         Raises
         ------
         ValueError
-            a part outside the image, a look that misses the Earth, or an attitude too rough for the nodes.
+            The part lies outside the image, a look misses the Earth, or the attitude is too rough for the nodes.
         """
         low, high = terrain.limits
         span = np.array([lines, pixels, (low - 1.0, high + 1.0)])
@@ -105,7 +108,7 @@ class LookMap:
         )
 
     def ground(self, lines: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """East, north and height of the terrain that a grid of image points sees: (L,), (P,) -> (L, P) each, metres.
+        """Return east, north and height, in metres, of the terrain seen by image points: (L,), (P,) -> (L, P) each.
 
         Raises
         ------
@@ -126,7 +129,7 @@ class LookMap:
         return self._met(east, north)
 
     def _met(self, east: list[np.ndarray], north: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where looks, polynomials in x, meet the terrain."""
+        """Return the intersections of looks, polynomials in x, with the terrain."""
         low, high = self.span[2]
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
 
@@ -159,30 +162,32 @@ class LookMap:
         )
 
     def run(self) -> tuple[float, float]:
-        """How far the middle look moves east and north for each metre that it is followed up."""
+        """Return how far the middle look moves east and north for each metre of height."""
         low, high = self.span[2]
         ends = np.full(2, self.span[0].mean()), np.full(2, self.span[1].mean()), np.array([low, high])
         east, north = self._at(*ends)
         return float((east[1] - east[0]) / (high - low)), float((north[1] - north[0]) / (high - low))
 
     def _at(self, line: np.ndarray, pixel: np.ndarray, height: np.ndarray) -> np.ndarray:
-        """East and north at single places, (2, N)."""
+        """Return east and north at single image points and heights, (2, N)."""
         count = self.east.shape[1]
         a, b = self._basis(0, line, count), self._basis(1, pixel, self.east.shape[2])
         c = self._basis(2, height, _HEIGHTS)
         return np.stack([np.einsum("hij,nh,ni,nj->n", v, c, a, b, optimize=True) for v in (self.east, self.north)])
 
     def _basis(self, axis: int, place: np.ndarray, count: int) -> np.ndarray:
+        """Return Chebyshev polynomials along an axis at positions, (..., count)."""
         first, last = self.span[axis]
         return chebyshev.chebvander((2.0 * np.asarray(place) - first - last) / (last - first), count - 1)
 
 
 def _nodes(ends: np.ndarray, count: int) -> np.ndarray:
+    """Return Chebyshev points between two ends, (count,)."""
     return np.asarray(0.5 * (ends[0] + ends[1]) + 0.5 * (ends[1] - ends[0]) * chebyshev.chebpts1(count))
 
 
 def _coefficients(values: np.ndarray) -> np.ndarray:
-    """Chebyshev coefficients of values at the nodes, along every axis."""
+    """Return Chebyshev coefficients of values at the nodes, along every axis."""
     for axis, count in enumerate(values.shape):
         to = chebyshev.chebvander(chebyshev.chebpts1(count), count - 1).T * (2.0 / count)
         to[0] *= 0.5
@@ -193,6 +198,7 @@ def _coefficients(values: np.ndarray) -> np.ndarray:
 def _local(
     sensor: Sensor, frame: GroundFrame, line: np.ndarray, pixel: np.ndarray, height: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Return east and north of looks at heights, by the rigorous sensor, in metres."""
     points = sensor.ground(line, pixel, height)
     if not np.all(np.isfinite(points)):
         raise UnphysicalError("a look misses the Earth")
@@ -200,6 +206,7 @@ def _local(
 
 
 def _horner(terms: list[np.ndarray], x: np.ndarray) -> np.ndarray:
+    """Evaluate a polynomial with array coefficients, ascending powers, at x."""
     out = terms[-1] * x
     for term in terms[-2:0:-1]:
         out += term
@@ -209,31 +216,33 @@ def _horner(terms: list[np.ndarray], x: np.ndarray) -> np.ndarray:
 
 
 MARGIN = 24
-"""Pixels and lines about a window that its image needs; the point spread function ends there."""
+"""Margin about a window that its image needs, in pixels and lines; the point spread function ends there."""
 LARGEST_ERROR = 0.002
-"""Pixels: of the interpolated places, against the rigorous sensor on the terrain."""
+"""Largest error of interpolated positions relative to the rigorous sensor on the terrain, in pixels."""
 _NEAR = 2
-"""Points beyond the samples for cubic interpolation."""
+"""Number of points beyond the samples for cubic interpolation."""
 BORDER = MARGIN + _NEAR + 1
-"""Lines and pixels between a window and the ends of an image, at least."""
+"""Least number of lines and pixels between a window and the ends of an image."""
 _SAMPLES_AT_ONCE = 4_000_000
+"""Largest number of ground samples in a strip, to bound memory."""
 _CHECKS = 400
+"""Number of samples at which the interpolation is checked."""
 
 
 GroundImage = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Apparent reflectance of places of the ground, east and north of the frame's middle in metres, of one shape."""
+"""Function from east and north, in metres from the frame's middle and of one shape, to apparent reflectance."""
 
 
 @dataclass(frozen=True, eq=False)
 class PushbroomScene:
-    """What there is to see.
+    """Scene of a pushbroom image: terrain with its apparent reflectance.
 
     Attributes
     ----------
     frame : GroundFrame
         Coordinates of the ground.
     terrain : Terrain
-        heights.
+        Heights.
     image : GroundImage
         Apparent reflectance, light and air included.
     """
@@ -245,14 +254,14 @@ class PushbroomScene:
 
 @dataclass(frozen=True)
 class Window:
-    """A part of an image: whole lines and pixels, counted in the image.
+    """Part of an image: whole lines and pixels, counted in the image.
 
     Attributes
     ----------
     first_line, first_pixel : int
-        Of its first sample.
+        Line and pixel of the first sample.
     lines, pixels : int
-        Its size.
+        Size of the window.
     """
 
     first_line: int
@@ -266,7 +275,7 @@ class Window:
         return self.first_line + 0.5 * (self.lines - 1), self.first_pixel + 0.5 * (self.pixels - 1)
 
     def fits(self, sensor: Sensor) -> bool:
-        """Whether it lies inside a sensor's image with the border that rendering needs."""
+        """Return whether it lies inside a sensor's image with the border that rendering needs."""
         return (
             min(self.first_line, self.first_pixel) >= BORDER
             and self.first_line + self.lines + BORDER <= sensor.lines
@@ -274,7 +283,7 @@ class Window:
         )
 
     def sample(self, sensor: Sensor, height: float) -> tuple[float, float]:
-        """Distance of two pixels along the line, and of two lines, on ground of a height in its middle, metres."""
+        """Return the ground distance of two pixels along the line, and of two lines, at its middle, in metres."""
         line, pixel = self.middle
         steps = np.array([-0.5, 0.5, 0.0, 0.0])
         points = sensor.ground(line + steps, pixel + np.roll(steps, 2), height)
@@ -287,14 +296,14 @@ class RenderedPatch:
 
     Attributes
     ----------
-    photons : np.ndarray
-        Expected photons in every pixel, (lines, pixels).
+    photons : (lines, pixels) ndarray
+        Expected photons in every pixel.
     window : Window
-        Which pixels.
+        Window of the image.
     motion : ImageMotion
-        Of the image in its middle.
+        Motion of the image in its middle.
     error : float
-        Largest difference of an interpolated place from the rigorous one on the terrain that was found, pixels.
+        Largest measured difference of an interpolated position from the rigorous one on the terrain, pixels.
     """
 
     photons: np.ndarray
@@ -304,7 +313,7 @@ class RenderedPatch:
 
 
 def look_map(sensor: Sensor, frame: GroundFrame, terrain: Terrain, window: Window) -> LookMap:
-    """The looks that an image of a window needs.
+    """Return the looks that an image of a window needs.
 
     Raises
     ------
@@ -324,7 +333,10 @@ def look_map(sensor: Sensor, frame: GroundFrame, terrain: Terrain, window: Windo
 
 
 def extent_of(looks: LookMap, step: int = 16) -> Extent:
-    """The ground that looks see, a little enlarged; checks that no slope hides another."""
+    """Return the extent of the ground that looks see, a little enlarged.
+
+    Raises SteepTerrainError where the terrain is as steep as a look.
+    """
     (first, last), (left, right), _ = looks.span
     lines, pixels = (np.linspace(a, b, int((b - a) / step) + 2) for a, b in ((first, last), (left, right)))
     east, north, _ = looks.ground(lines, pixels)
@@ -335,12 +347,12 @@ def extent_of(looks: LookMap, step: int = 16) -> Extent:
 
 
 def require_open(looks: LookMap, extent: Extent) -> None:
-    """Refuse terrain that hides a part of itself from the looks.
+    """Raise SteepTerrainError if terrain hides a part of itself from the looks.
 
     Raises
     ------
     SteepTerrainError
-        a slope that faces away is as steep as the look.
+        A slope that faces away is as steep as the look.
     """
     to_east, to_north = looks.run()
     spacing = min(looks.terrain.surface.spacing)
@@ -366,30 +378,30 @@ def render_patch(
     oversampling: int = 3,
     looks: LookMap | None = None,
 ) -> RenderedPatch:
-    """Expected photons of a window of an image.
+    """Render the expected photons of a window of an image.
 
     Parameters
     ----------
     sensor : Sensor
-        The true one.
+        True sensor.
     optics : LineOptics
-        Of its line.
+        Optics of its line.
     scene : PushbroomScene
-        What there is to see.
+        Terrain with its apparent reflectance.
     window : Window
-        Which lines and pixels.
+        Lines and pixels of the image.
     oversampling : int
-        Samples of the ground along each side of a pixel.
-    looks : LookMap | None
-        `look_map` of the same, if it is there already.
+        Number of ground samples along each side of a pixel.
+    looks : LookMap or None
+        `look_map` of the same sensor and window, if it exists already.
 
     Raises
     ------
     ValueError
-        a window too near to the image's ends, ground that the scene does not know, or terrain so rough that the places
-        cannot be interpolated.
+        The window is too near to the image's ends, its ground lies outside the scene, or the terrain is too rough for
+        the interpolation.
     SteepTerrainError
-        Terrain that hides a part of itself.
+        The terrain hides a part of itself.
     """
     looks = looks or look_map(sensor, scene.frame, scene.terrain, window)
     line, pixel = window.middle
@@ -415,7 +427,7 @@ def _expected(
     motion: ImageMotion,
     looks: LookMap | None,
 ) -> tuple[np.ndarray, float]:
-    """Expected photons at one moment of the collection, and the error of places; arguments as `render_patch`."""
+    """Return expected photons at one moment of the collection, and the position error; arguments as `render_patch`."""
     looks = looks or look_map(sensor, scene.frame, scene.terrain, window)
     # samples at pixels first, then finer if the terrain asks for it
     for fine in (1, oversampling):
@@ -446,8 +458,10 @@ def _expected(
 
 
 def _samples(looks: LookMap, window: Window, oversampling: int, fine: int) -> tuple[np.ndarray, np.ndarray]:
-    """East and north of all samples of a window with its margin; `fine` places for each pixel are found on the terrain,
-    the rest is interpolated with cubics.
+    """Return east and north of all samples of a window with its margin.
+
+    For each pixel `fine` positions along each side are computed on the terrain, the others are interpolated with
+    cubics.
     """
     reach = MARGIN + _NEAR
     lines = np.arange((window.lines + 2 * reach - 1) * fine + 1) / fine + (window.first_line - reach)
@@ -462,7 +476,7 @@ def _samples(looks: LookMap, window: Window, oversampling: int, fine: int) -> tu
 
 
 def _spread(values: np.ndarray, factor: int, axis: int) -> np.ndarray:
-    """Cubic (Lagrange) interpolation to `factor` samples per step along an axis, without the outer steps."""
+    """Interpolate by cubics (Lagrange) to `factor` samples per step along an axis, without the outer steps."""
     v = np.moveaxis(values, axis, 0)
     count = len(v) - 3
     out = np.empty((factor * count + 1, *v.shape[1:]))
@@ -483,7 +497,7 @@ def _spread(values: np.ndarray, factor: int, axis: int) -> np.ndarray:
 
 
 def _filtered(values: np.ndarray, kernel: np.ndarray, oversampling: int, window: Window) -> np.ndarray:
-    """Samples, with a margin, through the point spread function, at the pixels."""
+    """Return samples, with a margin, convolved with the point spread function, at the pixels."""
     # what the ring of a transform brings from the far side falls into the margin alone
     shape = [fft.next_fast_len(n, True) for n in values.shape]
     spectrum = fft.rfft2(values.astype(np.float32, copy=False), s=shape)
@@ -496,8 +510,9 @@ def _filtered(values: np.ndarray, kernel: np.ndarray, oversampling: int, window:
 
 
 def _interpolation_error(sensor: Sensor, looks: LookMap, window: Window, oversampling: int, fine: int) -> float:
-    """Largest error of places that `_samples` gives, on blocks of the window, pixels: the images of the places on the
-    terrain, by the sensor's own way back, against where they were taken.
+    """Return the largest position error of `_samples` on blocks of the window, in pixels.
+
+    The points on the terrain are imaged by the rigorous sensor and compared with the samples' image coordinates.
     """
     random, size = np.random.default_rng(1), 5
     taken, places = [], []

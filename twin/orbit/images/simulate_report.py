@@ -48,11 +48,12 @@ if TYPE_CHECKING:
 
 
 _DPI = 110
+"""Resolution of the figures, in dots per inch."""
 _PARTS = {"lens": BLUE, "pixel": GREEN, "diffusion": ORANGE, "step": SKY, "stages": VERMILION}
 
 
 def _images_png(run: Simulation) -> bytes:
-    """The lines' images side by side, each stretched between its 0.5% and 99.5% grey values."""
+    """Draw the lines' images side by side, each stretched between its 0.5% and 99.5% grey values."""
     with look("simulate-images"):
         images = run.patch.images
         columns = min(len(images), 3)
@@ -67,7 +68,7 @@ def _images_png(run: Simulation) -> bytes:
 
 
 def _control_png(run: Simulation) -> bytes:
-    """Orthophoto and elevation model."""
+    """Draw orthophoto and elevation model."""
     with look("simulate-control"):
         figure = new_figure(4.6)
         photo, heights = figure.subplots(1, 2)
@@ -81,11 +82,12 @@ def _control_png(run: Simulation) -> bytes:
 
 
 def _modulus(values: np.ndarray) -> np.ndarray:
-    """Modulus of complex values; real ones keep their sign."""
+    """Return the modulus of complex values; real ones keep their sign."""
     return np.abs(values) if np.iscomplexobj(values) else values
 
 
 def _transfer_figure(run: Simulation) -> Figure:
+    """Draw the modulation transfer along line and track, with its factors."""
     figure = new_figure(3.4)
     panels = figure.subplots(1, 2, sharey=True)
     frequency = np.linspace(0.0, 0.5, 101)
@@ -116,6 +118,7 @@ _NAMES = {
 
 
 def _show_image(axes: Axes, name: str, image: LineImage) -> None:
+    """Show a line's image between its 0.5% and 99.5% grey values."""
     low, high = np.percentile(image.frame, (0.5, 99.5))
     window = image.window
     first, left = window.first_line - 0.5, window.first_pixel - 0.5
@@ -126,6 +129,7 @@ def _show_image(axes: Axes, name: str, image: LineImage) -> None:
 
 
 def _show_raster(axes: Axes, raster: Raster, colours: str) -> AxesImage:
+    """Show a map in kilometres east and north."""
     low, high = np.percentile(raster.values, (0.5, 99.5))
     rows, columns = raster.values.shape
     half = 0.5 * raster.spacing
@@ -142,7 +146,7 @@ def _show_raster(axes: Axes, raster: Raster, colours: str) -> AxesImage:
 
 
 def sections(run: Simulation) -> tuple[Section, ...]:
-    """Images, control, measured points, sharpness, data."""
+    """Return the report's sections: images, control, measured points, sharpness, data."""
     points, spec = run.points, run.spec.points
     measured = () if points is None or spec is None else (points_section(run.patch, points, spec),)
     return _images(run), _control(run), *measured, _sharpness(run), _data(run)
@@ -164,6 +168,7 @@ def _images(run: Simulation) -> Section:
 
 
 def _lines(run: Simulation, name: str, title: str, caption: str, keys: Sequence[str]) -> Table:
+    """Return a table of quantities of the lines' images."""
     rows = {line: LINE(image) for line, image in run.patch.images.items()}
     return LINE.table(name, title, caption, rows, keys, "line", digits=4)
 
@@ -209,7 +214,7 @@ def _data(run: Simulation) -> Section:
 
 
 def simulation_report(run: Simulation) -> Report:
-    """Report of a pass."""
+    """Return the report of a simulated pass."""
     patch = run.spec.patch
     longitude, latitude = np.degrees(run.place)
     images = run.patch.images
@@ -241,19 +246,20 @@ def simulation_report(run: Simulation) -> Report:
 
 
 def map_facts(raster: Raster, note: str, heights: bool = False) -> FrameFacts:
-    """What the TIFF of a map says of itself: a GeoTIFF."""
+    """Return the tags of a map's GeoTIFF."""
     longitude, latitude, *steps = list(GEOREFERENCE(raster).values())[3:]
     return FrameFacts(note=note, place=MapPlace(longitude, latitude, steps[0], steps[1], heights))
 
 
 def _summary(run: Simulation) -> Table:
+    """Return the summary table of the images."""
     caption = "Distance of samples on the ground and modulation transfer at half a cycle per sample, in the middle."
     keys = ("sample_along_line_m", "sample_along_track_m", "mtf_nyquist_along_line", "mtf_nyquist_along_track")
     return _lines(run, "images", "Images", caption, (*keys, "mean_dn", "rms_contrast"))
 
 
 def changes_text(perturb: Mapping[str, InteriorChangeSpec]) -> str:
-    """Return in words what has changed in the lines of a camera since the laboratory."""
+    """Return the changes of a camera's lines since the laboratory in words."""
     changes = (
         f"{name} f {format_quantity(c.principal_distance, LENGTH)}, "
         f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"
@@ -263,6 +269,7 @@ def changes_text(perturb: Mapping[str, InteriorChangeSpec]) -> str:
 
 
 def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
+    """Return the input quantities listed in the report."""
     test, camera = setup.test, setup.camera
     terrain, light = test.ground.terrain, test.ground.light
     relief = "its own relief" if terrain.relief is None else f"relief {format_quantity(terrain.relief, LENGTH)} rms"
@@ -284,5 +291,6 @@ def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
 
 
 def _warnings(run: Simulation) -> tuple[str, ...]:
+    """Return warnings about saturated images."""
     full = [name for name, image in run.patch.images.items() if image.saturated]
     return (f"saturated pixels in {', '.join(full)}; lower ground.texture.mean or the line time",) if full else ()

@@ -1,11 +1,9 @@
-"""A pass over a patch of ground from what its file says: orbit, the camera as it is and as it was known, images.
+"""Simulated pass over a patch of ground: run, results and export.
 
-The quantities of a simulated pass: simulate.json, and what artefacts/NAME.json hold for other software and as truth.
-
-simulate.json has what the user of the images may know. The camera, orbit and attitude, and the georeference are files
-of their own; the camera and the trajectory as they truly are stand in truth.json alone.
-
-The simulated measurements as a folder of tables with a test file that reads them back.
+The run makes orbit, the true and the laboratory's camera, images and measured points from a test's file. simulate.json
+has what the user of the images may know. The camera, orbit and attitude, and the georeference are artefacts of their
+own for other software; the true camera and trajectory are in truth.json alone. The export writes the simulated
+measurements as a folder of tables with a test file that reads them back.
 """
 
 from __future__ import annotations
@@ -75,26 +73,27 @@ _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
         "terrain": (("ground", "terrain"), "less relief, a larger exponent or larger posts"),
     }
 )
+"""Key of the input to change, and advice, by the part of a PatchError."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFlight:
-    """A pass without its images.
+    """Simulated pass without its images.
 
     Attributes
     ----------
     earth : Earth
-        Below it.
+        Earth below it.
     truth : ThreeLineCameraSpec
-        The camera as it is.
+        True camera.
     trajectory : Trajectory
-        The true one.
+        True trajectory.
     measured : Trajectory
-        What the satellite says of it.
-    sensors : Mapping[str, Sensor]
-        Line -> as it is, over the whole orbit.
-    users : Mapping[str, Sensor]
-        Line -> as the user knows it: the laboratory's camera on the measured trajectory.
+        Trajectory as the satellite measures it.
+    sensors : mapping of str to Sensor
+        True sensor of each line, over the whole orbit.
+    users : mapping of str to Sensor
+        Sensor of each line as the user knows it: the laboratory's camera on the measured trajectory.
     """
 
     earth: Earth
@@ -107,22 +106,22 @@ class SimulatedFlight:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Simulation(SimulatedFlight):
-    """A pass and what it gave.
+    """Simulated pass with images, control and measured points.
 
     Attributes
     ----------
     setup : SimulateSetup
-        What its file says.
+        Test file with camera and detectors.
     seed : int
-        Of all random numbers.
-    lines : Mapping[str, ImagedLine]
-        Those that are rendered, by name.
-    place : tuple[float, float]
+        Seed of all random numbers.
+    lines : mapping of str to ImagedLine
+        Rendered lines, by name.
+    place : tuple of float
         Longitude and latitude of the patch's middle, radians.
     patch : Patch
         Images and control.
-    points : PatchPoints | None
-        Measured in the images; None where none were asked for.
+    points : PatchPoints or None
+        Points measured in the images; None where none were requested.
     """
 
     setup: SimulateSetup
@@ -134,22 +133,22 @@ class Simulation(SimulatedFlight):
 
     @property
     def spec(self) -> OrbitSimulateSpec:
-        """The test."""
+        """Specification of the test."""
         return self.setup.test
 
     @property
     def laboratory(self) -> ThreeLineCameraSpec:
-        """The camera as it was measured before launch."""
+        """Camera as measured before launch."""
         return self.setup.camera
 
 
 def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
-    """Orbit and cameras of a pass; the same for the same seed as those of `run_simulation`.
+    """Return orbit and cameras of a pass; the same for the same seed as those of `run_simulation`.
 
     Raises
     ------
     BenchError
-        No such orbit.
+        The orbit is impossible.
     """
     spec, root = setup.test, np.random.SeedSequence(seed)
     earth = Earth.from_spec(spec.earth)
@@ -166,12 +165,14 @@ def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
 
 
 def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Simulation:
-    """Fly the pass: ``python -m twin.orbit simulate``; nothing is traced, so that the backend is not used.
+    """Simulate the pass of ``python -m twin.orbit simulate``.
+
+    Nothing is traced, so that the backend is not used.
 
     Raises
     ------
     BenchError
-        No such orbit, a patch that a line cannot image, points that cannot be measured.
+        The orbit is impossible, a line cannot image the patch, or points cannot be measured.
     """
     spec, root = setup.test, np.random.SeedSequence(seed)
     flight = fly_simulation(setup, seed)
@@ -200,6 +201,7 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
 
 
 def _points(patch: Patch, spec: OrbitSimulateSpec) -> PatchPoints | None:
+    """Return the points measured in a patch; None where the test requests none."""
     if spec.points is None:
         return None
     try:
@@ -209,13 +211,14 @@ def _points(patch: Patch, spec: OrbitSimulateSpec) -> PatchPoints | None:
 
 
 def _sensor(camera: LineCamera, trajectory: Trajectory, earth: Earth, spec: OrbitSimulateSpec) -> Sensor:
-    """A line's image over the whole orbit."""
+    """Return the sensor of a line's image over the whole orbit."""
     lines = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
     effects = LightEffects.of(spec.effects)
     return Sensor(camera, trajectory, earth, spec.line_time, trajectory.first + 0.5 * spec.line_time, lines, effects)
 
 
 def _place(sensor: Sensor, spec: OrbitSimulateSpec) -> tuple[float, float]:
+    """Return longitude and latitude of the patch's middle, in radians."""
     line = (spec.patch.time - sensor.first_line_time) / sensor.line_time
     line = float(np.clip(line, -0.5, sensor.lines - 0.5))
     point = sensor.ground(np.array([line]), np.array([spec.patch.pixel]), spec.ground.terrain.height)
@@ -224,14 +227,16 @@ def _place(sensor: Sensor, spec: OrbitSimulateSpec) -> tuple[float, float]:
 
 
 _TRUE_POINTS = 21
-"""Along each side of the grid of true ground points."""
+"""Number of points along each side of the grid of true ground points."""
 _LOOK = (
     "y = (pixel - (pixels - 1)/2) pitch, r^2 = x0^2 + (y - y0)^2, d = k1 r^2 + k2 r^4; the look in camera axes "
     "is along (x0 (1 + d), -(y - y0)(1 + d), f); pixel 0 is the middle of the first"
 )
+"""Formula of a pixel's look, for readers of camera.json."""
 
 
 def _line_time(image: LineImage, row: int) -> float:
+    """Return the time of exposure of a row of the window, in seconds from the epoch."""
     return float(image.measured.time(np.array([image.window.first_line + row]))[0])
 
 
@@ -260,7 +265,7 @@ LINE: Record[LineImage] = Record(
 
 
 def _per_pixel(raster: Raster) -> Array:
-    """Radians of longitude per column and of latitude per row, which go to the south."""
+    """Return radians of longitude per column and of latitude per row, which go to the south."""
     return raster.spacing / np.array(raster.frame.scale) * np.array([1.0, -1.0])
 
 
@@ -318,7 +323,7 @@ SIMULATE: Record[Simulation] = Record(
 
 
 def camera_data(camera: ThreeLineCameraSpec) -> dict[str, Any]:
-    """Interior orientation and mounting of every line, and how they make a look."""
+    """Return interior orientation and mounting of every line, with the formula of a look."""
     lines = {
         name: {
             "pixels": camera.pixels_of(name),
@@ -336,10 +341,10 @@ def camera_data(camera: ThreeLineCameraSpec) -> dict[str, Any]:
 
 
 def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
-    """Orbit and attitude at the times of the pass's readings; between them the errors of a measured trajectory are the
-    cubic spline that `twin.orbit.flight.trajectory` describes.
+    """Return orbit and attitude at the times of the pass's readings.
 
-    Quaternions are (x, y, z, w); neighbours lie on one side, so that they can be joined.
+    Between the readings the errors of a measured trajectory are the cubic spline that `twin.orbit.flight.trajectory`
+    describes. Quaternions are (x, y, z, w); neighbours lie on one side, so that they can be interpolated.
     """
     errors = run.spec.errors
     fixes, looks = (
@@ -360,12 +365,13 @@ def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
 
 
 def georeference_data(run: Simulation) -> dict[str, Any]:
-    """Where the pixels of orthophoto and elevation model lie."""
+    """Return the georeference of orthophoto and elevation model."""
     control = run.patch.control
     return {"orthophoto": GEOREFERENCE(control.orthophoto), "dem": GEOREFERENCE(control.dem)}
 
 
 def _errors(one: LineJudgement) -> list[list[float | None]]:
+    """Return the errors of every point, None where it was not measured."""
     return [[float(v) if np.isfinite(v) else None for v in row] for row in one.error]
 
 
@@ -378,7 +384,7 @@ MATCH_COUNTS = {
     "wrong_accepted": "wrong places among those that consensus let pass",
     "right_rejected_by_consensus": "right matches that consensus rejected",
 }
-"""Count of places in one line -> what it is."""
+"""Meaning of each count of points in one line."""
 
 JUDGED: Record[LineJudgement] = Record(
     "Points of one sort in one line against the truth; RMS and mean of those that are not wrong.",
@@ -399,20 +405,20 @@ TRUE_POINTS: Record[tuple[Patch, MatchedPoints]] = Record(
 
 
 def _grid(shape: tuple[int, ...]) -> tuple[Array, Array]:
-    """Rows and columns of a grid over an image."""
+    """Return rows and columns of a grid over an image."""
     row, column = np.meshgrid(*(np.linspace(0.0, n - 1.0, _TRUE_POINTS) for n in shape), indexing="ij")
     return row.ravel(), column.ravel()
 
 
 def _true_grid(patch: Patch, name: str) -> dict[str, Any]:
-    """True places of a grid of a line's image."""
+    """Return true ground points of a grid of a line's image."""
     row, column = _grid(patch.images[name].frame.shape)
     line, pixel = patch.images[name].image_point(row, column)
     return {"line": line, "pixel": pixel, "itrs_m": patch.true_point(name, row, column)}
 
 
 def _control_error(patch: Patch) -> dict[str, Any]:
-    """Error in plan of the control at a grid of the orthophoto."""
+    """Return the error in plan of the control at a grid of the orthophoto."""
     photo = patch.control.orthophoto
     row, column = _grid(photo.values.shape)
     east, north = patch.control.error(*photo.east_north(row, column))
@@ -439,11 +445,11 @@ TRUTH: Record[Simulation] = Record(
 
 
 _EXACT = 1e-3
-"""Metres; of control without errors."""
+"""Sigma of control without errors, in metres."""
 
 
 def simulation_exported(run: Simulation) -> dict[str, str]:
-    """Path -> text of the files of one pass over a patch, whose points were measured in its images.
+    """Return the files of one pass over a patch whose points were measured in its images, text by path.
 
     Raises
     ------

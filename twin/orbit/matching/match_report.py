@@ -9,11 +9,11 @@ from twin.orbit.images.point_report import found_table, how_measured, point_arte
 from twin.orbit.matching.match_run import IMAGE, Match
 
 _FAR = 0.5
-"""Share of the reach: matches that lie farther from where they were expected leave the search little room."""
+"""Share of the search range beyond which a displacement leaves the search little room."""
 
 
 def match_report(run: Match) -> Report:
-    """Report of a run."""
+    """Return the report of a run."""
     return Report(
         "Points measured in images",
         *_verdict(run),
@@ -25,6 +25,7 @@ def match_report(run: Match) -> Report:
 
 
 def _verdict(run: Match) -> tuple[str, tuple[str, ...]]:
+    """Return the verdict and the sentences after it."""
     role = run.measurements.ground.role
     counts = [f"{int(np.sum(role == name))} {name}" for name in ("control", "check", "tie") if np.any(role == name)]
     ways = [
@@ -49,6 +50,7 @@ def _verdict(run: Match) -> tuple[str, tuple[str, ...]]:
 
 
 def _facts(run: Match) -> tuple[tuple[str, str], ...]:
+    """Return the input quantities listed in the report."""
     maps, spec = run.ground.control, run.setup.test
     plan, height = spec.control_sigma
     return (
@@ -61,17 +63,20 @@ def _facts(run: Match) -> tuple[tuple[str, str], ...]:
 
 
 def _measured(run: Match) -> Section:
+    """Return the report section on the measured points."""
     text = how_measured(run.setup.test.points, "camera and platform as they are known")
     return Section("Measured points", (text,), point_artefacts(run.ground, run.points))
 
 
 def _images(run: Match) -> Section:
+    """Return the report section on the images."""
     rows = {name: IMAGE(image) for name, image in run.ground.images.items()}
     caption = "Lines count from the first of the table of times, pixels from the one that sees farthest to the right."
     return Section("Images", (), (IMAGE.table("windows", "Images", caption, rows, label="line", digits=4),))
 
 
 def _warnings(run: Match) -> tuple[str, ...]:
+    """Return warnings on the search range and the accuracy of the datum."""
     found, reach = [], run.setup.test.points.reach
     for one in run.points.sorts.values():
         for name, line in one.lines.items():

@@ -1,7 +1,7 @@
-"""Points of an orthophoto, and tie points, in a user's line images: ``python -m twin.orbit match``.
+"""Measurement of control, check and tie points in a user's line images: ``python -m twin.orbit match``.
 
-The images are brought together with what is known before: the laboratory's camera, orbit and attitude, line times. From
-there on all is as in a simulated patch (`twin.orbit.images.image_points`). What match.json holds stands at the end.
+Images and maps are related by the prior knowledge: the laboratory's camera, orbit and attitude, line times. The
+measurement is that of a simulated patch (`twin.orbit.images.image_points`). The records at the end define match.json.
 """
 
 from __future__ import annotations
@@ -55,36 +55,36 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MatchSetup
 
 _BORDER = 5
-"""Places along each side of an image that are followed to the ground."""
+"""Number of positions along each side of an image that are followed to the ground."""
 _SPARE = 300.0
-"""Metres of map about what the images show, beside the reach: camera and platform are wrong by as much."""
+"""Margin of the map about the images' ground, in metres, beside the search range, for errors of camera and platform."""
 _PIXEL = 30.0
 """Bytes per pixel of an image, with the part of the maps that it shows."""
 
 
 @dataclass(frozen=True, eq=False)
 class UserGround(ImagedGround):
-    """A piece of ground in a user's images and maps."""
+    """Piece of ground in a user's images and maps."""
 
     control: Maps[MapPart]
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """What was measured.
+    """Points measured in a user's images.
 
     Attributes
     ----------
     setup : MatchSetup
-        What the file says.
+        Test file with the camera.
     ground : UserGround
         Images and maps.
     points : PatchPoints
-        Measured in the images.
+        Measured points.
     measurements : PassMeasurements
-        The same with orbit, attitude and line times, as a calibration takes them.
-    accuracy : float | None
-        Of the maps' way to WGS 84 as its authority states it, metres; None where it is not stated.
+        Points with orbit, attitude and line times, as a calibration takes them.
+    accuracy : float or None
+        Accuracy of the maps' transformation to WGS 84 as its authority states it, metres; None where it is not stated.
     """
 
     setup: MatchSetup
@@ -95,14 +95,14 @@ class Match:
 
 
 def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Match:
-    """Measure points; nothing is traced or drawn.
+    """Measure points in images; nothing is traced or drawn at random.
 
     Raises
     ------
     InputError
-        Files that cannot be read, or do not fit together.
+        Files cannot be read, or do not fit together.
     BenchError
-        Points that cannot be measured.
+        Points cannot be measured.
     """
     advance("points", 0, 3)
     spec, folder = setup.test, Path()
@@ -143,7 +143,7 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _times(spec: OrbitMatchSpec, clock: LineClock, epoch: str) -> LineTimes:
-    """Line times by a line's own numbers, its first line in the table being 0."""
+    """Return line times by a line's own numbers, its first line in the table being 0."""
     meant = PassConventions(None, spec.lines.time_scale, 0.0, spec.lines.moment, 0.0, 0.0, "right")  # type: ignore[arg-type]
     try:
         middle, _ = line_times(clock, meant, epoch, clock.line)
@@ -160,6 +160,7 @@ def _sensor(
     times: LineTimes,
     light: LightEffects,
 ) -> Sensor:
+    """Return the sensor of a line, or raise InputError if its lines lie outside orbit and attitude."""
     try:
         return Sensor.of_lines(camera, path, Earth(), times, light)
     except ValueError as error:
@@ -168,7 +169,7 @@ def _sensor(
 
 
 def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, count: int) -> LineFrame:
-    """The image, one of so many, with columns along the line's pixels."""
+    """Return the image of a line, one of `count`, with columns along the line's pixels."""
     path = folder / spec.file
     part = spec.window
     frame = _read_image(path, spec, count)
@@ -194,7 +195,7 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path, cou
 
 
 def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
-    """Grey values (rows, columns) of the image, or of its window; so many alike have to fit into the memory."""
+    """Return grey values (rows, columns) of the image, or of its window; `count` like it must fit into the memory."""
     from twin.orbit.measured.maps import opened
 
     file, part = str(path), spec.window
@@ -227,7 +228,7 @@ def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
 def _extent(
     spec: OrbitMatchSpec, images: Mapping[str, LineFrame], heights: tuple[float, float]
 ) -> tuple[GroundFrame, tuple[float, float, float, float]]:
-    """Plane coordinates of the ground, and west, east, south and north end of what the images can show, metres."""
+    """Return plane coordinates of the ground, and the images' bounds west, east, south and north, in metres."""
     seen, reach = [], spec.points.reach + spec.points.template
     for name, image in images.items():
         window = image.window
@@ -251,7 +252,7 @@ def _extent(
 
 
 def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, Mapping[str, ImagePoints]]:
-    """Accepted points, control and check before ties."""
+    """Return the accepted points, control and check before ties."""
     ids: list[str] = []
     places, roles = [], []
     rows: dict[str, list[ImagePoints]] = {name: [] for name in spec.images}
@@ -277,7 +278,7 @@ def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, 
 
 
 def _used(points: MatchedPoints) -> np.ndarray:
-    """(n,) bool: seen by a line, or by two for ties."""
+    """Return the mask of points seen by a line, or by two for ties, (n,) bool."""
     seen = np.sum([line.accepted for line in points.lines.values()], axis=0)
     return np.asarray(seen >= (2 if points.kind == "tie" else 1))
 
@@ -326,5 +327,5 @@ MATCH: Record[Match] = Record(
 
 
 def exported(run: Match) -> dict[str, str]:
-    """Path -> text of a folder of measurements."""
+    """Return a folder of measurements, text by path."""
     return campaign_files([run.measurements], run.setup.camera.plain())

@@ -1,11 +1,11 @@
-"""Time scales and what clocks read: UTC, GPS, TAI, TT and the other systems' times, to seconds of atomic time.
+"""Time scales: conversion of clock readings in UTC, GPS, TAI, TT and others to seconds of atomic time.
 
 A reading is a day and seconds of that day, as the clock shows them. An instant is SI seconds of TAI in two parts, so
 that nothing is lost over decades: whole days since MJD 0 (of TAI) and the rest in seconds.
 
-GPS time is 19 s behind TAI and BeiDou time 33 s, for good; Galileo and QZSS time are taken as GPS time, from which they
-are steered to differ by nanoseconds; TT is 32.184 s ahead of TAI. UTC is behind by the leap seconds (IERS Conventions
-2010, chapter 10).
+GPS time is 19 s behind TAI and BeiDou time 33 s, permanently; Galileo and QZSS time are taken as GPS time, from which
+they are steered to differ by nanoseconds; TT is 32.184 s ahead of TAI. UTC is behind by the leap seconds (IERS
+Conventions 2010, chapter 10).
 """
 
 from __future__ import annotations
@@ -24,24 +24,25 @@ from twin.orbit.flight.earth import DAY, years_without_announced_leap_seconds
 TAI_MINUS: Mapping[str, float] = FrozenMap(
     {"TAI": 0.0, "GPS": 19.0, "GAL": 19.0, "QZS": 19.0, "BDT": 33.0, "TT": -32.184}
 )
-"""Scale -> seconds to be added to its readings for TAI; those of UTC change."""
+"""Offset TAI minus scale, in seconds, of every scale with a constant offset; that of UTC changes."""
 SCALES = ("UTC", *TAI_MINUS)
+"""Names of the time scales that can be read."""
 _MJD_ZERO = date(1858, 11, 17).toordinal()
 FIRST_DAY, LAST_DAY = date(1972, 1, 1).toordinal() - _MJD_ZERO, date(2100, 1, 1).toordinal() - _MJD_ZERO
-"""Modified Julian days in which instants can lie: UTC has whole leap seconds since the first."""
+"""First and last modified Julian day of instants: UTC has whole leap seconds since the first."""
 _FORM = "a date and time such as 2011-03-05T03:05:00.25 or 2011-064T03:05:00.25, 1972 to 2099"
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """What a clock showed.
+    """Readings of a clock.
 
     Attributes
     ----------
-    day : np.ndarray
-        (N,) modified Julian days, whole.
-    second : np.ndarray
-        (N,) seconds of the day, from 0 to 86400, within a leap second up to 86401.
+    day : (N,) ndarray of int
+        Modified Julian days.
+    second : (N,) ndarray
+        Seconds of the day, from 0 to 86400, within a leap second up to 86401.
     """
 
     day: np.ndarray
@@ -52,19 +53,19 @@ class Readings:
 
     @classmethod
     def after(cls, epoch: str, seconds: np.ndarray) -> Readings:
-        """Readings of a clock whose days all have 86400 s.
+        """Return readings of a clock whose days all have 86400 s.
 
         Parameters
         ----------
         epoch : str
-            What it read at 0 s, ISO 8601 text.
-        seconds : np.ndarray
-            (N,) since then.
+            Reading of the clock at 0 s, ISO 8601 text.
+        seconds : (N,) ndarray
+            Seconds since then.
 
         Raises
         ------
         Problem
-            Not such a text.
+            The epoch is not a date and time.
         """
         day, second = calendar_reading(epoch)
         whole = np.floor((second + seconds) / DAY)
@@ -72,17 +73,17 @@ class Readings:
 
     @classmethod
     def of_texts(cls, texts: Sequence[str]) -> Readings:
-        """From calendar texts.
+        """Parse readings from calendar texts.
 
         Parameters
         ----------
-        texts : Sequence[str]
-            N of them.
+        texts : sequence of str
+            N dates with times of day.
 
         Raises
         ------
         Problem
-            Not such a text; ``within`` holds its index.
+            A text is not a date and time; ``within`` holds its index.
         """
         day, second = np.empty(len(texts), np.int64), np.empty(len(texts))
         known: dict[str, int] = {}
@@ -104,16 +105,16 @@ class Readings:
         return cls(day, second)
 
     def taken(self, keep: np.ndarray | slice) -> Readings:
-        """Some of them, by mask, slice or index (K,)."""
+        """Return the readings that a mask, slice or index (K,) selects."""
         return Readings(self.day[keep], self.second[keep])
 
     def instants(self, scale: str) -> Instants:
-        """The instants, if the clock shows this scale.
+        """Return the instants of the readings, taken as readings of this time scale.
 
         Raises
         ------
         Problem
-            a leap second on a day that has none, or of a scale that has none.
+            A leap second on a day or in a scale that has none.
         """
         late = self.second >= DAY
         if scale != "UTC":
@@ -133,32 +134,32 @@ class Readings:
 
 @dataclass(frozen=True, eq=False)
 class Instants:
-    """Instants of TAI.
+    """Instants of TAI in two parts.
 
     Attributes
     ----------
-    day : np.ndarray
-        (N,) whole days since MJD 0.
-    second : np.ndarray
-        (N,) SI seconds after them.
+    day : (N,) ndarray of int
+        Whole days since MJD 0.
+    second : (N,) ndarray
+        SI seconds after them.
     """
 
     day: np.ndarray
     second: np.ndarray
 
     def since(self, epoch: str) -> np.ndarray:
-        """SI seconds (N,) from an epoch in UTC, ISO 8601 text, leap seconds counted; exact to 1e-11 s within a day."""
+        """Return SI seconds (N,) from an epoch in UTC, ISO 8601 text, with leap seconds; exact to 1e-11 s in a day."""
         start = Readings.of_texts([epoch.strip()]).instants("UTC")
         day, second = start.day[0], start.second[0]
         return np.asarray((self.day - day) * DAY + (self.second - second))
 
     def later(self, seconds: float) -> Instants:
-        """So many seconds later."""
+        """Return the instants shifted later by a number of SI seconds."""
         return Instants(self.day, self.second + seconds)
 
 
 def epoch_before(instants: Instants) -> str:
-    """UTC of the first of the instants, at its full second, ISO 8601 text ending in Z."""
+    """Return UTC of the first of the instants, rounded down to a full second, ISO 8601 text ending in Z."""
     first = np.argmin(instants.day * DAY + instants.second)
     second = float(instants.second[first])
     rough = int(instants.day[first]) + (second - tai_minus_utc(int(instants.day[first]))) / DAY
@@ -169,12 +170,12 @@ def epoch_before(instants: Instants) -> str:
 
 
 def tai_minus_utc(day: int) -> float:
-    """TAI - UTC on a modified Julian day, seconds.
+    """Return TAI - UTC on a modified Julian day, in seconds.
 
     Raises
     ------
     Problem
-        Before 1972 or after 2099.
+        The day is before 1972 or after 2099.
     """
     if not FIRST_DAY <= day <= LAST_DAY:
         raise Problem("outside the years of this time scale", f"MJD {day}", _FORM)
@@ -184,29 +185,29 @@ def tai_minus_utc(day: int) -> float:
 
 
 def calendar(day: int) -> str:
-    """Date of a modified Julian day."""
+    """Return the date of a modified Julian day, ISO 8601."""
     return date.fromordinal(day + _MJD_ZERO).isoformat()
 
 
 def calendar_reading(text: str) -> tuple[int, float]:
-    """Modified Julian day and second of the day that a text shows.
+    """Return the modified Julian day and second of the day of a date and time.
 
     Raises
     ------
     Problem
-        Not such a text.
+        The text is not a date and time.
     """
     one = single_reading(text)
     return int(one.day[0]), float(one.second[0])
 
 
 def single_reading(text: str) -> Readings:
-    """What one text shows.
+    """Parse one date and time.
 
     Raises
     ------
     Problem
-        Not a text of a date and a time.
+        The text is not a date and time.
     """
     try:
         return Readings.of_texts([text.strip()])
@@ -215,12 +216,12 @@ def single_reading(text: str) -> Readings:
 
 
 def known_scale(name: str) -> str:
-    """The scale of this name, as files of others spell it: GPST for GPS, GLO and GLONASS for UTC.
+    """Return the time scale of a name as other files spell it: GPST for GPS, GLO and GLONASS for UTC.
 
     Raises
     ------
     Problem
-        Another one.
+        The scale is not supported.
     """
     upper = name.strip().upper()
     found = {"GPST": "GPS", "GLO": "UTC", "GLONASS": "UTC", "BDS": "BDT", "TDT": "TT"}.get(upper, upper)
@@ -230,7 +231,7 @@ def known_scale(name: str) -> str:
 
 
 def _day_of(text: str) -> int:
-    """Modified Julian day of 2011-03-05, or of day 64 of a year, 2011-064. ValueError if it is neither."""
+    """Return the modified Julian day of 2011-03-05, or of day 64 of a year, 2011-064; ValueError if it is neither."""
     if len(text) == 8 and text[4] == "-" and text[5:].isdigit() and text[:4].isdigit():
         start = date(int(text[:4]), 1, 1)
         found = start + timedelta(days=int(text[5:]) - 1)

@@ -1,13 +1,14 @@
-"""Passes of Pléiades, Pléiades Neo and SPOT 6 and 7 as their DIMAP files (versions 2 and 3) tell of them: the rigorous
-model of a scene in the geometry of its sensor.
+"""DIMAP files (versions 2 and 3) of Pléiades, Pléiades Neo and SPOT 6 and 7: rigorous model of a scene.
+
+The product is one in sensor geometry.
 
 - Rows and columns of the image count from 1, the centre of the first pixel. Row r is exposed at START + (r - 1)
   LINE_PERIOD; times are UTC.
-- Positions and velocities are Earth-fixed. Velocities are against the turning Earth; those against the stars, as the
-  ground segment of Pléiades writes them, are recognised by omega x P, which is taken off.
-- A quaternion Q0 .. Q3 has its scalar first and turns the body's axes into the Earth-fixed ones, v_earth = R(q) v_body.
-  It is given in samples, or as polynomials of (t - OFFSET) / SCALE, where t is seconds of the day of START, which are
-  then made unit.
+- Positions and velocities are Earth-fixed. Velocities are relative to the rotating Earth; inertial velocities, as the
+  ground segment of Pléiades writes them, are recognised by omega x P, which is subtracted.
+- A quaternion Q0 .. Q3 has its scalar first and rotates the body's axes into the Earth-fixed ones, v_earth = R(q)
+  v_body. The attitude is given as samples, or as polynomials of (t - OFFSET) / SCALE, where t is seconds of the day of
+  START, which are then normalised.
 - In the body X points forward, Z to the scene, Y to the right. A column's look is (tan psi_y, -tan psi_x, 1), where
   tan psi_x = XLOS_0 + XLOS_1 c + ... and tan psi_y likewise by YLOS, of c = column - 1 + FIRST_COL - 1.
 - Looks are straight up to the atmosphere, whose refraction is part of the model where ATMOSPHERIC_REFRACTION_SETTING is
@@ -15,7 +16,7 @@ model of a scene in the geometry of its sensor.
   refraction of the standard atmosphere, and to 1 urad without.
 
 Orders and signs are those by which the Ames Stereo Pipeline reads these files. The formula of the looks is that of the
-imagery user guide of Pléiades; FIRST_COL is added as that program found it, where the guide subtracts it.
+imagery user guide of Pléiades; FIRST_COL is added as in that program, where the guide subtracts it.
 """
 
 from __future__ import annotations
@@ -45,39 +46,45 @@ from twin.orbit.measured.orbit_files import (
 from twin.orbit.measured.xml_file import Element, read_xml, readings, require_rising
 
 PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
-"""Products with a rigorous model."""
+"""Metadata profiles of products with a rigorous model."""
 _WHAT = "a DIMAP file of a product in sensor geometry"
 _VERSIONS = ("2", "3")
 _PERIOD: Mapping[str, float] = FrozenMap(
     {"ms": 1e-3, "millisecond": 1e-3, "s": 1.0, "second": 1.0, "us": 1e-6, "microsecond": 1e-6}
 )
-"""Unit -> seconds; milliseconds where none stands."""
+"""Seconds per unit of a line period; a period without a unit is in milliseconds."""
 _LENGTH: Mapping[str, float] = FrozenMap({"micrometer": 1e-6, "um": 1e-6, "mm": 1e-3, "m": 1.0})
+"""Metres per unit of a detector's pixel size."""
 _MOST_TERMS = 8
+"""Largest number of terms of a polynomial."""
 _DAY = 86400.0
 _SAMPLES = 240
-"""Of a polynomial attitude: a cubic spline through them is right to 1e-12 rad for a turn by 30 deg."""
+"""Number of samples of a polynomial attitude: a cubic spline through them is right to 1e-12 rad for a rotation of 30
+deg.
+"""
 _MARGIN = 0.05
 """Share of an image's time, before its first line and after its last one, for which attitudes are sampled."""
 _NEAR = 0.1
-"""Seconds for which an orbit is carried on beyond its readings: the third derivative of its positions makes 2 um."""
+"""Longest extrapolation of an orbit beyond its readings, in seconds: the third derivative of its positions makes 2 um.
+"""
 _LINES_OFF = 3.0
+"""Largest disagreement of times and number of lines, in lines."""
 
 
 @dataclass(frozen=True, eq=False)
 class AttitudePolynomial:
-    """Quaternions as polynomials of time.
+    """Attitude as polynomials of quaternion components over time.
 
     Attributes
     ----------
     day : int
-        Modified Julian day whose seconds count.
+        Modified Julian day whose seconds are counted.
     offset : float
         Second of the day at which the polynomials' variable is 0.
     scale : float
-        Seconds by which it grows by 1.
-    coefficients : Array
-        (4, K) of Q0, the scalar, to Q3, ascending powers.
+        Seconds by which the variable grows by 1.
+    coefficients : (4, K) ndarray
+        Coefficients of Q0, the scalar, to Q3, ascending powers.
     """
 
     day: int
@@ -86,47 +93,47 @@ class AttitudePolynomial:
     coefficients: Array
 
     def at(self, second: Array) -> Array:
-        """Unit quaternions (N, 4), scalar first, at seconds (N,) of the day."""
+        """Return unit quaternions (N, 4), scalar first, at seconds (N,) of the day."""
         values = np.polynomial.polynomial.polyval((second - self.offset) / self.scale, self.coefficients.T).T
         return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)
 class DimapPass:
-    """What a DIMAP file says of a pass.
+    """Rigorous model of a pass, read from a DIMAP file.
 
     Attributes
     ----------
     file : str
-        Where it is from.
+        Path of the file.
     profile : str
-        Of the product, one of `PROFILES`.
+        Metadata profile of the product, one of `PROFILES`.
     version : str
-        Of the format.
+        Version of the format.
     name : str
-        Of the data set.
+        Name of the data set.
     lines, pixels : int
-        Of the image.
+        Size of the image.
     first_line : Readings
-        When the first line was exposed, UTC, one reading.
+        Exposure of the first line, UTC, one reading.
     line_time : float
-        From one line to the next, seconds.
+        Time from one line to the next, seconds.
     orbit : OrbitReadings
-        Its readings, ITRS and UTC.
-    attitude : AttitudeReadings | AttitudePolynomial
-        Its samples, or polynomials.
-    forward, right : Array
-        Coefficients (K,) of the tangents of a pixel's look, ascending powers of the pixel from 0.
-    pitch : float | None
-        Of the detector's pixels, metres; None where the file does not say.
+        Orbit, ITRS and UTC.
+    attitude : AttitudeReadings or AttitudePolynomial
+        Attitude, as samples or as polynomials.
+    forward, right : (K,) ndarray
+        Coefficients of the tangents of a pixel's look, ascending powers of the pixel from 0.
+    pitch : float or None
+        Pixel pitch of the detector, metres; None where the file does not say.
     refracted : bool
-        Whether its geometry knows refraction.
+        The model contains atmospheric refraction.
     inertial_velocity : bool
-        Whether its velocities were those against the stars.
+        The file's velocities were inertial and have been converted.
     light_speed : bool
-        Whether it says that the speed of light was taken into account, of which nothing is known here.
-    rpc : tuple[str, ...]
-        Names of files with its rational polynomials.
+        The file says that the speed of light was taken into account; in which way is not documented.
+    rpc : tuple of str
+        Names of the files of the product's rational polynomials.
     """
 
     file: str
@@ -149,14 +156,14 @@ class DimapPass:
 
     @property
     def duration(self) -> float:
-        """From the first line to the last, seconds."""
+        """Time from the first line to the last, seconds."""
         return (self.lines - 1) * self.line_time
 
     def samples(self) -> AttitudeReadings:
-        """The attitude as readings; of polynomials those about the time of the image.
+        """Return the attitude as readings; polynomials are sampled over the time of the image.
 
-        Samples that begin and end with the first and the last line do not hold the halves of these lines outside: the
-        spline through them is carried on by up to a sample's interval.
+        Samples that begin and end with the first and the last line do not cover the outer halves of these lines: the
+        spline through them is extrapolated by up to a sample's interval.
         """
         if isinstance(self.attitude, AttitudeReadings):
             return self._spanning_samples(self.attitude)
@@ -170,12 +177,12 @@ class DimapPass:
         return AttitudeReadings(self.file, clock, turns, None, "ITRS", "UTC", "first", "body_to_frame")
 
     def spanning_orbit(self) -> OrbitReadings:
-        """The orbit's readings, with one more at either end where the image begins or ends a moment beyond them.
+        """Return the orbit's readings, extended by one at either end where the image reaches a moment beyond them.
 
         Raises
         ------
         InputError
-            It does by more than that.
+            The image reaches further beyond the readings.
         """
         time = self._since(self.orbit.clock)
         assert self.orbit.velocity is not None
@@ -196,7 +203,7 @@ class DimapPass:
         return OrbitReadings(self.file, self._clock(time), position, velocity, "ITRS", "UTC")
 
     def _spanning_samples(self, attitude: AttitudeReadings) -> AttitudeReadings:
-        """Return samples of the attitude with one more at either end where the image reaches a moment beyond them."""
+        """Return the attitude samples, extended by one at either end where the image reaches a moment beyond them."""
         assert attitude.quaternion is not None
         time = self._since(attitude.clock)
         far = min(_NEAR, float(np.median(np.diff(time))))
@@ -210,8 +217,9 @@ class DimapPass:
         return replace(attitude, clock=self._clock(times[order]), quaternion=quaternion[order])
 
     def _ends_beyond(self, time: Array) -> list[tuple[float, int]]:
-        """Return the ends of the image, with a line to spare, that lie outside of readings at times (N,), and which
-        of the readings is next to each: 0 or -1.
+        """Return the ends of the image, with a line to spare, that lie outside of readings at times (N,).
+
+        Each comes with the index of the nearest reading: 0 or -1.
         """
         ends = ((-self.line_time, 0), (self.duration + self.line_time, -1))
         return [(at, end) for at, end in ends if not in_span(at, time[0], time[-1])]
@@ -223,37 +231,41 @@ class DimapPass:
         return Readings(int(self.first_line.day[0]) + day.astype(np.int64), second - _DAY * day)
 
     def _since(self, clock: Readings) -> Array:
-        """Seconds (N,) from the first line."""
+        """Return seconds (N,) from the first line."""
         return np.asarray((clock.day - self.first_line.day[0]) * _DAY + clock.second - self.first_line.second[0])
 
 
 _GRAVITY = 3.986004418e14
-"""m^3/s^2; against the turning Earth an acceleration differs by a seventh, 6 mm in `_NEAR`."""
+"""Gravitational parameter of the Earth, in m^3/s^2.
+
+Relative to the rotating Earth an acceleration differs by a seventh, 6 mm in `_NEAR`.
+"""
 
 
 def _norm(vector: Array) -> float:
+    """Return the length of a vector."""
     return float(np.linalg.norm(vector))
 
 
 def is_dimap(lines: list[str]) -> bool:
-    """Whether a file that begins with these lines is one."""
+    """Return whether a file that begins with these lines is a DIMAP file."""
     return "<Dimap_Document" in "\n".join(lines)
 
 
 def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
-    """The rigorous model of a product.
+    """Read the rigorous model of a product.
 
     Parameters
     ----------
-    path : str | Path
-        Of its file DIM_*.XML.
-    band : str | None
-        Whose looks are taken; may be left out where all bands have the same.
+    path : str or Path
+        File DIM_*.XML of the product.
+    band : str or None
+        Band whose looks are read; may be left out where all bands have the same.
 
     Raises
     ------
     InputError
-        It cannot be read, or is another product; with file, line and element.
+        The file cannot be read, or is another product; with file, line and element.
     """
     root = read_xml(path, _WHAT)
     version, profile = _identified(root)
@@ -294,7 +306,7 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
 
 
 def _switch(settings: Element | None, name: str) -> bool:
-    """Whether a setting is on; one that does not stand there is off."""
+    """Return whether a setting is on; one that the file does not contain is off."""
     found = None if settings is None else settings.maybe(name)
     if found is None:
         return False
@@ -307,7 +319,7 @@ _SWITCHES: Mapping[str, bool] = FrozenMap({"true": True, "1": True, "false": Fal
 
 
 def _identified(root: Element) -> tuple[str, str]:
-    """Version and profile."""
+    """Return version and profile, or raise InputError for another format."""
     if root.tag != "Dimap_Document":
         allowed = "<Dimap_Document>; PHR_Dimap_Document is DIMAP_PHR, of the ground segment of Pléiades"
         root.wrong("not a DIMAP file", f"<{root.tag}>", allowed)
@@ -325,7 +337,7 @@ def _identified(root: Element) -> tuple[str, str]:
 
 
 def _moment(element: Element) -> Readings:
-    """The UTC that stands in an element, with or without its Z."""
+    """Return the UTC of an element, with or without its Z."""
     try:
         return readings(element.file, [element.text], [element.line])
     except InputError as error:
@@ -334,7 +346,7 @@ def _moment(element: Element) -> Readings:
 
 
 def _times(time: Element, lines: int) -> tuple[Readings, float]:
-    """When the first line was exposed, and seconds from line to line."""
+    """Return the exposure of the first line, and the line period in seconds."""
     span = time.one("Time_Range")
     first, last = _moment(span.one("START")), _moment(span.one("END"))
     stamp = time.one("Time_Stamp", "LINE_PERIOD")
@@ -348,7 +360,7 @@ def _times(time: Element, lines: int) -> tuple[Readings, float]:
 
 
 def _clock(items: list[Element], file: str) -> Readings:
-    """Rising times of elements."""
+    """Return the times of elements, which must increase."""
     moments = [_moment(one.one("TIME")) for one in items]
     clock = Readings(np.array([m.day[0] for m in moments]), np.array([m.second[0] for m in moments]))
     require_rising(file, clock, [one.line for one in items])
@@ -356,7 +368,7 @@ def _clock(items: list[Element], file: str) -> Readings:
 
 
 def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
-    """Return the readings, and whether their velocities were those against the stars."""
+    """Return the orbit readings, and whether the file's velocities were inertial."""
     points = ephemeris.all("Point_List", "Point")
     if len(points) < 4:
         ephemeris.wrong("too few points of the orbit", str(len(points)), "4 or more in Point_List")
@@ -374,6 +386,7 @@ def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
 
 
 def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | AttitudePolynomial:
+    """Return the attitude, as samples or as polynomials."""
     polynomial = attitudes.maybe("Polynomial_Quaternions")
     samples = attitudes.all("Quaternion_List", "Quaternion")
     if (polynomial is None) == (not samples):
@@ -401,7 +414,7 @@ def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | Att
 
 
 def _looks(calibration: Element, band: str | None) -> tuple[Array, Array]:
-    """Tangents forward and to the right, ascending powers of the pixel from 0."""
+    """Return coefficients of the looks' tangents forward and to the right, ascending powers of the pixel from 0."""
     direct = calibration.all("Polynomial_Look_Angles")
     bands = [*calibration.all("Band_Calibration_List", "Band_Calibration"), *calibration.all("Band_Calibration")]
     named = {one.words("BAND_ID"): one.one("Polynomial_Look_Angles") for one in bands}
@@ -425,7 +438,7 @@ def _looks(calibration: Element, band: str | None) -> tuple[Array, Array]:
 
 
 def _tangent(element: Element, name: str, first: int) -> Array:
-    """Coefficients (K,) for powers of a pixel that is ``first`` columns behind the first of the calibration."""
+    """Return coefficients (K,) for powers of a pixel that is ``first`` columns behind the first of the calibration."""
     terms = [element.number(f"{name}_0", least=-1.0, most=1.0)]
     if name == "XLOS":
         element.one("XLOS_1")

@@ -1,8 +1,8 @@
-"""Earth orientation from tables: UT1, polar motion and the celestial pole's offsets, and the rotation that they give.
+"""Earth orientation from tables: UT1, polar motion, celestial pole offsets, and the rotation GCRS -> ITRS.
 
 Between the days of a table its numbers are interpolated by cubics through four of them (IERS Gazette 13, 1997). UT1 is
-interpolated as UT1 - TAI, which has no steps. What oceans do to pole and UT1 within a day is not in the tables and is
-left out: some 3 cm on the ground.
+interpolated as UT1 - TAI, which has no steps. The tables do not contain the effects of ocean tides on pole and UT1
+within a day, which are left out: some 3 cm on the ground.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from twin.orbit.measured.clock import FIRST_DAY, LAST_DAY, calendar, calendar_re
 from twin.orbit.measured.xml_file import first_lines, numbers, text_lines
 
 WHAT = "a table of Earth orientation: finals2000A or C04 as the IERS gives them, or CSV"
+"""Description of the file for error messages."""
 _RATE_STEP = 1.0
-"""Seconds to either side for the rate of rotation: rounding is 1e-16 rad/s, curvature far less."""
+"""Half step of the difference for the rotation rate, in seconds: rounding is 1e-16 rad/s, curvature far less."""
 _COLUMNS = (
     Column("mjd", least=FIRST_DAY, most=LAST_DAY),
     Column("ut1_utc", TIME, least=-1.0, most=1.0),
@@ -38,20 +39,20 @@ _COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class EarthOrientation:
-    """A table of Earth orientation; made by `read_earth_orientation`.
+    """Table of Earth orientation, made by `read_earth_orientation`.
 
     Attributes
     ----------
     file : str
-        Where it is from.
-    mjd : np.ndarray
-        (K,) modified Julian dates in UTC, rising, four or more.
-    ut1_tai : np.ndarray
-        (K,) UT1 - TAI, seconds.
-    pole : np.ndarray
-        (K, 2) x and y of the pole, radians.
-    offsets : np.ndarray
-        (K, 2) dX and dY of the celestial pole against IAU 2006/2000A, radians.
+        Path of the file.
+    mjd : (K,) ndarray
+        Modified Julian dates in UTC, increasing, four or more.
+    ut1_tai : (K,) ndarray
+        UT1 - TAI, seconds.
+    pole : (K, 2) ndarray
+        x and y of the pole, radians.
+    offsets : (K, 2) ndarray
+        Offsets dX and dY of the celestial pole from IAU 2006/2000A, radians.
     """
 
     file: str
@@ -61,12 +62,12 @@ class EarthOrientation:
     offsets: np.ndarray
 
     def rotation(self, epoch: str, first: float, last: float) -> TableRotation:
-        """The Earth's rotation from `first` to `last`, seconds from an epoch in UTC.
+        """Return the Earth's rotation from `first` to `last`, seconds from an epoch in UTC.
 
         Raises
         ------
         InputError
-            The table does not reach over the span.
+            The table does not cover the span.
         """
         day, second = calendar_reading(epoch)
         begin, end = (day + (second + t) / DAY for t in (first, last))
@@ -79,7 +80,7 @@ class EarthOrientation:
         return TableRotation(self, epoch, celestial_pole(epoch, first, last))
 
     def at(self, mjd: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """UT1 - TAI (N,), seconds, pole (N, 2) and offsets (N, 2), radians, at dates in UTC (N,)."""
+        """Return UT1 - TAI (N,), seconds, pole (N, 2) and offsets (N, 2), radians, at dates in UTC (N,)."""
         count = len(self.mjd)
         start = np.clip(np.searchsorted(self.mjd, mjd, side="right") - 2, 0, count - 4)
         which = start[..., None] + np.arange(4)
@@ -96,15 +97,15 @@ class EarthOrientation:
 
 @dataclass(frozen=True, eq=False)
 class TableRotation:
-    """Rotation GCRS -> ITRS by a table; as `twin.orbit.flight.earth.EarthRotation`.
+    """Rotation GCRS -> ITRS from a table; interface of `twin.orbit.flight.earth.EarthRotation`.
 
     Attributes
     ----------
     table : EarthOrientation
-        Of Earth orientation.
+        Table of Earth orientation.
     epoch : str
         UTC, ISO 8601 text; times are SI seconds from it.
-    celestial_pole : Any
+    celestial_pole : callable
         Spline of the pole's X and Y and of the locator s by IAU 2006/2000A, radians.
     """
 
@@ -113,7 +114,10 @@ class TableRotation:
     celestial_pole: Any
 
     def turn(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """UT1 as the second part of a Julian date whose first is `julian`, (...), and pole and offsets (..., 2)."""
+        """Return UT1 (...), pole and celestial pole offsets (..., 2), radians, at times (...).
+
+        UT1 is the second part of a Julian date, in days, whose first part is `julian`.
+        """
         t = np.asarray(seconds, dtype=np.float64)
         day, second = calendar_reading(self.epoch)
         tai = second + tai_minus_utc(day) + t
@@ -126,7 +130,7 @@ class TableRotation:
         return 2400000.5 + calendar_reading(self.epoch)[0]
 
     def matrix(self, seconds: Any) -> np.ndarray:
-        """Rotation GCRS -> ITRS: x_itrs = matrix @ x_gcrs; (...) -> (..., 3, 3)."""
+        """Return the rotation GCRS -> ITRS: x_itrs = matrix @ x_gcrs; (...) -> (..., 3, 3)."""
         t = np.asarray(seconds, dtype=np.float64)
         ut1, pole, offsets = self.turn(t)
         x, y, s = np.moveaxis(self.celestial_pole(t), -1, 0)
@@ -134,26 +138,28 @@ class TableRotation:
         return np.asarray(erfa.c2tcio(celestial, erfa.era00(self.julian, ut1), self._polar(t, pole)))
 
     def mean_equinox(self, seconds: Any) -> np.ndarray:
-        """Rotation TEME -> ITRS, (...) -> (..., 3, 3): by Greenwich mean sidereal time of 1982 and polar motion
-        (Vallado et al., AIAA 2006-6753, appendix C).
+        """Return the rotation TEME -> ITRS, (...) -> (..., 3, 3).
+
+        By Greenwich mean sidereal time of 1982 and polar motion (Vallado et al., AIAA 2006-6753, appendix C).
         """
         ut1, pole, _ = self.turn(seconds)
         return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], 0.0) @ _about_z(erfa.gmst82(self.julian, ut1)))
 
     def _polar(self, t: np.ndarray, pole: np.ndarray) -> np.ndarray:
+        """Return polar motion, the rotation TIRS -> ITRS, (..., 3, 3)."""
         one, two = tai_of(self.epoch)
         return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], erfa.sp00(one, two + (t + erfa.TTMTAI) / DAY)))
 
 
 def rate_of(matrix: Any, seconds: np.ndarray) -> np.ndarray:
-    """Angular velocity (N, 3), rad/s, of the axes to which a rotation of time leads, in these axes.
+    """Return the angular velocity (N, 3), in rad/s, of the target axes of a rotation, in these axes.
 
     Parameters
     ----------
-    matrix : Any
-        Seconds (N,) -> (N, 3, 3).
-    seconds : np.ndarray
-        (N,).
+    matrix : callable
+        Function from seconds (N,) to rotation matrices (N, 3, 3).
+    seconds : (N,) ndarray
+        Times, seconds.
     """
     turn = matrix(seconds + _RATE_STEP) @ np.swapaxes(matrix(seconds - _RATE_STEP), -1, -2)
     # of a rotation by a small angle, whose sine and angle differ by 1e-12 of it
@@ -166,7 +172,7 @@ def rate_of(matrix: Any, seconds: np.ndarray) -> np.ndarray:
 
 
 def constant_orientation(epoch: str, ut1_utc: float, pole: tuple[float, float]) -> EarthOrientation:
-    """A table of a week that holds the same everywhere.
+    """Return a table over a week of constant polar motion and uniform UT1, without celestial pole offsets.
 
     Parameters
     ----------
@@ -174,7 +180,7 @@ def constant_orientation(epoch: str, ut1_utc: float, pole: tuple[float, float]) 
         UTC, ISO 8601 text.
     ut1_utc : float
         UT1 - UTC at the epoch, seconds; UT1 runs on evenly from there, also over a leap second.
-    pole : tuple[float, float]
+    pole : tuple of float
         x and y of the pole, radians.
     """
     day, _ = calendar_reading(epoch)
@@ -186,18 +192,18 @@ def constant_orientation(epoch: str, ut1_utc: float, pole: tuple[float, float]) 
 
 
 def read_earth_orientation(path: str | Path) -> EarthOrientation:
-    """A table of Earth orientation.
+    """Read a table of Earth orientation.
 
     Parameters
     ----------
-    path : str | Path
-        Of a file finals2000A (all, data or daily), C04 (14 or 20), or CSV with columns mjd, ut1_utc [s], x_pole
-        [arcsec], y_pole [arcsec] and perhaps dx [mas] and dy [mas].
+    path : str or Path
+        File finals2000A (all, data or daily), C04 (14 or 20), or CSV with columns mjd, ut1_utc [s], x_pole [arcsec],
+        y_pole [arcsec] and optionally dx [mas] and dy [mas].
 
     Raises
     ------
     InputError
-        It cannot be read, or holds fewer than four days.
+        The file cannot be read, or holds fewer than four days.
     """
     file, start = str(path), list(first_lines(path, WHAT, 400))
     if any("mjd" in line.lower() and not line.startswith("#") and "," in line for line in start):
@@ -212,6 +218,7 @@ def read_earth_orientation(path: str | Path) -> EarthOrientation:
 
 
 def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
+    """Parse the rows of a C04 table."""
     cells = [line.split() for _, line in rows]
     lines = [k for k, _ in rows]
     place = [4, 5, 6, 7, 8, 9] if len(cells[0]) == 21 else [3, 4, 5, 6, 8, 9]
@@ -230,10 +237,14 @@ def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
 _FINAL = {"x": (134, 144), "y": (144, 154), "UT1-UTC": (154, 165), "dX": (165, 175), "dY": (175, 185)}
 """Columns of Bulletin B, which is final; later days have Bulletin A alone."""
 _FINALS = {"MJD": (7, 15), "x": (18, 27), "y": (37, 46), "UT1-UTC": (58, 68), "dX": (97, 106), "dY": (116, 125)}
+"""Columns of Bulletin A."""
 
 
 def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
-    """Bulletin B of finals2000A where it is given, else A; days without prediction of what is needed are left out."""
+    """Parse finals2000A: Bulletin B where the file has it, else A.
+
+    Days without a prediction of pole and UT1 are left out.
+    """
     cells, lines = [], []
     for k, line in rows:
         cut = [line[a:b].strip() for a, b in _FINALS.values()]
@@ -253,6 +264,7 @@ def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
 def _checked(
     file: str, lines: list[int], mjd: np.ndarray, ut1_utc: np.ndarray, pole: np.ndarray, offsets: np.ndarray
 ) -> EarthOrientation:
+    """Return the table, or raise InputError if its days or values are not plausible."""
     if len(mjd) < 4:
         raise InputError(Issue("too few days", file, None, (), f"{len(mjd)} days", "four days or more"))
     for row in (*np.flatnonzero(np.diff(mjd) <= 0.0)[:1] + 1, *np.flatnonzero(np.diff(mjd) > 10.0)[:1] + 1):
@@ -268,6 +280,7 @@ def _checked(
 
 
 def _about_z(angle: np.ndarray) -> np.ndarray:
+    """Return the matrix that rotates axes about Z by an angle, (..., 3, 3)."""
     c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
     rows = np.stack([c, s, zero, -s, c, zero, zero, zero, zero + 1.0], axis=-1)
     return np.asarray(rows.reshape(*np.shape(angle), 3, 3))

@@ -36,16 +36,16 @@ _GEOGRAPHIC = "EPSG:4979"
 
 @dataclass(frozen=True, eq=False)
 class GroundFile:
-    """What a file of ground points holds.
+    """Ground points read from a file.
 
     Attributes
     ----------
     points : GroundPoints
-        In the ITRS.
-    accuracy : float | None
-        Of the way there, as the systems' authority states it, metres; None where it is not stated.
-    images : Mapping[str, np.ndarray]
-        Image file -> (n, 5) row of `points`, line, pixel and their sigmas, where the file has some.
+        The points, in the ITRS.
+    accuracy : float or None
+        Accuracy of the transformation to the ITRS as its authority states it, metres; None where it is not stated.
+    images : mapping of str to (n, 5) ndarray
+        Image measurements by image file, where the file has some: row of `points`, line, pixel and their sigmas.
     """
 
     points: GroundPoints
@@ -55,7 +55,7 @@ class GroundFile:
 
 @dataclass(eq=False)
 class _Rows:
-    """Rows of a file: names, places in its own system, sigmas (NaN where there are none), roles, lines."""
+    """Rows of a file: names, coordinates in its own system, sigmas (NaN where there are none), roles, lines."""
 
     ids: list[str]
     places: np.ndarray
@@ -65,19 +65,19 @@ class _Rows:
 
 
 def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
-    """The points of a file.
+    """Read the ground points of a file.
 
     Parameters
     ----------
     spec : GroundFileSpec
-        The file, and what it does not say itself.
+        Path of the file, and what the file itself does not specify.
     folder : Path
-        That relative paths start from.
+        Folder to which relative paths refer.
 
     Raises
     ------
     InputError
-        It cannot be read; with file and line, or the feature of a GeoJSON file.
+        The file cannot be read; with file and line, or the feature of a GeoJSON file.
     """
     path = folder / spec.file
     images: dict[str, np.ndarray] = {}
@@ -115,13 +115,14 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
 
 
 def _required(spec: GroundFileSpec) -> str:
+    """Return the coordinate system of the test's file, or raise InputError if it names none."""
     if spec.crs is None:
         raise spec.error("the system of the coordinates is not said", ("crs",), allowed="EPSG:4979, EPSG:32650, ...")
     return spec.crs
 
 
 def _covariance(spec: GroundFileSpec, file: str, rows: _Rows, itrs: np.ndarray, earth_fixed: bool) -> np.ndarray:
-    """(n, 3, 3) in axes of the ITRS, m^2."""
+    """Return covariances (n, 3, 3) in axes of the ITRS, in m^2."""
     sigma = rows.sigmas.copy()
     missing = np.isnan(sigma).any(axis=1)
     for row in np.flatnonzero(missing)[:1]:
@@ -138,6 +139,7 @@ def _covariance(spec: GroundFileSpec, file: str, rows: _Rows, itrs: np.ndarray, 
 
 
 def _unique(file: str, ids: Sequence[str], lines: Sequence[int | None]) -> None:
+    """Raise InputError if a name occurs twice."""
     seen: set[str] = set()
     for name, line in zip(ids, lines, strict=True):
         if name in seen:
@@ -146,12 +148,14 @@ def _unique(file: str, ids: Sequence[str], lines: Sequence[int | None]) -> None:
 
 
 def _role(file: str, role: str, line: int | None, key: tuple[str | int, ...] = ("role",)) -> str:
+    """Return the role, or raise InputError if it is neither control nor check."""
     if role not in ROLES[:2]:
         raise InputError(Issue("no such role", file, line, key, shown(role), names_text(ROLES[:2])))
     return role
 
 
 def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
+    """Read the rows of a CSV file."""
     table, file = read_table(path, _COLUMNS), str(path)
     sets = [names for names in _PLACES if all(name in table for name in names)]
     others = [n for names in _PLACES for n in names if n in table and not (sets and n in sets[0])]
@@ -180,7 +184,7 @@ def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
 
 
 def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
-    """InputError unless columns of these names can be coordinates of the system."""
+    """Raise InputError unless columns of these names can be coordinates of the system."""
     import pyproj
 
     try:
@@ -195,6 +199,7 @@ def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
 
 
 def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:
+    """Read the point features of a GeoJSON file."""
     file, text = str(path), table_text(path, "a GeoJSON file")
     data = parse_json(text, file)
     features = data.get("features") if isinstance(data, dict) else None
@@ -234,6 +239,7 @@ def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:
 
 
 def _finite(value: Any) -> bool:
+    """Return whether a value of a JSON file is a finite number."""
     try:
         return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:
@@ -241,10 +247,11 @@ def _finite(value: Any) -> bool:
 
 
 _GCP = ("latitude", "longitude", "height", "sigma x", "sigma y", "sigma z")
+"""Names of the numeric fields of a point in a .gcp file."""
 
 
 def _alike(first: Any, second: Any) -> bool:
-    """Whether two geographic systems name the same datum, or one that PROJ takes for the same."""
+    """Return whether two geographic systems name the same datum, or one that PROJ treats as the same."""
     import pyproj
 
     bodies = (first.ellipsoid, second.ellipsoid)
@@ -256,7 +263,7 @@ def _alike(first: Any, second: Any) -> bool:
 
 
 def _of_header(spec: GroundFileSpec, header: str) -> str:
-    """The system of a header `# WKT:`, which the test may repeat."""
+    """Return the system of a header `# WKT:`, which the test's file may repeat."""
     import pyproj
 
     try:
@@ -275,7 +282,7 @@ def _of_header(spec: GroundFileSpec, header: str) -> str:
 
 
 def _gcp(path: Path) -> tuple[_Rows, dict[str, np.ndarray], str | None]:
-    """Points of a .gcp file, where its images have them, and the system that its header states."""
+    """Return the points of a .gcp file, their image measurements, and the system of its header."""
     file, header = str(path), None
     rows, lines = [], []
     for k, line in enumerate(text_lines(path, "a .gcp file")):

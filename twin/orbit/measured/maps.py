@@ -1,12 +1,13 @@
-"""Maps from GeoTIFF and other rasters that GDAL reads, by parts: an orthophoto may be larger than the memory.
+"""Maps and coordinate reference systems: rasters, geoids and transformations to the ITRS.
 
-Coordinates of any reference system to the ITRS and back, and heights above a geoid to heights above the ellipsoid.
+Rasters are GeoTIFF and other files that GDAL reads; they are read in parts, since an orthophoto may be larger than the
+memory. The part of a user's map that images show is given in the plane coordinates of the ground; its pixels stay as
+they are.
 
-PROJ knows the systems. It is never let guess: no ballpark transformation, and where it lacks a grid it says so. WGS 84
-counts as the ITRS, as everywhere here. So does CGCS2000, from which PROJ has no way: it is ITRF97 at epoch 2000.0, and
-plates have moved since by some 3 cm a year.
-
-The part of a user's map that images show, in the plane coordinates of the ground; its pixels stay as they are.
+Coordinates of any reference system are transformed to the ITRS and back, and heights above a geoid to heights above the
+ellipsoid. PROJ provides the systems. It never guesses: ballpark transformations are excluded, and a missing grid is an
+error. WGS 84 is taken as the ITRS, as everywhere in the program. So is CGCS2000, from which PROJ has no transformation:
+it is ITRF97 at epoch 2000.0, and plates have moved since by some 3 cm a year.
 """
 
 from __future__ import annotations
@@ -33,30 +34,30 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.measurements import RasterFileSpec
 
 LARGEST_PART = 100_000_000
-"""Pixels that are read at once."""
+"""Largest number of pixels read at once."""
 _DRIVERS = ("GTiff", "GTX", "COG")
-"""Plain grids; other drivers of GDAL open files and addresses that a raster names."""
+"""GDAL drivers of plain grids; other drivers open files and addresses that a raster names."""
 
 
 @dataclass(frozen=True, eq=False)
 class GeoRaster:
-    """A raster whose places are known; made by `open_raster`. Nothing is held in memory.
+    """Georeferenced raster file, made by `open_raster`; its values are read on request.
 
     Attributes
     ----------
     file : str
-        Its path.
+        Path of the file.
     crs : pyproj.CRS
-        Of its coordinates.
-    transform : tuple[float, float, float, float, float, float]
+        Coordinate reference system.
+    transform : tuple of float
         (a, b, c, d, e, f): x = a column + b row + c and y = d column + e row + f, (0, 0) being the middle of the first
         pixel.
-    shape : tuple[int, int]
+    shape : tuple of int
         Rows and columns.
     band : int
-        That is read, counted from 1.
+        Number of the band that is read, counted from 1.
     dtype : str
-        Of its values.
+        Data type of the values.
     """
 
     file: str
@@ -67,31 +68,31 @@ class GeoRaster:
     dtype: str
 
     def coordinates_of(self, row: Any, column: Any) -> tuple[np.ndarray, np.ndarray]:
-        """X and y in the raster's system of places (row, column), whole or not, (...)."""
+        """Return x and y in the raster's system at real-valued (row, column), (...)."""
         a, b, c, d, e, f = self.transform
         return a * np.asarray(column) + b * np.asarray(row) + c, d * np.asarray(column) + e * np.asarray(row) + f
 
     def row_column_of(self, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse."""
+        """Return row and column of coordinates, (...): the inverse of `coordinates_of`."""
         a, b, c, d, e, f = self.transform
         u, v, area = np.asarray(x) - c, np.asarray(y) - f, a * e - b * d
         with np.errstate(invalid="ignore"):  # of places beyond the system, which are infinite
             return (a * v - d * u) / area, (e * u - b * v) / area
 
     def read(self, rows: slice | None = None, columns: slice | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Values (r, c) of a part, of the raster's own type, and which of them hold something (bool).
+        """Return values (r, c) of a part, in the raster's data type, and the mask of valid ones (bool).
 
         Parameters
         ----------
-        rows : slice | None
-            Of the part, within the raster; None for all.
-        columns : slice | None
-            likewise.
+        rows : slice or None
+            Rows of the part, within the raster; None for all.
+        columns : slice or None
+            Columns of the part; None for all.
 
         Raises
         ------
         InputError
-            Too large a part, or a file that is damaged.
+            The part is too large, or the file is damaged.
         """
         part = rows or slice(0, self.shape[0]), columns or slice(0, self.shape[1])
         size = [s.stop - s.start for s in part]
@@ -111,21 +112,21 @@ class GeoRaster:
 
 
 def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoRaster:
-    """A raster's place and size.
+    """Read the georeference and size of a raster.
 
     Parameters
     ----------
-    path : str | Path
-        Of the file.
+    path : str or Path
+        Path of the file.
     band : int
-        That is to be read, counted from 1.
-    crs : str | None
-        Of a file that does not say it.
+        Number of the band to be read, counted from 1.
+    crs : str or None
+        Coordinate reference system of a file that does not specify it.
 
     Raises
     ------
     InputError
-        No such file, none that GDAL reads as a plain grid, without a place, with complex or no values.
+        The file does not exist, is not a plain grid that GDAL reads, has no georeference, or has complex or no values.
     """
     file = str(path)
     with opened(file) as source:
@@ -158,7 +159,13 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
 
 @contextmanager
 def opened(file: str) -> Iterator[Any]:
-    """The file as rasterio's dataset. InputError if it is none that can be read, or becomes so while it is read."""
+    """Open a file as rasterio's dataset, for the duration of a `with` block.
+
+    Raises
+    ------
+    InputError
+        The file cannot be opened, or an error occurs while it is read.
+    """
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
@@ -200,7 +207,7 @@ class Geoid:
 
     @classmethod
     def read(cls, path: str | Path) -> Geoid:
-        """From a GeoTIFF or GTX file of one's own; InputError if it is none, or no grid over the Earth."""
+        """Read a user's geoid from a GeoTIFF or GTX file; InputError if it is not a grid of longitude and latitude."""
         raster = open_raster(path)
         if not raster.crs.is_geographic:
             name = raster.crs.name
@@ -219,23 +226,24 @@ class Geoid:
 
     @property
     def _whole_turn(self) -> bool:
+        """True where the grid spans all 360 degrees of longitude."""
         step = abs(self.raster.transform[0])
         return abs(self.raster.shape[1] * step - 360.0) < 0.6 * step
 
     def __call__(self, longitude: Any, latitude: Any) -> np.ndarray:
-        """Height of the geoid, metres, (...).
+        """Return the height of the geoid above the ellipsoid, in metres, (...).
 
         Parameters
         ----------
-        longitude : Any
-            Degrees, any turn, (...).
-        latitude : Any
+        longitude : array_like
+            Degrees, in any range, (...).
+        latitude : array_like
             Degrees, (...).
 
         Raises
         ------
         Problem
-            a place beyond the grid.
+            A position lies outside the grid.
         """
         lon, lat = np.broadcast_arrays(np.asarray(longitude, float), np.asarray(latitude, float))
         rows, columns = self.raster.shape
@@ -258,18 +266,18 @@ class Geoid:
 
 @dataclass(frozen=True, eq=False)
 class Datum:
-    """A coordinate reference system with what its heights are counted from; made by `Datum.of`.
+    """Coordinate reference system with the reference surface of its heights, made by `Datum.of`.
 
     Attributes
     ----------
     crs : pyproj.CRS
-        As given: two coordinates or three.
-    geoid : Geoid | None
-        That heights are above; None for the ellipsoid.
+        System of the input: two coordinates or three.
+    geoid : Geoid or None
+        Geoid to which heights refer; None for the ellipsoid.
     forward : pyproj.Transformer
-        To geocentric coordinates of the ITRS.
+        Transformation to geocentric coordinates of the ITRS.
     geographic : pyproj.Transformer
-        To longitude and latitude, degrees, of the same system.
+        Transformation to longitude and latitude, degrees, of the same system.
     """
 
     crs: pyproj.CRS
@@ -279,21 +287,22 @@ class Datum:
 
     @classmethod
     def of(cls, text: str, heights: str | None, geoid: Geoid | None) -> Datum:
-        """The system of this name.
+        """Make the datum of a coordinate reference system.
 
         Parameters
         ----------
         text : str
-            Of the system, for PROJ.
-        heights : str | None
-            ``ellipsoid`` or ``geoid``; None where the system itself says it.
-        geoid : Geoid | None
-            For heights above it.
+            Code or text of the system, for PROJ.
+        heights : str or None
+            Reference of the heights, ``ellipsoid`` or ``geoid``; None where the system itself defines it.
+        geoid : Geoid or None
+            Geoid to which heights refer.
 
         Raises
         ------
         Problem
-            No such system, heights that are not said or said twice, no way to the ITRS without a guess.
+            The system is unknown, the reference of the heights is missing or specified twice, or no exact
+            transformation to the ITRS exists.
         """
         try:
             crs = pyproj.CRS(text)
@@ -323,21 +332,21 @@ class Datum:
         return cls(crs, geoid, forward, geographic)
 
     def itrs(self, x: Any, y: Any, z: Any) -> np.ndarray:
-        """Places (..., 3) in the ITRS, metres.
+        """Return ITRS coordinates (..., 3), in metres.
 
         Parameters
         ----------
-        x : Any
-            Longitude in degrees, easting, or geocentric, (...).
-        y : Any
-            Latitude in degrees, northing, or geocentric, (...).
-        z : Any
-            Height, or geocentric, metres, (...).
+        x : array_like
+            Longitude in degrees, easting, or geocentric x, (...).
+        y : array_like
+            Latitude in degrees, northing, or geocentric y, (...).
+        z : array_like
+            Height, or geocentric z, metres, (...).
 
         Raises
         ------
         Problem
-            a place where the system has none, or beyond the geoid's grid.
+            Coordinates lie outside the system's range, or beyond the geoid's grid.
         """
         x, y, z = (np.asarray(v, np.float64) for v in np.broadcast_arrays(x, y, z))
         if self.crs.is_geographic and (np.any(np.abs(y) > 90.0) or np.any(np.abs(x) > 540.0)):
@@ -357,7 +366,7 @@ class Datum:
 
     @property
     def accuracy(self) -> float | None:
-        """Accuracy of the way to the ITRS as its authority states it, metres; None if it does not, or before `itrs`."""
+        """Accuracy of the transformation to the ITRS by its authority, metres; None if unknown, or before `itrs`."""
         stated = self.forward.accuracy
         if stated < 0.0:
             try:
@@ -368,6 +377,7 @@ class Datum:
 
 
 def _to_itrs(crs: pyproj.CRS) -> pyproj.Transformer:
+    """Return the transformation from a system to geocentric coordinates of the ITRS."""
     geodetic, target = crs.geodetic_crs, pyproj.CRS("EPSG:4978")
     if geodetic is not None and geodetic.datum is not None and geodetic.datum.name == CGCS2000:
         target = GeocentricCRS(datum=geodetic.datum)
@@ -375,32 +385,32 @@ def _to_itrs(crs: pyproj.CRS) -> pyproj.Transformer:
 
 
 MOST_HEIGHT = 2.0e4
-"""Metres above or below the ellipsoid or a geoid: farther no ground lies, whatever its datum."""
+"""Largest height of ground above or depth below an ellipsoid or geoid, whatever its datum, in metres."""
 _SAMPLED = 512
-"""Rows and columns at which a map is looked through for its extreme heights."""
+"""Number of rows and columns at which a map is searched for its extreme heights."""
 _WGS84 = "EPSG:4326"
 
 
 @dataclass(frozen=True, eq=False)
 class MapPart:
-    """A part of a map; see `twin.orbit.ground.orthophoto.Map`.
+    """Part of a map; implements `twin.orbit.ground.orthophoto.Map`.
 
     Attributes
     ----------
-    values : np.ndarray
-        (rows, columns); grey values float32 with NaN where there are none, or heights above the ellipsoid.
-    valid : np.ndarray | None
-        (rows, columns) bool; None for all.
+    values : (rows, columns) ndarray
+        Grey values float32 with NaN where there are none, or heights above the ellipsoid.
+    valid : (rows, columns) ndarray of bool or None
+        Mask of valid values; None if all are.
     raster : GeoRaster
-        That it is cut from.
-    first : tuple[int, int]
-        Row and column of its first value there.
+        Raster from which the part is cut.
+    first : tuple of int
+        Row and column of the first value in the raster.
     frame : GroundFrame
         Plane coordinates of the ground.
     way : pyproj.Transformer
-        From the raster's system to longitude and latitude, degrees.
+        Transformation from the raster's system to longitude and latitude, degrees.
     spacing : float
-        Of rows and columns on the ground, metres, their geometric mean.
+        Spacing of rows and columns on the ground, metres, their geometric mean.
     """
 
     values: np.ndarray
@@ -412,13 +422,13 @@ class MapPart:
     spacing: float
 
     def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates of places (row, column), whole or not, metres, broadcast."""
+        """Return east and north, in metres, at real-valued (row, column), broadcast."""
         row, column = np.broadcast_arrays(np.asarray(row, float), np.asarray(column, float))
         x, y = self.raster.coordinates_of(row + self.first[0], column + self.first[1])
         return self.frame.plane(*np.radians(self.way.transform(x, y)))
 
     def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse."""
+        """Return row and column of plane coordinates east and north, in metres: the inverse of `east_north`."""
         east, north = np.broadcast_arrays(np.asarray(east, float), np.asarray(north, float))
         longitude, latitude = np.degrees(self.frame.geographic(east, north))
         x, y = self.way.transform(longitude, latitude, direction="INVERSE")
@@ -432,16 +442,16 @@ class MapPart:
 
 @dataclass(frozen=True, eq=False)
 class UserMap:
-    """A map in a file, of which parts are read; made by `UserMap.open`.
+    """Map in a file, of which parts are read; made by `UserMap.open`.
 
     Attributes
     ----------
     raster : GeoRaster
         The file.
     way : pyproj.Transformer
-        From its system to longitude and latitude, degrees.
-    geoid : Geoid | None
-        That its values are heights above; None for the ellipsoid, or for grey values.
+        Transformation from the raster's system to longitude and latitude, degrees.
+    geoid : Geoid or None
+        Geoid to which the values refer; None for the ellipsoid, or for grey values.
     """
 
     raster: GeoRaster
@@ -450,21 +460,22 @@ class UserMap:
 
     @classmethod
     def open(cls, spec: RasterFileSpec, folder: Path, heights: bool = False) -> UserMap:
-        """A map of a file.
+        """Open the map of a file.
 
         Parameters
         ----------
         spec : RasterFileSpec
-            The file, and what it does not say itself.
+            Path of the file, and what the file itself does not specify.
         folder : Path
-            That relative paths start from.
+            Folder to which relative paths refer.
         heights : bool
-            Whether it is an elevation model, whose heights must be said to be above something.
+            True for an elevation model, whose heights need a reference surface.
 
         Raises
         ------
         InputError
-            It cannot be read, no way from its system without a guess, heights above nothing.
+            The file cannot be read, no exact transformation from its system exists, or heights lack a reference
+            surface.
         """
         raster = open_raster(folder / spec.file, spec.band, spec.crs)
         flat = raster.crs.sub_crs_list[0] if raster.crs.is_compound else raster.crs
@@ -486,12 +497,12 @@ class UserMap:
         return cls(raster, way, geoid)
 
     def limits(self) -> tuple[float, float]:
-        """Least and largest height of some thousand places over the whole elevation model.
+        """Return the least and largest height, sampled over the whole elevation model.
 
         Raises
         ------
         InputError
-            There are none, or they are no heights of ground.
+            There are no values, or they are not heights of ground.
         """
         shape = tuple(min(n, _SAMPLED) for n in self.raster.shape)
         with opened(self.raster.file) as source:
@@ -508,21 +519,21 @@ class UserMap:
         return low, high
 
     def part(self, frame: GroundFrame, ends: tuple[float, float, float, float], heights: bool = False) -> MapPart:
-        """What lies within some ends.
+        """Return the part of the map within bounds.
 
         Parameters
         ----------
         frame : GroundFrame
             Plane coordinates of the ground.
-        ends : tuple[float, float, float, float]
+        ends : tuple of float
             West, east, south and north, metres.
         heights : bool
-            Whether its values are heights.
+            True where the values are heights.
 
         Raises
         ------
         InputError
-            Nothing does, or too much for the memory; a place without a geoid.
+            The map does not cover the bounds, the part is too large for the memory, or the geoid does not cover it.
         """
         side = np.linspace(0.0, 1.0, 21)
         east = ends[0] + (ends[1] - ends[0]) * np.concatenate([side, side, 0.0 * side, 0.0 * side + 1.0])
@@ -559,7 +570,7 @@ class UserMap:
         return MapPart(shown, part.valid, self.raster, first, frame, self.way, float(np.sqrt(area)))
 
     def _heights(self, part: MapPart) -> np.ndarray:
-        """Above the ellipsoid."""
+        """Return heights above the ellipsoid, in metres."""
         values = part.values.astype(np.float64)
         if self.geoid is not None:
             rows, columns = (np.arange(n, dtype=float) for n in values.shape)

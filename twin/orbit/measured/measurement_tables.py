@@ -1,8 +1,8 @@
-"""What was measured of a pass as tables: reading them with every convention stated, and writing them to the same bits.
+"""Tables of a pass's measurements: reading with explicit conventions, writing without loss of digits.
 
-Rows may stand in any order, columns in any order and unit. What cannot be told from the numbers, such as the order of a
-quaternion, the file of the test says; what can be told, such as a velocity that is not that of the positions, is
-checked.
+Rows may be in any order, columns in any order and unit. Conventions that the numbers do not show, such as the order of
+a quaternion's components, are specified by the test's file; what the numbers do show, such as a velocity that is not
+that of the positions, is checked.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from twin.orbit.measured.orbit_files import AGAINST_EARTH, INERTIAL, SPEED_TOLER
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 
 _FAR, _FAST, _LATE, _MANY = 1e9, 1e5, 1e10, 1e9
-"""Metres, m/s, seconds and lines beyond which nothing is meant; below them sums of squares do not overflow."""
+"""Limits of plausible input, in metres, m/s, seconds and lines; below them sums of squares do not overflow."""
 _TIME = Column("time", TIME, least=-_LATE, most=_LATE)
 _PLACE = tuple(Column(axis, LENGTH, least=-_FAR, most=_FAR) for axis in "xyz")
 _SPEED = tuple(Column(f"v{axis}", SPEED, needed=False, least=-_FAST, most=_FAST) for axis in "xyz")
 _QUATERNION = tuple(Column(f"q{k}", least=-1.001, most=1.001) for k in range(1, 5))
 _LARGE = 1e6
-"""Metres: sigma of a coordinate."""
+"""Largest sigma of a coordinate, in metres."""
 _CORRELATIONS = ("correlation_xy", "correlation_xz", "correlation_yz")
 COLUMNS: Mapping[str, tuple[Column, ...]] = {
     "platform": (_TIME, *_PLACE, *_SPEED, *_QUATERNION),
@@ -69,11 +69,13 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
         Column("correlation", needed=False, least=-0.999999, most=0.999999),
     ),
 }
-"""Key of a pass -> columns of its table; `tie_points` has those of `image_points`."""
+"""Columns of each table of a pass, by its key; `tie_points` has those of `image_points`."""
 _SIGMAS = (("sigma",), ("plan_sigma", "height_sigma"), ("x_sigma", "y_sigma", "z_sigma"))
+"""Alternative sets of columns for the sigmas of ground coordinates."""
 _EARTH_AXES = np.array([6_378_137.0, 6_378_137.0, 6_356_752.314])
+"""Semi-axes of the WGS84 ellipsoid, in metres."""
 CALIBRATING: Mapping[str, int] = {"control": 1, "check": 2}
-"""Points without which there is no calibration, by role: in how many line cameras one of them must be seen."""
+"""Ground points that a calibration needs: by role, in how many line cameras one of them must be seen."""
 
 
 def read_pass(
@@ -83,25 +85,26 @@ def read_pass(
     camera: ThreeLineCameraSpec,
     needed: Mapping[str, int] = CALIBRATING,
 ) -> PassMeasurements:
-    """What the tables of a pass say.
+    """Read the tables of a pass.
 
     Parameters
     ----------
     name : str
-        Of the pass.
+        Name of the pass.
     spec : PassFilesSpec
-        Its epoch and files, with paths that hold from here.
+        Epoch and files, with paths relative to the working directory.
     conventions : ConventionsSpec
-        Of all tables.
+        Conventions of all tables.
     camera : ThreeLineCameraSpec
-        Whose lines they name.
-    needed : Mapping[str, int]
-        Role -> in how many line cameras one of its points must be seen.
+        Payload whose lines the tables name.
+    needed : mapping of str to int
+        By role, in how many line cameras one of its points must be seen.
 
     Raises
     ------
     InputError
-        a table cannot be read or is not as `COLUMNS` says, or what it says cannot be, with file, line and column.
+        A table cannot be read, does not have the columns of `COLUMNS`, or holds impossible values; with file, line and
+        column.
     """
     files = spec.files
     platform = _platform(spec, conventions)
@@ -143,7 +146,7 @@ def read_pass(
 
 
 def _platform(spec: PassFilesSpec, conventions: ConventionsSpec) -> PlatformTable:
-    """Orbit and attitude of a pass, from tables or from files of other formats."""
+    """Return orbit and attitude of a pass, from tables or from files of other formats."""
     if isinstance(spec.platform, PlatformFilesSpec):
         # what reads them waits for libraries that tables do not need
         from twin.orbit.measured.platform_files import platform_table, read_platform
@@ -157,23 +160,23 @@ def _platform(spec: PassFilesSpec, conventions: ConventionsSpec) -> PlatformTabl
 def read_measurements(
     data: OrbitDataSpec, camera: ThreeLineCameraSpec, advance: Advance = silent, needed: Mapping[str, int] = CALIBRATING
 ) -> tuple[PassMeasurements, ...]:
-    """All passes of a test.
+    """Read all passes of a test.
 
     Parameters
     ----------
     data : OrbitDataSpec
         Conventions and files.
     camera : ThreeLineCameraSpec
-        Whose lines they name.
+        Payload whose lines the tables name.
     advance : Advance
-        How far it is.
-    needed : Mapping[str, int]
-        Role -> in how many line cameras one of its points must be seen.
+        Callback that reports progress.
+    needed : mapping of str to int
+        By role, in how many line cameras one of its points must be seen.
 
     Raises
     ------
     InputError
-        a table cannot be read, or what it says cannot be, with file, line and column.
+        A table cannot be read or holds impossible values; with file, line and column.
     """
     found = []
     for name, files in data.passes.items():
@@ -185,23 +188,23 @@ def read_measurements(
 def _line_times_of(
     table: Table, conventions: ConventionsSpec, camera: ThreeLineCameraSpec, platform: PlatformTable
 ) -> tuple[dict[str, LineTimes], dict[str, float]]:
-    """Line camera -> its line times with the first line as 0, and the number of that line in the file.
+    """Return the line times of each line camera, counted from its first line, and that line's number in the file.
 
     Parameters
     ----------
     table : Table
-        Of the lines of all cameras.
+        Times of the lines of all cameras.
     conventions : ConventionsSpec
-        Which moment of an exposure its times are.
+        Conventions, which say to which moment of an exposure its time refers.
     camera : ThreeLineCameraSpec
-        Whose lines they are.
+        Payload with the lines.
     platform : PlatformTable
-        Whose readings must cover them.
+        Readings of orbit and attitude, which must cover the lines.
 
     Raises
     ------
     InputError
-        a camera that is none, a line twice, times that do not rise, lines outside the readings.
+        A camera is unknown, a line occurs twice, times do not increase, or lines lie outside the readings.
     """
     require_known(table, "camera", tuple(camera.lines))
     path = TabulatedTrajectory(platform)
@@ -230,18 +233,18 @@ def _line_times_of(
 
 
 def ground_of(table: Table) -> GroundPoints:
-    """Points with coordinates.
+    """Return the ground points of a table with coordinates.
 
     Parameters
     ----------
     table : Table
-        Of them.
+        Table of control and check points.
 
     Raises
     ------
     InputError
-        a name twice, another role, a point far from the Earth's surface, sigmas that are missing, given in two ways, or
-        no covariance.
+        A name occurs twice, a role is unknown, a point is far from the Earth's surface, or sigmas are missing, given in
+        two ways, or not a covariance.
     """
     _once(table, "point")
     require_known(table, "role", ("control", "check"))
@@ -257,7 +260,7 @@ def ground_of(table: Table) -> GroundPoints:
 
 
 def _covariance(table: Table, place: Array) -> Array:
-    """(n, 3, 3) in axes of the ITRS, m^2."""
+    """Return covariances (n, 3, 3) in axes of the ITRS, in m^2."""
     ways = [way for way in _SIGMAS if any(name in table for name in way)]
     allowed = "or ".join(", ".join(f"{name} [m]" for name in way) + " " for way in _SIGMAS).strip()
     if len(ways) != 1:
@@ -298,30 +301,30 @@ def _image_points_of(
     camera: ThreeLineCameraSpec,
     trajectory: TabulatedTrajectory,
 ) -> dict[str, ImagePoints]:
-    """Line camera -> its image points, by number of the point.
+    """Return the image points of each line camera, by number of the ground point.
 
     Parameters
     ----------
     table : Table
-        Of all cameras.
-    names : Mapping[str, int]
-        Point -> its number.
-    times : Mapping[str, LineTimes]
-        Line camera -> line times.
-    origins : Mapping[str, float]
-        Line camera -> number of its first line.
+        Image points of all cameras.
+    names : mapping of str to int
+        Number of each ground point.
+    times : mapping of str to LineTimes
+        Line times of each line camera.
+    origins : mapping of str to float
+        Number of each line camera's first line in the file.
     conventions : ConventionsSpec
-        Of pixels.
+        Conventions of pixel coordinates.
     camera : ThreeLineCameraSpec
-        Its lines.
+        Payload with the lines.
     trajectory : TabulatedTrajectory
-        Must be known when the points were exposed.
+        Orbit and attitude, which must cover the exposures of the points.
 
     Raises
     ------
     InputError
-        a point or camera that is none, a point twice in a camera, a place outside the image or exposed where orbit or
-        attitude are not known.
+        A point or camera is unknown, a point occurs twice in a camera, lies outside the image, or was exposed when
+        orbit or attitude are not known.
     """
     require_known(table, "camera", tuple(times))
     number = np.array([names.get(name, -1) for name in table["point"].tolist()])
@@ -360,21 +363,21 @@ def _image_points_of(
 
 
 def image_covariance(table: Table, rows: NDArray[np.intp]) -> Array:
-    """Covariances of line and pixel in some rows of a table of image points, (n, 2, 2), pixels squared."""
+    """Return covariances of line and pixel in rows of a table of image points, (n, 2, 2), in pixels squared."""
     a, b = table["line_sigma"][rows], table["pixel_sigma"][rows]
     c = a * b * (table["correlation"][rows] if "correlation" in table else 0.0)
     return np.stack([np.stack([a * a, c], -1), np.stack([c, b * b], -1)], axis=1)
 
 
 def require_known(table: Table, column: str, names: tuple[str, ...]) -> None:
-    """InputError unless every cell is one of these names."""
+    """Raise InputError unless every cell of a column is one of these names."""
     for row in np.flatnonzero(~np.isin(table[column].astype(str), names))[:1]:
         cell = str(table[column][row])
         raise table.error(int(row), column, f"no such {column}", shown(cell), names_text(names), nearest(cell, names))
 
 
 def _once(table: Table, column: str) -> None:
-    """InputError for a name that stands twice."""
+    """Raise InputError if a name occurs twice in a column."""
     seen: dict[str, int] = {}
     for row, name in enumerate(table[column].tolist()):
         if name in seen:
@@ -399,14 +402,14 @@ TEST_FILE = "calibrate.yaml"
 
 
 def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]) -> dict[str, str]:
-    """Path -> text of a folder of measurements: ``data.yaml``, the tables of each pass, the camera.
+    """Return the files of a folder of measurements, text by path: ``data.yaml``, tables of each pass, camera.
 
     Parameters
     ----------
-    passes : Sequence[PassMeasurements]
-        With different names.
-    camera : Mapping[str, Any]
-        Of the payload's file, plain data.
+    passes : sequence of PassMeasurements
+        Passes with different names.
+    camera : mapping
+        Content of the payload's file, plain data.
     """
     files, listed = {CAMERA_FILE: dump_yaml(camera)}, {}
     for one in passes:
@@ -418,7 +421,7 @@ def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]
 
 
 def _pass_tables(one: PassMeasurements) -> dict[str, str]:
-    """Key of a pass -> text of its table, with all digits."""
+    """Return the text of each table of a pass by its key, with all digits."""
     platform = one.platform
     orbit = {"time [s]": platform.orbit_time, **_columns(("x [m]", "y [m]", "z [m]"), platform.position)}
     if platform.velocity is not None:
@@ -443,6 +446,7 @@ def _pass_tables(one: PassMeasurements) -> dict[str, str]:
 
 
 def _ground(points: GroundPoints) -> dict[str, Any]:
+    """Return the columns of the table of ground points."""
     sigma = np.sqrt(np.diagonal(points.covariance, axis1=1, axis2=2))
     found: dict[str, Any] = {
         "point": points.ids,
@@ -460,6 +464,7 @@ def _ground(points: GroundPoints) -> dict[str, Any]:
 
 
 def _images(images: Mapping[str, ImagePoints], ground: GroundPoints, chosen: np.ndarray) -> dict[str, Any]:
+    """Return the columns of a table of image points, of the ground points that the mask `chosen` selects."""
     heads = ("point", "camera", "line", "pixel", "line_sigma", "pixel_sigma", "correlation")
     found: dict[str, Any] = {head: [] for head in heads}
     for name, row in images.items():
@@ -482,44 +487,46 @@ def _images(images: Mapping[str, ImagePoints], ground: GroundPoints, chosen: np.
 
 
 def _columns(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the columns of an array by their names."""
     return dict(zip(names, values.T, strict=True))
 
 
 def _csv(columns: Mapping[str, Any]) -> str:
-    """Text of a table; the shortest digits that read back to the same bits."""
+    """Return the text of a table, with the shortest digits that read back to the same bits."""
     cells = [[str(v) for v in np.asarray(c, dtype=object).tolist()] for c in columns.values()]
     rows = [", ".join(columns), *map(",".join, zip(*cells, strict=True))]
     return "\n".join(rows) + "\n"
 
 
 _LEAST_RADIUS, _MOST_RADIUS = 6.45e6, 5.0e7
-"""Metres from the Earth's centre: of satellites that map the Earth."""
+"""Range of geocentric distances of mapping satellites, in metres."""
 _UNIT_TOLERANCE = 1e-3
+"""Largest departure of a quaternion's norm from 1."""
 _FALL, _JUMP = 12.0, 0.05
-"""Largest acceleration, m/s^2, and share of the speed by which readings one interval apart may change it by noise."""
+"""Largest acceleration, in m/s^2, and largest change of the velocity by noise of readings, as a share of the speed."""
 _LEAST_TURN, _FASTEST_TURN = np.radians(2.0), np.radians(10.0)
-"""Between two readings, radians, and radians for each second: more than agile satellites turn."""
+"""Limit of the rotation between two readings, radians plus radians per second: more than that of agile satellites."""
 
 
 def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: ConventionsSpec) -> PlatformTable:
-    """Orbit and attitude.
+    """Return orbit and attitude from their tables.
 
     Parameters
     ----------
     epoch : str
         UTC.
     orbit : Table
-        Its table.
+        Table of the orbit.
     attitude : Table
-        Its table, which may be the same.
+        Table of the attitude, which may be the same.
     conventions : ConventionsSpec
-        Of both.
+        Conventions of both.
 
     Raises
     ------
     InputError
-        a time twice, a place where no satellite is, a velocity that is not that of the places, a quaternion that is not
-        of unit length.
+        A time occurs twice, a position is impossible for a satellite, a velocity is not that of the positions, or a
+        quaternion is not of unit length.
     """
     order, looks = _rising(orbit), _rising(attitude)
     time, place = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
@@ -551,14 +558,14 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
 
 
 def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
-    """Quaternions x, y, z, w that turn the project's body axes into those of the frame.
+    """Return quaternions x, y, z, w that rotate the project's body axes into those of the frame.
 
     Parameters
     ----------
-    numbers : Array
-        (n, 4) q1 to q4 as the file has them.
+    numbers : (n, 4) ndarray
+        q1 to q4 as in the file.
     conventions : ConventionsSpec
-        What they mean.
+        Conventions of the file.
     """
     said = conventions.quaternion
     assert said is not None
@@ -576,7 +583,7 @@ def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
 
 
 def _rising(table: Table) -> NDArray[np.intp]:
-    """Rows in the order of time. InputError for a time twice."""
+    """Return the rows in the order of time; InputError if a time occurs twice."""
     order = np.argsort(table["time"], kind="stable")
     for row in order[1:][np.diff(table["time"][order]) == 0.0][:1]:
         raise table.error(int(row), "time", "this time stands twice", f"{table['time'][row]:.9g} s", "each time once")
@@ -584,7 +591,7 @@ def _rising(table: Table) -> NDArray[np.intp]:
 
 
 def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Array) -> None:
-    """InputError for a place that no orbit passes between its neighbours."""
+    """Raise InputError for a position that no orbit passes between its neighbours."""
     step = np.diff(time)
     with np.errstate(over="ignore", invalid="ignore"):  # of times that all but coincide
         rate = np.diff(place, axis=0) / step[:, None]
@@ -597,7 +604,7 @@ def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Arra
 
 
 def _check_turns(table: Table, order: NDArray[np.intp], quaternion: Array) -> None:
-    """InputError for a turn from one reading to the next that no satellite makes."""
+    """Raise InputError for a rotation between two readings that is too fast for a satellite."""
     step = np.diff(table["time"][order])
     turn = 2.0 * np.arccos(np.clip(np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=1)), 0.0, 1.0))
     for k in np.flatnonzero(turn > _LEAST_TURN + _FASTEST_TURN * step)[:1]:
@@ -606,7 +613,7 @@ def _check_turns(table: Table, order: NDArray[np.intp], quaternion: Array) -> No
 
 
 def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, place: Array, speed: Array) -> None:
-    """InputError unless the velocity is the rate of change of the places."""
+    """Raise InputError unless the velocity is the rate of change of the positions."""
     far, inertial = velocity_misfit(time, place, speed)
     if np.median(far) > SPEED_TOLERANCE:
         row = int(order[int(np.argsort(far)[len(far) // 2])])

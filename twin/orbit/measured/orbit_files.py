@@ -1,12 +1,12 @@
-"""Orbits and attitudes in other people's files: CCSDS messages (OEM 502.0-B, AEM 504.0-B) and SP3-c and SP3-d.
+"""Orbit and attitude files of other programs: CCSDS messages (OEM 502.0-B, AEM 504.0-B), SP3-c and SP3-d.
 
-An attitude's quaternion q = (e sin(a/2), cos(a/2)) belongs to the rotation by a about e that takes frame A to frame B.
-So from A to the body the axes of the body are those of A turned by q, and components in the body become those in A by
-R(q): it turns body_to_frame. ATTITUDE_DIR B2A, or a body that is frame A, is the other way. Version 1 says by
-QUATERNION_TYPE where the scalar stands; version 2 has it last.
+CCSDS: an attitude's quaternion q = (e sin(a/2), cos(a/2)) belongs to the rotation by a about e that takes frame A to
+frame B. So from A to the body the axes of the body are those of A rotated by q, and components in the body become those
+in A by R(q): the convention is body_to_frame. ATTITUDE_DIR B2A, or a body that is frame A, is the other way. In version
+1 QUATERNION_TYPE gives the position of the scalar; version 2 has it last.
 
-Positions are kilometres, velocities dm/s, both Earth-fixed; the time system stands in the header. A position of zeros
-is a missing one. A file without its last line EOF is whole where it has as many epochs as its header says.
+SP3: positions are in kilometres, velocities in dm/s, both Earth-fixed; the time system is in the header. A position of
+zeros is a missing one. A file without its last line EOF is complete where it has as many epochs as its header says.
 """
 
 from __future__ import annotations
@@ -28,18 +28,19 @@ Frame = Literal["ITRS", "GCRS", "EME2000", "TEME"]
 Scalar = Literal["last", "first"]
 Turns = Literal["body_to_frame", "frame_to_body"]
 FRAMES: tuple[str, ...] = get_args(Frame)
+"""Reference frames that can be read."""
 
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Part of an orbit that is joined by itself, as between two manoeuvres.
+    """Part of an orbit that is interpolated by itself, as between two manoeuvres.
 
     Attributes
     ----------
     first, last : int
-        Of its readings, counted from 0.
-    usable : Readings | None
-        Two clock readings between which the file says that it may be used; None for all of it.
+        First and last of its readings, counted from 0.
+    usable : Readings or None
+        Two clock readings between which the file allows its use; None for all of it.
     """
 
     first: int
@@ -49,24 +50,24 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class OrbitReadings:
-    """An orbit as a file holds it.
+    """Orbit as read from a file, in the file's frame and time scale.
 
     Attributes
     ----------
     file : str
-        Where it is from.
+        Path of the file.
     clock : Readings
-        N readings, rising.
-    position : np.ndarray
-        (N, 3) metres.
-    velocity : np.ndarray | None
-        (N, 3) m/s in axes and against axes of the same frame; None where the file has none.
-    frame : str | None
-        In which; None where the file does not say.
-    scale : str | None
-        Of the clock; None where the file does not say.
-    segments : tuple[Segment, ...]
-        Parts that no interpolation may join; empty for one.
+        N readings, increasing.
+    position : (N, 3) ndarray
+        Positions, metres.
+    velocity : (N, 3) ndarray or None
+        Velocities, m/s, in and relative to the axes of the same frame; None where the file has none.
+    frame : str or None
+        Reference frame; None where the file does not say.
+    scale : str or None
+        Time scale of the clock; None where the file does not say.
+    segments : tuple of Segment
+        Parts between which no interpolation is allowed; empty for a single part.
     """
 
     file: str
@@ -78,7 +79,7 @@ class OrbitReadings:
     segments: tuple[Segment, ...] = ()
 
     def taken(self, part: slice) -> OrbitReadings:
-        """Return some of the readings, with what is among them of the segments."""
+        """Return the readings of a slice, with the segments cut accordingly."""
         begin, end, _ = part.indices(len(self.clock))
         here = (one for one in self.segments if one.first < end and one.last >= begin)
         segments = (replace(one, first=max(one.first - begin, 0), last=min(one.last, end - 1) - begin) for one in here)
@@ -88,26 +89,26 @@ class OrbitReadings:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeReadings:
-    """An attitude as a file holds it.
+    """Attitude as read from a file, in the file's conventions.
 
     Attributes
     ----------
     file : str
-        Where it is from.
+        Path of the file.
     clock : Readings
-        M readings, rising.
-    quaternion : np.ndarray | None
-        (M, 4) components as they stand in the file; None for angles.
-    angles : np.ndarray | None
-        (M, 3) roll, pitch, yaw, radians; None for quaternions.
-    frame : str | None
-        That the body is turned against; None where the file does not say.
-    scale : str | None
-        Of the clock; None where the file does not say.
-    scalar : Scalar | None
-        Where the scalar part stands; None where the file does not say.
-    turns : Turns | None
-        What the quaternion turns into what; None where the file does not say.
+        M readings, increasing.
+    quaternion : (M, 4) ndarray or None
+        Components in the file's order; None for angles.
+    angles : (M, 3) ndarray or None
+        Roll, pitch, yaw, radians; None for quaternions.
+    frame : str or None
+        Frame relative to which the body is rotated; None where the file does not say.
+    scale : str or None
+        Time scale of the clock; None where the file does not say.
+    scalar : Scalar or None
+        Position of the scalar part; None where the file does not say.
+    turns : Turns or None
+        Direction of the rotation; None where the file does not say.
     """
 
     file: str
@@ -120,21 +121,21 @@ class AttitudeReadings:
     turns: Turns | None = None
 
     def taken(self, part: slice) -> AttitudeReadings:
-        """Return some of the readings."""
+        """Return the readings of a slice."""
         turns, angles = (None if values is None else values[part] for values in (self.quaternion, self.angles))
         return replace(self, clock=self.clock.taken(part), quaternion=turns, angles=angles)
 
 
 def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_FRAME") -> str:
-    """The frame of this name as files of others spell it.
+    """Return the reference frame of a name as other files spell it.
 
     Every ITRF and WGS 84 counts as ITRS: realisations since 1992 agree to some centimetres. GCRF and ICRF are GCRS, and
-    J2000 is EME2000, which is turned against it by 0.02 arcsec.
+    J2000 is EME2000, which is rotated relative to it by 0.02 arcsec.
 
     Raises
     ------
     InputError
-        Another one.
+        The frame is not supported.
     """
     word = name.strip().upper().replace("-", "").replace("_", "")
     # SP3 has five letters: ITR97, IER97 of the IERS, IGS14, IGb08, and ECF where a realisation is not said
@@ -148,8 +149,9 @@ def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_F
 
 
 def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
-    """InputError unless positions (N, 3), metres, on these lines lie between the Earth's surface and 100 000 km: what
-    fails has the wrong unit.
+    """Raise InputError unless positions (N, 3), in metres, lie between the Earth's surface and 100 000 km.
+
+    Positions that fail have the wrong unit. `lines` are the lines of the file on which they stand.
     """
     radius = np.linalg.norm(position, axis=1)
     for row in np.flatnonzero((radius < 6.3e6) | (radius > 1e8))[:1]:
@@ -158,7 +160,7 @@ def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
 
 
 def require_unit(file: str, quaternion: np.ndarray, lines: list[int]) -> None:
-    """InputError unless quaternions (M, 4) on these lines have length 1 to a thousandth."""
+    """Raise InputError unless quaternions (M, 4) on these lines have length 1 to a thousandth."""
     length = np.linalg.norm(quaternion, axis=1)
     for row in np.flatnonzero(np.abs(length - 1.0) > 1e-3)[:1]:
         found = f"length {length[row]:.6g}"
@@ -166,27 +168,30 @@ def require_unit(file: str, quaternion: np.ndarray, lines: list[int]) -> None:
 
 
 SPEED_TOLERANCE = 0.02
-"""Relative tolerance of a velocity. Positions of 1 m noise 1 s apart differ by less, and the velocity against the stars
-differs by 6 % and more."""
+"""Relative tolerance of a velocity.
+
+Positions of 1 m noise 1 s apart differ by less, and the inertial velocity differs by 6 % and more.
+"""
 
 
 def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, bool]:
-    """Return by how much velocities differ from the change of Earth-fixed places, and whether they are recognised as
-    those against the stars, which are larger by omega x P.
+    """Return the misfit of velocities to the change of Earth-fixed positions, and whether they are inertial ones.
+
+    Inertial velocities are larger by omega x P.
 
     Parameters
     ----------
-    time : Array
-        (N,), seconds.
-    place : Array
-        (N, 3), ITRS, metres.
-    speed : Array
-        (N, 3), in axes of the ITRS, m/s.
+    time : (N,) ndarray
+        Times, seconds.
+    place : (N, 3) ndarray
+        Positions in the ITRS, metres.
+    speed : (N, 3) ndarray
+        Velocities in axes of the ITRS, m/s.
 
     Returns
     -------
-    tuple[Array, bool]
-        Relative differences (N - 1,), and whether the velocities less omega x P fit while they themselves do not.
+    tuple of (N - 1,) ndarray and bool
+        Relative differences, and whether the velocities less omega x P fit while they themselves do not.
     """
     rate = np.diff(place, axis=0) / np.diff(time)[:, None]
     # across a long step the chord is shorter than the arc, and lies to its side; that is no error of the velocity
@@ -198,14 +203,16 @@ def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, boo
 
 
 def require_own_velocity(orbit: OrbitReadings) -> None:
-    """InputError if velocities of Earth-fixed positions are those against the stars."""
+    """Raise InputError if the velocities of Earth-fixed positions are inertial ones."""
     time = (orbit.clock.day - orbit.clock.day[0]) * 86400.0 + orbit.clock.second
     if orbit.velocity is not None and velocity_misfit(time, orbit.position, orbit.velocity)[1]:
         raise InputError(Issue(INERTIAL, orbit.file, None, (), None, AGAINST_EARTH))
 
 
 INERTIAL = "the velocities are against the stars, larger than those of the Earth-fixed positions by omega x P"
+"""Problem text of inertial velocities with Earth-fixed positions."""
 AGAINST_EARTH = "velocities against the same axes as the positions, or none"
+"""Text of the allowed velocities."""
 
 
 _COVARIANCE = ("COVARIANCE_START", "COVARIANCE_STOP")
@@ -213,7 +220,7 @@ _COVARIANCE = ("COVARIANCE_START", "COVARIANCE_STOP")
 
 @dataclass
 class _Segment:
-    """Metadata and data lines of a segment, with the lines on which they stand."""
+    """Metadata and data of a segment of a CCSDS message, with their lines in the file."""
 
     keys: dict[str, tuple[str, int]] = field(default_factory=dict)
     rows: list[list[str]] = field(default_factory=list)
@@ -221,7 +228,7 @@ class _Segment:
 
 
 def message_kind(lines: list[str]) -> str | None:
-    """OEM or AEM for a message's first lines; None for another file."""
+    """Return OEM or AEM for a message's first lines; None for another file."""
     text = "\n".join(lines[:20])
     for kind in ("OEM", "AEM"):
         if f"CCSDS_{kind}_VERS" in text or f"<{kind.lower()}" in text:
@@ -230,19 +237,19 @@ def message_kind(lines: list[str]) -> str | None:
 
 
 def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
-    """The orbit of an OEM.
+    """Read the orbit of a CCSDS OEM.
 
     Parameters
     ----------
-    path : str | Path
-        Of the file.
-    satellite : str | None
-        Its OBJECT_ID or OBJECT_NAME; may be left out where there is one only.
+    path : str or Path
+        Path of the file.
+    satellite : str or None
+        OBJECT_ID or OBJECT_NAME of the satellite; may be left out where there is only one.
 
     Raises
     ------
     InputError
-        It cannot be read, about another body than the Earth, or its segments do not fit together.
+        The file cannot be read, is about another body than the Earth, or its segments do not fit together.
     """
     file = str(path)
     segments = _chosen(file, _segments(path, "OEM"), satellite)
@@ -266,7 +273,7 @@ def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
 
 
 def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings:
-    """The attitude of an AEM of quaternions; arguments and errors as `read_oem`."""
+    """Read the attitude of a CCSDS AEM of quaternions; arguments and errors as `read_oem`."""
     file = str(path)
     segments = _chosen(file, _segments(path, "AEM"), satellite)
     kind, line = _same(file, segments, "ATTITUDE_TYPE")
@@ -302,6 +309,7 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
 
 
 def _segments(path: str | Path, kind: str) -> list[_Segment]:
+    """Return the segments of a message that hold data."""
     file, lines = str(path), text_lines(path, f"a CCSDS {kind}")
     xml = any(line.lstrip().startswith("<") for line in lines[:20])
     found = list(_from_xml(file, "\n".join(lines), kind) if xml else _from_text(file, lines, kind))
@@ -311,6 +319,7 @@ def _segments(path: str | Path, kind: str) -> list[_Segment]:
 
 
 def _from_text(file: str, lines: list[str], kind: str) -> Iterator[_Segment]:
+    """Parse the segments of a message in text form (KVN)."""
     segment: _Segment | None = None
     inside, skipped = "", False
     for k, raw in enumerate(lines):
@@ -346,10 +355,13 @@ def _from_text(file: str, lines: list[str], kind: str) -> Iterator[_Segment]:
 
 
 _STATE = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
+"""Elements of a state vector in XML."""
 _TURN = {"LAST": ("EPOCH", "Q1", "Q2", "Q3", "QC"), "FIRST": ("EPOCH", "QC", "Q1", "Q2", "Q3")}
+"""Elements of an attitude state in XML, by QUATERNION_TYPE."""
 
 
 def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
+    """Parse the segments of a message in XML."""
     root = parsed_xml(text, file)
     for one in root.iter("segment"):
         segment = _Segment()
@@ -370,7 +382,7 @@ def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
 
 
 def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[_Segment]:
-    """The segments of one satellite."""
+    """Return the segments of one satellite."""
     names: dict[str, Mapping[str, None]] = {}
     for segment in segments:
         known = {segment.keys[k][0]: None for k in ("OBJECT_ID", "OBJECT_NAME") if k in segment.keys}
@@ -391,7 +403,7 @@ def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[
 
 
 def _same(file: str, segments: list[_Segment], key: str, usual: str | None = None) -> tuple[str, int]:
-    """What all segments say of a key, and on which line."""
+    """Return the value of a key that all segments share, and its line in the file."""
     said = [s.keys.get(key) for s in segments]
     values = {None if one is None else one[0] for one in said}
     if values == {None} and usual is not None:
@@ -406,6 +418,7 @@ def _same(file: str, segments: list[_Segment], key: str, usual: str | None = Non
 
 
 def _scale(file: str, segments: list[_Segment]) -> str:
+    """Return the time scale of the segments."""
     name, line = _same(file, segments, "TIME_SYSTEM")
     try:
         return known_scale(name)
@@ -414,8 +427,10 @@ def _scale(file: str, segments: list[_Segment]) -> str:
 
 
 def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
-    """Segments of an orbit: nothing may be interpolated from one to the next, for they meet where an orbit breaks, as
-    at a manoeuvre, nor used outside of USEABLE_START_TIME and USEABLE_STOP_TIME (502.0-B, 5.2.4).
+    """Return the segments of an orbit.
+
+    Nothing may be interpolated from one to the next, for they meet where an orbit breaks, as at a manoeuvre, nor used
+    outside of USEABLE_START_TIME and USEABLE_STOP_TIME (502.0-B, 5.2.4).
     """
     found, first = [], 0
     for segment in segments:
@@ -432,7 +447,7 @@ def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
 
 
 def _joined(segments: list[_Segment]) -> tuple[list[list[str]], list[int]]:
-    """Rows of all segments with their lines; the time at which one ends and the next begins stands once."""
+    """Return rows of all segments with their lines, without repeating a time at which one ends and the next begins."""
     rows: list[list[str]] = []
     lines: list[int] = []
     for segment in segments:
@@ -443,27 +458,28 @@ def _joined(segments: list[_Segment]) -> tuple[list[list[str]], list[int]]:
 
 
 WHAT = "an SP3 file"
+"""Description of the file for error messages."""
 
 
 def is_sp3(first: str) -> bool:
-    """Whether a file that begins with this line is one."""
+    """Return whether a file that begins with this line is an SP3 file."""
     return first.startswith(("#a", "#b", "#c", "#d")) and not first.startswith("##")
 
 
 def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
-    """The orbit of a satellite.
+    """Read the orbit of a satellite from an SP3 file.
 
     Parameters
     ----------
-    path : str | Path
-        Of the file.
-    satellite : str | None
-        Its number as the file has it, L51; may be left out where there is one only.
+    path : str or Path
+        Path of the file.
+    satellite : str or None
+        Identifier of the satellite in the file, such as L51; may be left out where there is only one.
 
     Raises
     ------
     InputError
-        No such satellite, fewer than two places, a line that cannot be read, a file that ends early.
+        The satellite is unknown, has fewer than two positions, a line cannot be read, or the file ends early.
     """
     file, lines = str(path), text_lines(path, WHAT)
     head = lines[0]
@@ -516,7 +532,7 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
 
 
 def _satellite(file: str, lines: list[str], wanted: str | None, old: bool) -> str:
-    """Return the name of a satellite in the file; in files of versions a and b a number may stand for it."""
+    """Return the name of a satellite in the file; in files of versions a and b it may be a bare number."""
     names = list(dict.fromkeys(line[1:4].strip() for line in lines if line[:1] == "P"))
     key, found = ("satellite",), names_text(names[:20]) or "none"
     if wanted is None:
@@ -531,6 +547,7 @@ def _satellite(file: str, lines: list[str], wanted: str | None, old: bool) -> st
 
 
 def _sp3_scale(file: str, lines: list[str], old: bool) -> str:
+    """Return the time scale of an SP3 file; without a statement, versions a and b have GPS time."""
     for k, line in enumerate(lines[:400]):
         if line.startswith("%c"):
             if old and line[9:12].lower() in ("ccc", "", "   "):
@@ -545,7 +562,7 @@ def _sp3_scale(file: str, lines: list[str], old: bool) -> str:
 
 
 def _epoch(file: str, k: int, line: str) -> str:
-    """Calendar text of an epoch header record."""
+    """Return the calendar text of an epoch header record."""
     cells = line[1:].split()
     try:
         year, month, day, hour, minute = (int(c) for c in cells[:5])

@@ -1,6 +1,6 @@
-"""What was measured of a pass, in the project's own conventions: frames, signs and pixel coordinates.
+"""Measurements of a pass in the project's own conventions: frames, signs and pixel coordinates.
 
-Whatever files it came from, and whether a satellite or the simulation made it, this is what an analysis takes.
+Every analysis takes this form, from whatever files the measurements came, of a satellite or of the simulation.
 """
 
 from __future__ import annotations
@@ -17,23 +17,26 @@ from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable
 
 ROLES = ("control", "check", "tie")
-"""Roles of ground points: their coordinates are used; they only test the result; they are not known."""
+"""Roles of ground points.
+
+Coordinates of control points are used, those of check points only test the result, those of tie points are unknown.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class GroundPoints:
-    """Points on the ground.
+    """Ground points with covariance and role.
 
     Attributes
     ----------
-    ids : NDArray[np.object_]
-        (n,) names, each once.
-    itrs : Array
-        (n, 3) metres; NaN where the role is tie and nothing is known.
-    covariance : Array
-        (n, 3, 3) of the coordinates, ITRS axes, m^2; zero for exact ones, and for ties.
-    role : NDArray[np.object_]
-        (n,) one of `ROLES`.
+    ids : (n,) ndarray of object
+        Unique names.
+    itrs : (n, 3) ndarray
+        Coordinates in the ITRS, metres; NaN for tie points without coordinates.
+    covariance : (n, 3, 3) ndarray
+        Covariance of the coordinates, ITRS axes, m^2; zero for exact ones, and for ties.
+    role : (n,) ndarray of object
+        Role of each point, one of `ROLES`.
     """
 
     ids: NDArray[np.object_]
@@ -43,24 +46,24 @@ class GroundPoints:
 
     @classmethod
     def of(cls, ids: ArrayLike, itrs: ArrayLike, covariance: ArrayLike, role: ArrayLike) -> GroundPoints:
-        """The points, checked.
+        """Make ground points from arrays, with checks.
 
         Parameters
         ----------
-        ids : ArrayLike
-            (n,) names.
-        itrs : ArrayLike
-            (n, 3), metres.
-        covariance : ArrayLike
+        ids : (n,) array_like
+            Names.
+        itrs : (n, 3) array_like
+            Coordinates, metres.
+        covariance : array_like
             (n, 3, 3), or one (3, 3) for all, m^2.
-        role : ArrayLike
+        role : array_like
             (n,), or one for all.
 
         Raises
         ------
         ValueError
-            Shapes that do not match, a name twice, a role that is none, control or check points whose coordinates are
-            not finite, a covariance that is none.
+            Shapes do not match, a name occurs twice, a role is unknown, coordinates of control or check points are not
+            finite, or a covariance is not symmetric and positive semidefinite.
         """
         names, places = np.array(ids, dtype=object), np.array(itrs, np.float64)
         n = len(names)
@@ -84,12 +87,12 @@ class GroundPoints:
         return len(self.ids)
 
     def with_ties(self, names: Sequence[str]) -> GroundPoints:
-        """These points, and after them tie points of these names, of which nothing is known."""
+        """Return these points, followed by tie points of these names without coordinates."""
         ties = GroundPoints.of(names, np.full((len(names), 3), np.nan), np.zeros((3, 3)), "tie")
         return GroundPoints(*(np.concatenate([getattr(one, k.name) for one in (self, ties)]) for k in fields(self)))
 
     def taken(self, keep: ArrayLike) -> GroundPoints:
-        """Some of them, by mask or index."""
+        """Return the points that a mask or index selects."""
         where = np.asarray(keep)
         return GroundPoints(self.ids[where], self.itrs[where], self.covariance[where], self.role[where])
 
@@ -100,12 +103,12 @@ class ImagePoints:
 
     Attributes
     ----------
-    point : NDArray[np.intp]
-        (n,) which ground point each of them shows.
-    line, pixel : Array
-        (n,) image coordinates; the centre of the first line's first pixel is (0, 0).
-    covariance : Array
-        (n, 2, 2) of line and pixel, pixels squared.
+    point : (n,) ndarray of int
+        Index of the ground point of each image point.
+    line, pixel : (n,) ndarray
+        Image coordinates; the centre of the first line's first pixel is (0, 0).
+    covariance : (n, 2, 2) ndarray
+        Covariance of line and pixel, pixels squared.
     """
 
     point: NDArray[np.intp]
@@ -115,23 +118,23 @@ class ImagePoints:
 
     @classmethod
     def of(cls, point: ArrayLike, line: ArrayLike, pixel: ArrayLike, covariance: ArrayLike) -> ImagePoints:
-        """The points, checked.
+        """Make image points from arrays, with checks.
 
         Parameters
         ----------
-        point : ArrayLike
-            (n,) whole numbers.
-        line : ArrayLike
-            (n,).
-        pixel : ArrayLike
-            (n,).
-        covariance : ArrayLike
+        point : (n,) array_like of int
+            Indices of ground points.
+        line : (n,) array_like
+            Line coordinates.
+        pixel : (n,) array_like
+            Pixel coordinates.
+        covariance : array_like
             (n, 2, 2), or one (2, 2) for all, pixels squared.
 
         Raises
         ------
         ValueError
-            Shapes that do not match, values that are not finite.
+            Shapes do not match or values are not finite.
         """
         which, at, along = np.array(point, np.intp), np.array(line, np.float64), np.array(pixel, np.float64)
         if which.ndim != 1 or at.shape != which.shape or along.shape != which.shape:
@@ -142,39 +145,39 @@ class ImagePoints:
         return cls(which, at, along, spread)
 
     def taken(self, keep: ArrayLike) -> ImagePoints:
-        """Some of them, by mask or index."""
+        """Return the image points that a mask or index selects."""
         where = np.asarray(keep)
         return ImagePoints(self.point[where], self.line[where], self.pixel[where], self.covariance[where])
 
     @classmethod
     def joined(cls, parts: Sequence[ImagePoints]) -> ImagePoints:
-        """Several sets one after the other; at least one."""
+        """Concatenate one or more sets of image points."""
         return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
 
     def numbered(self, first: int) -> ImagePoints:
-        """These image points with their ground points counted from ``first``."""
+        """Return these image points with their ground points counted from ``first``."""
         return replace(self, point=self.point - first)
 
 
 def point_names(roles: NDArray[np.object_]) -> list[str]:
-    """Return names for points of these roles: c, k or t, and their number."""
+    """Return names for points of these roles: c, k or t (control, check, tie), and their number."""
     letter = {"control": "c", "check": "k", "tie": "t"}
     return [f"{letter[role]}{k}" for k, role in enumerate(roles.tolist())]
 
 
 _APART = 0.01
-"""Metres: two targets that images from orbit show apart lie farther from each other."""
+"""Least distance of two targets that images from orbit resolve, in metres."""
 
 
 def duplicates(ids: NDArray[np.object_], places: Array) -> str:
-    """Return a warning that names points which are one point under two names; empty where there are none.
+    """Return a warning about points that have the same coordinates under two names; empty where there are none.
 
     Parameters
     ----------
-    ids : NDArray[np.object_]
-        (n,) names.
-    places : Array
-        (n, 3), ITRS, metres; NaN where unknown.
+    ids : (n,) ndarray of object
+        Names.
+    places : (n, 3) ndarray
+        Coordinates, ITRS, metres; NaN where unknown.
     """
     known = np.flatnonzero(np.all(np.isfinite(places), axis=1))
     pairs = sorted(cKDTree(places[known]).query_pairs(_APART))
@@ -185,6 +188,7 @@ def duplicates(ids: NDArray[np.object_], places: Array) -> str:
 
 
 _NAMED = 8
+"""Largest number of names that a message lists."""
 
 
 def listed(names: Sequence[str]) -> str:
@@ -195,20 +199,20 @@ def listed(names: Sequence[str]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class PassMeasurements:
-    """One pass as it was measured.
+    """Measurements of one pass.
 
     Attributes
     ----------
     name : str
-        Of the pass, or of the field that it passes.
+        Name of the pass, or of the field that it passes.
     platform : PlatformTable
         Readings of orbit and attitude.
-    line_times : Mapping[str, LineTimes]
-        Line camera -> when its lines were exposed.
+    line_times : mapping of str to LineTimes
+        Exposure times of the lines of each line camera.
     ground : GroundPoints
         Control, check and tie points.
-    images : Mapping[str, ImagePoints]
-        Line camera -> image points; `point` counts the rows of `ground`.
+    images : mapping of str to ImagePoints
+        Image points of each line camera; `point` counts the rows of `ground`.
     """
 
     name: str

@@ -1,9 +1,7 @@
-"""Orbit and attitude from files of any format into a table of readings in the ITRS.
+"""Orbit and attitude from files of any format: a table of readings in the ITRS, and the sensor of a DIMAP scene.
 
-Reading and understanding are two steps: `PlatformReadings` holds what the files say, `Conventions` what it means, and
-`platform_table` makes the table of both, so that the same readings can be understood another way.
-
-The scene of a DIMAP file as a sensor like all others.
+Reading and interpretation are two steps: `PlatformReadings` holds the numbers of the files, `Conventions` their
+meaning, and `platform_table` makes the table of both, so that the same readings can be interpreted in another way.
 """
 
 from __future__ import annotations
@@ -53,33 +51,33 @@ _TURN = (
     *(Column(name, ANGLE, needed=False) for name in _ANGLES),
 )
 _LARGEST_ERROR = 0.01
-"""Metres; of positions between readings."""
+"""Largest error of positions between readings, in metres."""
 _EME2000_FROM_GCRS = np.asarray(erfa.bp06(2451545.0, 0.0)[0])
-"""Frame bias (IERS Conventions 2010, section 5.5.4)."""
+"""Frame bias, rotation GCRS -> EME2000 (IERS Conventions 2010, section 5.5.4)."""
 
 
 @dataclass(frozen=True)
 class Conventions:
-    """What the numbers of orbit and attitude files mean; names as in `scenes.specs.orbit.measurements`.
+    """Conventions of orbit and attitude files; names as in `scenes.specs.orbit.measurements`.
 
     Attributes
     ----------
     orbit_frame, attitude_frame : str
-        axes.
+        Reference frames.
     orbit_scale, attitude_scale : str
         Time scales.
     orbit_offset, attitude_offset : float
         Seconds to be added to the times.
     scalar : str
-        Where a quaternion's scalar part stands.
+        Position of a quaternion's scalar part.
     turns : str
-        What a quaternion turns into what.
-    body_axes : tuple[str, str, str]
-        Of the attitude's body.
+        Direction of a quaternion's rotation.
+    body_axes : tuple of str
+        Axes of the body whose attitude the file gives.
     sequence : str
-        Of angles.
+        Sequence of rotation angles.
     law : Attitude
-        Of the orbital frame.
+        Definition of the orbital frame.
     """
 
     orbit_frame: str
@@ -97,15 +95,15 @@ class Conventions:
 
 @dataclass(frozen=True, eq=False)
 class PlatformReadings:
-    """Orbit and attitude as their files hold them.
+    """Orbit and attitude as read from their files, before interpretation.
 
     Attributes
     ----------
     orbit : OrbitReadings
-        Of one file.
+        Readings of the orbit.
     attitude : AttitudeReadings
-        Of another.
-    earth : EarthOrientation | None
+        Readings of the attitude.
+    earth : EarthOrientation or None
         Table of Earth orientation; None where there is none.
     """
 
@@ -115,19 +113,19 @@ class PlatformReadings:
 
 
 def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadings, Conventions]:
-    """What the files of a platform hold, and what it means.
+    """Read the files of a platform, with the conventions of their numbers.
 
     Parameters
     ----------
     spec : PlatformFilesSpec
-        The files, and what they do not say themselves.
+        The files, and the conventions that they do not specify themselves.
     folder : Path
-        That relative paths start from.
+        Folder to which relative paths refer.
 
     Raises
     ------
     InputError
-        a file that cannot be read, something that neither file nor spec says, or that they say differently.
+        A file cannot be read, or a convention is specified neither by file nor spec, or differently.
     """
     orbit, attitude = _orbit(spec.orbit, folder), _attitude(spec.attitude, folder)
     turned = attitude.quaternion is not None
@@ -155,22 +153,22 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
 
 
 def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | None = None) -> PlatformTable:
-    """The readings understood in one way.
+    """Return the table of readings under given conventions.
 
     Parameters
     ----------
     readings : PlatformReadings
-        Of the files.
+        Readings of the files.
     meant : Conventions
-        What they mean.
-    epoch : str | None
-        From which times count, UTC, ISO 8601; None for the first second of the orbit.
+        Conventions of the readings.
+    epoch : str or None
+        Zero of the times, UTC, ISO 8601; None for the first second of the orbit.
 
     Raises
     ------
     InputError
-        a leap second that is none, no Earth orientation for an inertial frame, attitude by an orbital frame at times
-        without orbit.
+        A leap second does not exist, Earth orientation for an inertial frame is missing, or the attitude relative to an
+        orbital frame has times without orbit.
     """
     orbit, attitude = readings.orbit, readings.attitude
     usable: Instants | None = None
@@ -221,7 +219,7 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
 
 
 def _one_segment(readings: PlatformReadings, meant: Conventions) -> tuple[OrbitReadings, Instants | None]:
-    """That part of an orbit in which most of the attitude lies, and between which moments it may be used."""
+    """Return the segment of an orbit with most of the attitude, and the instants between which it may be used."""
     orbit, attitude = readings.orbit, readings.attitude
     looks = _instants(attitude.file, attitude.clock, meant.attitude_scale, meant.attitude_offset)
     fixes = _instants(orbit.file, orbit.clock, meant.orbit_scale, meant.orbit_offset)
@@ -242,6 +240,7 @@ def _one_segment(readings: PlatformReadings, meant: Conventions) -> tuple[OrbitR
 def _in_itrs(
     orbit: OrbitReadings, frame: str, time: np.ndarray, rotation: TableRotation | None
 ) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return positions and velocities in the ITRS."""
     if frame == "ITRS" or rotation is None:
         return orbit.position, orbit.velocity
     turn = to_itrs(frame, rotation)
@@ -254,7 +253,7 @@ def _in_itrs(
 
 
 def to_itrs(frame: str, rotation: TableRotation) -> Any:
-    """Seconds (N,) -> rotation (N, 3, 3) from an inertial frame to the ITRS, by the Earth's rotation."""
+    """Return a function from seconds (N,) to rotations (N, 3, 3) from an inertial frame to the ITRS."""
     if frame == "TEME":
         return rotation.mean_equinox
     if frame == "EME2000":
@@ -263,7 +262,7 @@ def to_itrs(frame: str, rotation: TableRotation) -> Any:
 
 
 def _body(attitude: AttitudeReadings, meant: Conventions) -> np.ndarray:
-    """Rotation (M, 3, 3) from the body to the attitude's frame."""
+    """Return rotations (M, 3, 3) from the body to the attitude's frame."""
     if attitude.quaternion is not None:
         q = attitude.quaternion if meant.scalar == "last" else np.roll(attitude.quaternion, -1, axis=1)
         matrix = np.asarray(Rotation.from_quat(q).as_matrix())
@@ -277,6 +276,7 @@ def _body(attitude: AttitudeReadings, meant: Conventions) -> np.ndarray:
 
 
 def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants:
+    """Return the instants of clock readings, shifted by the offset in seconds."""
     try:
         return clock.instants(scale).later(offset)
     except Problem as problem:
@@ -284,7 +284,7 @@ def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants
 
 
 def _stated(spec: Any, key: str, said: str | None, found: str | None, what: str) -> str:
-    """What spec and file say together."""
+    """Return a convention that spec or file specifies; InputError if neither does or they differ."""
     if said is None and found is None:
         raise spec.error(f"{what} is not said, neither by the file nor here", (key,), allowed=f"`{key}:` here")
     if said is not None and found is not None and said != found:
@@ -295,6 +295,7 @@ def _stated(spec: Any, key: str, said: str | None, found: str | None, what: str)
 
 
 def _earth(spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, meant: Conventions) -> EarthOrientation | None:
+    """Return the Earth orientation of a table or of constant values; None where neither is given."""
     if spec.earth_orientation is not None:
         return earth_orientation.read_earth_orientation(folder / spec.earth_orientation)
     if spec.earth is not None:
@@ -304,6 +305,7 @@ def _earth(spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, meant: C
 
 
 def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
+    """Read the orbit from a file of any format."""
     path = folder / spec.file
     head = list(first_lines(path, "an orbit: SP3, CCSDS OEM, DIMAP, or CSV"))
     if is_dimap(head):
@@ -328,6 +330,7 @@ def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
 
 
 def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
+    """Read the attitude from a file of any format."""
     path = folder / spec.file
     head = list(first_lines(path, "an attitude: CCSDS AEM, DIMAP, or CSV"))
     if is_dimap(head):
@@ -351,12 +354,12 @@ def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
 
 
 def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFileSpec) -> Readings:
-    """What the clock read in each row of a table, by its column time or date_time.
+    """Return the clock readings of a table's rows, from its column time or date_time.
 
     Raises
     ------
     InputError
-        Times that are not said once, a text that is no date and time, seconds without their epoch.
+        The table has none or both of the columns, a text is not a date and time, or seconds come without their epoch.
     """
     if ("time" in table) == ("date_time" in table):
         found, allowed = ", ".join(table.columns), "time [s] with `epoch:`, or date_time"
@@ -375,7 +378,7 @@ def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFil
 
 
 def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readings, str | None]:
-    """Rising readings of a table; with the scale UTC where each of them says so by a Z."""
+    """Return increasing readings of a table, with the scale UTC where each of them ends in Z."""
     clock = clock_of(table, spec)
     if "date_time" in table:
         if spec.epoch is not None:
@@ -390,7 +393,7 @@ def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readin
 
 
 def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: Readings) -> Readings:
-    """Readings of a clock that shows UTC, for which its file says whether leap seconds since the epoch are counted."""
+    """Return readings of a clock that shows UTC, corrected if the file counts leap seconds since the epoch."""
     try:
         days, where = np.unique(clock.day, return_inverse=True)
         start = tai_minus_utc(calendar_reading(str(spec.epoch))[0])
@@ -409,16 +412,16 @@ _ITRS = Conventions("ITRS", "UTC", "ITRS", "UTC", scalar="first", turns="body_to
 
 @dataclass(frozen=True, eq=False)
 class DimapScene:
-    """A scene.
+    """Scene of a DIMAP file with its rigorous sensor model.
 
     Attributes
     ----------
     read : DimapPass
-        What its file says.
+        Content of the file.
     sensor : Sensor
-        The rigorous model; line 0 and pixel 0 are the format's row 1 and column 1.
+        Rigorous model; line 0 and pixel 0 are the format's row 1 and column 1.
     epoch : str
-        UTC from which the sensor's times count.
+        UTC from which the sensor's times are counted.
     """
 
     read: DimapPass
@@ -427,21 +430,21 @@ class DimapScene:
 
 
 def read_scene(path: str | Path, band: str | None = None, effects: LightEffects | None = None) -> DimapScene:
-    """The scene of a DIMAP file.
+    """Read the scene of a DIMAP file.
 
     Parameters
     ----------
-    path : str | Path
-        Of its file DIM_*.XML.
-    band : str | None
-        Whose looks are taken; may be left out where all bands have the same.
-    effects : LightEffects | None
-        What happens to the light; None for refraction where the file says so, and nothing else.
+    path : str or Path
+        File DIM_*.XML of the product.
+    band : str or None
+        Band whose looks are read; may be left out where all bands have the same.
+    effects : LightEffects or None
+        Effects on the light; None for refraction where the file says so, and nothing else.
 
     Raises
     ------
     InputError
-        It cannot be read, or its orbit or attitude do not reach over the image.
+        The file cannot be read, or its orbit or attitude do not cover the image.
     """
     read = read_dimap(path, band)
     readings = PlatformReadings(read.spanning_orbit(), read.samples(), None)
@@ -463,3 +466,4 @@ def read_scene(path: str | Path, band: str | None = None, effects: LightEffects 
 
 
 _REMEDY = "ephemeris and attitudes from before the first line to after the last one"
+"""Text of the allowed ephemeris and attitude."""

@@ -1,9 +1,8 @@
-"""XML of other people's formats as elements that know their lines, read so that a file can do no more than be read.
+"""Safe parsing of XML and of lines of numbers from other programs' files, with errors that name file and line.
 
-A document type and entities of its own are refused before anything is expanded, nothing is fetched, and size, depth and
-number of elements are bounded. The text is UTF-8, whatever its first line says.
-
-Lines of numbers in text files of other people's formats, with errors that name file and line.
+XML is parsed to elements that know their lines. A document type and entity declarations are refused before anything is
+expanded, nothing is fetched, and size, depth and number of elements are bounded. The text is UTF-8, whatever its first
+line says.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from twin.orbit.measured.clock import Readings
 
 
 def text_lines(path: str | Path, what: str) -> list[str]:
-    """Lines of a file without their ends; raises as `scenes.yaml.csv_table.table_text`."""
+    """Return the lines of a file without line ends; raises as `scenes.yaml.csv_table.table_text`."""
     text = table_text(path, what)
     if "\0" in text:
         line = text[: text.index("\0")].count("\n") + 1
@@ -32,29 +31,29 @@ def text_lines(path: str | Path, what: str) -> list[str]:
 
 
 def first_lines(path: str | Path, what: str, count: int = 20) -> Iterator[str]:
-    """The first lines that are not empty, to tell a format by."""
+    """Return the first lines that are not empty, from which a format is recognised."""
     filled = (line for line in text_lines(path, what) if line.strip())
     yield from (line for _, line in zip(range(count), filled, strict=False))
 
 
 def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], heads: Sequence[str]) -> np.ndarray:
-    """(N, K) floats of N rows of K texts.
+    """Parse N rows of K texts to floats (N, K).
 
     Parameters
     ----------
     file : str
-        For messages.
-    cells : Sequence[Sequence[str]]
+        Path of the file, for messages.
+    cells : sequence of sequence of str
         The rows.
-    lines : Sequence[int]
-        (N,) of the rows in the file.
-    heads : Sequence[str]
-        (K,) what the columns are, for messages.
+    lines : sequence of int
+        Line numbers (N,) of the rows in the file.
+    heads : sequence of str
+        Names (K,) of the columns, for messages.
 
     Raises
     ------
     InputError
-        a row with another number of texts, one that is no number, not finite, or beyond LARGEST_NUMBER.
+        A row has another number of texts, or a text is not a number, not finite, or beyond LARGEST_NUMBER.
     """
     width = len(heads)
     uneven = next((k for k, row in enumerate(cells) if len(row) != width), None)
@@ -79,7 +78,7 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
 
 
 def readings(file: str, texts: Sequence[str], lines: Sequence[int]) -> Readings:
-    """Clock readings of N calendar texts on these lines; InputError for one that is none."""
+    """Parse clock readings of N calendar texts on these lines; InputError if one is not a date and time."""
     try:
         return Readings.of_texts(texts)
     except Problem as problem:
@@ -90,7 +89,7 @@ def readings(file: str, texts: Sequence[str], lines: Sequence[int]) -> Readings:
 
 
 def require_rising(file: str, clock: Readings, lines: Sequence[int]) -> None:
-    """InputError unless each of the readings (N,) on these lines is later than the one before it."""
+    """Raise InputError unless each of the readings (N,) on these lines is later than the one before it."""
     back = (np.diff(clock.day) * 86400.0 + np.diff(clock.second)) <= 0.0
     for row in np.flatnonzero(back)[:1]:
         problem = "a time that is not later than the one before it"
@@ -98,6 +97,7 @@ def require_rising(file: str, clock: Readings, lines: Sequence[int]) -> None:
 
 
 def _is_number(text: str) -> bool:
+    """Return whether a text is a number without underscores."""
     try:
         float(text)
     except ValueError:
@@ -106,6 +106,7 @@ def _is_number(text: str) -> bool:
 
 
 _MOST_BYTES = 1 << 26
+"""Largest size of an XML file, in bytes."""
 _MOST_DEPTH = 64
 _MOST_ELEMENTS = 2_000_000
 _NONE: Mapping[str, str] = FrozenMap()
@@ -113,24 +114,24 @@ _NONE: Mapping[str, str] = FrozenMap()
 
 @dataclass(eq=False)
 class Element:
-    """An element.
+    """Element of an XML document.
 
     Attributes
     ----------
     tag : str
-        Its name.
+        Name of the element.
     file : str
-        Where it stands.
+        Path of the file.
     line : int
-        Of its start, counted from 1.
-    attributes : Mapping[str, str]
-        By name.
-    path : tuple[str, ...]
-        Tags from the document's root to it.
-    children : list[Element]
-        In order.
+        Line of its start, counted from 1.
+    attributes : mapping of str to str
+        Attributes by name.
+    path : tuple of str
+        Tags from the document's root to the element.
+    children : list of Element
+        Child elements in order.
     text : str
-        Between its tags, without spaces at the ends; that of its children left out.
+        Text between its tags, without spaces at the ends and without that of its children.
     """
 
     tag: str
@@ -142,11 +143,11 @@ class Element:
     text: str = ""
 
     def iter(self, tag: str) -> Iterator[Element]:
-        """Elements of this name below it, and itself, in the order of the file."""
+        """Return the elements of this name among itself and all descendants, in the order of the file."""
         return (one for one in self.below() if one.tag == tag)
 
     def below(self) -> Iterator[Element]:
-        """Itself and all elements below it, in the order of the file."""
+        """Return itself and all descendants, in the order of the file."""
         waiting = [self]
         while waiting:
             one = waiting.pop()
@@ -154,14 +155,14 @@ class Element:
             waiting += reversed(one.children)
 
     def all(self, *tags: str) -> list[Element]:
-        """Elements at a path below this one; none where there are none."""
+        """Return the elements at a path below this one; an empty list where there are none."""
         found = [self]
         for tag in tags:
             found = [child for one in found for child in one.children if child.tag == tag]
         return found
 
     def maybe(self, *tags: str) -> Element | None:
-        """The element at a path below this one; None where there is none.
+        """Return the element at a path below this one; None where there is none.
 
         Raises
         ------
@@ -174,7 +175,7 @@ class Element:
         return found[0] if found else None
 
     def one(self, *tags: str) -> Element:
-        """The element at a path below this one.
+        """Return the element at a path below this one.
 
         Raises
         ------
@@ -194,19 +195,19 @@ class Element:
         raise InputError(issue)
 
     def words(self, *tags: str) -> str:
-        """The text at a path below this one; InputError where there is none, or it is empty."""
+        """Return the text at a path below this one; InputError where there is none, or it is empty."""
         found = self.one(*tags)
         if not found.text:
             found.wrong("nothing stands in it", None, "a value")
         return found.text
 
     def floats(self, count: int | None = None) -> np.ndarray:
-        """Its numbers, (count,), parted by spaces or commas; any number of them where count is None.
+        """Return the numbers of its text, (count,), separated by spaces or commas; any number if count is None.
 
         Raises
         ------
         InputError
-            Another number of them, something that is none, or not finite.
+            The count differs, or a text is not a finite number.
         """
         cells = self.text.replace(",", " ").split()
         if not cells or (count is not None and len(cells) != count):
@@ -219,23 +220,24 @@ class Element:
     def number(
         self, *tags: str, least: float = -np.inf, most: float = np.inf, unit: Mapping[str, float] | None = None
     ) -> float:
-        """The number at a path below this one.
+        """Return the number at a path below this one.
 
         Parameters
         ----------
         tags : str
-            Of the path.
+            Path.
         least : float
-            It may be.
+            Smallest allowed value.
         most : float
-            It may be.
-        unit : Mapping[str, float] | None
-            What its attribute ``unit`` may be -> by what the number is multiplied; the first where it has none.
+            Largest allowed value.
+        unit : mapping of str to float or None
+            Factor by which the number is multiplied, by the value of its attribute ``unit``; the first where it has
+            none.
 
         Raises
         ------
         InputError
-            None, no number, beyond the bounds, another unit.
+            The element is missing, is not a number, is out of bounds or has an unknown unit.
         """
         found = self.one(*tags) if tags else self
         value = float(found.floats(1)[0])
@@ -249,7 +251,7 @@ class Element:
         return value
 
     def whole(self, *tags: str, least: int = 1, most: int = 10_000_000) -> int:
-        """The whole number at a path below this one; raises as `number`."""
+        """Return the whole number at a path below this one; raises as `number`."""
         found = self.one(*tags)
         value = found.number(least=least, most=most)
         if value != round(value):
@@ -261,11 +263,12 @@ class Element:
         raise InputError(Issue(problem, self.file, self.line, self.path, found, allowed))
 
     def _wrong(self, problem: str, tags: tuple[str, ...], line: int, found: str, allowed: str) -> NoReturn:
+        """Raise InputError about an element at a path below this one."""
         raise InputError(Issue(f"{tags[-1]} {problem}", self.file, line, (*self.path, *tags), found, allowed))
 
 
 class _Builder:
-    """Elements from the parser's events."""
+    """Builder of elements from the parser's events."""
 
     def __init__(self, file: str) -> None:
         self.file = file
@@ -312,32 +315,32 @@ class _Builder:
 
 
 def read_xml(path: str | Path, what: str) -> Element:
-    """The root of a file.
+    """Read the root element of an XML file.
 
     Parameters
     ----------
-    path : str | Path
-        Of the file, UTF-8.
+    path : str or Path
+        Path of the file, UTF-8.
     what : str
-        It should be, for messages.
+        Description of the expected file, for messages.
 
     Raises
     ------
     InputError
-        There is none, it is too large, not XML, or has a document type or entities.
+        The file does not exist, is too large, not XML, or has a document type or entities.
     """
     return parsed_xml(table_text(path, what, _MOST_BYTES), str(path))
 
 
 def parsed_xml(text: str, file: str) -> Element:
-    """The root of a document that was read; raises as `read_xml`.
+    """Parse the root element of a document's text; raises as `read_xml`.
 
     Parameters
     ----------
     text : str
-        Of it.
+        Text of the document.
     file : str
-        For messages.
+        Path of the file, for messages.
     """
     builder = _Builder(file)
     try:
