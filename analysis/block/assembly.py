@@ -1,4 +1,4 @@
-"""From a block to packets and priors: the unknowns in order, and how every observation meets them."""
+"""Assembly of a block into observations and priors, with the order and columns of the unknowns."""
 
 from __future__ import annotations
 
@@ -10,32 +10,35 @@ from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array, Indices
-from analysis.block.block import Block, CameraKnowledge, CamerasKnowledge, Term
+from analysis.block.block import Block, CameraPrior, JointCameraPrior, Term
 from analysis.block.error_processes import BlockError, Corrections, Part, Support
 from analysis.block.point_reduction import FixedPoints, Heights, LineImage, Packets, Pointings, PriorGroup, Reduction
 from analysis.orbit.three_line_model import BIAS, DRIFT
 
 OFFSET = ("along", "across", "down")
+"""Axes of an orbit error in the mean body axes of a pass."""
 DATUM = 1000.0
-"""Metres: sigma of a common shift of all control points where one is looked for."""
+"""A-priori sigma, in metres, of a common shift of all control points where one is estimated."""
 _FLOOR = 1e-10
-"""Of the largest eigenvalue of a camera's covariance: what no law lets change changes by 1e-5 sigma."""
+"""Smallest eigenvalue of a camera's covariance relative to the largest: combinations that the prior fixes may still
+change by 1e-5 sigma.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Process:
-    """The unknowns of one law in one scope.
+    """Unknowns of one error model in one scope.
 
     Attributes
     ----------
     name : str
-        "PASS attitude walk" and so on.
+        Name such as "PASS attitude walk".
     support : Support
-        Of the law.
+        Unknowns of the error model.
     column : int
-        Of its first unknown.
+        Column of the first unknown.
     kind : str
-        What it corrects.
+        Quantity that it corrects, "attitude" or "station".
     """
 
     name: str
@@ -45,38 +48,40 @@ class Process:
 
     @property
     def columns(self) -> Indices:
-        """All of them."""
+        """Columns of all unknowns."""
         return np.arange(self.column, self.column + self.support.size)
 
 
 @dataclass(frozen=True, eq=False)
 class Assembly:
-    """A block in equations.
+    """Equations of a block.
 
     Attributes
     ----------
     block : Block
-        It is of.
+        Block that is adjusted.
     reduction : Reduction
-        Its packets and priors.
-    processes : Mapping[tuple[str, str], tuple[Process, ...]]
-        Kind ("attitude", "station") and pass -> its laws.
-    every : tuple[Process, ...]
+        Observations (packets) and priors of the block.
+    processes : mapping of (str, str) to tuple of Process
+        Processes of each kind ("attitude", "station") and pass.
+    all_processes : tuple of Process
         All processes, each once.
-    changes : Mapping[str, Indices]
-        Scene -> (4,) unknowns of its camera. units: scene -> (4,) their sizes, radians and metres.
-    datum : Indices
-        (0,) or (3,) unknowns of a common shift of the control points.
-    axes : Mapping[str, Array]
-        Pass -> (3, 3) mean body axes as columns, ITRS.
-    images : Mapping[str, int]
-        Set of each scene within the reduction.
+    changes : mapping of str to (4,) ndarray of int
+        Columns of the camera changes of each scene.
+    units : mapping of str to (4,) ndarray
+        Scale of these unknowns, in radians and metres.
+    datum : (0,) or (3,) ndarray of int
+        Columns of a common shift of the control points.
+    axes : mapping of str to (3, 3) ndarray
+        Mean body axes of each pass as columns, ITRS.
+    images : mapping of str to int
+        Index of each scene's packet set in the reduction.
     """
 
     block: Block
     reduction: Reduction
     processes: Mapping[tuple[str, str], tuple[Process, ...]]
-    every: tuple[Process, ...]
+    all_processes: tuple[Process, ...]
     changes: Mapping[str, Indices]
     units: Mapping[str, Array]
     datum: Indices
@@ -84,43 +89,46 @@ class Assembly:
     images: Mapping[str, int]
 
     def names(self) -> tuple[str, ...]:
-        """(P,) of the unknowns, where each law is a constant (`network.simplified`)."""
-        found = [""] * self.reduction.size
-        for one in self.every:
-            axes = BIAS if one.kind == "attitude" else tuple(f"offset {n}" for n in OFFSET)
+        """Return the (P,) names of the unknowns of a block whose error models are all constants.
+
+        `network.simplified` makes such a block.
+        """
+        names = [""] * self.reduction.size
+        for process in self.all_processes:
+            axes = BIAS if process.kind == "attitude" else tuple(f"offset {n}" for n in OFFSET)
             for k, axis in enumerate(axes):
-                found[one.column + k] = f"{one.name} {axis}"
+                names[process.column + k] = f"{process.name} {axis}"
         for scene in self.block.scenes:
             for column, name in zip(self.changes[scene.name].tolist(), DRIFT, strict=True):
-                found[column] = f"{scene.of} {scene.camera} {name}"
-        return tuple(name or "terrain height" for name in found)
+                names[column] = f"{scene.of} {scene.camera} {name}"
+        return tuple(name or "terrain height" for name in names)
 
     def corrections(self, of: str, times: Array) -> Corrections:
-        """Of a pass at times (n,)."""
+        """Return the attitude and station corrections of a pass at times (n,)."""
         parts = []
         for kind in ("attitude", "station"):
-            for one in self.processes[kind, of]:
-                parts.append(Part(kind == "attitude", one.column, one.support))
+            for process in self.processes[kind, of]:
+                parts.append(Part(kind == "attitude", process.column, process.support))
         return Corrections(tuple(parts), self.axes[of], times)
 
 
 def assembled(block: Block, datum: bool = False) -> Assembly:
-    """The equations of a block.
+    """Assemble the equations of a block.
 
     Parameters
     ----------
     block : Block
-        What is observed; its `check` has found nothing.
+        Block that has passed its `check`.
     datum : bool
-        Whether a shift that all control points share is an unknown, known to `DATUM`.
+        True to estimate a shift that all control points share, with the a-priori sigma `DATUM`.
 
     Raises
     ------
     BlockError
-        a block that cannot be used.
+        The block cannot be adjusted.
     """
     times = _times(block)
-    every: list[Process] = []
+    all_processes: list[Process] = []
     by_pass: dict[tuple[str, str], tuple[Process, ...]] = {}
     priors: list[PriorGroup] = []
     size = 0
@@ -131,16 +139,16 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
                 moments = np.concatenate([times[name] for name in members])
                 middle = next(p.middle for p in block.passes if p.name == members[0]) if term.scope == "pass" else None
                 support = Support.of(term.law, moments, middle)
-                made = Process(f"{scope} {term.law.group}".strip(), support, size, kind)
-                scopes[kind, k, scope] = made
-                every.append(made)
+                process = Process(f"{scope} {term.law.group}".strip(), support, size, kind)
+                scopes[kind, k, scope] = process
+                all_processes.append(process)
                 precision = sparse.csr_matrix(sparse.kron(support.precision, sparse.eye(3)))
-                priors.append(PriorGroup(term.law.group, made.columns, precision, np.zeros(support.size)))
+                priors.append(PriorGroup(term.law.group, process.columns, precision, np.zeros(support.size)))
                 size += support.size
-        for one in block.passes:
-            if one.name in times:
-                by_pass[kind, one.name] = tuple(
-                    scopes[kind, k, _scope_of(block, term, one.name)] for k, term in enumerate(terms)
+        for block_pass in block.passes:
+            if block_pass.name in times:
+                by_pass[kind, block_pass.name] = tuple(
+                    scopes[kind, k, _scope_of(block, term, block_pass.name)] for k, term in enumerate(terms)
                 )
     changes, units, size = _cameras(block, priors, size)
     common = np.zeros(0, np.intp)
@@ -155,134 +163,137 @@ def assembled(block: Block, datum: bool = False) -> Assembly:
         priors.append(PriorGroup("datum", shift, precision, np.zeros(3)))
         size += 3
     priors += _angles(block, scopes)
-    axes = {one.name: _axes(block, one.name) for one in block.passes if one.name in times}
-    bare = Assembly(
+    axes = {block_pass.name: _axes(block, block_pass.name) for block_pass in block.passes if block_pass.name in times}
+    without_sets = Assembly(
         block,
         Reduction((), priors, size, len(block.points.ids)),
         by_pass,
-        tuple(every),
+        tuple(all_processes),
         changes,
         units,
         shift,
         axes,
         {},
     )
-    sets, images = _sets(bare, common)
-    whole = Reduction(tuple(sets), tuple(priors), size, len(block.points.ids))
-    return replace(bare, reduction=whole, images=images)
+    sets, images = _sets(without_sets, common)
+    reduction = Reduction(tuple(sets), tuple(priors), size, len(block.points.ids))
+    return replace(without_sets, reduction=reduction, images=images)
 
 
 def _times(block: Block) -> dict[str, Array]:
-    """Pass -> times of all its observations; passes without any are left out."""
-    found: dict[str, list[Array]] = {}
+    """Return the times of all observations of each pass; passes without observations are omitted."""
+    times: dict[str, list[Array]] = {}
     for scene in block.scenes:
         if scene.rays.time is not None and len(scene.rays.time):
-            found.setdefault(scene.of, []).append(scene.rays.time)
-    for one in block.footprints:
-        if len(one.time):
-            found.setdefault(one.of, []).append(one.time)
-    if not found:
+            times.setdefault(scene.of, []).append(scene.rays.time)
+    for footprints in block.footprints:
+        if len(footprints.time):
+            times.setdefault(footprints.of, []).append(footprints.time)
+    if not times:
         raise BlockError("block: no observations")
-    return {name: np.concatenate(found[name]) for name in (p.name for p in block.passes) if name in found}
+    return {name: np.concatenate(times[name]) for name in (p.name for p in block.passes) if name in times}
 
 
 def _scope_of(block: Block, term: Term, name: str) -> str:
+    """Return the name of the scope of an error model that a pass belongs to."""
     if term.scope == "pass":
         return name
     return "" if term.scope == "block" else next(p.tracker for p in block.passes if p.name == name)
 
 
 def _scopes(block: Block, term: Term, times: Mapping[str, Array]) -> dict[str, list[str]]:
-    """Scope -> its passes."""
-    found: dict[str, list[str]] = {}
+    """Return the passes of each scope of an error model."""
+    scopes: dict[str, list[str]] = {}
     for name in times:
-        found.setdefault(_scope_of(block, term, name), []).append(name)
-    return found
+        scopes.setdefault(_scope_of(block, term, name), []).append(name)
+    return scopes
 
 
 def _axes(block: Block, name: str) -> Array:
-    """(3, 3) the rotation nearest to the mean attitude of a pass."""
+    """Return the (3, 3) rotation nearest to the mean attitude of a pass."""
     attitudes = [s.rays.attitude for s in block.scenes if s.of == name and len(s.rays.point)]
     attitudes += [f.attitude for f in block.footprints if f.of == name]
     return np.asarray(Rotation.from_matrix(np.concatenate(attitudes)).mean().as_matrix())
 
 
 def _unit(count: int) -> sparse.csr_matrix:
+    """Return a sparse identity matrix."""
     return sparse.csr_matrix(sparse.eye(count))
 
 
 def _cameras(block: Block, priors: list[PriorGroup], size: int) -> tuple[dict[str, Indices], dict[str, Array], int]:
-    """Unknowns of the cameras' changes in all passes in which they took an image."""
-    order = [one.name for one in block.passes]
+    """Return columns and units of the camera changes in all passes with an image, and the number of unknowns."""
+    order = [block_pass.name for block_pass in block.passes]
     changes: dict[str, Indices] = {}
     units: dict[str, Array] = {}
-    together = block.monitored if isinstance(block.monitored, CamerasKnowledge) else None
-    joint: list[tuple[Indices, Indices, Array]] = []
+    joint_prior = block.monitored if isinstance(block.monitored, JointCameraPrior) else None
+    joint_parts: list[tuple[Indices, Indices, Array]] = []
     for camera in dict.fromkeys(s.camera for s in block.scenes):
-        mine = [s for s in block.scenes if s.camera == camera]
-        held = sorted({order.index(s.of) for s in mine})
-        where = (4 * np.array(held)[:, None] + np.arange(4)).ravel()
+        camera_scenes = [s for s in block.scenes if s.camera == camera]
+        pass_numbers = sorted({order.index(s.of) for s in camera_scenes})
+        rows = (4 * np.array(pass_numbers)[:, None] + np.arange(4)).ravel()
         deviation = np.sqrt(np.maximum(np.diag(block.known[camera].covariance), 0.0)).reshape(-1, 4).max(axis=0)
         if not np.all(deviation > 0.0):
-            wrong = DRIFT[int(np.argmin(deviation))]
-            raise BlockError(f"block: camera {camera!r}: {wrong} needs a standard deviation above zero")
-        unit = np.tile(deviation, len(held))
-        columns = size + np.arange(len(where))
-        if together is not None:
-            joint.append((columns, 4 * len(order) * together.cameras.index(camera) + where, unit))
+            component = DRIFT[int(np.argmin(deviation))]
+            raise BlockError(f"block: camera {camera!r}: {component} needs a standard deviation above zero")
+        unit = np.tile(deviation, len(pass_numbers))
+        columns = size + np.arange(len(rows))
+        if joint_prior is not None:
+            joint_parts.append((columns, 4 * len(order) * joint_prior.cameras.index(camera) + rows, unit))
         else:
-            knowledge: CameraKnowledge = _alone(block, camera)
+            prior: CameraPrior = _alone(block, camera)
             group = "camera" if block.monitored is None else "monitor"
-            spread = knowledge.covariance[np.ix_(where, where)]
-            priors.append(_known_group(group, columns, knowledge.mean[held].ravel(), spread, unit))
-        for scene in mine:
-            place = 4 * held.index(order.index(scene.of))
-            changes[scene.name], units[scene.name] = columns[place : place + 4], deviation
-        size += len(where)
-    if together is not None:
-        columns, where, unit = (np.concatenate(part) for part in zip(*joint, strict=True))
-        spread = together.covariance[np.ix_(where, where)]
-        priors.append(_known_group("monitor", columns, together.mean.ravel()[where], spread, unit))
+            spread = prior.covariance[np.ix_(rows, rows)]
+            priors.append(_known_group(group, columns, prior.mean[pass_numbers].ravel(), spread, unit))
+        for scene in camera_scenes:
+            start = 4 * pass_numbers.index(order.index(scene.of))
+            changes[scene.name], units[scene.name] = columns[start : start + 4], deviation
+        size += len(rows)
+    if joint_prior is not None:
+        columns, rows, unit = (np.concatenate(part) for part in zip(*joint_parts, strict=True))
+        spread = joint_prior.covariance[np.ix_(rows, rows)]
+        priors.append(_known_group("monitor", columns, joint_prior.mean.ravel()[rows], spread, unit))
     return changes, units, size
 
 
-def _alone(block: Block, camera: str) -> CameraKnowledge:
-    """What is known of a camera by itself."""
-    assert not isinstance(block.monitored, CamerasKnowledge)
+def _alone(block: Block, camera: str) -> CameraPrior:
+    """Return the prior of one camera."""
+    assert not isinstance(block.monitored, JointCameraPrior)
     return (block.monitored or block.known).get(camera, block.known[camera])
 
 
 def _known_group(group: str, columns: Indices, mean: Array, spread: Array, unit: Array) -> PriorGroup:
-    """Knowledge of unknowns with their covariance (k, k), in units (k,)."""
+    """Return the prior of unknowns with a covariance (k, k), scaled by units (k,)."""
     values, vectors = np.linalg.eigh(spread / unit / unit[:, None])
-    # what is exactly known still moves by a hundred thousandth of its size, for it has to have an inverse
+    # fixed combinations keep a small variance, so that the covariance has an inverse
     root = np.maximum(values, _FLOOR * max(float(values[-1]), 1.0))
     precision = (vectors / root) @ vectors.T
     return PriorGroup(group, columns, sparse.csr_matrix(0.5 * (precision + precision.T)), mean / unit)
 
 
 def _angles(block: Block, scopes: Mapping[tuple[str, int, str], Process]) -> list[PriorGroup]:
-    """Angles between star trackers as knowledge of the difference of their constants."""
-    found = []
+    """Return the angles between star trackers as priors on differences of their constant errors."""
+    groups = []
     constants = [k for k, term in enumerate(block.attitude) if term.scope == "tracker" and term.law.kind == "constant"]
     for angle in block.angles:
         if not constants:
             raise BlockError("block: an angle between star trackers needs a constant error of each of them")
         pair = [scopes.get(("attitude", constants[0], name)) for name in angle.between]
         if pair[0] is None or pair[1] is None:
-            continue  # a tracker that gave no attitude of this block
+            continue  # the tracker measured no attitude in this block
         size = np.array(pair[0].support.law.sigma)
-        use = np.flatnonzero(size > 0)
-        columns = np.concatenate([pair[0].columns[use], pair[1].columns[use]])
-        value, sigma = np.array(angle.value)[use], np.array(angle.sigma)[use]
-        design = np.concatenate([np.diag(size[use] / sigma), -np.diag(size[use] / sigma)], axis=1)
-        mean = np.concatenate([value / size[use], np.zeros(len(use))])
-        found.append(PriorGroup("tracker angles", columns, sparse.csr_matrix(design.T @ design), mean))
-    return found
+        axes = np.flatnonzero(size > 0)
+        columns = np.concatenate([pair[0].columns[axes], pair[1].columns[axes]])
+        value, sigma = np.array(angle.value)[axes], np.array(angle.sigma)[axes]
+        design = np.concatenate([np.diag(size[axes] / sigma), -np.diag(size[axes] / sigma)], axis=1)
+        mean = np.concatenate([value / size[axes], np.zeros(len(axes))])
+        groups.append(PriorGroup("tracker angles", columns, sparse.csr_matrix(design.T @ design), mean))
+    return groups
 
 
-def _sets(bare: Assembly, common: Indices) -> tuple[list[Packets], dict[str, int]]:
-    block = bare.block
+def _sets(assembly: Assembly, common: Indices) -> tuple[list[Packets], dict[str, int]]:
+    """Return the packet sets of a block and the set index of each scene."""
+    block = assembly.block
     sets: list[Packets] = []
     images: dict[str, int] = {}
     for scene in block.scenes:
@@ -293,32 +304,49 @@ def _sets(bare: Assembly, common: Indices) -> tuple[list[Packets], dict[str, int
         unit = np.broadcast_to(np.eye(2), (len(rays.point), 2, 2)) if rays.spread is None else rays.spread
         white = np.linalg.inv(np.linalg.cholesky(block.image**2 * unit))
         images[scene.name] = len(sets)
-        corrections = bare.corrections(scene.of, rays.time)
-        change, size = bare.changes[scene.name], bare.units[scene.name]
+        corrections = assembly.corrections(scene.of, rays.time)
+        change, size = assembly.changes[scene.name], assembly.units[scene.name]
         sets.append(LineImage(scene.name, block.cameras[scene.camera], rays, white, corrections, change, size))
-    for one in block.footprints:
-        corrections = bare.corrections(one.of, one.time)
+    for footprints in block.footprints:
+        corrections = assembly.corrections(footprints.of, footprints.time)
         sets.append(
             Pointings(
-                f"{one.of} laser", one.point, one.station, one.attitude, one.aim, one.distance, corrections, one.sigma
+                f"{footprints.of} laser",
+                footprints.point,
+                footprints.station,
+                footprints.attitude,
+                footprints.aim,
+                footprints.distance,
+                corrections,
+                footprints.sigma,
             )
         )
     points = block.points
     control = np.flatnonzero(points.role == "control")
     if len(control):
         white = np.linalg.inv(np.linalg.cholesky(points.covariance[control]))
-        sets.append(FixedPoints("control", control, points.start[control], white, bare.datum))
+        sets.append(FixedPoints("control", control, points.start[control], white, assembly.datum))
     if block.terrain is not None:
-        t = block.terrain
-        # a model whose heights have nothing in common still needs an unknown
-        sets.append(Heights("terrain", t.point, t.place, t.normal, t.sigma, common, max(t.common, 1e-6)))
+        terrain = block.terrain
+        # the unknown is needed even without a common height error
+        sets.append(
+            Heights(
+                "terrain",
+                terrain.point,
+                terrain.place,
+                terrain.normal,
+                terrain.sigma,
+                common,
+                max(terrain.common, 1e-6),
+            )
+        )
     return sets, images
 
 
 def group_ranks(priors: Sequence[PriorGroup]) -> dict[str, int]:
-    """Group -> how many observations its priors stand for."""
-    found: dict[str, int] = {}
-    for one in priors:
-        rank = len(one.columns) // 2 if one.group == "tracker angles" else len(one.columns)
-        found[one.group] = found.get(one.group, 0) + rank
-    return found
+    """Return the number of pseudo-observations of the priors of each variance group."""
+    ranks: dict[str, int] = {}
+    for prior in priors:
+        rank = len(prior.columns) // 2 if prior.group == "tracker angles" else len(prior.columns)
+        ranks[prior.group] = ranks.get(prior.group, 0) + rank
+    return ranks

@@ -1,4 +1,4 @@
-"""What a block adjustment is given: scenes, passes, cameras, points and what else observes them."""
+"""Input of a block adjustment: scenes, passes, cameras, points and further observations."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from analysis.orbit.three_line_model import LineModel, Rays
 
 Scope = Literal["pass", "tracker", "block"]
 SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
-"""What can be left out of a block by name."""
+"""Names of the observations that can be excluded from a block."""
 
 
 @dataclass(frozen=True)
 class Term:
-    """A law of errors, and what shares one draw of it: a pass, all passes of one star tracker, or the block."""
+    """Error model and its scope, the observations that share one realisation.
+
+    The scope is a pass, all passes of one star tracker, or the whole block.
+    """
 
     law: Law
     scope: Scope = "pass"
@@ -28,16 +31,16 @@ class Term:
 
 @dataclass(frozen=True)
 class Pass:
-    """A pass of the satellite.
+    """Pass of the satellite.
 
     Attributes
     ----------
     name : str
-        Of the pass.
+        Name of the pass.
     tracker : str
-        Star tracker that gave its attitude.
-    middle : float | None
-        When rates and walks of its own are zero, seconds; None for the middle of its observations.
+        Star tracker that measured the attitude.
+    middle : float or None
+        Time at which the pass's rates and random walks are zero, in seconds; None for the middle of its observations.
     """
 
     name: str
@@ -47,18 +50,18 @@ class Pass:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The image of one line camera in one pass.
+    """Image of one line camera in one pass.
 
     Attributes
     ----------
     name : str
-        Of the scene.
+        Name of the scene.
     of : str
-        Name of its pass.
+        Name of the pass.
     camera : str
-        Of the block's cameras.
+        Name of the camera.
     rays : Rays
-        Image points with times; `point` counts the block's points.
+        Image points with times; `point` is an index into the block's points.
     """
 
     name: str
@@ -68,15 +71,15 @@ class Scene:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraKnowledge:
-    """What is known of a camera's d_alpha, d_beta, d_gamma (radians) and d_f (metres) in all passes of the block.
+class CameraPrior:
+    """Prior of a camera's d_alpha, d_beta, d_gamma (radians) and d_f (metres) in the T passes of a block.
 
     Attributes
     ----------
-    mean : Array
-        (T, 4), in the order of the block's passes.
-    covariance : Array
-        (4 T, 4 T), pass by pass.
+    mean : (T, 4) ndarray
+        Expected changes, in the order of the block's passes.
+    covariance : (4 T, 4 T) ndarray
+        Covariance of the changes, pass by pass.
     """
 
     mean: Array
@@ -84,28 +87,28 @@ class CameraKnowledge:
 
 
 @dataclass(frozen=True, eq=False)
-class CamerasKnowledge:
-    """The same of all cameras together, of which one body may have moved several.
+class JointCameraPrior:
+    """Joint prior of the changes of C cameras in T passes, which one body's motion may correlate.
 
     Attributes
     ----------
-    cameras : tuple[str, ...]
-        C names.
-    mean : Array
-        (C, T, 4).
-    covariance : Array
-        (4 T C, 4 T C), camera by camera and in each pass by pass.
+    cameras : tuple of str
+        Names of the cameras.
+    mean : (C, T, 4) ndarray
+        Expected changes.
+    covariance : (4 T C, 4 T C) ndarray
+        Covariance of the changes, camera by camera and within each pass by pass.
     """
 
     cameras: tuple[str, ...]
     mean: Array
     covariance: Array
 
-    def of(self, camera: str) -> CameraKnowledge:
-        """One camera by itself."""
+    def of(self, camera: str) -> CameraPrior:
+        """Return the marginal prior of one camera."""
         k, size = self.cameras.index(camera), 4 * self.mean.shape[1]
-        own = slice(k * size, (k + 1) * size)
-        return CameraKnowledge(self.mean[k], self.covariance[own, own])
+        rows = slice(k * size, (k + 1) * size)
+        return CameraPrior(self.mean[k], self.covariance[rows, rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,14 +117,14 @@ class Points:
 
     Attributes
     ----------
-    ids : NDArray[np.object_]
-        (m,) names.
-    start : Array
-        (m, 3) given coordinates of control points, first guesses of the others, ITRS, metres.
-    role : NDArray[np.object_]
-        (m,) "control", "tie" or "check". Check points are tie points that are compared afterwards.
-    covariance : Array
-        (m, 3, 3) of control points, m^2.
+    ids : (m,) ndarray of str
+        Names of the points.
+    start : (m, 3) ndarray
+        Surveyed coordinates of control points, approximate ones of the others, ITRS, in metres.
+    role : (m,) ndarray of str
+        "control", "tie" or "check". Check points are adjusted as tie points and compared afterwards.
+    covariance : (m, 3, 3) ndarray
+        Covariance of control points, in m^2.
     """
 
     ids: NDArray[np.object_]
@@ -138,16 +141,21 @@ class Footprints:
     ----------
     of : str
         Name of the pass.
-    point : Indices
-        (n,) of the block's points that they hit.
-    time : Array
-        (n,) seconds. station: (n, 3) readings, ITRS, metres. attitude: (n, 3, 3) body to ITRS.
-    aim : Array
-        (n, 3) unit vectors of the beam in the body frame.
-    distance : Array
-        (n,) metres.
-    sigma : tuple[float, float]
-        Of the range, metres, and of the pointing with the beam's width about each of two axes, radians.
+    point : (n,) ndarray of int
+        Block points that the beam hits.
+    time : (n,) ndarray
+        Times, in seconds.
+    station : (n, 3) ndarray
+        Measured positions, ITRS, in metres.
+    attitude : (n, 3, 3) ndarray
+        Measured rotations from the body to ITRS.
+    aim : (n, 3) ndarray
+        Unit vectors of the beam in the body frame.
+    distance : (n,) ndarray
+        Measured ranges, in metres.
+    sigma : tuple of float
+        Sigma of the range, in metres, and of the pointing including the beam's width about each of two axes, in
+        radians.
     """
 
     of: str
@@ -160,7 +168,7 @@ class Footprints:
     sigma: tuple[float, float]
 
     def taken(self, keep: NDArray[np.bool_]) -> Footprints:
-        """Some of them, by mask (n,)."""
+        """Return the footprints that a mask (n,) selects."""
         rows = (self.time, self.station, self.attitude, self.aim, self.distance)
         time, station, attitude, aim, distance = (row[keep] for row in rows)
         return Footprints(self.of, self.point[keep], time, station, attitude, aim, distance, self.sigma)
@@ -168,20 +176,20 @@ class Footprints:
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """A terrain model as weak control of heights.
+    """Terrain model that serves as weak height control.
 
     Attributes
     ----------
-    point : Indices
-        (n,) of the block's points.
-    place : Array
-        (n, 3) on the model's surface, ITRS, metres.
-    normal : Array
-        (n, 3) unit normals of the surface there.
-    sigma : Array
-        (n,) of a height, independent, metres.
+    point : (n,) ndarray of int
+        Block points.
+    place : (n, 3) ndarray
+        Positions on the model's surface, ITRS, in metres.
+    normal : (n, 3) ndarray
+        Unit normals of the surface at these positions.
+    sigma : (n,) ndarray
+        Sigma of the independent height errors, in metres.
     common : float
-        Standard deviation of an error that all heights have in common, metres.
+        Sigma of a height error that all points share, in metres.
     """
 
     point: Indices
@@ -191,13 +199,23 @@ class Terrain:
     common: float
 
     def taken(self, keep: NDArray[np.bool_]) -> Terrain:
-        """The model at some of the points, by mask (n,)."""
+        """Return the model at the points that a mask (n,) selects."""
         return Terrain(self.point[keep], self.place[keep], self.normal[keep], self.sigma[keep], self.common)
 
 
 @dataclass(frozen=True)
 class TrackerAngle:
-    """Measured difference of two star trackers' constant errors about the body's axes, (3,) radians, with sigmas."""
+    """Measured difference of two star trackers' constant errors about the body's axes, with sigmas.
+
+    Attributes
+    ----------
+    between : tuple of str
+        Names of the two star trackers.
+    value : (3,) tuple of float
+        First minus second, about the body's axes, in radians.
+    sigma : (3,) tuple of float
+        Standard deviations, in radians.
+    """
 
     between: tuple[str, str]
     value: tuple[float, float, float]
@@ -206,50 +224,52 @@ class TrackerAngle:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A block of scenes.
+    """Block of scenes.
 
     Attributes
     ----------
-    passes : tuple[Pass, ...]
-        In order of the cameras' knowledge.
-    scenes : tuple[Scene, ...]
-        Of these passes.
-    cameras : Mapping[str, LineModel]
-        Name -> camera as calibrated, without a change.
-    known : Mapping[str, CameraKnowledge]
-        Name -> what is expected of its changes, without a monitor.
-    monitored : Mapping[str, CameraKnowledge] | CamerasKnowledge | None
-        Name -> the same after the monitor's readings, or of all cameras together; None for no monitor.
-    attitude : tuple[Term, ...]
-        Laws of its readings' errors. station: likewise along the axes of the pass.
+    passes : tuple of Pass
+        Passes, in the order of the cameras' priors.
+    scenes : tuple of Scene
+        Scenes of these passes.
+    cameras : mapping of str to LineModel
+        Calibrated cameras without changes, by name.
+    known : mapping of str to CameraKnowledge
+        Prior of each camera's changes without a monitor.
+    monitored : mapping of str to CameraKnowledge, CamerasKnowledge or None
+        Distribution of each camera's changes, or of all together, given the monitor's readings; None for no monitor.
+    attitude : tuple of Term
+        Error models of the attitude readings.
+    station : tuple of Term
+        Error models of the station readings, along the axes of the pass.
     image : float
-        Unit of the rays' spread, metres.
+        Unit of the rays' `spread`, in metres.
     points : Points
-        On the ground.
-    footprints : tuple[Footprints, ...]
-        Of a laser altimeter.
-    terrain : Terrain | None
-        Heights; None for none.
-    angles : tuple[TrackerAngle, ...]
-        Between star trackers.
+        Ground points.
+    footprints : tuple of Footprints
+        Footprints of a laser altimeter.
+    terrain : Terrain or None
+        Terrain heights; None for none.
+    angles : tuple of TrackerAngle
+        Measured angles between star trackers.
     """
 
     passes: tuple[Pass, ...]
     scenes: tuple[Scene, ...]
     cameras: Mapping[str, LineModel]
-    known: Mapping[str, CameraKnowledge]
+    known: Mapping[str, CameraPrior]
     attitude: tuple[Term, ...]
     station: tuple[Term, ...]
     image: float
     points: Points
-    monitored: Mapping[str, CameraKnowledge] | CamerasKnowledge | None = None
+    monitored: Mapping[str, CameraPrior] | JointCameraPrior | None = None
     footprints: tuple[Footprints, ...] = ()
     terrain: Terrain | None = None
     angles: tuple[TrackerAngle, ...] = field(default=())
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Those of `SENSORS` that the block has."""
+        """Names of the `SENSORS` that the block has."""
         has = {
             "ties": bool(np.any(self.points.role == "tie")),
             "control": bool(np.any(self.points.role == "control")),
@@ -261,12 +281,14 @@ class Block:
         return tuple(name for name in SENSORS if has[name])
 
     def without(self, sensor: str) -> Block:
-        """The block without one of its sensors. Control points become check points, whose images stay.
+        """Return the block without one of its sensors.
+
+        Without control, control points become tie points, and their image observations stay.
 
         Raises
         ------
         BlockError
-            No such sensor.
+            There is no such sensor.
         """
         if sensor not in SENSORS:
             raise BlockError(f"block: no sensor is called {sensor!r}; there are {', '.join(SENSORS)}")
@@ -275,13 +297,13 @@ class Block:
             role = np.where(points.role == "control", "tie", points.role).astype(object)
             return replace(self, points=replace(points, role=role))
         if sensor == "ties":
-            kept = points.role != "tie"
-            for one in self.footprints:  # the images see them as part of the laser
-                kept[one.point] = True
-            scenes = tuple(replace(s, rays=s.rays.taken(kept[s.rays.point])) for s in self.scenes)
+            mask = points.role != "tie"
+            for footprints in self.footprints:  # footprints stay in the images as laser observations
+                mask[footprints.point] = True
+            scenes = tuple(replace(s, rays=s.rays.taken(mask[s.rays.point])) for s in self.scenes)
             terrain = self.terrain
             if terrain is not None:
-                use = kept[terrain.point]
+                use = mask[terrain.point]
                 terrain = terrain.taken(use) if np.any(use) else None
             return replace(self, scenes=scenes, terrain=terrain)
         if sensor == "monitor":
@@ -293,15 +315,15 @@ class Block:
         return replace(self, angles=())
 
     def check(self) -> None:
-        """Raises BlockError for what cannot be used: names that do not match, scenes without points, bad numbers."""
-        names = [one.name for one in self.passes]
+        """Raise BlockError for mismatched names, image points without times and invalid numbers."""
+        names = [prior.name for prior in self.passes]
         if len(set(names)) != len(names) or len({s.name for s in self.scenes}) != len(self.scenes):
-            raise BlockError("block: two passes or two scenes have one name")
+            raise BlockError("block: two passes or two scenes have the same name")
         for scene in self.scenes:
             if scene.of not in names:
                 raise BlockError(f"block: scene {scene.name!r}: no pass is called {scene.of!r}")
             if scene.camera not in self.cameras or scene.camera not in self.known:
-                raise BlockError(f"block: scene {scene.name!r}: nothing is known of camera {scene.camera!r}")
+                raise BlockError(f"block: scene {scene.name!r}: camera {scene.camera!r} has no model or no prior")
             if scene.rays.time is None:
                 raise BlockError(f"block: scene {scene.name!r}: its image points have no times")
         if not (np.isfinite(self.image) and self.image > 0):
@@ -314,16 +336,16 @@ class Block:
         if np.any(control) and not np.all(np.linalg.eigvalsh(points.covariance[control]) > 0):
             raise BlockError("block: covariances of control points must be positive definite")
         for name in self.cameras:
-            watched = self.monitored or {}
-            if isinstance(watched, CamerasKnowledge):
-                if name not in watched.cameras:
-                    raise BlockError(f"block: the monitor says nothing of camera {name!r}")
-                watched = {name: watched.of(name)}
-            for known in (self.known, watched):
-                one = known.get(name)
-                if one is not None and one.covariance.shape != (4 * len(names), 4 * len(names)):
-                    shape = one.covariance.shape
-                    raise BlockError(f"block: camera {name!r}: covariance {shape} of {len(names)} passes")
+            monitored = self.monitored or {}
+            if isinstance(monitored, JointCameraPrior):
+                if name not in monitored.cameras:
+                    raise BlockError(f"block: the monitor has no reading of camera {name!r}")
+                monitored = {name: monitored.of(name)}
+            for priors in (self.known, monitored):
+                prior = priors.get(name)
+                if prior is not None and prior.covariance.shape != (4 * len(names), 4 * len(names)):
+                    shape = prior.covariance.shape
+                    raise BlockError(f"block: camera {name!r}: covariance {shape} does not match {len(names)} passes")
 
 
 def make_block(
@@ -381,7 +403,7 @@ def make_block(
     covariance = np.where(np.isfinite(given), given, 1.0)[:, None, None] ** 2 * np.eye(3)
     passes = tuple(dict.fromkeys(name for name, _ in images))
     same = np.asarray(np.kron(np.ones((len(passes),) * 2), np.diag(spread**2)), np.float64)
-    known = CameraKnowledge(np.zeros((len(passes), 4)), same)
+    known = CameraPrior(np.zeros((len(passes), 4)), same)
     ids = np.array([str(k) for k in range(len(start))], object)
     return Block(
         passes=tuple(Pass(name) for name in passes),

@@ -1,28 +1,27 @@
-"""Errors of readings as processes in time, each with the sparse precision of its unknowns.
+"""Error models of attitude and station readings as stochastic processes, with sparse precision matrices.
 
 A correction about (or along) three axes is, at time t,
 
     sigma_axis * sum over k of b_k(t) z_k,axis,
 
-with unknowns z whose prior is that of the process at unit size, the same about every axis:
+with unknowns z whose prior is that of the process at unit sigma, the same about every axis:
 
-- `constant`: one z of variance 1. `rate`: one, times the seconds from the middle of the scope.
-- `white`: readings at whole multiples of `interval`, independent, joined by the cubic spline through them
+- `constant`: one z of variance 1. `rate`: one z, times the seconds from the middle of the scope.
+- `white`: independent readings at whole multiples of `interval`, interpolated by the cubic spline through them
   (`analysis.orbit.forward_intersection` has the algebra). sigma is that of a reading.
-- `walk`: a random walk that is zero at the middle of the scope; sigma is what it gains in a second.
+- `walk`: a random walk that is zero at the middle of the scope; sigma is that of its increment over one second.
 - `slow`: a first-order Gauss-Markov process of standard deviation sigma and correlation time `time`.
-- `orbital`: amplitudes of cosine and sine of 2 pi t / `time`, of standard deviation sigma each.
+- `orbital`: amplitudes of cosine and sine of 2 pi t / `time`, each of standard deviation sigma.
 - `jitter`: the same at `frequency`, each amplitude a slow process of standard deviation sigma and correlation time
   `time`, so that sigma is the root mean square of the oscillation. It is a line of the spectrum of width 1 / (pi time):
-  a frequency that is known to s keeps its phase for 1 / (2 pi s).
+  a frequency with the standard deviation s keeps its phase for 1 / (2 pi s).
 
-A walk, a slow process and amplitudes of jitter have unknowns at whole multiples of `interval` and are straight lines
+A random walk, a slow process and amplitudes of jitter have unknowns at whole multiples of `interval` and are linear
 between them.
 
-Corrections of attitude and station of a pass at the times of its observations, linear in the unknowns of its laws.
-
-How much of each unknown a time meets is worked out when it is needed, for some of the observations at a time: it would
-else be most of what a block takes in memory.
+`Corrections` evaluates the corrections of attitude and station of a pass at the times of its observations, linear in
+the unknowns. Interpolation coefficients are computed on demand, for a part of the observations at a time: they would
+otherwise be most of a block's memory.
 """
 
 from __future__ import annotations
@@ -39,38 +38,45 @@ from analysis.orbit.forward_intersection import spline_blend, spline_precision
 
 Kind = Literal["constant", "rate", "white", "walk", "slow", "orbital", "jitter"]
 KINDS: tuple[Kind, ...] = ("constant", "rate", "white", "walk", "slow", "orbital", "jitter")
+"""Names of the error models."""
 STEPPED = ("white", "walk", "slow", "jitter")
-"""Laws with unknowns at multiples of an interval."""
+"""Error models with unknowns at multiples of an interval."""
 _GAP = 18
-"""Stretches of a spline's unknowns this far apart correlate by 1e-9 and are kept apart."""
+"""Gap, in intervals, from which on segments of a spline's unknowns are treated as independent; their correlation is
+1e-9.
+"""
 _MOST = 1e5
-"""Intervals from the first observation of a scope to the last; unknowns of more could not be adjusted together."""
+"""Largest number of intervals from the first to the last observation of a scope; more unknowns could not be adjusted
+together.
+"""
 _PINNED = 1e8
-"""Precision of a walk's zero at the middle, in squares of what it gains in an interval."""
+"""Precision of the constraint that a random walk is zero at the middle, relative to that of its increment over an
+interval.
+"""
 
 
 class BlockError(MeasurementError, ValueError):
-    """Input of a block adjustment that cannot be used, or a block that cannot be solved."""
+    """Invalid input of a block adjustment, or a block that cannot be solved."""
 
 
 @dataclass(frozen=True)
 class Law:
-    """One source of error of attitude or station.
+    """Error model of the attitude or of the station.
 
     Attributes
     ----------
     group : str
-        Its name, and that of its variance component.
-    kind : Kind
-        Of process, see the module.
-    sigma : tuple[float, float, float]
-        About or along three axes, radians or metres; of a rate per second, of a walk in a second.
+        Name of the error model and of its variance component.
+    kind : {'constant', 'rate', 'white', 'walk', 'slow', 'orbital', 'jitter'}
+        Kind of process; see the module.
+    sigma : (3,) tuple of float
+        Sigma about or along three axes, in radians or metres; of a rate per second, of a random walk over one second.
     interval : float
-        Between the unknowns of `white`, `walk`, `slow` and `jitter`, seconds.
+        Spacing of the unknowns of `white`, `walk`, `slow` and `jitter`, in seconds.
     time : float
-        Correlation time of `slow` and of the amplitudes of `jitter`, period of `orbital`, seconds.
+        Correlation time of `slow` and of the amplitudes of `jitter`, or period of `orbital`, in seconds.
     frequency : float
-        Of `jitter`, hertz.
+        Frequency of `jitter`, in hertz.
     """
 
     group: str
@@ -81,11 +87,15 @@ class Law:
     frequency: float = 0.0
 
     def check(self) -> None:
-        """Raises BlockError for numbers that cannot be used."""
+        """Raise BlockError if a parameter is invalid."""
         if self.kind not in KINDS:
-            raise BlockError(f"block: {self.group}: a law is one of {', '.join(KINDS)}, found {self.kind!r}")
+            raise BlockError(
+                f"block: {self.group}: the error model must be one of {', '.join(KINDS)}, found {self.kind!r}"
+            )
         if len(self.sigma) != 3 or not np.all(np.isfinite(self.sigma)) or min(self.sigma) < 0:
-            raise BlockError(f"block: {self.group}: three sigmas that are finite and not negative, found {self.sigma}")
+            raise BlockError(
+                f"block: {self.group}: need three sigmas that are finite and not negative, found {self.sigma}"
+            )
         if self.kind in STEPPED and not (np.isfinite(self.interval) and self.interval > 0):
             raise BlockError(f"block: {self.group}: the interval must be positive, found {self.interval}")
         if self.kind == "jitter" and not (np.isfinite(self.frequency) and self.frequency > 0):
@@ -94,27 +104,27 @@ class Law:
             raise BlockError(f"block: {self.group}: correlation time or period must be positive, found {self.time}")
 
     def spread(self, seconds: float) -> tuple[float, float, float]:
-        """Standard deviation (3) of the process at `seconds` from the middle of its scope, radians or metres."""
-        grown = {"rate": abs(seconds), "walk": float(np.sqrt(abs(seconds)))}.get(self.kind, 1.0)
-        a, b, c = (s * grown for s in self.sigma)
+        """Return the standard deviation (3) of the process `seconds` from the middle of its scope, in rad or m."""
+        growth = {"rate": abs(seconds), "walk": float(np.sqrt(abs(seconds)))}.get(self.kind, 1.0)
+        a, b, c = (s * growth for s in self.sigma)
         return a, b, c
 
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """The unknowns of one law in one scope: a pass, all passes of a star tracker, or the block.
+    """Unknowns of one error model in one scope: a pass, all passes of a star tracker, or the block.
 
     Attributes
     ----------
     law : Law
-        which.
-    numbers : Indices
-        (k,) of the unknowns of one axis: multiples of the interval where there is one, else 0, 1; of jitter twice the
-        multiple for the cosine, and one more for the sine.
+        Error model.
+    numbers : (k,) ndarray of int
+        Numbers of the unknowns of one axis: multiples of the interval if there is one, otherwise 0, 1; for jitter twice
+        the multiple for the cosine, and one more for the sine.
     middle : float
-        Time at which a rate vanishes, seconds.
-    precision : sparse.csr_matrix
-        (k, k) sparse, of the unknowns of one axis.
+        Time at which a rate is zero, in seconds.
+    precision : (k, k) csr_matrix
+        A-priori precision of the unknowns of one axis.
     """
 
     law: Law
@@ -124,25 +134,25 @@ class Support:
 
     @classmethod
     def of(cls, law: Law, times: Array, middle: float | None = None) -> Support:
-        """The unknowns that observations meet.
+        """Return the unknowns that observations depend on.
 
         Parameters
         ----------
         law : Law
-            Of the process.
-        times : Array
-            Of the observations, (n,), seconds.
-        middle : float | None
-            Where a rate and a walk are zero, seconds; None for the middle of the times.
+            Error model.
+        times : (n,) ndarray
+            Times of the observations, in seconds.
+        middle : float, optional
+            Time at which a rate and a random walk are zero, in seconds; the middle of the times by default.
 
         Raises
         ------
         BlockError
-            Numbers of the law that cannot be used, or no times.
+            A parameter of the error model is invalid, or there are no times.
         """
         law.check()
         if not len(times):
-            raise BlockError(f"block: {law.group}: no observation meets it")
+            raise BlockError(f"block: {law.group}: no observation depends on it")
         middle = 0.5 * float(times.min() + times.max()) if middle is None else middle
         if law.kind in ("constant", "rate", "orbital"):
             count = 2 if law.kind == "orbital" else 1
@@ -169,8 +179,8 @@ class Support:
             shape = (len(numbers), len(numbers))
             extra = sparse.csr_matrix(([_PINNED / law.interval], ([pin], [pin])), shape=shape)
             return cls(law, numbers, middle, sparse.csr_matrix(precision + extra))
-        kept = np.exp(-step / law.time)
-        precision = _chain(kept, 1.0 - kept**2).tolil()
+        correlation = np.exp(-step / law.time)
+        precision = _chain(correlation, 1.0 - correlation**2).tolil()
         precision[0, 0] += 1.0
         if law.kind == "jitter":
             both = (2 * numbers[:, None] + np.arange(2)).ravel()
@@ -179,13 +189,13 @@ class Support:
 
     @property
     def size(self) -> int:
-        """Unknowns: three axes of each number, an axis after the other, then the next number."""
+        """Number of unknowns: the three axes of each number, then the next number."""
         return 3 * len(self.numbers)
 
     def blend(self, times: Array) -> tuple[Indices, Array]:
-        """Which numbers (n, w) of an axis' unknowns each time meets, counted from 0, and by how much (n, w).
+        """Return the indices (n, w) of one axis' unknowns that act at each time, and their coefficients (n, w).
 
-        A time far from all observations meets nothing.
+        At a time far from all observations all coefficients are zero.
         """
         count, law = len(times), self.law
         if law.kind == "constant":
@@ -197,42 +207,46 @@ class Support:
             return np.tile(np.arange(2), (count, 1)), np.stack([np.cos(phase), np.sin(phase)], axis=1)
         if law.kind == "white":
             first, values = spline_blend(times, law.interval)
-            wanted = first[:, None] + np.arange(4)
+            numbers = first[:, None] + np.arange(4)
         else:
             first = np.asarray(np.floor(times / law.interval), np.intp)
             share = times / law.interval - first
-            wanted, values = np.stack([first, first + 1], axis=1), np.stack([1.0 - share, share], axis=1)
+            numbers, values = np.stack([first, first + 1], axis=1), np.stack([1.0 - share, share], axis=1)
             if law.kind == "jitter":
                 phase = 2.0 * np.pi * law.frequency * times
                 wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
-                wanted, values = 2 * first[:, None] + np.arange(4), np.repeat(values, 2, axis=1) * np.tile(wave, 2)
-        where = np.minimum(np.searchsorted(self.numbers, wanted), len(self.numbers) - 1)
-        return where, np.where(self.numbers[where] == wanted, values, 0.0)
+                numbers, values = 2 * first[:, None] + np.arange(4), np.repeat(values, 2, axis=1) * np.tile(wave, 2)
+        position = np.minimum(np.searchsorted(self.numbers, numbers), len(self.numbers) - 1)
+        return position, np.where(self.numbers[position] == numbers, values, 0.0)
 
     def whitened(self) -> Array:
-        """(k, k) dense root R of the precision, R R' = precision: R' z are independent and in order of time."""
+        """Return a (k, k) dense root R of the precision, R R' = precision.
+
+        The whitened unknowns R' z are independent and in order of time.
+        """
         return np.asarray(np.linalg.cholesky(self.precision.toarray()[::-1, ::-1])[::-1, ::-1])
 
 
-def _chain(kept: Array, gained: Array) -> sparse.csr_matrix:
-    """(k, k) precision of z_n+1 = kept_n z_n + noise of variance gained_n, without that of the first."""
-    count = len(kept) + 1
-    steps = sparse.diags([-kept, np.ones(count - 1)], [0, 1], shape=(count - 1, count))
-    return sparse.csr_matrix(steps.T @ sparse.diags(1.0 / gained) @ steps)
+def _chain(correlation: Array, variance: Array) -> sparse.csr_matrix:
+    """Return the (k, k) precision of z_n+1 = kept_n z_n + noise of variance gained_n, without that of the first."""
+    count = len(correlation) + 1
+    steps = sparse.diags([-correlation, np.ones(count - 1)], [0, 1], shape=(count - 1, count))
+    return sparse.csr_matrix(steps.T @ sparse.diags(1.0 / variance) @ steps)
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One law's share of a correction.
+    """Contribution of one error model to a correction.
 
     Attributes
     ----------
     turns : bool
-        Whether it turns the body, radians; else it shifts the station along the axes of the pass, metres.
+        True for a rotation of the body, in radians; False for a shift of the station along the axes of the pass, in
+        metres.
     first : int
-        Of its unknowns, three axes of each number.
+        Column of the first unknown.
     support : Support
-        Of the law.
+        Unknowns of the error model.
     """
 
     turns: bool
@@ -241,22 +255,22 @@ class Part:
 
     @cached_property
     def sigma(self) -> Array:
-        """(3,) of the axes."""
+        """Standard deviations (3,) of the axes."""
         return np.array(self.support.law.sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class Corrections:
-    """Corrections at the times of n observations.
+    """Attitude and station corrections at the times of n observations.
 
     Attributes
     ----------
-    parts : tuple[Part, ...]
-        Of the laws; those that turn come first.
-    axes : Array
-        (3, 3) axes of the pass (along, across, down) as columns, ITRS.
-    time : Array
-        (n,) seconds.
+    parts : tuple of Part
+        Contributions of the error models; rotations come first.
+    axes : (3, 3) ndarray
+        Axes of the pass (along, across, down) as columns, ITRS.
+    time : (n,) ndarray
+        Times, in seconds.
     """
 
     parts: tuple[Part, ...]
@@ -264,98 +278,100 @@ class Corrections:
     time: Array
 
     def taken(self, which: Indices) -> Corrections:
-        """At some of the observations, (k,)."""
+        """Return the corrections of selected observations (k,)."""
         return replace(self, time=self.time[which])
 
     @cached_property
     def _blends(self) -> tuple[tuple[Indices, Array], ...]:
+        """Indices and coefficients of the unknowns of each part."""
         return tuple(one.support.blend(self.time) for one in self.parts)
 
     @property
     def columns(self) -> Indices:
-        """(n, w) unknowns of all parts."""
-        every = [np.zeros((len(self.time), 0), np.intp)]
-        for one, (number, _) in zip(self.parts, self._blends, strict=True):
-            columns = one.first + 3 * number[:, :, None] + np.arange(3)
-            every.append(columns.reshape(len(number), 3 * number.shape[1]))
-        return np.concatenate(every, axis=1)
+        """Columns (n, w) of the unknowns of all parts."""
+        parts = [np.zeros((len(self.time), 0), np.intp)]
+        for part, (number, _) in zip(self.parts, self._blends, strict=True):
+            columns = part.first + 3 * number[:, :, None] + np.arange(3)
+            parts.append(columns.reshape(len(number), 3 * number.shape[1]))
+        return np.concatenate(parts, axis=1)
 
     def factors(self, turns: bool) -> tuple[Indices, Array]:
-        """Unknowns (n, w, 3) of the turns or of the shifts, and their coefficients (n, w, 3), SI."""
+        """Return columns (n, w, 3) and coefficients (n, w, 3), SI units, of the rotations or of the shifts."""
         count = len(self.time)
         columns, factors = [np.zeros((count, 0, 3), np.intp)], [np.zeros((count, 0, 3))]
-        for one, (number, blend) in zip(self.parts, self._blends, strict=True):
-            if one.turns == turns:
-                columns.append(one.first + 3 * number[:, :, None] + np.arange(3))
-                factors.append(blend[:, :, None] * one.sigma)
+        for part, (number, blend) in zip(self.parts, self._blends, strict=True):
+            if part.turns == turns:
+                columns.append(part.first + 3 * number[:, :, None] + np.arange(3))
+                factors.append(blend[:, :, None] * part.sigma)
         return np.concatenate(columns, axis=1), np.concatenate(factors, axis=1)
 
     def at(self, x: Array) -> tuple[Array, Array]:
-        """Turns (n, 3), radians, and shifts (n, 3) along the axes of the pass, metres, with unknowns x (P,)."""
-        turn, shift = np.zeros((2, len(self.time), 3))
-        for one, (number, blend) in zip(self.parts, self._blends, strict=True):
-            own = one.sigma * x[one.first : one.first + one.support.size].reshape(-1, 3)
-            value = np.einsum("nw,nwa->na", blend, own[number])
-            if one.turns:
-                turn += value
+        """Return rotations (n, 3), in rad, and shifts (n, 3) along the axes of the pass, in m, for unknowns (P,)."""
+        rotation, shift = np.zeros((2, len(self.time), 3))
+        for part, (number, blend) in zip(self.parts, self._blends, strict=True):
+            unknowns = part.sigma * x[part.first : part.first + part.support.size].reshape(-1, 3)
+            value = np.einsum("nw,nwa->na", blend, unknowns[number])
+            if part.turns:
+                rotation += value
             else:
                 shift += value
-        return turn, shift
+        return rotation, shift
 
     def slopes(self, by_turn: Array, by_station: Array) -> Array:
-        """(n, d, w) derivatives of d rows by the unknowns.
+        """Return the (n, d, w) derivatives of d equations with respect to the unknowns.
 
         Parameters
         ----------
-        by_turn : Array
-            Derivatives by the rotation vector, (n, d, 3), 1/rad.
-        by_station : Array
-            By the station, ITRS, (n, d, 3), 1/m.
+        by_turn : (n, d, 3) ndarray
+            Derivatives with respect to the rotation vector, 1/rad.
+        by_station : (n, d, 3) ndarray
+            Derivatives with respect to the station, ITRS, 1/m.
         """
         count, depth = by_turn.shape[:2]
         widths = [3 * blend.shape[1] for _, blend in self._blends]
-        found = np.empty((count, depth, sum(widths)))
-        along, done = by_station @ self.axes, 0
-        for one, (_, blend), width in zip(self.parts, self._blends, widths, strict=True):
-            by = (by_turn if one.turns else along) * one.sigma
+        slopes = np.empty((count, depth, sum(widths)))
+        along, column = by_station @ self.axes, 0
+        for part, (_, blend), width in zip(self.parts, self._blends, widths, strict=True):
+            by = (by_turn if part.turns else along) * part.sigma
             for k in range(blend.shape[1]):
-                place = done + 3 * k
-                np.multiply(by, blend[:, k, None, None], out=found[:, :, place : place + 3])
-            done += width
-        return found
+                start = column + 3 * k
+                np.multiply(by, blend[:, k, None, None], out=slopes[:, :, start : start + 3])
+            column += width
+        return slopes
 
 
-def turned(turn: Array, vector: Array) -> Array:
-    """(n, 3) vectors turned by rotation vectors (n, 3) of up to a degree; of d vectors (n, d, 3) each likewise.
+def rotated(rotation: Array, vector: Array) -> Array:
+    """Rotate vectors (n, 3), or d vectors each (n, d, 3), by rotation vectors (n, 3) of up to a degree.
 
-    The series of the rotation to the third order, which leaves out 1e-9 of a degree.
+    The series of the rotation is truncated after the third order; the error is 1e-9 of a degree.
     """
     if vector.ndim == 3:
-        turn = turn[:, None]
-    square = np.sum(turn**2, axis=-1, keepdims=True)
-    once = cross(turn, vector)
-    return np.asarray(vector + (1.0 - square / 6.0) * once + (0.5 - square / 24.0) * cross(turn, once))
+        rotation = rotation[:, None]
+    square = np.sum(rotation**2, axis=-1, keepdims=True)
+    product = cross(rotation, vector)
+    return np.asarray(vector + (1.0 - square / 6.0) * product + (0.5 - square / 24.0) * cross(rotation, product))
 
 
-def turned_back(turn: Array, vector: Array) -> Array:
-    """Vectors turned by the inverse of rotations, see `turned`."""
-    return turned(-turn, vector)
+def rotated_back(rotation: Array, vector: Array) -> Array:
+    """Rotate vectors by the inverse rotations; see `rotated`."""
+    return rotated(-rotation, vector)
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Vector product along the last axis; several times faster than numpy's for many short vectors."""
-    found = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    """Return the vector product along the last axis, several times faster than numpy's for many short vectors."""
+    product = np.empty(np.broadcast_shapes(a.shape, b.shape))
     for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-        np.multiply(a[..., j], b[..., k], out=found[..., i])
-        found[..., i] -= a[..., k] * b[..., j]
-    return found
+        np.multiply(a[..., j], b[..., k], out=product[..., i])
+        product[..., i] -= a[..., k] * b[..., j]
+    return product
 
 
-def by_rotation_vector(turn: Array, by_turn: Array) -> Array:
-    """(n, d, 3) derivatives by the rotation vectors (n, 3), from those by a small turn of the turned body.
+def rotation_vector_derivatives(rotation: Array, by_turn: Array) -> Array:
+    """Return the (n, d, 3) derivatives with respect to rotation vectors (n, 3).
 
-    It is the right Jacobian of the rotation, to the second order.
+    Input are the derivatives with respect to a small rotation of the rotated body; the conversion is the right Jacobian
+    of the rotation, to second order.
     """
     # t (I - S / 2 + S^2 / 6), where t S = t x turn
-    once = cross(by_turn, turn[:, None])
-    return np.asarray(by_turn - 0.5 * once + cross(once, turn[:, None]) / 6.0)
+    product = cross(by_turn, rotation[:, None])
+    return np.asarray(by_turn - 0.5 * product + cross(product, rotation[:, None]) / 6.0)

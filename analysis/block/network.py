@@ -1,7 +1,8 @@
-"""What holds a block together: scenes that share points, and what the observations leave to the readings' priors.
+"""Connectivity of a block: scenes that share points, and combinations of unknowns that stay open.
 
-Every law of a pass is taken for one constant here (`simplified`): three turns and three shifts of each pass and the
-cameras' changes say by name what is open; that a slow course of the attitude is open, too, adds nothing to the name.
+Every error model of a pass is replaced by one constant here (`simplified`): three rotations and three shifts of each
+pass and the cameras' changes suffice to name what is undetermined. That a slow variation of the attitude is
+undetermined as well would add nothing to the name.
 """
 
 from __future__ import annotations
@@ -23,28 +24,28 @@ from analysis.orbit.calibration_parameters import echelon, shown
 from analysis.orbit.forward_intersection import level_axes
 
 _SHOWN = 0.25
-"""Of the largest part: smaller parts of a combination are not named."""
+"""Smallest part of a combination, relative to its largest, that is listed."""
 _TAKING = 6
-"""Unknowns of one combination that are named."""
+"""Largest number of unknowns of one combination that are listed."""
 _NOTHING = 1e-3
-"""Sigma of the prior over that of the observations, below which they tell nothing."""
+"""Ratio of the prior's sigma to that of the observations below which the observations determine nothing."""
 _MOST = 12
-"""Combinations that are named, the widest open first."""
+"""Largest number of combinations that are listed, the least determined first."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """How scenes hang together.
+    """Connected parts of a block.
 
     Attributes
     ----------
-    parts : tuple[tuple[str, ...], ...]
-        Scenes that points connect, the largest part first; scenes with no observation are in none.
-    controlled : tuple[bool, ...]
-        Of each part, whether a control point, or footprint, is seen in it.
-    alone : tuple[str, ...]
-        Scenes that share no point with any other.
-    empty : tuple[str, ...]
+    parts : tuple of tuple of str
+        Scenes that points connect, the largest part first; scenes without observations belong to none.
+    controlled : tuple of bool
+        For each part, True if it sees a control point or a laser footprint.
+    alone : tuple of str
+        Scenes that share no point with another.
+    empty : tuple of str
         Scenes without image points.
     """
 
@@ -55,7 +56,7 @@ class Network:
 
 
 def network_of(block: Block) -> Network:
-    """Parts of a block: scenes that see a point together are in one."""
+    """Return the connected parts of a block: scenes that see the same point belong together."""
     scenes = [s for s in block.scenes if len(s.rays.point)]
     count = len(block.points.ids)
     rows = np.concatenate([np.full(len(s.rays.point), k) for k, s in enumerate(scenes)])
@@ -63,13 +64,13 @@ def network_of(block: Block) -> Network:
     sees = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(scenes), count))
     together = sees @ sees.T
     _, label = connected_components(together, directed=False)
-    held = block.points.role == "control"
-    for one in block.footprints:
-        held = held.copy()
-        held[one.point] = True
+    control = block.points.role == "control"
+    for footprints in block.footprints:
+        control = control.copy()
+        control[footprints.point] = True
     order = sorted(set(label.tolist()), key=lambda k: -int(np.sum(label == k)))
     parts = tuple(tuple(s.name for s, k in zip(scenes, label.tolist(), strict=True) if k == part) for part in order)
-    controlled = tuple(bool((sees[np.flatnonzero(label == part)] @ held).sum() > 0) for part in order)
+    controlled = tuple(bool((sees[np.flatnonzero(label == part)] @ control).sum() > 0) for part in order)
     shared = np.asarray((together > 0).sum(axis=1)).ravel()
     alone = tuple(s.name for s, n in zip(scenes, shared.tolist(), strict=True) if n <= 1)
     empty = tuple(s.name for s in block.scenes if not len(s.rays.point))
@@ -77,7 +78,10 @@ def network_of(block: Block) -> Network:
 
 
 def simplified(block: Block) -> Block:
-    """The block with one constant turn and one constant shift of each pass, of the size that all laws have together."""
+    """Return the block with one constant rotation and one constant shift of each pass.
+
+    Their sigmas are those of all error models together.
+    """
     spans: dict[str, list[float]] = {}
     for scene in block.scenes:
         if scene.rays.time is not None and len(scene.rays.time):
@@ -94,83 +98,87 @@ def simplified(block: Block) -> Block:
 
 
 @dataclass(frozen=True)
-class Open:
-    """A change that the observations tell less well than the priors.
+class OpenCombination:
+    """Combination of unknowns that the observations determine less well than the priors.
 
     Attributes
     ----------
-    names : tuple[str, ...]
+    names : tuple of str
         Unknowns that take part.
-    change : tuple[float, ...]
-        Of each, for one sigma of what the observations allow, at most that of the prior; metres and radians.
-    told : float
-        Sigma of the prior over that of the observations alone: 0 where they say nothing, below 1.
+    change : tuple of float
+        Change of each for one sigma of the combination as the observations allow, at most that of the prior, in metres
+        and radians.
+    sigma_ratio : float
+        Ratio of the prior's sigma to that of the observations alone: 0 if they determine nothing, always below 1.
     """
 
     names: tuple[str, ...]
     change: tuple[float, ...]
-    told: float
+    sigma_ratio: float
 
     def __str__(self) -> str:
         parts = [shown(name, change) for name, change in zip(self.names, self.change, strict=True)]
-        return f"{', '.join(parts)} (told to {100.0 * self.told:.2g}% of the prior)"
+        return f"{', '.join(parts)} (prior sigma is {100.0 * self.sigma_ratio:.2g} % of that of the observations)"
 
 
-def open_combinations(found: BlockAdjustment) -> tuple[Open, ...]:
-    """What of the block's unknowns the observations leave to the priors, by name, the widest open first.
+def open_combinations(adjustment: BlockAdjustment) -> tuple[OpenCombination, ...]:
+    """Return the combinations of a block's unknowns that only the priors determine, the least determined first.
 
-    What is told to less than a thousandth, and the rest, are a space each, and a combination has an unknown that is in
-    no other one of its space (`echelon`): the eigenvectors of a space whose eigenvalues are alike are any.
+    Combinations that the observations determine to less than a thousandth, and the others, form one space each. In each
+    space, a combination has an unknown that is in no other one (`echelon`), because the eigenvectors of similar
+    eigenvalues are arbitrary.
     """
-    plain = assembled(simplified(found.assembly.block))
-    ground = np.where(np.isfinite(found.ground), found.ground, found.assembly.block.points.start)
-    weight = tuple(np.ones(len(one.point)) for one in plain.reduction.sets)
+    plain = assembled(simplified(adjustment.assembly.block))
+    ground = np.where(np.isfinite(adjustment.ground), adjustment.ground, adjustment.assembly.block.points.start)
+    weight = tuple(np.ones(len(space.point)) for space in plain.reduction.sets)
     data = plain.reduction.eliminated(State(np.zeros(plain.reduction.size), ground, weight, {})).data.toarray()
     prior = plain.reduction.prior({}).toarray()
-    # eigenvalues of the observations' information in units of the priors'
+    # eigenvalues of the observations' normal matrix relative to that of the priors
     values, vectors = eigh(data, prior)
     names, sizes = plain.names(), _sizes(plain.block, plain.names())
     spaces = np.split(vectors[:, values < 1.0], [int(np.sum(values < _NOTHING**2))], axis=1)
     combinations = []
-    for vector in np.concatenate([echelon(one) for one in spaces], axis=1).T:
+    for vector in np.concatenate([echelon(space) for space in spaces], axis=1).T:
         vector = vector / np.sqrt(vector @ prior @ vector)
-        taking = np.flatnonzero(np.abs(vector) >= _SHOWN * np.abs(vector).max())
-        taking = taking[np.argsort(-np.abs(vector[taking]), kind="stable")][:_TAKING]
-        change = vector * sizes * np.sign(vector[taking[0]])
-        told = float(np.sqrt(max(float(vector @ data @ vector), 0.0)))
-        combinations.append(Open(tuple(names[i] for i in taking.tolist()), tuple(change[taking].tolist()), told))
-    return tuple(sorted(combinations, key=lambda one: one.told)[:_MOST])
+        members = np.flatnonzero(np.abs(vector) >= _SHOWN * np.abs(vector).max())
+        members = members[np.argsort(-np.abs(vector[members]), kind="stable")][:_TAKING]
+        change = vector * sizes * np.sign(vector[members[0]])
+        sigma_ratio = float(np.sqrt(max(float(vector @ data @ vector), 0.0)))
+        combinations.append(
+            OpenCombination(tuple(names[i] for i in members.tolist()), tuple(change[members].tolist()), sigma_ratio)
+        )
+    return tuple(sorted(combinations, key=lambda combination: combination.sigma_ratio)[:_MOST])
 
 
 def _sizes(block: Block, names: tuple[str, ...]) -> Array:
-    """(P,) SI size of a unit of each unknown of a simplified block."""
-    turn, shift = block.attitude[0].law.sigma, block.station[0].law.sigma
+    """Return the (P,) unit of each unknown of a simplified block, SI."""
+    rotation, shift = block.attitude[0].law.sigma, block.station[0].law.sigma
     sizes: dict[str, float] = {}
-    for one in block.passes:
-        for axis, size in zip(("roll", "pitch", "yaw"), turn, strict=True):
-            sizes[f"{one.name} {axis}"] = size
+    for block_pass in block.passes:
+        for axis, size in zip(("roll", "pitch", "yaw"), rotation, strict=True):
+            sizes[f"{block_pass.name} {axis}"] = size
         for axis, size in zip(("along", "across", "down"), shift, strict=True):
-            sizes[f"{one.name} offset {axis}"] = size
+            sizes[f"{block_pass.name} offset {axis}"] = size
         for camera, known in block.known.items():
-            own = np.sqrt(np.diag(known.covariance)).reshape(-1, 4).max(axis=0)
-            for axis, size in zip(("d_alpha", "d_beta", "d_gamma", "d_f"), own.tolist(), strict=True):
-                sizes[f"{one.name} {camera} {axis}"] = size
+            camera_sigma = np.sqrt(np.diag(known.covariance)).reshape(-1, 4).max(axis=0)
+            for axis, size in zip(("d_alpha", "d_beta", "d_gamma", "d_f"), camera_sigma.tolist(), strict=True):
+                sizes[f"{block_pass.name} {camera} {axis}"] = size
     common = 1.0 if block.terrain is None else max(block.terrain.common, 1e-6)
     return np.array([sizes.get(name, common) for name in names])
 
 
 @dataclass(frozen=True)
 class DatumTest:
-    """A shift that all control points have in common, as the readings and the other sensors see it.
+    """Common shift of all control points, as seen by the readings and the other sensors.
 
     Attributes
     ----------
     east, north, up : float
-        Of the given coordinates against the rest of the block, metres.
-    sigma : tuple[float, float, float]
-        Of each.
+        Shift of the surveyed coordinates against the rest of the block, in metres.
+    sigma : (3,) tuple of float
+        Standard deviations of the shift, in metres.
     chi_square : float
-        Of the three, with three degrees of freedom where there is no such shift.
+        Chi-square of the shift, with three degrees of freedom if there is none.
     """
 
     east: float
@@ -180,13 +188,13 @@ class DatumTest:
     chi_square: float
 
 
-def datum_test(found: BlockAdjustment) -> DatumTest | None:
-    """The shift of an adjustment that looked for one; None where it did not."""
-    shift = found.datum()
+def datum_test(adjustment: BlockAdjustment) -> DatumTest | None:
+    """Return the datum shift of an adjustment that estimated one, otherwise None."""
+    shift = adjustment.datum()
     if shift is None:
         return None
     value, covariance = shift
-    points = found.assembly.block.points
+    points = adjustment.assembly.block.points
     middle = np.mean(points.start[points.role == "control"], axis=0)
     axes = level_axes(middle[None])[0]
     level, spread = axes @ value, axes @ covariance @ axes.T

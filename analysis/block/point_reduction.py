@@ -1,21 +1,19 @@
-"""Normal equations of packets and priors with the ground points eliminated, in pieces of bounded memory.
+"""Normal equations of observations and priors with the ground points eliminated, in pieces of bounded memory.
 
-A ground point meets only its own packets, so that its (3, 3) block is inverted alone (Schur complement). Points whose
-packets meet the same unknowns in the same order form a bundle: their rows make one dense matrix, and one product of
-matrices reduces them all. Rows are linearised anew whenever they are needed, a piece of the points at a time; what is
-kept of a point is its (3, 3) covariance at known x. Time and memory are so linear in the points, and what does not grow
-with them is the reduced matrix.
+**Packets.** A packet is the d equations that one measurement of one ground point gives: they depend on the point p and
+on w of the unknowns x. Packet sets of one kind are linearised together and whitened by their a-priori covariance: miss
++ by_x dx + by_point dp. The elimination knows nothing of cameras.
 
-The points' reduction on several processes, each of which holds the packets of a share of the points.
+**Elimination.** A ground point occurs only in its own packets, so that its (3, 3) block is inverted alone (Schur
+complement). Points whose packets depend on the same unknowns in the same order form a bundle: their equations make one
+dense matrix, and one matrix product eliminates them all. Equations are linearised again whenever they are needed, for
+some of the points at a time; only the (3, 3) covariance of a point for known x is stored. Time and memory are thus
+linear in the number of points, and only the reduced matrix does not depend on it.
 
-What grows with the points stays where it is: the packets of a share are sent once. Unknowns, places of the points and
-weights go to the shares, reduced equations come back and are added in the order of the shares, so that the same number
-of shares gives the same bits, and another one the same sums to rounding.
-
-Observations of ground points in packets: rows that one measurement of one point gives, and what they depend on.
-
-A packet of d rows observes one point p and w of the unknowns x. Sets of packets of one kind are linearised together,
-whitened by their a-priori covariance: miss + by_x dx + by_point dp. The core (`point_reduction`) knows no cameras.
+**Parallel elimination.** `SharedReduction` distributes the points over several processes. The packets of a share are
+sent once. Unknowns, coordinates of the points and weights go to the shares; the reduced equations come back and are
+added in the order of the shares, so that the same number of shares gives bit-identical results, and another number the
+same sums to rounding.
 """
 
 from __future__ import annotations
@@ -30,49 +28,49 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from analysis.arrays import Array, Indices
-from analysis.block.error_processes import Corrections, by_rotation_vector, cross, turned, turned_back
+from analysis.block.error_processes import Corrections, cross, rotated, rotated_back, rotation_vector_derivatives
 from analysis.block.reweighting import standardised_packets
 from analysis.orbit.three_line_model import LineModel, Rays
 
 
 class Packets(Protocol):
-    """A set of packets."""
+    """Set of packets of one kind."""
 
     @property
     def name(self) -> str:
-        """Of the set, for messages: the scene."""
+        """Name of the set, such as that of the scene, for messages."""
 
     @property
     def group(self) -> str:
-        """Variance group."""
+        """Name of the variance group."""
 
     @property
     def rows(self) -> int:
-        """d, of each packet."""
+        """Number d of equations of each packet."""
 
     @property
     def point(self) -> Indices:
-        """(n,) ground point that each packet observes."""
+        """Index (n,) of the ground point that each packet observes."""
 
     @property
     def columns(self) -> Indices:
-        """(n, w) unknowns that each packet meets."""
+        """Columns (n, w) of the unknowns that each packet depends on."""
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """Misclosures (k, d), their derivatives by the columns (k, d, w) and by the points (k, d, 3), whitened.
+        """Return whitened misclosures (k, d) and derivatives by the columns (k, d, w) and by the points (k, d, 3).
 
         Parameters
         ----------
-        which : Indices
-            Packets, (k,).
-        x : Array
-            All unknowns, (P,).
-        ground : Array
-            Points of these packets, (k, 3), ITRS, metres.
+        which : (k,) ndarray of int
+            Indices of packets.
+        x : (P,) ndarray
+            All unknowns.
+        ground : (k, 3) ndarray
+            Points of these packets, ITRS, in metres.
         """
 
     def taken(self, which: Indices, point: Indices) -> Packets:
-        """Some of the packets, (k,), whose points have other numbers, (k,)."""
+        """Return selected packets (k,) with new point indices (k,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,19 +80,19 @@ class LineImage:
     Attributes
     ----------
     name : str
-        Of the scene.
+        Name of the scene.
     camera : LineModel
-        As it is known, before its changes in this pass.
+        Camera before its change in this pass.
     rays : Rays
         Image points with readings of station and attitude.
-    white : Array
-        (n, 2, 2) whitens their misclosures.
+    white : (n, 2, 2) ndarray
+        Matrices that whiten the misclosures.
     corrections : Corrections
-        Of the readings.
-    change : Indices
-        (4,) unknowns of the camera's d_alpha, d_beta, d_gamma, d_f.
-    unit : Array
-        (4,) size of each, radians and metres.
+        Corrections of the readings.
+    change : (4,) ndarray of int
+        Columns of the camera's d_alpha, d_beta, d_gamma, d_f.
+    unit : (4,) ndarray
+        Unit of each of these unknowns, in radians and metres.
     group : str
         Variance group.
     """
@@ -111,40 +109,30 @@ class LineImage:
 
     @property
     def point(self) -> Indices:
-        """(n,)."""
+        """Index (n,) of the ground point of each packet."""
         return self.rays.point
 
     @property
     def columns(self) -> Indices:
-        """(n, w)."""
-        own = np.broadcast_to(self.change, (len(self.rays.point), len(self.change)))
-        return np.concatenate([self.corrections.columns, own], axis=1)
+        """Columns (n, w) of the unknowns of each packet."""
+        change = np.broadcast_to(self.change, (len(self.rays.point), len(self.change)))
+        return np.concatenate([self.corrections.columns, change], axis=1)
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """See `Packets`.
-
-        Parameters
-        ----------
-        which : Indices
-            Packets, (k,).
-        x : Array
-            All unknowns, (P,).
-        ground : Array
-            Points of these packets, (k, 3), ITRS, metres.
-        """
+        """Return whitened misclosures and derivatives; see `Packets.linearised`."""
         rays, camera = self.rays, self.camera.drifted(self.unit * x[self.change])
         corrections = self.corrections.taken(which)
-        turn, shift = corrections.at(x)
+        rotation, shift = corrections.at(x)
         attitude = rays.attitude[which]
         arm = ground - rays.station[which] - shift @ corrections.axes.T
-        body = turned_back(turn, np.einsum("nji,nj->ni", attitude, arm))
+        body = rotated_back(rotation, np.einsum("nji,nj->ni", attitude, arm))
         seen = camera.seen(body, rays.image[which])
         white = self.white[which]
         by_body = white @ seen.by_body
-        by_measured = turned(turn, by_body)
+        by_measured = rotated(rotation, by_body)
         by_ground = by_measured @ np.swapaxes(attitude, 1, 2)
-        # a small turn s of the body moves the arm by arm x s, and t . (arm x s) = (t x arm) . s
-        by_turn = by_rotation_vector(turn, cross(by_body, body[:, None]))
+        # a small rotation s of the body moves the arm by arm x s, and t . (arm x s) = (t x arm) . s
+        by_turn = rotation_vector_derivatives(rotation, cross(by_body, body[:, None]))
         slopes = corrections.slopes(by_turn, -by_ground)
         return (
             np.einsum("nij,nj->ni", white, seen.miss),
@@ -153,31 +141,34 @@ class LineImage:
         )
 
     def taken(self, which: Indices, point: Indices) -> LineImage:
-        """See `Packets`."""
+        """Return selected packets; see `Packets.taken`."""
         rays = replace(self.rays.taken(which), point=point)
         return replace(self, rays=rays, white=self.white[which], corrections=self.corrections.taken(which))
 
 
 @dataclass(frozen=True, eq=False)
 class Pointings:
-    """Laser altimeter footprints: range, and where the beam points in the body frame.
+    """Laser altimeter footprints: range, and direction of the beam in the body frame.
 
     Attributes
     ----------
     name : str
-        Of the pass.
-    point : Indices
-        (n,) footprints.
-    station : Array
-        (n, 3) readings, ITRS, metres. attitude: (n, 3, 3) body to ITRS.
-    aim : Array
-        (n, 3) unit vectors of the beam in the body frame.
-    distance : Array
-        (n,) measured, metres.
+        Name of the set.
+    point : (n,) ndarray of int
+        Indices of the footprints' points.
+    station : (n, 3) ndarray
+        Measured positions, ITRS, in metres.
+    attitude : (n, 3, 3) ndarray
+        Measured rotations from the body to ITRS.
+    aim : (n, 3) ndarray
+        Unit vectors of the beam in the body frame.
+    distance : (n,) ndarray
+        Measured ranges, in metres.
     corrections : Corrections
-        Of the readings.
-    sigma : tuple[float, float]
-        Of the range, metres, and of the pointing about each of two axes, radians, with the beam's width.
+        Corrections of the readings.
+    sigma : tuple of float
+        Sigma of the range, in metres, and of the pointing including the beam's width about each of two axes, in
+        radians.
     group : str
         Variance group.
     """
@@ -195,49 +186,39 @@ class Pointings:
 
     @property
     def columns(self) -> Indices:
-        """(n, w)."""
+        """Columns (n, w) of the unknowns of each packet."""
         return self.corrections.columns
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """See `Packets`: range, then the beam's two components.
-
-        Parameters
-        ----------
-        which : Indices
-            Packets, (k,).
-        x : Array
-            All unknowns, (P,).
-        ground : Array
-            Points of these packets, (k, 3), ITRS, metres.
-        """
+        """Return whitened misclosures of the range and the beam's two components; see `Packets.linearised`."""
         corrections = self.corrections.taken(which)
-        turn, shift = corrections.at(x)
+        rotation, shift = corrections.at(x)
         attitude = self.attitude[which]
         arm = ground - self.station[which] - shift @ corrections.axes.T
-        arm = turned_back(turn, np.einsum("nji,nj->ni", attitude, arm))
-        far = np.linalg.norm(arm, axis=1)
-        unit = arm / far[:, None]
+        arm = rotated_back(rotation, np.einsum("nji,nj->ni", attitude, arm))
+        distance = np.linalg.norm(arm, axis=1)
+        unit = arm / distance[:, None]
         aim = self.aim[which]
         first = np.cross(aim, np.eye(3)[np.abs(aim[0]).argmin()])
         first = first / np.linalg.norm(first, axis=1, keepdims=True)
         across = np.stack([first, np.cross(aim, first)], axis=1)
         miss = np.concatenate(
             [
-                (far - self.distance[which])[:, None] / self.sigma[0],
+                (distance - self.distance[which])[:, None] / self.sigma[0],
                 np.einsum("nij,nj->ni", across, unit) / self.sigma[1],
             ],
             axis=1,
         )
-        flat = np.eye(3) - unit[:, :, None] * unit[:, None, :]
+        projection = np.eye(3) - unit[:, :, None] * unit[:, None, :]
         by_arm = np.concatenate(
-            [unit[:, None] / self.sigma[0], across @ flat / (self.sigma[1] * far[:, None, None])], axis=1
+            [unit[:, None] / self.sigma[0], across @ projection / (self.sigma[1] * distance[:, None, None])], axis=1
         )
-        by_turn = by_rotation_vector(turn, cross(by_arm, arm[:, None]))
-        by_point = turned(turn, by_arm) @ np.swapaxes(attitude, 1, 2)
+        by_turn = rotation_vector_derivatives(rotation, cross(by_arm, arm[:, None]))
+        by_point = rotated(rotation, by_arm) @ np.swapaxes(attitude, 1, 2)
         return miss, corrections.slopes(by_turn, -by_point), by_point
 
     def taken(self, which: Indices, point: Indices) -> Pointings:
-        """See `Packets`."""
+        """Return selected packets; see `Packets.taken`."""
         rows = (self.station, self.attitude, self.aim, self.distance)
         station, attitude, aim, distance = (row[which] for row in rows)
         return replace(
@@ -253,20 +234,20 @@ class Pointings:
 
 @dataclass(frozen=True, eq=False)
 class FixedPoints:
-    """Given coordinates of control points, with a shift that they may have in common.
+    """Surveyed coordinates of control points, with a shift that they may have in common.
 
     Attributes
     ----------
     name : str
-        Of the set.
-    point : Indices
-        (n,).
-    given : Array
-        (n, 3) ITRS, metres.
-    white : Array
-        (n, 3, 3) whitens their misclosures.
-    datum : Indices
-        (0,) or (3,) unknowns of what all given coordinates are too large by, along ITRS axes, metres.
+        Name of the set.
+    point : (n,) ndarray of int
+        Indices of the points.
+    given : (n, 3) ndarray
+        Surveyed coordinates, ITRS, in metres.
+    white : (n, 3, 3) ndarray
+        Matrices that whiten the misclosures.
+    datum : (0,) or (3,) ndarray of int
+        Columns of the common excess of all surveyed coordinates along the ITRS axes, in metres.
     group : str
         Variance group.
     """
@@ -281,49 +262,41 @@ class FixedPoints:
 
     @property
     def columns(self) -> Indices:
-        """(n, 0) or (n, 3)."""
+        """Columns (n, 0) or (n, 3) of the unknowns of each packet."""
         return np.broadcast_to(self.datum, (len(self.point), len(self.datum)))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """See `Packets`.
-
-        Parameters
-        ----------
-        which : Indices
-            Packets, (k,).
-        x : Array
-            All unknowns, (P,).
-        ground : Array
-            Points of these packets, (k, 3), ITRS, metres.
-        """
+        """Return whitened misclosures and derivatives; see `Packets.linearised`."""
         white = self.white[which]
         shift = x[self.datum] if len(self.datum) else np.zeros(3)
         miss = np.einsum("nij,nj->ni", white, ground - self.given[which] + shift)
         return miss, white[:, :, : len(self.datum)], white
 
     def taken(self, which: Indices, point: Indices) -> FixedPoints:
-        """See `Packets`."""
+        """Return selected packets; see `Packets.taken`."""
         return replace(self, point=point, given=self.given[which], white=self.white[which])
 
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """Heights of a terrain model at points, with an error that the model has everywhere.
+    """Terrain model heights at points, with a common error of the model.
 
     Attributes
     ----------
     name : str
-        Of the model.
-    point : Indices
-        (n,).
-    place : Array
-        (n, 3) where the model's surface lies at the point's first place, ITRS, metres.
-    normal : Array
-        (n, 3) of the surface there; unit vectors.
-    sigma : Array
-        (n,) of a height, independent from point to point, metres.
-    common : Indices
-        (1,) unknown of the model's common error. unit: its size, metres.
+        Name of the set.
+    point : (n,) ndarray of int
+        Indices of the points.
+    place : (n, 3) ndarray
+        Positions on the model's surface at the points' start values, ITRS, in metres.
+    normal : (n, 3) ndarray
+        Unit normals of the surface at these positions.
+    sigma : (n,) ndarray
+        Sigma of the independent height errors, in metres.
+    common : (1,) ndarray of int
+        Column of the model's common error.
+    unit : float
+        Unit of the common error, in metres.
     group : str
         Variance group.
     """
@@ -340,56 +313,46 @@ class Heights:
 
     @property
     def columns(self) -> Indices:
-        """(n, 1)."""
+        """Columns (n, 1) of the unknown of each packet."""
         return np.broadcast_to(self.common, (len(self.point), 1))
 
     def linearised(self, which: Indices, x: Array, ground: Array) -> tuple[Array, Array, Array]:
-        """See `Packets`.
-
-        Parameters
-        ----------
-        which : Indices
-            Packets, (k,).
-        x : Array
-            All unknowns, (P,).
-        ground : Array
-            Points of these packets, (k, 3), ITRS, metres.
-        """
+        """Return whitened misclosures and derivatives; see `Packets.linearised`."""
         normal, sigma = self.normal[which], self.sigma[which]
         above = np.sum(normal * (ground - self.place[which]), axis=1) - self.unit * float(x[self.common[0]])
         by_x = np.broadcast_to(-self.unit / sigma[:, None, None], (len(which), 1, 1))
         return (above / sigma)[:, None], by_x, (normal / sigma[:, None])[:, None]
 
     def taken(self, which: Indices, point: Indices) -> Heights:
-        """See `Packets`."""
+        """Return selected packets; see `Packets.taken`."""
         place, normal, sigma = self.place[which], self.normal[which], self.sigma[which]
         return replace(self, point=point, place=place, normal=normal, sigma=sigma)
 
 
 _PIECE = 4_000
-"""Points that are linearised at once."""
+"""Number of points that are linearised at once."""
 _FLUSH = 4_000_000
-"""Entries of the reduced matrix that are collected before they are added up."""
+"""Number of entries of the reduced matrix that are collected before they are summed."""
 _WHOLE = 10_000
-"""Unknowns up to which they are added up in a whole matrix, of 0.8 GB."""
+"""Number of unknowns up to which a dense matrix, of 0.8 GB, accumulates the sums."""
 _LOOSE = 1e-10
-"""1/m^2: a point's own weight where nothing else holds it; 100 km in each coordinate."""
+"""Weight in 1/m^2 that keeps undetermined points invertible; sigma of 100 km in each coordinate."""
 
 
 @dataclass(frozen=True, eq=False)
 class PriorGroup:
-    """What is known beforehand of some unknowns: precision (k, k) sparse of x[columns] - mean.
+    """Prior of some unknowns: x[columns] - mean has zero mean and the given precision.
 
     Attributes
     ----------
     group : str
         Variance group.
-    columns : Indices
-        (k,).
-    precision : sparse.csr_matrix
-        (k, k).
-    mean : Array
-        (k,).
+    columns : (k,) ndarray of int
+        Columns of the unknowns.
+    precision : (k, k) csr_matrix
+        Precision matrix.
+    mean : (k,) ndarray
+        Expected values.
     """
 
     group: str
@@ -400,18 +363,18 @@ class PriorGroup:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Points whose packets meet the same unknowns.
+    """Points whose packets depend on the same unknowns.
 
     Attributes
     ----------
-    points : Indices
-        (n,).
-    members : tuple[tuple[int, Indices], ...]
-        Set and its packets (n,), in order.
-    columns : Indices
-        (W,) unknowns of all packets of a point, each once.
-    places : tuple[Indices, ...]
-        Of each member, where its unknowns stand among the columns.
+    points : (n,) ndarray of int
+        Indices of the points.
+    members : tuple of (int, (n,) ndarray of int)
+        Packet sets and their packets, in order.
+    columns : (W,) ndarray of int
+        Columns of all unknowns of a point's packets, each once.
+    places : tuple of ndarray of int
+        Positions of each member's unknowns among the columns.
     """
 
     points: Indices
@@ -422,7 +385,19 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Weighted rows of a bundle: by x (n, D, W), by the point (n, D, 3), misclosures (n, D)."""
+    """Weighted equations of a bundle.
+
+    Attributes
+    ----------
+    bundle : Bundle
+        Bundle of n points with D equations each.
+    by_x : (n, D, W) ndarray
+        Derivatives with respect to the unknowns.
+    by_point : (n, D, 3) ndarray
+        Derivatives with respect to the point.
+    miss : (n, D) ndarray
+        Misclosures.
+    """
 
     bundle: Bundle
     by_x: Array
@@ -432,18 +407,20 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Eliminated:
-    """Equations of packets at one state, their points eliminated.
+    """Normal equations of packets at one state with the points eliminated.
 
     Attributes
     ----------
-    data : sparse.csc_matrix
-        (P, P) sparse.
-    right : Array
-        (P,) gradient of half the squares.
-    spread : Array
-        (m, 3, 3) covariance of the points at known x. start: (m, 3) their steps where x stays.
-    square : Mapping[str, float]
-        Weighted squares of the packets by group.
+    data : (P, P) csc_matrix
+        Reduced normal matrix.
+    right : (P,) ndarray
+        Gradient of half the sum of squares.
+    spread : (m, 3, 3) ndarray
+        Covariance of the points for known x, in m^2.
+    start : (m, 3) ndarray
+        Steps of the points for unchanged x, in metres.
+    square : mapping of str to float
+        Weighted sum of squares of the packets of each group.
     """
 
     data: sparse.csc_matrix
@@ -455,12 +432,12 @@ class Eliminated:
 
 @dataclass(frozen=True, eq=False)
 class Reduced(Eliminated):
-    """Equations of packets and priors: `right` has the priors, too.
+    """Normal equations of packets and priors; `right` includes the priors.
 
     Attributes
     ----------
-    prior : sparse.csc_matrix
-        (P, P) sparse, with the factors.
+    prior : (P, P) csc_matrix
+        Precision of the priors, with the variance factors.
     """
 
     prior: sparse.csc_matrix
@@ -468,18 +445,18 @@ class Reduced(Eliminated):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where an iteration stands.
+    """State of an iteration.
 
     Attributes
     ----------
-    x : Array
-        Unknowns, (P,).
-    ground : Array
-        Points, (m, 3), ITRS, metres.
-    weight : tuple[Array, ...]
-        Set -> robust weights of its packets.
-    factor : Mapping[str, float]
-        Group -> variance factor.
+    x : (P,) ndarray
+        Unknowns.
+    ground : (m, 3) ndarray
+        Points, ITRS, in metres.
+    weight : tuple of ndarray
+        Robust weights of the packets of each set.
+    factor : mapping of str to float
+        Variance factor of each group.
     """
 
     x: Array
@@ -490,14 +467,14 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """Packets beside what all others say.
+    """Residuals of packets and their redundancy.
 
     Attributes
     ----------
-    standard : tuple[Array, ...]
-        Set -> (n, d) standardised residuals.
-    taken : Mapping[str, float]
-        Group -> what the adjustment took of its observations: their count less their redundancy.
+    standard : tuple of (n, d) ndarray
+        Standardised residuals of each packet set.
+    taken : mapping of str to float
+        Number of observations of each group minus its redundancy.
     """
 
     standard: tuple[Array, ...]
@@ -510,12 +487,14 @@ class Reduction:
 
     Attributes
     ----------
-    sets : Sequence[Packets]
-        Of packets.
-    priors : Sequence[PriorGroup]
-        Of the unknowns, which must leave none free.
+    sets : sequence of Packets
+        Packet sets.
+    priors : sequence of PriorGroup
+        Priors, which must cover every unknown.
     size : int
-        P, number of unknowns. count: m, number of points.
+        Number of unknowns, P.
+    count : int
+        Number of points, m.
     """
 
     sets: Sequence[Packets]
@@ -525,15 +504,15 @@ class Reduction:
 
     @cached_property
     def bundles(self) -> tuple[Bundle, ...]:
-        """All points that any packet observes."""
+        """Bundles of all observed points."""
         points, codes, owners, places, tables = [], [], [], [], []
         first = 0
-        for k, one in enumerate(self.sets):
-            columns = one.columns
+        for k, packets in enumerate(self.sets):
+            columns = packets.columns
             if not len(columns):
                 continue
             where, code = _distinct(columns)
-            points.append(one.point)
+            points.append(packets.point)
             codes.append(first + code)
             owners.append(np.full(len(columns), k, np.int32))
             places.append(np.arange(len(columns)))
@@ -542,117 +521,121 @@ class Reduction:
         if not points:
             return ()
         order = np.lexsort((np.concatenate(codes), np.concatenate(points)))
-        every: list[Indices] = [np.concatenate(v).astype(np.intp)[order] for v in (points, codes, owners, places)]
-        point, code, owner, place = every
+        sorted_columns: list[Indices] = [
+            np.concatenate(v).astype(np.intp)[order] for v in (points, codes, owners, places)
+        ]
+        point, code, owner, place = sorted_columns
         starts: Indices = np.flatnonzero(np.diff(point, prepend=-1))
         counts = np.diff(np.append(starts, len(point)))
-        found = []
+        bundles = []
         for count in np.unique(counts).tolist():
             at = starts[counts == count][:, None] + np.arange(count)
             kinds, kind = _distinct(code[at])
             sort = np.argsort(kind, kind="stable")
             for piece in np.split(sort, np.cumsum(np.bincount(kind, minlength=len(kinds)))[:-1]):
                 rows = at[piece]
-                met = [tables[c] for c in code[rows[0]].tolist()]
-                meets = np.asarray(np.unique(np.concatenate(met)), np.intp)
-                standing = tuple(np.searchsorted(meets, one) for one in met)
-                # a long bundle is cut, so that its rows have bounded memory
+                tables_met = [tables[c] for c in code[rows[0]].tolist()]
+                columns_met = np.asarray(np.unique(np.concatenate(tables_met)), np.intp)
+                positions = tuple(np.searchsorted(columns_met, packets) for packets in tables_met)
+                # a long bundle is split to bound the memory of its rows
                 for a in range(0, len(rows), _PIECE):
                     part = rows[a : a + _PIECE]
                     members = tuple((int(owner[part[0, j]]), place[part[:, j]]) for j in range(count))
-                    found.append(Bundle(point[part[:, 0]], members, meets, standing))
-        return tuple(found)
+                    bundles.append(Bundle(point[part[:, 0]], members, columns_met, positions))
+        return tuple(bundles)
 
     @cached_property
     def pieces(self) -> tuple[tuple[Bundle, ...], ...]:
-        """Bundles in pieces of bounded memory."""
-        found: list[list[Bundle]] = [[]]
+        """Bundles grouped into pieces of bounded memory."""
+        pieces: list[list[Bundle]] = [[]]
         size = 0
-        for one in self.bundles:
-            if size and size + len(one.points) > _PIECE:
-                found.append([])
+        for bundle in self.bundles:
+            if size and size + len(bundle.points) > _PIECE:
+                pieces.append([])
                 size = 0
-            found[-1].append(one)
-            size += len(one.points)
-        return tuple(tuple(piece) for piece in found)
+            pieces[-1].append(bundle)
+            size += len(bundle.points)
+        return tuple(tuple(piece) for piece in pieces)
 
     @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """(m,) which points any packet observes."""
-        found = np.zeros(self.count, bool)
-        for one in self.sets:
-            found[one.point] = True
-        return found
+        """Mask (m,) of the observed points."""
+        mask = np.zeros(self.count, bool)
+        for packets in self.sets:
+            mask[packets.point] = True
+        return mask
 
-    def rows(self, at: State, weighted: bool = True) -> Iterator[Rows]:
-        """Rows of all bundles, in the order of `pieces`.
+    def rows(self, state: State, weighted: bool = True) -> Iterator[Rows]:
+        """Yield the equations of all bundles, in the order of `pieces`.
 
         Parameters
         ----------
-        at : State
-            state.
+        state : State
+            State at which the equations are linearised.
         weighted : bool
-            Whether rows are multiplied by the roots of their weights.
+            True to multiply the equations by the square roots of their weights.
         """
         for piece in self.pieces:
-            wanted: dict[int, list[Indices]] = {}
-            for one in piece:
-                for k, which in one.members:
-                    wanted.setdefault(k, []).append(which)
-            parts, used = {}, dict.fromkeys(wanted, 0)
-            for k, several in wanted.items():
-                which = np.concatenate(several)
+            needed: dict[int, list[Indices]] = {}
+            for bundle in piece:
+                for k, which in bundle.members:
+                    needed.setdefault(k, []).append(which)
+            parts, used = {}, dict.fromkeys(needed, 0)
+            for k, selections in needed.items():
+                which = np.concatenate(selections)
                 packets = self.sets[k]
-                miss, by_x, by_point = packets.linearised(which, at.x, at.ground[packets.point[which]])
+                miss, by_x, by_point = packets.linearised(which, state.x, state.ground[packets.point[which]])
                 if weighted:
-                    root = np.sqrt(at.weight[k][which] / at.factor.get(packets.group, 1.0))
+                    root = np.sqrt(state.weight[k][which] / state.factor.get(packets.group, 1.0))
                     miss, by_x, by_point = (
                         root[:, None] * miss,
                         root[:, None, None] * by_x,
                         root[:, None, None] * by_point,
                     )
                 parts[k] = (miss, by_x, by_point)
-            for one in piece:
-                n, width = len(one.points), len(one.columns)
-                depth = sum(self.sets[k].rows for k, _ in one.members)
-                rows = Rows(one, np.zeros((n, depth, width)), np.empty((n, depth, 3)), np.empty((n, depth)))
+            for bundle in piece:
+                n, width = len(bundle.points), len(bundle.columns)
+                depth = sum(self.sets[k].rows for k, _ in bundle.members)
+                rows = Rows(bundle, np.zeros((n, depth, width)), np.empty((n, depth, 3)), np.empty((n, depth)))
                 d = 0
-                for (k, which), place in zip(one.members, one.places, strict=True):
+                for (k, which), position in zip(bundle.members, bundle.places, strict=True):
                     a = used[k]
                     used[k] = b = a + len(which)
                     miss, by_x, by_point = (v[a:b] for v in parts[k])
                     rows.miss[:, d : d + miss.shape[1]] = miss
                     rows.by_point[:, d : d + miss.shape[1]] = by_point
-                    rows.by_x[:, d : d + miss.shape[1], place] = by_x
+                    rows.by_x[:, d : d + miss.shape[1], position] = by_x
                     d += miss.shape[1]
                 yield rows
 
-    def reduced(self, at: State) -> Reduced:
-        """Equations of packets and priors at a state."""
-        return self.with_priors(self.eliminated(at), at)
+    def reduced(self, state: State) -> Reduced:
+        """Return the normal equations of packets and priors at a state."""
+        return self.with_priors(self.eliminated(state), state)
 
-    def with_priors(self, found: Eliminated, at: State) -> Reduced:
-        """The equations of the packets with what is known beforehand."""
-        departed = np.zeros(self.size)
-        for one in self.priors:
-            pull = one.precision @ (at.x[one.columns] - one.mean) / at.factor.get(one.group, 1.0)
-            np.add.at(departed, one.columns, pull)
-        right = found.right + departed
-        return Reduced(found.data, right, found.spread, found.start, found.square, self.prior(at.factor))
+    def with_priors(self, equations: Eliminated, state: State) -> Reduced:
+        """Return the normal equations of packets with the priors added."""
+        gradient = np.zeros(self.size)
+        for prior in self.priors:
+            pull = prior.precision @ (state.x[prior.columns] - prior.mean) / state.factor.get(prior.group, 1.0)
+            np.add.at(gradient, prior.columns, pull)
+        right = equations.right + gradient
+        return Reduced(
+            equations.data, right, equations.spread, equations.start, equations.square, self.prior(state.factor)
+        )
 
-    def eliminated(self, at: State) -> Eliminated:
-        """Equations of the packets at a state."""
+    def eliminated(self, state: State) -> Eliminated:
+        """Return the normal equations of the packets at a state, with the points eliminated."""
         data = _Collected(self.size)
         right = np.zeros(self.size)
         spread, start = np.zeros((self.count, 3, 3)), np.zeros((self.count, 3))
-        square = dict.fromkeys((one.group for one in self.sets), 0.0)
-        for rows in self.rows(at):
+        square = dict.fromkeys((packets.group for packets in self.sets), 0.0)
+        for rows in self.rows(state):
             a, b, m = rows.by_x, rows.by_point, rows.miss
-            turned = np.swapaxes(b, 1, 2)
-            own = turned @ b + _LOOSE * np.eye(3)
-            inverse = np.linalg.inv(own)
-            pull = np.einsum("nij,nj->ni", turned, m)
-            cross = turned @ a
+            transposed = np.swapaxes(b, 1, 2)
+            point_normal = transposed @ b + _LOOSE * np.eye(3)
+            inverse = np.linalg.inv(point_normal)
+            pull = np.einsum("nij,nj->ni", transposed, m)
+            cross = transposed @ a
             root = np.linalg.cholesky(inverse)
             n, depth, width = a.shape
             flat = a.reshape(n * depth, width)
@@ -669,109 +652,112 @@ class Reduction:
         return Eliminated(data.total(), right, spread, start, square)
 
     def prior(self, factor: Mapping[str, float]) -> sparse.csc_matrix:
-        """(P, P) precision of the unknowns beforehand, with the factors."""
+        """Return the (P, P) a-priori precision of the unknowns, with the variance factors."""
         rows, columns, values = [], [], []
-        for one in self.priors:
-            some = one.precision.tocoo()
-            rows.append(one.columns[some.row])
-            columns.append(one.columns[some.col])
-            values.append(some.data / factor.get(one.group, 1.0))
+        for prior in self.priors:
+            precision = prior.precision.tocoo()
+            rows.append(prior.columns[precision.row])
+            columns.append(prior.columns[precision.col])
+            values.append(precision.data / factor.get(prior.group, 1.0))
         where = (np.concatenate(rows), np.concatenate(columns))
         return sparse.csc_matrix((np.concatenate(values), where), shape=(self.size, self.size))
 
     def prior_square(self, x: Array, factor: Mapping[str, float]) -> dict[str, float]:
-        """Group -> weighted squares of what is known beforehand."""
-        found: dict[str, float] = {}
-        for one in self.priors:
-            departed = x[one.columns] - one.mean
-            value = float(departed @ (one.precision @ departed)) / factor.get(one.group, 1.0)
-            found[one.group] = found.get(one.group, 0.0) + value
-        return found
+        """Return the weighted sum of squares of the priors of each group."""
+        squares: dict[str, float] = {}
+        for prior in self.priors:
+            deviation = x[prior.columns] - prior.mean
+            value = float(deviation @ (prior.precision @ deviation)) / factor.get(prior.group, 1.0)
+            squares[prior.group] = squares.get(prior.group, 0.0) + value
+        return squares
 
-    def point_steps(self, at: State, found: Eliminated, step: Array) -> Array:
-        """(m, 3) change of the points that goes with a change of the unknowns.
+    def point_steps(self, state: State, equations: Eliminated, step: Array) -> Array:
+        """Return the (m, 3) steps of the points that correspond to a step of the unknowns, in metres.
 
         Parameters
         ----------
-        at : State
-            state.
-        found : Eliminated
-            Equations of this state.
-        step : Array
-            Change of the unknowns, (P,).
+        state : State
+            State at which the equations are linearised.
+        equations : Eliminated
+            Normal equations of this state.
+        step : (P,) ndarray
+            Step of the unknowns.
         """
-        moved = found.start.copy()
-        for rows in self.rows(at):
-            pulled = np.einsum("nij,j->ni", rows.by_x, step[rows.bundle.columns])
-            pull = np.einsum("nij,ni->nj", rows.by_point, pulled)
-            moved[rows.bundle.points] -= np.einsum("nij,nj->ni", found.spread[rows.bundle.points], pull)
-        return moved
+        steps = equations.start.copy()
+        for rows in self.rows(state):
+            by_step = np.einsum("nij,j->ni", rows.by_x, step[rows.bundle.columns])
+            pull = np.einsum("nij,ni->nj", rows.by_point, by_step)
+            steps[rows.bundle.points] -= np.einsum("nij,nj->ni", equations.spread[rows.bundle.points], pull)
+        return steps
 
-    def checked(self, at: State, spread: Array, covariance: Callable[[Indices], Array]) -> Checked:
-        """Residuals over their standard deviations, and what the adjustment took of the observations.
+    def checked(self, state: State, spread: Array, covariance: Callable[[Indices], Array]) -> Checked:
+        """Return the standardised residuals and the redundancy of the observations.
 
         Parameters
         ----------
-        at : State
-            state.
-        spread : Array
-            Covariance of the points at known x, (m, 3, 3).
-        covariance : Callable[[Indices], Array]
-            Of some unknowns (w,): (w, w).
+        state : State
+            State at which the equations are linearised.
+        spread : (m, 3, 3) ndarray
+            Covariance of the points for known x, in m^2.
+        covariance : callable
+            Function that returns the (w, w) covariance of selected unknowns (w,).
         """
         sets = self.sets
-        standard = [np.zeros((len(one.point), one.rows)) for one in sets]
-        taken = dict.fromkeys((one.group for one in sets), 0.0)
-        for rows in self.rows(at, weighted=False):
+        standard = [np.zeros((len(packets.point), packets.rows)) for packets in sets]
+        absorbed = dict.fromkeys((packets.group for packets in sets), 0.0)
+        for rows in self.rows(state, weighted=False):
             where = rows.bundle.points
             weights = np.concatenate(
                 [
-                    np.repeat((at.weight[k][w] / at.factor[sets[k].group])[:, None], sets[k].rows, axis=1)
+                    np.repeat((state.weight[k][w] / state.factor[sets[k].group])[:, None], sets[k].rows, axis=1)
                     for k, w in rows.bundle.members
                 ],
                 axis=1,
             )
             inner = spread[where]
-            moved = inner @ np.swapaxes(rows.by_point * weights[:, :, None], 1, 2) @ rows.by_x
-            through = rows.by_x - rows.by_point @ moved
+            coupling = inner @ np.swapaxes(rows.by_point * weights[:, :, None], 1, 2) @ rows.by_x
+            projected = rows.by_x - rows.by_point @ coupling
             shared = covariance(rows.bundle.columns)
             d = 0
             for k, which in rows.bundle.members:
                 depth = sets[k].rows
-                part, by_point = through[:, d : d + depth], rows.by_point[:, d : d + depth]
-                told = np.tensordot(part, shared, 1)
-                cofactor = told @ np.swapaxes(part, 1, 2) + by_point @ inner @ np.swapaxes(by_point, 1, 2)
-                weight, unit = at.weight[k][which], at.factor[sets[k].group]
+                part, by_point = projected[:, d : d + depth], rows.by_point[:, d : d + depth]
+                product = np.tensordot(part, shared, 1)
+                cofactor = product @ np.swapaxes(part, 1, 2) + by_point @ inner @ np.swapaxes(by_point, 1, 2)
+                weight, unit = state.weight[k][which], state.factor[sets[k].group]
                 standard[k][which] = standardised_packets(rows.miss[:, d : d + depth], cofactor, weight, unit)
-                taken[sets[k].group] += float(np.sum(weight * np.trace(cofactor, axis1=1, axis2=2)) / unit)
+                absorbed[sets[k].group] += float(np.sum(weight * np.trace(cofactor, axis1=1, axis2=2)) / unit)
                 d += depth
-        return Checked(tuple(standard), taken)
+        return Checked(tuple(standard), absorbed)
 
     def packets_at(self, points: Indices) -> tuple[Indices, ...]:
-        """Set -> which of its packets observe some of the points, (k,)."""
-        wanted = np.zeros(self.count, bool)
-        wanted[points] = True
-        return tuple(np.flatnonzero(wanted[one.point]) for one in self.sets)
+        """Return, for each set, the indices of the packets that observe selected points (k,)."""
+        selected = np.zeros(self.count, bool)
+        selected[points] = True
+        return tuple(np.flatnonzero(selected[packets.point]) for packets in self.sets)
 
     def restricted(self, points: Indices) -> Reduction:
-        """The packets of some of the points alone, which are counted in this order; without priors."""
+        """Return the packets of selected points alone, renumbered in this order, without priors."""
         number = np.full(self.count, -1)
         number[points] = np.arange(len(points))
         packets = self.packets_at(points)
-        sets = tuple(one.taken(which, number[one.point[which]]) for one, which in zip(self.sets, packets, strict=True))
+        sets = tuple(
+            packets_of_set.taken(which, number[packets_of_set.point[which]])
+            for packets_of_set, which in zip(self.sets, packets, strict=True)
+        )
         return Reduction(sets, (), self.size, len(points))
 
-    def state_of(self, points: Indices, at: State) -> State:
-        """What of a state a restricted reduction has."""
-        weight = tuple(w[which] for w, which in zip(at.weight, self.packets_at(points), strict=True))
-        return State(at.x, at.ground[points], weight, at.factor)
+    def state_of(self, points: Indices, state: State) -> State:
+        """Return the part of a state that a restricted reduction needs."""
+        weight = tuple(w[which] for w, which in zip(state.weight, self.packets_at(points), strict=True))
+        return State(state.x, state.ground[points], weight, state.factor)
 
 
 def _distinct(rows: Indices) -> tuple[Indices, Indices]:
-    """Where each distinct row (n, w) of whole numbers stands first (k,), in their order, and which each row is (n,)."""
+    """Return the index (k,) of each distinct row of integers (n, w), in ascending order, and the row codes (n,)."""
     if not rows.shape[1]:
         return np.zeros(1, np.intp), np.zeros(len(rows), np.intp)
-    # a product of odd numbers wraps around and tells rows apart all but surely; whether it did is looked at
+    # hashes by random odd factors almost surely differ for different rows; collisions are checked below
     factors = np.random.default_rng(0).integers(1, 2**62, rows.shape[1]) * 2 + 1
     with np.errstate(over="ignore"):
         key = rows.astype(np.int64) @ factors
@@ -779,7 +765,7 @@ def _distinct(rows: Indices) -> tuple[Indices, Indices]:
     code = code.ravel()
     if not np.array_equal(rows[where][code], rows):
         _, where, code = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    # in the order of the numbers, so that neighbours in time stay neighbours
+    # keep the order of the numbers, so that neighbours in time stay neighbours
     order = np.lexsort(rows[where].T[::-1])
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -787,7 +773,7 @@ def _distinct(rows: Indices) -> tuple[Indices, Indices]:
 
 
 class _Collected:
-    """A sum of dense blocks at indices, whole where the unknowns are few and else in a sparse matrix."""
+    """Sum of dense blocks at indices, in a dense matrix for few unknowns and otherwise in a sparse one."""
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -797,7 +783,7 @@ class _Collected:
         self.entries = 0
 
     def add(self, columns: Indices, block: Array) -> None:
-        """Add a block (w, w) at its columns, of which none stands twice."""
+        """Add a block (w, w) at its columns, which must be distinct."""
         if self.whole is not None:
             self.whole[columns[:, None], columns] += block
             return
@@ -808,51 +794,51 @@ class _Collected:
             self.flush()
 
     def flush(self) -> None:
-        """Add up what was collected."""
+        """Sum the collected blocks."""
         if self.parts:
             row, column, value = (np.concatenate(v) for v in zip(*self.parts, strict=True))
             self.sum = self.sum + sparse.csc_matrix((value, (row, column)), shape=(self.size, self.size))
         self.parts, self.entries = [], 0
 
     def total(self) -> sparse.csc_matrix:
-        """The sum, made symmetric."""
+        """Return the symmetrised sum."""
         self.flush()
-        found = self.sum if self.whole is None else sparse.csc_matrix(self.whole)
-        return 0.5 * (found + found.T)
+        total = self.sum if self.whole is None else sparse.csc_matrix(self.whole)
+        return 0.5 * (total + total.T)
 
 
 class Pool(Protocol):
-    """Processes that hold things and work on them."""
+    """Processes that hold objects and work on them."""
 
     @property
     def count(self) -> int:
         """Number of processes."""
 
     def hold(self, things: Sequence[Any]) -> Sequence[Any]:
-        """Give each thing to a process; what is returned stands for it as the first argument of work."""
+        """Send each object to a process and return handles, which serve as the first argument of work."""
 
     def results(self, work: Callable[[tuple[Any, ...]], Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Work done with each of the arguments, in their order."""
+        """Return the results of a function for each of the arguments, in their order."""
 
 
 @dataclass(frozen=True, eq=False)
 class SharedReduction:
-    """Packets of a block by shares of the points; see `Reduction`, whose methods these are.
+    """Packets of a block distributed over processes by points; the methods are those of `Reduction`.
 
     Attributes
     ----------
     whole : Reduction
         Packets and priors of the block.
     pool : Pool
-        Where the shares are.
-    points : tuple[Indices, ...]
-        Of each share, (m_k,).
-    packets : tuple[tuple[Indices, ...], ...]
-        Of each share, set -> packets.
-    held : tuple[Any, ...]
-        What stands for each share.
-    columns : tuple[Indices, ...]
-        (w_k,) unknowns that each share meets.
+        Processes that hold the shares.
+    points : tuple of (m_k,) ndarray of int
+        Points of each share.
+    packets : tuple of tuple of ndarray of int
+        Packets of each share, by set.
+    held : tuple
+        Handle of each share.
+    columns : tuple of (w_k,) ndarray of int
+        Columns of the unknowns that each share depends on.
     """
 
     whole: Reduction
@@ -864,32 +850,41 @@ class SharedReduction:
 
     @classmethod
     def of(cls, whole: Reduction, pool: Pool) -> SharedReduction:
-        """Give each process of a pool a share, of points that the same sets observe as far as that goes."""
+        """Distribute a reduction over the processes of a pool.
+
+        Each process receives points that, as far as possible, the same sets observe.
+        """
         first, last = np.full(whole.count, len(whole.sets)), np.full(whole.count, -1)
-        for k, one in enumerate(whole.sets):
-            first[one.point] = np.minimum(first[one.point], k)
-            last[one.point] = k
+        for k, packets_of_set in enumerate(whole.sets):
+            first[packets_of_set.point] = np.minimum(first[packets_of_set.point], k)
+            last[packets_of_set.point] = k
         order = np.lexsort((last, first))
         seen = order[last[order] >= 0]
         points = tuple(np.sort(part) for part in np.array_split(seen, min(pool.count, len(seen))))
         packets = tuple(whole.packets_at(part) for part in points)
         held = tuple(pool.hold([whole.restricted(part) for part in points]))
-        columns = tuple(pool.results(_columns, [(one,) for one in held]))
+        columns = tuple(pool.results(_columns, [(packets_of_set,) for packets_of_set in held]))
         return cls(whole, pool, points, packets, held, columns)
 
-    def _states(self, at: State) -> list[State]:
+    def _states(self, state: State) -> list[State]:
+        """Return the part of a state that each share needs."""
         return [
-            State(at.x, at.ground[points], tuple(w[p] for w, p in zip(at.weight, packets, strict=True)), at.factor)
+            State(
+                state.x,
+                state.ground[points],
+                tuple(w[p] for w, p in zip(state.weight, packets, strict=True)),
+                state.factor,
+            )
             for points, packets in zip(self.points, self.packets, strict=True)
         ]
 
-    def eliminated(self, at: State) -> Eliminated:
-        """Equations of the packets at a state."""
+    def eliminated(self, state: State) -> Eliminated:
+        """Return the normal equations of the packets at a state, with the points eliminated."""
         size, count = self.whole.size, self.whole.count
         data, right = sparse.csc_matrix((size, size)), np.zeros(size)
         spread, start = np.zeros((count, 3, 3)), np.zeros((count, 3))
         square = dict.fromkeys((one.group for one in self.whole.sets), 0.0)
-        parts = self.pool.results(_eliminated, list(zip(self.held, self._states(at), strict=True)))
+        parts = self.pool.results(_eliminated, list(zip(self.held, self._states(state), strict=True)))
         for points, part in zip(self.points, parts, strict=True):
             data, right = data + part.data, right + part.right
             spread[points], start[points] = part.spread, part.start
@@ -897,41 +892,21 @@ class SharedReduction:
                 square[group] += value
         return Eliminated(data, right, spread, start, square)
 
-    def point_steps(self, at: State, found: Eliminated, step: Array) -> Array:
-        """(m, 3) change of the points that goes with a change of the unknowns.
-
-        Parameters
-        ----------
-        at : State
-            state.
-        found : Eliminated
-            Equations of this state.
-        step : Array
-            Change of the unknowns, (P,).
-        """
-        moved = np.zeros((self.whole.count, 3))
+    def point_steps(self, at: State, equations: Eliminated, step: Array) -> Array:
+        """Return the (m, 3) steps of the points for a step of the unknowns; see `Reduction.point_steps`."""
+        steps = np.zeros((self.whole.count, 3))
         arguments = [
-            (held, state, found.spread[points], found.start[points], step)
+            (held, state, equations.spread[points], equations.start[points], step)
             for held, state, points in zip(self.held, self._states(at), self.points, strict=True)
         ]
         for points, part in zip(self.points, self.pool.results(_stepped, arguments), strict=True):
-            moved[points] = part
-        return moved
+            steps[points] = part
+        return steps
 
     def checked(self, at: State, spread: Array, covariance: Callable[[Indices], Array]) -> Checked:
-        """Residuals over their standard deviations, and what the adjustment took of the observations.
-
-        Parameters
-        ----------
-        at : State
-            state.
-        spread : Array
-            Covariance of the points at known x, (m, 3, 3).
-        covariance : Callable[[Indices], Array]
-            Of some unknowns (w,): (w, w).
-        """
-        standard = [np.zeros((len(one.point), one.rows)) for one in self.whole.sets]
-        taken = dict.fromkeys((one.group for one in self.whole.sets), 0.0)
+        """Return the standardised residuals and the redundancy of the observations; see `Reduction.checked`."""
+        standard = [np.zeros((len(packets_of_set.point), packets_of_set.rows)) for packets_of_set in self.whole.sets]
+        absorbed = dict.fromkeys((packets_of_set.group for packets_of_set in self.whole.sets), 0.0)
         arguments = [
             (held, state, spread[points], columns, covariance(columns))
             for held, state, points, columns in zip(self.held, self._states(at), self.points, self.columns, strict=True)
@@ -940,30 +915,34 @@ class SharedReduction:
             for k, which in enumerate(packets):
                 standard[k][which] = part.standard[k]
             for group, value in part.taken.items():
-                taken[group] += value
-        return Checked(tuple(standard), taken)
+                absorbed[group] += value
+        return Checked(tuple(standard), absorbed)
 
 
-def _columns(given: tuple[Reduction]) -> Indices:
-    return np.unique(np.concatenate([np.zeros(0, np.intp), *(one.columns for one in given[0].bundles)]))
+def _columns(arguments: tuple[Reduction]) -> Indices:
+    """Return the columns of the unknowns that a share depends on."""
+    return np.unique(np.concatenate([np.zeros(0, np.intp), *(bundle.columns for bundle in arguments[0].bundles)]))
 
 
-def _eliminated(given: tuple[Reduction, State]) -> Eliminated:
-    share, at = given
-    return share.eliminated(at)
+def _eliminated(arguments: tuple[Reduction, State]) -> Eliminated:
+    """Return the normal equations of a share."""
+    share, state = arguments
+    return share.eliminated(state)
 
 
-def _stepped(given: tuple[Reduction, State, Array, Array, Array]) -> Array:
-    share, at, spread, start, step = given
-    nothing = sparse.csc_matrix((0, 0))
-    return share.point_steps(at, Eliminated(nothing, np.zeros(0), spread, start, {}), step)
+def _stepped(arguments: tuple[Reduction, State, Array, Array, Array]) -> Array:
+    """Return the steps of a share's points."""
+    share, state, spread, start, step = arguments
+    no_data = sparse.csc_matrix((0, 0))
+    return share.point_steps(state, Eliminated(no_data, np.zeros(0), spread, start, {}), step)
 
 
-def _checked(given: tuple[Reduction, State, Array, Indices, Array]) -> Checked:
-    share, at, spread, columns, covariance = given
+def _checked(arguments: tuple[Reduction, State, Array, Indices, Array]) -> Checked:
+    """Return the residual check of a share."""
+    share, state, spread, columns, covariance = arguments
 
-    def some(wanted: Indices) -> Array:
-        where = np.searchsorted(columns, wanted)
-        return covariance[np.ix_(where, where)]
+    def part_of(selected: Indices) -> Array:
+        position = np.searchsorted(columns, selected)
+        return covariance[np.ix_(position, position)]
 
-    return share.checked(at, spread, some)
+    return share.checked(state, spread, part_of)

@@ -1,6 +1,6 @@
-"""What residuals say of weights: robust weights of packets of rows, and factors on the variances of groups.
+"""Robust weights of packets of observations, and variance factors of groups, from residuals.
 
-Of an adjustment of any kind: a campaign's (`analysis.calibration`) and a block's.
+The module serves adjustments of any kind: a calibration campaign's (`analysis.calibration`) and a block's.
 """
 
 from __future__ import annotations
@@ -18,38 +18,47 @@ from analysis.statistics import robust_variance
 S = TypeVar("S", bound="Weighted")
 T = TypeVar("T")
 SETTLED = 1e-3
-"""Largest change of weights at rest, and the largest weight of a packet that counts as given up."""
+"""Largest change of weights at convergence, and the largest weight of a packet that counts as rejected."""
 _ROUNDS = 50
+"""Largest number of rounds of reweighting."""
 _FREE_ROUNDS = 12
-"""From then on weights that leave packets out only fall: two of a point that are doubted in turns would never rest."""
+"""Round from which on rejecting weights can only decrease: two packets of a point that are rejected alternately would
+otherwise never converge.
+"""
 Robust = Literal["huber", "igg"]
-# Lengths of standardised residuals of image points, Rayleigh for good ones. Beyond HUBER lie 5 in 100 good points, they
-# lose weight; beyond REJECT 1 in 10 000, they are left out (IGG III: Yang, Song and Xu, J. Geodesy 76 (2002) 353).
+# Limits of the standardised residual of an image point, which is Rayleigh-distributed for good points. Of these,
+# 5 in 100 exceed HUBER and lose weight; 1 in 10 000 exceed REJECT and are excluded (IGG III: Yang, Song and Xu,
+# J. Geodesy 76 (2002) 353).
 HUBER = float(np.sqrt(chi2.isf(0.05, 2)))
 REJECT = float(np.sqrt(chi2.isf(1e-4, 2)))
 _LEAST_REDUNDANCY = 10.0
-"""A variance from fewer redundant observations is uncertain by 45% or more: the group keeps its factor."""
-# A part of an image point that no other observation checks has no residual to standardise.
+"""Smallest redundancy from which a variance is estimated. With less, the variance is uncertain by 45 % or more, and the
+group keeps its factor.
+"""
 _UNCHECKED = 1e-6
+"""Redundancy below which a component of a packet counts as unchecked; it has no residual to standardise."""
 _LARGEST_RATIO = 0.9
+"""Largest ratio of successive changes that is extrapolated."""
 LARGEST_FACTOR = 1e2
-"""Largest factor on a variance; the smallest is its inverse. Weights cannot correct sigmas that are wrong by more than
-a factor of ten.
+"""Largest variance factor; the smallest is its inverse. Weights cannot correct sigmas that are wrong by more than a
+factor of ten.
 """
 
 
 @dataclass(frozen=True)
 class GroupTest:
-    """A variance group after the adjustment.
+    """Test of a variance group after the adjustment.
 
     Attributes
     ----------
     count : int
-        observations. redundancy: how many of them the others check.
+        Number of observations.
+    redundancy : float
+        Redundancy of the group, the number of observations that others check.
     square : float
-        Their weighted squares, whose expectation is the redundancy.
+        Weighted sum of squared residuals, whose expectation is the redundancy.
     factor : float
-        On the variances; 1 where not estimated.
+        Variance factor; 1 if not estimated.
     """
 
     count: int
@@ -59,20 +68,20 @@ class GroupTest:
 
     @property
     def ratio(self) -> float:
-        """Variance of the residuals over that which the sigmas predict; NaN where nothing checks the group."""
+        """Ratio of the residuals' variance to that predicted by the sigmas; NaN without redundancy."""
         return self.square / self.redundancy if self.redundancy > 1e-6 else float("nan")
 
     @property
     def estimated(self) -> float:
-        """Next factor on the variances, by Foerstner's estimate, within 1 / `LARGEST_FACTOR` and `LARGEST_FACTOR`.
+        """Next variance factor by Foerstner's estimate, between 1 / `LARGEST_FACTOR` and `LARGEST_FACTOR`.
 
-        It is unbiased for packets of weight 1 and 0; a weight that falls with the residual makes it too small.
+        It is unbiased for packets of weight 1 and 0; a weight that decreases with the residual makes it too small.
         """
         return bounded(self.factor * self.ratio) if self.redundancy >= _LEAST_REDUNDANCY else self.factor
 
     @property
     def p_value(self) -> float:
-        """Two-sided chance of such squares, as of a chi-square with the redundancy for its freedom."""
+        """Two-sided p-value of the sum of squares, as a chi-square with the redundancy as its degrees of freedom."""
         if self.redundancy < 1.0:
             return 1.0
         high = float(chi2.sf(self.square, self.redundancy))
@@ -80,26 +89,26 @@ class GroupTest:
 
 
 class UnsettledError(MeasurementError, ValueError):
-    """Weights that do not come to rest."""
+    """Weights that do not converge."""
 
 
 def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit: float) -> Array:
-    """(n, d) whitened residuals of n packets of d rows over their own standard deviation.
+    """Return the (n, d) standardised residuals of n packets of d equations.
 
-    An observation of variance C that takes part with weight w, G that of the adjusted one: without it the others would
-    predict it with H = G / (1 - w G / C), and the residual is (1 - w G / C) times observed minus predicted. Its
-    variance is (1 - w G / C) (C + (1 - w) G): less than C with full weight, C + G without any. So the standardised
-    residual does not depend on the observation's own weight, which could otherwise swing for ever where others hardly
-    check it. It is exact where the weights of the others stand for their variances.
+    Let an observation of variance C have the weight w, and G be the variance of the adjusted observation. Without it
+    the others would predict it with H = G / (1 - w G / C), and the residual is (1 - w G / C) times observed minus
+    predicted. Its variance is (1 - w G / C) (C + (1 - w) G): less than C with full weight, C + G with none. The
+    standardised residual therefore does not depend on the observation's own weight, which could otherwise oscillate
+    where others hardly check it. It is exact if the weights of the others correspond to their variances.
 
     Parameters
     ----------
-    residual : Array
-        Whitened, (n, d).
-    cofactors : Array
-        Covariance of the adjusted packets, whitened, (n, d, d).
-    weight : Array
-        Robust weights, (n,).
+    residual : (n, d) ndarray
+        Whitened residuals.
+    cofactors : (n, d, d) ndarray
+        Covariance of the adjusted packets, whitened.
+    weight : (n,) ndarray
+        Robust weights.
     unit : float
         Variance factor of their group.
     """
@@ -114,9 +123,14 @@ def standardised_packets(residual: Array, cofactors: Array, weight: Array, unit:
 
 
 def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
-    """(n,) weights of packets from their standardised residuals (n, d), d = 2 for image points.
+    """Return the (n,) weights of packets from their standardised residuals (n, d); d = 2 for image points.
 
-    Huber's, IGG III that ends in zero, or "accept": 1 up to that end and zero beyond.
+    The weights are Huber's, IGG III, which decrease to zero, or "accept": 1 up to that zero and 0 beyond.
+
+    Raises
+    ------
+    ValueError
+        The kind is unknown.
     """
     size = np.linalg.norm(standard, axis=1)
     huber, reject = limits(standard.shape[1])
@@ -132,45 +146,46 @@ def robust_weights(standard: Array, kind: Robust | Literal["accept"]) -> Array:
 
 
 def limits(rows: int) -> tuple[float, float]:
-    """Lengths of standardised residuals of so many rows from which on a packet loses weight, and is left out."""
+    """Return the lengths of d standardised residuals from which on a packet is down-weighted, and rejected."""
     return float(np.sqrt(chi2.isf(0.05, rows))), float(np.sqrt(chi2.isf(1e-4, rows)))
 
 
 def bounded(factor: float) -> float:
-    """A variance factor within its bounds."""
+    """Return a variance factor limited to its bounds."""
     return float(np.clip(factor, 1.0 / LARGEST_FACTOR, LARGEST_FACTOR))
 
 
 def extrapolated(factors: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Where three rounds of variance factors lead to, by Aitken's rule in the logarithm.
+    """Return the limit of three rounds of variance factors by Aitken's rule, applied to the logarithm.
 
-    Factors of groups that check each other creep: rounds leave up to nine tenths of the way.
+    Factors of groups that check each other converge slowly: a round may leave up to nine tenths of the distance.
     """
-    found = {}
+    limits_of_groups = {}
     for group in factors[-1]:
         first, middle, last = (float(np.log(max(f[group], 1e-300))) for f in factors)
         ratio = (last - middle) / (middle - first) if middle != first else 0.0
         ratio = min(max(ratio, 0.0), _LARGEST_RATIO)
-        found[group] = bounded(float(np.exp(last + (last - middle) * ratio / (1.0 - ratio))))
-    return found
+        limits_of_groups[group] = bounded(float(np.exp(last + (last - middle) * ratio / (1.0 - ratio))))
+    return limits_of_groups
 
 
 @dataclass(frozen=True)
 class Rule:
-    """How weights of packets and factors of groups follow from residuals.
+    """Rule by which weights of packets and variance factors of groups follow from residuals.
 
     Attributes
     ----------
-    packets : Robust | Literal['accept'] | None
-        Huber's weights, IGG III, or "accept": 1 up to where IGG III ends and zero beyond; None leaves them.
-    factor : Literal['median', 'components'] | None
-        Of the image points by the median of their residuals, or of groups by variance components; None leaves them.
-    groups : Collection[str] | None
-        Whose components are estimated; None for all.
+    packets : {'huber', 'igg', 'accept'} or None
+        Huber's weights, IGG III, or "accept": 1 up to the end of IGG III and 0 beyond; None for unchanged weights.
+    factor : {'median', 'components'} or None
+        Factor of the image points from the median of their residuals, or of groups by variance components; None for
+        unchanged factors.
+    groups : collection of str or None
+        Groups whose components are estimated; None for all.
     screening : int
-        Rounds with Huber's weights that come first, in which no factor is estimated.
+        Number of first rounds with Huber's weights, in which no factor is estimated.
     tolerance : float
-        Largest change of a weight, or relative one of a factor, at rest.
+        Largest change of a weight, or relative change of a factor, at convergence.
     """
 
     packets: Robust | Literal["accept"] | None = None
@@ -181,76 +196,79 @@ class Rule:
 
 
 class Weighted(Protocol):
-    """A state with weights."""
+    """State with weights."""
 
     @property
     def weight(self) -> tuple[Array, ...]:
-        """Robust weights of each set of packets, 0 to 1."""
+        """Robust weights of each packet set, 0 to 1."""
 
     @property
     def factor(self) -> Mapping[str, float]:
-        """Group -> factor on its variances."""
+        """Variance factor of each group."""
 
 
 class Reweighted(Protocol[S, T]):
-    """An adjustment, as far as its weights are concerned: states S, solutions T."""
+    """Interface of an adjustment to its reweighting, with states S and solutions T."""
 
     def solve(self, at: S, screening: bool) -> tuple[S, T]:
-        """State and solution with the weights of a state; a rough one will do while gross errors are looked for."""
+        """Return state and solution for the weights of a state; a rough solution suffices while screening."""
 
     def judged(self, at: S, found: T) -> tuple[Array, ...]:
-        """Standardised residuals of each set of packets."""
+        """Return the standardised residuals of each packet set."""
 
     def tests(self, at: S, found: T) -> Mapping[str, GroupTest]:
-        """Variance groups."""
+        """Return the test of each variance group."""
 
     def weighed(self, at: S, weight: tuple[Array, ...], factor: Mapping[str, float]) -> S:
-        """The state with other weights, and with none at points that too little is left of.
+        """Return the state with other weights, and with zero weight at points with too few remaining observations.
 
         Parameters
         ----------
         at : S
-            state.
-        weight : tuple[Array, ...]
-            Robust weights of each set of packets, (n,), 0 to 1.
-        factor : Mapping[str, float]
-            Group -> factor on its variances.
+            Current state.
+        weight : tuple of (n,) ndarray
+            Robust weights of each packet set, 0 to 1.
+        factor : mapping of str to float
+            Variance factor of each group.
         """
 
 
-def settled(problem: Reweighted[S, T], at: S, rule: Rule) -> tuple[S, T]:
-    """Solve until weights and factors rest.
+def settled(problem: Reweighted[S, T], state: S, rule: Rule) -> tuple[S, T]:
+    """Solve an adjustment repeatedly until weights and variance factors converge.
 
     Raises
     ------
     UnsettledError
-        They do not.
+        They do not converge.
     """
     factors: list[Mapping[str, float]] = []
-    for turn in range(_ROUNDS):
-        screening = turn < rule.screening
-        at, found = problem.solve(at, screening)
+    for round_number in range(_ROUNDS):
+        screening = round_number < rule.screening
+        state, solution = problem.solve(state, screening)
         if rule.packets is None and rule.factor is None:
-            return at, found
-        weight, factor = at.weight, dict(at.factor)
-        standard = () if rule.packets is None and rule.factor == "components" else problem.judged(at, found)
+            return state, solution
+        weight, factor = state.weight, dict(state.factor)
+        standard = () if rule.packets is None and rule.factor == "components" else problem.judged(state, solution)
         if rule.factor == "median":
             factor["image"] = bounded(factor["image"] * robust_variance(np.sum(np.concatenate(standard) ** 2, axis=1)))
         elif rule.factor == "components" and not screening:
-            tests = problem.tests(at, found)
-            factor |= {g: one.estimated for g, one in tests.items() if rule.groups is None or g in rule.groups}
+            tests = problem.tests(state, solution)
+            factor |= {g: test.estimated for g, test in tests.items() if rule.groups is None or g in rule.groups}
             factors.append(factor)
         if rule.packets is not None:
             kind = "huber" if screening else rule.packets
-            weight = tuple(robust_weights(one, kind) for one in standard)
-            if kind != "huber" and turn >= _FREE_ROUNDS:
-                weight = tuple(np.minimum(new, old) for new, old in zip(weight, at.weight, strict=True))
-        new = problem.weighed(at, weight, factor)
-        changes = [float(np.abs(a - b).max(initial=0.0)) for a, b in zip(new.weight, at.weight, strict=True)]
-        change = max(*changes, *(abs(factor[g] / at.factor[g] - 1.0) for g in factor))
+            weight = tuple(robust_weights(test, kind) for test in standard)
+            if kind != "huber" and round_number >= _FREE_ROUNDS:
+                weight = tuple(
+                    np.minimum(new_state, old_weight)
+                    for new_state, old_weight in zip(weight, state.weight, strict=True)
+                )
+        new_state = problem.weighed(state, weight, factor)
+        changes = [float(np.abs(a - b).max(initial=0.0)) for a, b in zip(new_state.weight, state.weight, strict=True)]
+        change = max(*changes, *(abs(factor[g] / state.factor[g] - 1.0) for g in factor))
         if change < rule.tolerance and not screening:
-            return at, found
+            return state, solution
         if len(factors) == 3:
-            new, factors = problem.weighed(new, new.weight, extrapolated(factors)), []
-        at = new
-    raise UnsettledError(f"weights do not settle in {_ROUNDS} rounds, the last change is {change:.2g}")
+            new_state, factors = problem.weighed(new_state, new_state.weight, extrapolated(factors)), []
+        state = new_state
+    raise UnsettledError(f"weights do not converge in {_ROUNDS} rounds, the last change is {change:.2g}")

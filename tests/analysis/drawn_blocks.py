@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from analysis.block.block import Block, CameraKnowledge, Footprints, Pass, Points, Scene, Term, Terrain, TrackerAngle
+from analysis.block.block import Block, CameraPrior, Footprints, Pass, Points, Scene, Term, Terrain, TrackerAngle
 from analysis.block.error_processes import Law
 from analysis.orbit.three_line_model import LineModel, Rays
 
@@ -190,7 +190,7 @@ def draw(plan: Plan, random: np.random.Generator, true: Plan | None = None) -> D
     change = {f"{p.name}/{c}": constant[c] + own * random.standard_normal(4) for p in passes for c in plan.cameras}
     size = len(passes)
     law = np.kron(np.ones((size, size)), np.diag(common**2)) + np.kron(np.eye(size), np.diag(own**2))
-    known = {c: CameraKnowledge(np.zeros((size, 4)), law) for c in plan.cameras}
+    known = {c: CameraPrior(np.zeros((size, 4)), law) for c in plan.cameras}
     monitored = None
     if plan.monitor is not None:
         monitored = {}
@@ -199,7 +199,7 @@ def draw(plan: Plan, random: np.random.Generator, true: Plan | None = None) -> D
         gain = law @ np.linalg.inv(law + noise)
         for c in plan.cameras:
             read = np.array([change[f"{p.name}/{c}"] for p in passes]) + sigma * random.standard_normal((size, 4))
-            monitored[c] = CameraKnowledge((gain @ read.ravel()).reshape(size, 4), law - gain @ law)
+            monitored[c] = CameraPrior((gain @ read.ravel()).reshape(size, 4), law - gain @ law)
 
     def at(name: str, when: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Reading of the station (n, 3), of the attitude (n, 3, 3), and true body axes in place of the latter."""

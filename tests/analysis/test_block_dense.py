@@ -191,8 +191,8 @@ def test_open_combinations_without_any_control_are_shifts_and_turns_of_all_passe
     drawn = draw(plan(WHITE, control=0, monitor=None, terrain=None, footprints=0), np.random.default_rng(5))
     found = open_combinations(adjust_block(drawn.block))
     # three shifts of all passes together, and pitch against d_alpha of all cameras, are told by nothing
-    assert found[0].told < 1e-3
-    named = [set(one.names) for one in found if one.told < 1e-3]
+    assert found[0].sigma_ratio < 1e-3
+    named = [set(one.names) for one in found if one.sigma_ratio < 1e-3]
     for axis in ("along", "across", "down"):
         assert any({f"P0 offset {axis}", f"P1 offset {axis}"} <= names for names in named), axis
     assert any({"P0 pitch", "P0 fore d_alpha", "P0 back d_alpha"} <= names for names in named)
@@ -213,14 +213,14 @@ def test_spread_of_laws_and_laws_that_make_no_sense():
         for kind, grown in (("walk", abs(seconds) ** 0.5), ("rate", abs(seconds)), ("white", 1.0), ("constant", 1.0)):
             assert Law("a", kind, (1.0, 2.0, 3.0)).spread(seconds) == pytest.approx(grown * np.array([1.0, 2.0, 3.0]))
     for law, said in (
-        (Law("a", "brown", (1.0,) * 3), "a law is one of"),
+        (Law("a", "brown", (1.0,) * 3), "the error model must be one of"),
         (Law("a", "white", (1.0, -1.0, 1.0)), "three sigmas that are finite and not negative"),
         (Law("a", "walk", (1.0,) * 3, 0.0), "the interval must be positive"),
         (Law("a", "jitter", (1.0,) * 3, 1.0, 5.0), "the frequency must be positive"),
         (Law("a", "slow", (1.0,) * 3, 1.0), "correlation time or period must be positive"),
     ):
         refuses(BlockError, said, law.check)
-    refuses(BlockError, "no observation meets it", Support.of, WHITE, np.zeros(0))
+    refuses(BlockError, "no observation depends on it", Support.of, WHITE, np.zeros(0))
     refuses(BlockError, "the interval is too short", Support.of, WHITE, np.array([0.0, 1e9]))
 
 

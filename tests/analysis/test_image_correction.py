@@ -94,7 +94,7 @@ def test_one_point_and_three() -> None:
 
 def test_what_points_do_not_determine() -> None:
     place, spread = points(8)
-    for count, kind, message in ((0, "shift", "do not determine"), (2, "affine", "3 or more")):
+    for count, kind, message in ((0, "shift", "too few"), (2, "affine", "3 or more")):
         refuses(ValueError, message, image_correction, place[:count], place[:count], spread[:count], kind)
     line = np.stack([np.linspace(0.0, 1e4, 8), np.linspace(5.0, 2e4, 8)], axis=-1)
     refuses(ValueError, "one line", image_correction, line, line, spread, "affine")

@@ -200,7 +200,7 @@ def test_frequencies_that_cannot_be_looked_at_are_told() -> None:
     refuses(JitterError, "no frequencies", periodogram, given, 3.0, 3.001)
     both = np.concatenate([given.weight, 0.0 * given.weight], axis=2)
     unseen = Observations.of(given.value, given.group, given.time, both, given.nuisance)
-    refuses(JitterError, "moves nothing", periodogram, unseen, 1.0, 2.0)
+    refuses(JitterError, "has no effect on the observations", periodogram, unseen, 1.0, 2.0)
 
 
 SLOW = 2.7

@@ -14,7 +14,7 @@ from scipy import sparse
 
 from analysis.arrays import UndeterminedError
 from analysis.block import block_adjustment, reweighting
-from analysis.block.block import CamerasKnowledge, Term
+from analysis.block.block import JointCameraPrior, Term
 from analysis.block.block_adjustment import adjust_block, pruned
 from analysis.block.error_processes import BlockError, Law
 from analysis.calibration import normal_equations, strip_adjustment
@@ -73,16 +73,16 @@ def test_blocks():
     some = {name: replace(k, covariance=k.covariance[:4, :4]) for name, k in block.known.items()}
     still = {name: replace(k, covariance=0.0 * k.covariance) for name, k in block.known.items()}
     white = (Term(Law("attitude", "white", (1e-6,) * 3, 0.5)),)
-    unwatched = CamerasKnowledge((), np.zeros((0, 2, 4)), np.eye(0))
+    unwatched = JointCameraPrior((), np.zeros((0, 2, 4)), np.eye(0))
 
     def scene(**changes):
         return {"scenes": (replace(first, **changes), *block.scenes[1:])}
 
     for said, changes in {
         "no observations": {"scenes": ()},
-        "two passes or two scenes have one name": {"scenes": (first, *block.scenes)},
+        "two passes or two scenes have the same name": {"scenes": (first, *block.scenes)},
         "no pass is called 'other'": scene(of="other"),
-        "nothing is known of camera 'other'": scene(camera="other"),
+        "camera 'other' has no model or no prior": scene(camera="other"),
         "its image points have no times": scene(rays=replace(first.rays, time=None)),
         "the sigma of image points must be positive, found 0": {"image": 0.0},
         "a coordinate is not finite": {"points": replace(points, start=nowhere)},
@@ -90,7 +90,7 @@ def test_blocks():
         r"covariance \(4, 4\) of 2 passes": {"known": some},
         "needs a standard deviation above zero": {"known": still, "monitored": None},
         "needs a constant error of each of them": {"attitude": white},
-        "the monitor says nothing of camera 'fore'": {"monitored": unwatched},
+        "the monitor has no reading of camera 'fore'": {"monitored": unwatched},
     }.items():
         refuses(BlockError, said, adjust_block, replace(block, **changes))
     refuses(BlockError, "no sensor is called 'radar'; there are", block.without, "radar")
@@ -119,12 +119,12 @@ def test_what_does_not_converge_is_no_result(monkeypatch, cut):
     field, how = test_adjustment.measured(test_adjustment.VIEW, rng), {"gauge": test_adjustment.HOLD_X}
     module, name, error, said, call = {
         "block": (block_adjustment, "_MOST", BlockError, "are adjusted at once", partial(adjust_block, block)),
-        "rounds": (reweighting, "_ROUNDS", BlockError, "do not settle", partial(adjust_block, block, robust="huber")),
+        "rounds": (reweighting, "_ROUNDS", BlockError, "do not converge", partial(adjust_block, block, robust="huber")),
         "calibration": (
             reweighting,
             "_ROUNDS",
             CalibrationError,
-            "do not settle",
+            "do not converge",
             partial(adjust, [field], test_adjustment.LABORATORY, test_adjustment.NOISE, **how, robust="huber"),
         ),
         "strip": (strip_adjustment, "_STEPS", CalibrationError, "", partial(adjust_strip, rays, line, noise)),
@@ -226,7 +226,7 @@ def test_jitter(monkeypatch):
     refuses(JitterError, "do not match", Observations.of, given.value[:9], *parts[1:])
     refuses(JitterError, "their groups are mixed", Observations.of, given.value, given.group[::-1], *parts[2:])
     refuses(JitterError, "do not match mixtures", Observations.of, *parts, mix=np.ones((9, 2, 1)))
-    refuses(JitterError, "moments that lie apart", fit_spline, given, 0.0, 1.0)
+    refuses(JitterError, "needs distinct times", fit_spline, given, 0.0, 1.0)
     once = of_disparities(0.0 * time, 0.0 * time, 0.0 * time, 0.1, 0 * time, degree=0)
     refuses(JitterError, "all observations have the same time", periodogram, once, 0.5, 6.0)
     refuses(JitterError, "moves nothing", jitter._fitted, given, np.array([2.0]), np.zeros(1))

@@ -295,7 +295,7 @@ def test_bad_input_is_told():
         ("image of ray 3 is not finite", Rays.of, rays.point, lost, rays.station, rays.attitude),
         ("appears twice", Rays.of, np.zeros(40, int), rays.image, rays.station, rays.attitude),
         (r"image must be \(40, 2\)", Rays.of, rays.point, rays.image[:, :1], rays.station, rays.attitude),
-        ("a row of whole numbers", Rays.of, rays.point + 0.5, rays.image, rays.station, rays.attitude),
+        ("a one-dimensional array of integers", Rays.of, rays.point + 0.5, rays.image, rays.station, rays.attitude),
         ("must be a rotation", LineModel.of, 2 * eye, INTERIOR["nadir"]),
         ("must be a rotation", LineModel.of, np.diag([1.0, 1.0, -1.0]), INTERIOR["nadir"]),
         (r"to_body must be \(3, 3\), interior and position \(3,\)", LineModel.of, eye[:, :2], still, still),

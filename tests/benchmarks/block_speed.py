@@ -14,7 +14,7 @@ import time
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from analysis.block.block import Block, CameraKnowledge, Pass, Points, Scene, Term
+from analysis.block.block import Block, CameraPrior, Pass, Points, Scene, Term
 from analysis.block.block_adjustment import adjust_block
 from analysis.block.error_processes import Law
 from analysis.orbit.three_line_model import LineModel, Rays
@@ -106,7 +106,7 @@ def large_block(ties: int, seed: int = 1) -> tuple[Block, np.ndarray]:
     role = np.array(["control"] * CONTROL + ["tie"] * ties, object)
     points = Points(np.array([f"{r[0]}{k}" for k, r in enumerate(role)], object), start, role, own)
     law = np.kron(np.eye(len(passes)), np.diag(CAMERA**2))
-    known = {name: CameraKnowledge(np.zeros((len(passes), 4)), law) for name in LOOKS}
+    known = {name: CameraPrior(np.zeros((len(passes), 4)), law) for name in LOOKS}
     cameras = {
         name: LineModel.of(Rotation.from_euler("Y", look).as_matrix(), (FOCAL, 0, 0)) for name, look in LOOKS.items()
     }

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.block.block import CamerasKnowledge
+from analysis.block.block import JointCameraPrior
 from analysis.block.block_adjustment import adjust_block
 from optics.numerics.backend import one_blas_thread
 from scenes.specs.operation import read_operation
@@ -98,7 +98,7 @@ def by_hand(stated, shifts):
     mean = (gain @ shifts.ravel()).reshape(len(PASSES), len(LINES), 4).swapaxes(0, 1)
     left = own.reshape(count, count) - gain @ with_spots.reshape(count, size).T
     shape = (len(PASSES), len(LINES), 4)
-    return CamerasKnowledge(LINES, mean, left.reshape(*shape, *shape).transpose(1, 0, 2, 4, 3, 5).reshape(count, count))
+    return JointCameraPrior(LINES, mean, left.reshape(*shape, *shape).transpose(1, 0, 2, 4, 3, 5).reshape(count, count))
 
 
 @one_blas_thread()
@@ -121,7 +121,7 @@ def test_check_points_by_a_record_are_those_of_the_same_laws_and_readings_by_han
     assert found.p_value > 1e-3
     assert "monitor" in run.used
     # cameras that nobody watched leave the ground as uncertain as their stated changes
-    assert run.worth["without monitor"].predicted.le90 > 2 * run.worth["all"].predicted.le90
+    assert run.contributions["without monitor"].predicted.le90 > 2 * run.contributions["all"].predicted.le90
 
 
 def test_true_cameras_are_drawn_from_what_the_record_says(operated):

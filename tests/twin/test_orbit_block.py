@@ -9,7 +9,7 @@ from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from twin.framework.procedure import BenchError
 from twin.orbit.block.block_report import block_report
-from twin.orbit.block.block_run import ALL, NOTHING, run_adjustment
+from twin.orbit.block.block_run import ALL, TIES_ALONE, run_adjustment
 from twin.orbit.block.measured_block import change_covariance, measured_block
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign_adjustment import simultaneous
@@ -38,21 +38,21 @@ def run(tmp_path_factory):
 
 @pytest.mark.second
 def test_errors_of_check_points_are_those_predicted_and_every_sensor_helps(run):
-    assert 0.3 < run.worth[ALL].agreement < 2.0
-    full = run.worth[ALL].predicted
-    for name, one in run.worth.items():
+    assert 0.3 < run.contributions[ALL].normalised_squared_error < 2.0
+    full = run.contributions[ALL].predicted
+    for name, one in run.contributions.items():
         # less is known without a sensor; rounding of the quantiles
         assert one.predicted.ce90 > full.ce90 * (1 - 1e-6), name
         assert one.predicted.le90 > full.le90 * (1 - 1e-6), name
-    assert run.worth["without control"].predicted.ce90 > 2 * full.ce90
-    assert run.worth[NOTHING].predicted.le90 > 3 * full.le90
+    assert run.contributions["without control"].predicted.ce90 > 2 * full.ce90
+    assert run.contributions[TIES_ALONE].predicted.le90 > 3 * full.le90
     assert run.adjustment.p_value > 1e-4
     assert block_report(run).warnings == ()
 
 
 @pytest.mark.second
 def test_cameras_are_found_within_their_sigmas(run):
-    ratio = np.array([(c.found - c.truth) / c.sigma for c in run.cameras.values()])
+    ratio = np.array([(c.value - c.truth) / c.sigma for c in run.cameras.values()])
     # 16 normals: beyond 4 by chance in 1 of 1000 blocks
     assert np.max(np.abs(ratio)) < 4.0
     assert all(np.all(c.sigma < c.before) for c in run.cameras.values())
@@ -68,7 +68,7 @@ def test_readings_of_another_law_are_told(tmp_path):
     )
     wrong = run_adjustment(setup(tmp_path, ("\nangles:", "\n" + true + "angles:")), None, 3)
     told = " ".join(block_report(wrong).warnings)
-    assert "readings: errors that should be independent in a white process are alike" in told
+    assert "readings: errors that should be independent in a white process are positively correlated" in told
 
 
 @pytest.mark.second
@@ -80,7 +80,7 @@ def test_gross_errors_are_left_out_by_name(tmp_path):
     assert len(bad) > 8
     # an error along the ray of the other scenes is absorbed by the point's height
     assert len(bad - told) <= 0.2 * len(bad)
-    assert 0.3 < found.worth[ALL].agreement < 2.0
+    assert 0.3 < found.contributions[ALL].normalised_squared_error < 2.0
     assert any(w.startswith("left out as gross errors: ") for w in block_report(found).warnings)
 
 
@@ -112,10 +112,10 @@ def test_ground_points_that_are_none_are_refused():
     GroundPoints.of(*good)
     for k, wrong, words in (
         (1, np.zeros((2, 2)), "2 names and coordinates"),
-        (0, ["a", "a"], "a name stands twice"),
+        (0, ["a", "a"], "a name occurs twice"),
         (3, "boss", "roles are"),
         (1, np.full((2, 3), np.nan), "is not finite"),
-        (2, -np.eye(3), "a covariance is not one"),
+        (2, -np.eye(3), "a covariance is not symmetric and positive semidefinite"),
     ):
         with pytest.raises(ValueError, match=words):
             GroundPoints.of(*(wrong if j == k else one for j, one in enumerate(good)))
@@ -142,10 +142,10 @@ def test_measured_passes_as_their_calibration_has_them():
     assert found.drawn is None
     assert {("Beijing c4", "Beijing/forward"), ("Beijing k33", "Beijing/nadir")} <= set(found.rejected)
     assert len(found.rejected) <= 6
-    assert 0.5 < found.worth[ALL].agreement < 1.6
+    assert 0.5 < found.contributions[ALL].normalised_squared_error < 1.6
     assert found.adjustment.p_value > 1e-3
     assert len(found.network.parts) == 2
-    assert found.worth["without control"].predicted.le90 > 20 * found.worth[ALL].predicted.le90
+    assert found.contributions["without control"].predicted.le90 > 20 * found.contributions[ALL].predicted.le90
     # the same passes calibrated by the campaign's adjustment: the principal distances agree
     calibrated = simultaneous(source_of(MeasuredCalibrationSetup.read(MEASURED.with_name("calibrate.yaml")), None))
     for line in ("forward", "nadir", "backward"):

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.arrays import ARCSEC, Array
-from analysis.block.block import CamerasKnowledge
+from analysis.block.block import JointCameraPrior
 from analysis.monitor.limits import Quantity
 from scenes.specs.orbit.adjust import MonitorRecordSpec
 from scenes.specs.orbit.setup import AnyAdjust
@@ -152,7 +152,7 @@ def run_operated_block(
         return run_adjustment(setup, backend, seed, advance, pool)
     named = spec
 
-    def monitor(epochs: Mapping[str, str], lines: Sequence[str]) -> CamerasKnowledge:
+    def monitor(epochs: Mapping[str, str], lines: Sequence[str]) -> JointCameraPrior:
         try:
             return _recorded(setup, named, epochs, lines, advance)
         except Problem as problem:
@@ -166,7 +166,7 @@ def run_operated_block(
 
 def _recorded(
     setup: AnyAdjust, spec: MonitorRecordSpec, epochs: Mapping[str, str], lines: Sequence[str], advance: Advance
-) -> CamerasKnowledge:
+) -> JointCameraPrior:
     with History(spec.record) as history:
         try:
             plan = kept_plan(history) if spec.plan is None else read_plan(Path(spec.plan), history)
@@ -200,7 +200,7 @@ def _recorded(
         return cameras_of(said, lines, [order.index(time) for time in times.values()])
 
 
-def cameras_of(said: Posterior, cameras: Sequence[str], passes: Sequence[int]) -> CamerasKnowledge:
+def cameras_of(said: Posterior, cameras: Sequence[str], passes: Sequence[int]) -> JointCameraPrior:
     """What is said of cameras, as a block of scenes takes it.
 
     Parameters
@@ -220,4 +220,4 @@ def cameras_of(said: Posterior, cameras: Sequence[str], passes: Sequence[int]) -
     shape = (len(where), len(cameras), 4)
     spread = spread.reshape(*shape, *shape).transpose(1, 0, 2, 4, 3, 5)
     size = int(np.prod(shape))
-    return CamerasKnowledge(tuple(cameras), mean, spread.reshape(size, size))
+    return JointCameraPrior(tuple(cameras), mean, spread.reshape(size, size))
