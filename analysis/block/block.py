@@ -392,6 +392,21 @@ def make_block(
     ------
     ValueError
         Arrays of other shapes, or sigmas that are not positive.
+
+    Examples
+    --------
+    One ray of one camera; see `adjust_block` for a block that can be solved:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> camera = analysis.LineModel.of(np.eye(3), [1.7, 0.0, 0.0])
+    >>> down = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    >>> rays = analysis.Rays.of([0], [[0.0, 0.0]], [[6.878e6, 0.0, 0.0]], [down], time=[0.0])
+    >>> block = analysis.make_block({("pass 1", "nadir"): rays}, {"nadir": camera}, [[6.378e6, 0.0, 0.0]],
+    ...     control_sigma=[0.1], image_sigma=2e-6, attitude_sigma=1e-5, station_sigma=0.5,
+    ...     camera_sigma=[5e-6, 5e-6, 5e-6, 2e-5])
+    >>> block.sensors, block.points.role.tolist()
+    (('control',), ['control'])
     """
     start, spread = np.array(points, np.float64), np.asarray(camera_sigma, np.float64)
     if start.ndim != 2 or start.shape[1] != 3 or spread.shape != (4,):

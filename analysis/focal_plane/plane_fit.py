@@ -236,6 +236,25 @@ def fit_focal_plane(
         The places lie so that a slope cannot be told.
     ValueError
         Wrong shapes, numbers that are not finite, a sigma that is not positive.
+
+    Examples
+    --------
+    Defocus of six places, from 10 um of piston and 2e-4 of tilt about Y':
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> place = np.array([[x, y] for x in (-0.02, 0.02) for y in (-0.1, 0.0, 0.1)])
+    >>> fit = analysis.fit_focal_plane(place, 10e-6 + 2e-4 * place[:, 0], 1e-6)
+    >>> round(fit.piston, 9), round(fit.slope_x, 9), round(abs(fit.slope_y), 9)
+    (1e-05, 0.0002, 0.0)
+    >>> np.round(np.sqrt(np.diag(fit.covariance)) * 1e6, 2)
+    array([ 0.41, 20.41,  5.  ])
+
+    Height and sigma of the plane at the edge:
+
+    >>> height, sigma = fit.plane([0.02, 0.1])
+    >>> round(float(height) * 1e6, 3), round(float(sigma) * 1e6, 2)
+    (14.0, 0.76)
     """
     spots, height = np.asarray(place, np.float64), np.asarray(defocus, np.float64)
     if spots.ndim != 2 or spots.shape[1] != 2 or height.shape != spots.shape[:1]:

@@ -184,6 +184,14 @@ class MatchOptions:
         is called FLAT below it.
     saturation : float | None
         DN from which a pixel counts as saturated; None: the largest value of an integer type.
+
+    Examples
+    --------
+    Place, affine matrix, offset and gain are eight unknowns; two more describe a difference in sharpness:
+
+    >>> import analysis
+    >>> analysis.MatchOptions(largest_sigma=0.1).parameters, analysis.MatchOptions(sharpness=False).parameters
+    (10, 8)
     """
 
     sharpness: bool = True
@@ -259,6 +267,19 @@ def distinct_points(image: ArrayLike, count: int, *, spacing: float, border: int
     ------
     ValueError
         Image not a plane, count or spacing below 1, border negative or so large that nothing is left.
+
+    Examples
+    --------
+    Nine points of a random texture, at least 30 px apart and 25 px from the border:
+
+    >>> import numpy as np
+    >>> from scipy.ndimage import gaussian_filter
+    >>> import analysis
+    >>> rng = np.random.default_rng(4)
+    >>> image = 1000 + 800 * gaussian_filter(rng.standard_normal((200, 200)), 2.0)
+    >>> points = analysis.distinct_points(image, 9, spacing=30, border=25)
+    >>> points.shape, bool(points.min() >= 25), bool(points.max() <= 174)
+    ((9, 2), True, True)
     """
     plane = checked_image(image, "distinct points")
     if count < 1 or not spacing >= 1 or border < 0:

@@ -96,6 +96,27 @@ def match_windows(
     ------
     ValueError
         Wrong shapes, reach out of range, a template too small for its margin.
+
+    Examples
+    --------
+    Two images of one texture, the second shifted by (0.3, -0.7) px:
+
+    >>> import numpy as np
+    >>> from scipy.ndimage import fourier_shift, gaussian_filter
+    >>> import analysis
+    >>> rng = np.random.default_rng(4)
+    >>> first = 1000 + 800 * gaussian_filter(rng.standard_normal((200, 200)), 2.0, mode="wrap")
+    >>> second = np.fft.ifft2(fourier_shift(np.fft.fft2(first), (0.3, -0.7))).real
+    >>> first, second = (image + 2 * rng.standard_normal(image.shape) for image in (first, second))
+    >>> points = np.rint(analysis.distinct_points(first, 9, spacing=30, border=30)).astype(int)
+    >>> windows = np.stack([first[r - 15 : r + 16, c - 15 : c + 16] for r, c in points])
+    >>> matches = analysis.match_windows(second, windows, points, reach=3)
+    >>> print(matches.text)
+    7 of 7 accepted
+    >>> np.round(np.mean(matches.place - points, axis=0), 2)
+    array([ 0.3, -0.7])
+    >>> bool(matches.sigma.max() < 0.05)
+    True
     """
     plane = checked_image(image, "match windows")
     patch = checked_templates(templates, "match windows")
@@ -281,6 +302,22 @@ def consensus(
     ------
     ValueError
         Shapes, too few points (two a term, five at least), degree or rates out of range.
+
+    Examples
+    --------
+    Forty matches with a scale error of 1 %, of which four are wrong by up to 20 px:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> rng = np.random.default_rng(5)
+    >>> predicted = rng.uniform(0, 1000, (40, 2))
+    >>> found = 1.01 * predicted + 0.1 * rng.standard_normal((40, 2))
+    >>> found[:4] += [[20, 0], [-15, 5], [8, 8], [0, -12]]
+    >>> agreed = analysis.consensus(predicted, found, degree=1)
+    >>> np.flatnonzero(~agreed.accepted)
+    array([0, 1, 2, 3])
+    >>> round(agreed.scatter, 2)
+    0.09
     """
     place = checked_places(predicted, None, "consensus")
     to = checked_places(found, len(place), "consensus")

@@ -56,6 +56,17 @@ class TimeLaw:
     every_s : float | None
         Mean time between two such steps, seconds; None where nothing is stated, and what is too small to be found then
         counts as not there.
+
+    Examples
+    --------
+    A drift that forgets its value in a day, and a trend that reaches one standard deviation after a year:
+
+    >>> import analysis
+    >>> day, year = 86400.0, 31557600.0
+    >>> round(float(analysis.TimeLaw(drift_s=day).covariance(0.0, day)), 4)
+    0.3679
+    >>> float(analysis.TimeLaw(trend_s=year).covariance(0.5 * year, year))
+    0.5
     """
 
     white: bool = False
@@ -148,6 +159,19 @@ class Disturbances:
         (M,) in time.
     jump_false_alarm : float
         Chance that a series without a jump has one reported, over all times and motions together.
+
+    Examples
+    --------
+    A measured value moves by a drift of 2 units and white motions of 0.5 units; the drift alone is wanted:
+
+    >>> import analysis
+    >>> prior = analysis.Disturbances.of(
+    ...     spots=[[2.0, 0.5]],
+    ...     parameters=[[2.0, 0.0]],
+    ...     laws=[analysis.TimeLaw(drift_s=10.0), analysis.TimeLaw(white=True)],
+    ... )
+    >>> prior.spot_covariance, prior.parameter_covariance
+    (array([[4.25]]), array([[4.]]))
     """
 
     name: str

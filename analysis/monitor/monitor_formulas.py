@@ -70,6 +70,15 @@ class MonitorGeometry:
     d_f_per_alpha_m: change of the principal distance per rad of d_alpha, m, from the calibrated distortion: turning
         the line of sight brings the line to a field where the plate scale differs. Only `derived` uses it.
     d_gamma_per_beta: likewise the turn of the imaged line per rad of d_beta. Only `derived` uses it.
+
+    Examples
+    --------
+    A camera of f = 2 m whose monitor spots lie 0.2 m apart on CCDs with 10 um pixels. One pixel is 2.5 urad:
+
+    >>> import analysis
+    >>> geometry = analysis.MonitorGeometry(principal_distance_m=2.0, separation_m=0.2, pitch_m=10e-6)
+    >>> geometry.pitch_m / (2 * geometry.principal_distance_m)
+    2.5e-06
     """
 
     principal_distance_m: float

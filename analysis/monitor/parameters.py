@@ -37,6 +37,19 @@ class CameraCalibration:
     parameter_jacobian: (4, P) d_alpha, d_beta, d_gamma (rad), d_f (m) per unit of motion.
     motions: names of the P motions that the `model` estimator assumes.
     channels: names of the camera's channels, in the order of its spots.
+
+    Examples
+    --------
+    Both spots move by one column when the camera turns by -2.5 urad about its Y:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> geometry = analysis.MonitorGeometry(principal_distance_m=2.0, separation_m=0.2, pitch_m=10e-6)
+    >>> camera = analysis.CameraCalibration.from_geometry(geometry)
+    >>> np.round(camera.spot_jacobian @ [-2.5e-6, 0, 0, 0], 6) + 0.0
+    array([0., 1., 0., 1.])
+    >>> camera.channels, camera.pair
+    (('left', 'right'), (0, 1))
     """
 
     geometry: MonitorGeometry
@@ -81,6 +94,22 @@ class MonitorCalibration:
     template: calibrated shapes of all spots, in that order.
     noise: of the area CCDs.
     ground: of a pair whose altitude is known, else None.
+
+    Examples
+    --------
+    One camera with two Gaussian spots; see `recover_monitor` for its use:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> geometry = analysis.MonitorGeometry(principal_distance_m=2.0, separation_m=0.2, pitch_m=10e-6)
+    >>> camera = analysis.CameraCalibration.from_geometry(geometry)
+    >>> row, column = np.mgrid[:65, :65] - 32
+    >>> shape = np.exp(-0.5 * (row**2 + column**2) / 2.0**2)
+    >>> template = analysis.SpotTemplate.from_image(shape, row=32, column=32, shape=(33, 33))
+    >>> noise = analysis.NoiseModel(gain_dn_per_e=0.1, dark_noise_e=20, offset_dn=200)
+    >>> template = analysis.SpotTemplate.stack([template, template])
+    >>> analysis.MonitorCalibration({"nadir": camera}, template, noise).spots
+    2
     """
 
     cameras: Mapping[str, CameraCalibration]

@@ -1,26 +1,26 @@
 """MTF at one frequency from a group of bars, in one frame or in several.
 
 Bars of equal width and spacing between the levels `bright` and `dark` are a square wave, whose fundamental has the
-amplitude (2 / pi) (bright - dark). In the image it has that times the MTF:
+amplitude (2 / pi) (bright - dark). In the image it is multiplied by the MTF:
 
     MTF = pi A / (2 (bright - dark))
 
 A, the phase and the two-dimensional frequency are fitted to all pixels of the region by least squares, with the
-harmonics 3, 5 and 7 where their aliases can be told from the fundamental. Slightly tilted bars pass through all
-sampling phases, so that this holds at Nyquist as well, where the contrast of untilted bars depends on how they fall on
-the pixels. Weights fall to the region's rim as half a sine: near the group's ends the bars that are missing beyond
-change level and amplitude a little, and the fit would take the change of level for bars (3e-4 of A in a region of 20 x
-35 px, 6 px from the ends).
+harmonics 3, 5 and 7 where their aliases can be separated from the fundamental. Slightly tilted bars pass through all
+sampling phases, so that this also holds at Nyquist, where the contrast of untilted bars depends on their phase against
+the pixels. Weights fall to the region's edge as half a sine: near the group's ends the missing bars beyond change level
+and amplitude a little, and the fit would take the change of level for bars (3e-4 of A in a region of 20 x 35 px, 6 px
+from the ends).
 
-The levels are those of areas so wide that no blur reaches their middle. Diffraction at a pupil's rim reaches far: at
+The levels are those of areas so wide that no blur reaches their middle. Diffraction at a pupil's rim extends far: at
 the distance d from a straight edge, lambda N / (15.5 d) of the step is missing, half a per cent at 10 px of 7 um and
 F/9. Patches beside the bars are therefore too dark or too bright by about a per cent, and the MTF is too high by it.
-Frames of an even bright field and of the closed shutter are right.
+Frames of an even bright field and of the closed shutter give the right levels.
 
-For comparison with practice: the contrast (max - min) / (max + min) and Coltman's correction pi / 4 (J. Opt. Soc. Am.
-44, 468 (1954), first term of his series), which is exact where the third harmonic is not passed.
+For comparison with practice, the contrast (max - min) / (max + min) and Coltman's correction pi / 4 (J. Opt. Soc. Am.
+44, 468 (1954), first term of his series) are given; the correction is exact where the third harmonic is not passed.
 
-Phases of single pages are those of their differences from the mean, which hold only noise that is new in each.
+Phases of single pages are those of their differences from the mean, which contain only noise that is new in each.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array, MeasurementError
 from analysis.mtf.edge_location import LARGEST_GREY, grey_fault
-from analysis.mtf.edge_pages import different_pages, left_over, mean_page
+from analysis.mtf.edge_pages import different_pages, mean_page, rounding_residual
 from analysis.mtf.slanted_edge import EdgeMtf
 from analysis.spots.noise import NoiseModel
 from analysis.statistics import chance_beyond, measured_bias, rice_sigma, signal_modulus
@@ -41,39 +41,56 @@ from analysis.statistics import chance_beyond, measured_bias, rice_sigma, signal
 _HARMONICS = (3, 5, 7)
 _LEAST_SIDE = 12
 _LEAST_PATCH = 16
-# Two frequencies are apart if they differ by so many cycles over the region in some direction.
+# Two frequencies are separated if they differ by this many cycles over the region in some direction.
 _APART = 1.5
-# A fundamental this many sigmas long is there; by chance, over the 1e3 cells of a spectrum, once in some 300 regions.
+# Significance of the fundamental, in sigmas; the false-alarm rate over the 1e3 cells of a spectrum is 1 in 300 regions.
 _LEAST_AMPLITUDE = 5.0
-# A quarter of the region may differ from the whole by so much of the amplitude.
+# Fraction of the amplitude by which a quarter of the region may differ from the whole.
 _UNEVEN = 0.15
 _STEPS = 8
-# Difference of light that even fields may show: their light is that of the bars, of whose mean level diffraction takes
-# 0.7 % to where there are none (a group of 32 px at F/9). Patches stand elsewhere, and any difference counts.
+# Relative difference of light that is allowed for even fields: diffraction moves 0.7 % of the bars' mean level out of
+# the group (32 px at F/9). For patches, which lie elsewhere, any significant difference counts.
 _LEAST_LIGHT = 0.01
 
 
 class BarError(MeasurementError, ValueError):
-    """A region that does not show measurable bars; the message says what is wrong and what to change."""
+    """Error raised for a region without measurable bars; the message says what is wrong and what to change."""
 
 
 @dataclass(frozen=True, eq=False)
 class BarMtf:
     """MTF of one group of bars.
 
-    frequency: (2,) cycles/pixel, (component down the column, component along the row); frequency_sigma: (2,). The
+    Attributes
+    ----------
+    frequency, frequency_sigma : (2,) ndarray
+        Frequency (component down the column, component along the row) and its standard deviation, cycles/pixel. The
         frequencies f and (0, 1) - f give the same pixels, so at Nyquist the direction of the tilt is not known.
-    mtf, sigma: at that frequency; noise_bias: how much noise lengthens mtf on the average, >= 0.
-    amplitude, phase: of the fundamental, grey values; rad at the region's middle, A cos(2 pi f . r + phase).
-    harmonics: number -> amplitude (grey values) of those that could be told apart.
-    dark, dark_sigma, bright, bright_sigma: grey values of the reference patches, offset included.
-    contrast: (max - min) / (max + min) of the region, offset taken off. Noise raises it.
-    contrast_transfer: contrast over that of the patches. coltman: pi / 4 of it.
-    light, light_sigma: by how much the light on the bars exceeds that on the patches, as the mean level in the bars
-        says, of which a light that acts on both levels moves as much. uneven: that stands out of the noise, and sigma
-        holds it.
-    page_noise: of one pixel in one page of the region and of the two patches, rms, where pages were measured.
-    same: pages of the region that another one repeats to the bit.
+    mtf, sigma : float
+        MTF at that frequency and its standard deviation.
+    noise_bias : float
+        Mean amount by which noise lengthens `mtf`, >= 0.
+    amplitude, phase : float
+        Amplitude of the fundamental, grey values, and phase at the region's middle, rad: A cos(2 pi f . r + phase).
+    harmonics : dict of int to float
+        Amplitude, grey values, of each harmonic that could be separated.
+    dark, dark_sigma, bright, bright_sigma : float
+        Grey values of the reference patches, offset included, and their standard deviations.
+    contrast : float
+        (max - min) / (max + min) of the region, offset subtracted. Noise raises it.
+    contrast_transfer : float
+        Contrast over that of the patches.
+    coltman : float
+        pi / 4 of `contrast_transfer`.
+    light, light_sigma : float
+        Relative excess of the light on the bars over that on the patches, from the mean level in the bars, and its
+        standard deviation. A light that acts on both levels moves the mean level in proportion.
+    uneven : bool
+        True if that excess is significant; `sigma` then includes it.
+    page_noise : tuple of float or None
+        Rms noise of one pixel in one page of the region and of the two patches, where pages were measured.
+    same : int
+        Number of pages of the region that are identical copies of another one.
     """
 
     frequency: Array
@@ -99,7 +116,7 @@ class BarMtf:
 
     @property
     def cycles_per_pixel(self) -> float:
-        """Length of the frequency vector."""
+        """Length of the frequency vector, cycles/pixel."""
         return float(np.hypot(*self.frequency))
 
 
@@ -115,38 +132,52 @@ def bar_mtf(
     offset: float = 0.0,
     rounding: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> BarMtf:
-    """MTF from the bars that fill a region.
+    """Measure the MTF from the bars that fill a region.
 
-    Of several frames of them see `bar_pages.measure_bar_pages`.
+    For several frames see `measure_bar_pages`.
 
     Parameters
     ----------
-    region : ArrayLike
-        (H, W) grey values, linear in light, inside the group.
-    dark : ArrayLike
-        Pixels, any shape, with the level of the spaces: the same region in frames of an even field, or even patches far
-        from edges.
-    bright : ArrayLike
-        Likewise with that of the bars.
-    frequency : ArrayLike | None
-        About what it is, good to one cycle over the region: (2,) cycles/pixel (down the column, along the row), or one
-        number, its length, or None for the strongest below Nyquist.
-    noise : NoiseModel | None
-        The detector's model; without one the variance is that of the residuals and of the patches.
+    region : (H, W) array_like
+        Grey values, linear in light, inside the group.
+    dark : array_like
+        Pixels, of any shape, with the level of the spaces: the same region in frames of an even field, or even patches
+        far from edges.
+    bright : array_like
+        Pixels with the level of the bars, likewise.
+    frequency : array_like or None
+        Approximate frequency, good to one cycle over the region: (2,) cycles/pixel (down the column, along the row), or
+        one number, its length, or None for the strongest below Nyquist.
+    noise : NoiseModel or None
+        Noise model of the detector; without one the variance is that of the residuals and of the patches.
     frames : int
         Number of averaged frames.
-    saturation : float | None
-        As in `slanted_edge_mtf`.
+    saturation : float or None
+        Grey value of saturation, as in `slanted_edge.slanted_edge_mtf`.
     offset : float
         Grey value without light, for the contrast only.
-    rounding : tuple[float, float, float]
-        Rms of what rounding leaves in a pixel of the region and in the two levels, grey values
-        (`edge_pages.left_over`).
+    rounding : tuple of float
+        Rms of the rounding error that remains in a pixel of the region and in the two levels, grey values
+        (`edge_pages.rounding_residual`).
 
     Raises
     ------
     BarError
-        No bars, saturated, too small, not filled, at Nyquist without tilt, or patches without contrast.
+        There are no bars; the region is saturated, too small or not filled; the bars are at Nyquist without tilt; or
+        the patches have no contrast.
+
+    Examples
+    --------
+    Bars between 200 and 1000 grey values have a fundamental of (2 / pi) 800. A camera that leaves 40 % of it:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> row, column = np.mgrid[:64, :64]
+    >>> wave = np.cos(2 * np.pi * (0.02 * row + 0.3 * column))
+    >>> image = 600 + 0.4 * (2 / np.pi) * 800 * wave
+    >>> bars = analysis.bar_mtf(image, np.full(100, 200.0), np.full(100, 1000.0), frequency=0.3)
+    >>> round(bars.mtf, 4), round(bars.cycles_per_pixel, 4)
+    (0.4, 0.3007)
     """
     if saturation is None and noise is not None:
         saturation = noise.saturation_dn
@@ -164,17 +195,17 @@ def bar_mtf(
             f"the patches have no contrast: bright {high:g} +- {high_sigma:.2g}, dark {low:g} +- {low_sigma:.2g}; "
             "choose even areas of the target's two levels, the brighter one as bright"
         )
-    place = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2.0 for n in grey.shape), indexing="ij")).reshape(2, -1)
+    position = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2.0 for n in grey.shape), indexing="ij")).reshape(2, -1)
     weight = window.ravel()
     value = grey.ravel()
     start = _start(grey, frequency)
     _check_phases(start, grey.shape)
     numbers = _separable(start, grey.shape)
-    fitted, parameters = _fit(place, value, weight, start, numbers)
+    fitted, parameters = _fit(position, value, weight, start, numbers)
     other = _other_alias(fitted, frequency)
     if other is not None:
-        fitted, parameters = _fit(place, value, weight, other, numbers)
-    design = _design(place, fitted, numbers, parameters)
+        fitted, parameters = _fit(position, value, weight, other, numbers)
+    design = _design(position, fitted, numbers, parameters)
     model = parameters @ design[:-2]
     inverse = np.linalg.inv(_gram(design * weight, design))
     if noise is None:
@@ -192,13 +223,13 @@ def bar_mtf(
     if amplitude < _LEAST_AMPLITUDE * along_sigma:
         raise BarError(
             f"no bars in the region: the amplitude of {amplitude:.3g} at {np.hypot(*fitted):.3f} cycles/pixel is only "
-            f"{amplitude / along_sigma:.1f} times its sigma; move the region, state the frequency, or average frames"
+            f"{amplitude / along_sigma:.1f} times its sigma; move the region, give the frequency, or average frames"
         )
-    _check_filled(place, grey.shape, value - model, fitted, amplitude, float(np.mean(variance)))
+    _check_filled(position, grey.shape, value - model, fitted, amplitude, float(np.mean(variance)))
     scale = math.pi / (2.0 * step)
     signal = signal_modulus(amplitude, along_sigma, across_sigma)
     mtf = scale * amplitude
-    # bars of equal width have the mean of the levels on the average; light that is not that of the levels changes both
+    # the mean of bars of equal width is the mean of the two levels; another light changes both levels in proportion
     light = 2.0 * (float(parameters[0]) - low) / step - 1.0
     light_sigma = math.sqrt(4.0 * float(covariance[0, 0]) + low_sigma**2 + high_sigma**2) / step
     least = _LEAST_LIGHT if np.shape(dark) == np.shape(bright) == grey.shape else 0.0
@@ -272,7 +303,10 @@ def _level(
 
 
 def _start(grey: Array, frequency: ArrayLike | None) -> Array:
-    """(2,) the strongest cell of the windowed spectrum near the wanted frequency, cycles/pixel, unwrapped to it."""
+    """Return the strongest cell of the windowed spectrum near the given frequency, (2,) cycles/pixel.
+
+    The cell is unwrapped to that frequency.
+    """
     shape = np.array(grey.shape)
     window = np.outer(*(np.hanning(n + 2)[1:-1] for n in grey.shape))
     flat = grey - np.average(grey, weights=window)
@@ -306,7 +340,7 @@ def _start(grey: Array, frequency: ArrayLike | None) -> Array:
 
 
 def _other_alias(fitted: Array, frequency: ArrayLike | None) -> Array | None:
-    """The alias near Nyquist whose length is nearer the stated one, if there is one."""
+    """Return the alias near Nyquist whose length is nearer to the given one; None if there is none."""
     if frequency is None or np.ndim(frequency) != 0:
         return None
     length = abs(float(np.asarray(frequency)))
@@ -329,7 +363,7 @@ def _check_phases(frequency: Array, shape: tuple[int, ...]) -> None:
     if not _apart(frequency, shape):
         raise BarError(
             f"{np.hypot(*frequency):.3f} cycles/pixel is not a frequency of bars in {shape[0]} x {shape[1]} px: less "
-            "than two periods; take a larger region or state the frequency"
+            "than two periods; take a larger region or give the frequency"
         )
     if not _apart(2.0 * frequency, shape):
         raise BarError(
@@ -339,18 +373,18 @@ def _check_phases(frequency: Array, shape: tuple[int, ...]) -> None:
 
 
 def _separable(frequency: Array, shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Harmonics whose aliases lie apart from zero, from the fundamental and from each other."""
-    kept: list[int] = []
+    """Return the harmonics whose aliases are separated from zero, from the fundamental and from each other."""
+    separable: list[int] = []
     for h in _HARMONICS:
-        others = [1, *kept]
+        others = [1, *separable]
         both = [(h - k) * frequency for k in others] + [(h + k) * frequency for k in others]
         if all(_apart(each, shape) for each in (*both, h * frequency, 2 * h * frequency)):
-            kept.append(h)
-    return tuple(kept)
+            separable.append(h)
+    return tuple(separable)
 
 
 def _waves(place: Array, frequency: Array, numbers: tuple[int, ...]) -> Array:
-    """Rows 1, then cosine and sine of the fundamental and of each harmonic, (3 + 2 K, N)."""
+    """Return rows of 1, then cosine and sine of the fundamental and of each harmonic, (3 + 2 K, N)."""
     phase = 2.0 * np.pi * (frequency @ place)
     turned = np.outer((1, *numbers), phase)
     pairs = np.stack([np.cos(turned), np.sin(turned)], axis=1).reshape(-1, phase.size)
@@ -358,7 +392,7 @@ def _waves(place: Array, frequency: Array, numbers: tuple[int, ...]) -> Array:
 
 
 def _design(place: Array, frequency: Array, numbers: tuple[int, ...], parameters: Array) -> Array:
-    """The waves, then the derivatives by the two components of the frequency, (P, N)."""
+    """Return the waves, then the derivatives with respect to the two components of the frequency, (P, N)."""
     waves = _waves(place, frequency, numbers)
     slope = np.zeros(waves.shape[1])
     for k, h in enumerate((1, *numbers)):
@@ -368,18 +402,21 @@ def _design(place: Array, frequency: Array, numbers: tuple[int, ...], parameters
 
 
 def _gram(first: Array, second: Array) -> Array:
-    """Products summed over pixels. Not by a matrix product, whose threads wait for each other on a busy machine."""
+    """Return products summed over pixels.
+
+    A matrix product is not used, since its threads wait for each other on a busy machine.
+    """
     return np.asarray(np.einsum("in,jn->ij", first, second))
 
 
 def _solved(design: Array, value: Array, weight: Array) -> Array:
-    """Least-squares parameters."""
+    """Return the least-squares parameters."""
     weighted = design * weight
     return np.asarray(np.linalg.solve(_gram(weighted, design), weighted @ value))
 
 
 def _fit(place: Array, value: Array, weight: Array, start: Array, numbers: tuple[int, ...]) -> tuple[Array, Array]:
-    """Least-squares frequency (2,) and amplitudes (3 + 2 K,) by Gauss-Newton steps."""
+    """Fit frequency (2,) and amplitudes (3 + 2 K,) by Gauss-Newton steps."""
     frequency = start
     limit: Array = np.asarray(0.5 / np.ptp(place, axis=1))
     for _ in range(_STEPS):
@@ -409,9 +446,10 @@ def _check_filled(
 
 
 FALSE_ALARM = 1e-4
-"""Rate at which pages are refused although the bars do not move in them."""
+"""Probability that pages are refused although the bars do not move in them."""
 _ROUGH = 0.3
-"""Noise of a pixel over the step of its grey values below which rounding is no noise: a tenth of it stays."""
+"""Ratio of noise to the step of grey values below which the rounding error does not average out: a tenth of it stays.
+"""
 
 
 def measure_bar_pages(
@@ -424,128 +462,134 @@ def measure_bar_pages(
     offset: float = 0.0,
     step: float = 0.0,
 ) -> BarMtf:
-    """MTF from the bars that fill a region in all pages.
+    """Measure the MTF from the bars that fill a region in all pages.
 
     Parameters
     ----------
-    region : Array
-        (P, H, W) grey values, linear in light; pages that repeat another one to the bit do not count.
-    dark : Array
-        Pages (Q, ...) with the level of the spaces, as in `bar_mtf`.
-    bright : Array
-        Likewise with that of the bars.
-    frequency : ArrayLike | None
-        As there.
-    saturation : float | None
-        As there; one page that reaches it is enough.
+    region : (P, H, W) ndarray
+        Grey values, linear in light; identical copies of a page do not count.
+    dark : (Q, ...) ndarray
+        Pages with the level of the spaces, as in `measure_bars`.
+    bright : (Q, ...) ndarray
+        Pages with the level of the bars.
+    frequency : array_like or None
+        Approximate frequency, as in `measure_bars`.
+    saturation : float or None
+        Grey value of saturation; one page that reaches it is enough for a refusal.
     offset : float
-        As there.
+        Grey value without light, for the contrast only.
     step : float
-        Between the grey values of a page, which are rounded to it; 0 for real numbers.
+        Step between the grey values of a page, to which they are rounded; 0 for real numbers.
 
     Raises
     ------
     BarError
-        As `bar_mtf`, and bars that move from page to page.
+        `measure_bars` fails, or the bars move from page to page.
     """
-    kept = different_pages(region)
-    pages, patches = region[kept], [patch[different_pages(patch)] for patch in (dark, bright)]
+    unique = different_pages(region)
+    pages, patches = region[unique], [patch[different_pages(patch)] for patch in (dark, bright)]
     mean = mean_page(pages, saturation)
     low, high = (mean_page(patch, saturation) for patch in patches)
-    # sums of huge real numbers may overflow; what is not finite is refused below
+    # sums of huge real numbers may overflow; values that are not finite are refused below
     with np.errstate(over="ignore", invalid="ignore"):
         noise = [float(np.sqrt(np.mean(np.var(patch.reshape(len(patch), -1), axis=1)))) for patch in patches]
-        own = math.inf if len(pages) == 1 else float(np.sqrt(np.mean(np.var(pages, axis=0, ddof=1))))
-    rounding = [left_over(rms, step) if math.isfinite(rms) else 0.0 for rms in (own, *noise)]
+        page_noise = math.inf if len(pages) == 1 else float(np.sqrt(np.mean(np.var(pages, axis=0, ddof=1))))
+    rounding = [rounding_residual(rms, step) if math.isfinite(rms) else 0.0 for rms in (page_noise, *noise)]
 
-    def measured(left: float) -> BarMtf:
+    def measured(rounding_error: float) -> BarMtf:
         return bar_mtf(
-            mean, low, high, frequency, saturation=saturation, offset=offset, rounding=(left, rounding[1], rounding[2])
+            mean,
+            low,
+            high,
+            frequency,
+            saturation=saturation,
+            offset=offset,
+            rounding=(rounding_error, rounding[1], rounding[2]),
         )
 
-    found = measured(rounding[0])
+    result = measured(rounding[0])
     if len(pages) == 1:
-        own = _scatter(mean, found)
-        if left_over(own, step) > own:
-            found = measured(left_over(own, step))
+        page_noise = _scatter(mean, result)
+        if rounding_residual(page_noise, step) > page_noise:
+            result = measured(rounding_residual(page_noise, step))
     else:
-        _check_drift(pages, mean, found, step)
-    return replace(found, page_noise=(own, noise[0], noise[1]), same=len(region) - len(pages))
+        _check_drift(pages, mean, result, step)
+    return replace(result, page_noise=(page_noise, noise[0], noise[1]), same=len(region) - len(pages))
 
 
-def _waves_of_page(shape: tuple[int, ...], found: BarMtf) -> Array:
-    """1, and the fundamental with its derivative by the phase, of unit amplitude, (3, N)."""
+def _waves_of_page(shape: tuple[int, ...], bars: BarMtf) -> Array:
+    """Return 1, and the fundamental of unit amplitude with its derivative by the phase, (3, N)."""
     place = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2.0 for n in shape), indexing="ij")).reshape(2, -1)
-    phase = 2.0 * np.pi * (found.frequency @ place) + found.phase
+    phase = 2.0 * np.pi * (bars.frequency @ place) + bars.phase
     return np.stack([np.ones(phase.size), np.cos(phase), -np.sin(phase)])
 
 
-def _scatter(mean: Array, found: BarMtf) -> float:
-    """Rms of what the fundamental leaves in a page, at most; harmonics are in it."""
-    waves = _waves_of_page(mean.shape, found)
+def _scatter(mean: Array, bars: BarMtf) -> float:
+    """Return the rms residual of the fundamental in a page, an upper limit of the noise, as harmonics are in it."""
+    waves = _waves_of_page(mean.shape, bars)
     value = mean.ravel()
     rest = value - np.linalg.lstsq(waves.T, value, rcond=None)[0] @ waves
     return float(np.sqrt(np.mean(rest**2)))
 
 
-def _check_drift(pages: Array, mean: Array, found: BarMtf, step: float) -> None:
-    """BarError unless all pages have the same phase."""
-    waves = _waves_of_page(mean.shape, found)
+def _check_drift(pages: Array, mean: Array, bars: BarMtf, step: float) -> None:
+    """Raise BarError if the pages differ significantly in phase."""
+    waves = _waves_of_page(mean.shape, bars)
     inverse = np.linalg.inv(waves @ waves.T)
     rest = (pages - mean).reshape(len(pages), -1)
     parts = rest @ waves.T @ inverse
     freedom = (rest.shape[1] - 3) * (len(pages) - 1)
     noise = math.sqrt(float(np.sum((rest - parts @ waves) ** 2)) / freedom)
-    noise = max(noise, left_over(noise, step), 1e-12 * found.amplitude)
-    phase = parts[:, 2] / found.amplitude
-    sigma = noise * math.sqrt(inverse[2, 2]) / found.amplitude
+    noise = max(noise, rounding_residual(noise, step), 1e-12 * bars.amplitude)
+    phase = parts[:, 2] / bars.amplitude
+    sigma = noise * math.sqrt(inverse[2, 2]) / bars.amplitude
     if chance_beyond(float(np.sum((phase / sigma) ** 2)), len(pages) - 1) < FALSE_ALARM:
-        moved = float(np.std(phase)) / (2.0 * math.pi * found.cycles_per_pixel)
+        moved = float(np.std(phase)) / (2.0 * math.pi * bars.cycles_per_pixel)
         raise BarError(
             f"the bars move by {moved:.2g} px rms from page to page (sigma of a page"
-            f" {sigma / (2.0 * math.pi * found.cycles_per_pixel):.1g} px), which lowers the MTF of their mean by about"
+            f" {sigma / (2.0 * math.pi * bars.cycles_per_pixel):.1g} px), which lowers the MTF of their mean by about"
             f" {min(0.5 * float(np.var(phase)), 1.0):.1%}: measure single pages, or hold the target still"
         )
 
 
-def page_warnings(found: EdgeMtf | BarMtf, step: float) -> list[str]:
-    """What pages, compared with each other and with the step of their grey values, warn of.
+def page_warnings(result: EdgeMtf | BarMtf, step: float) -> list[str]:
+    """Return the warnings that follow from comparing pages with each other and with the step of their grey values.
 
     Parameters
     ----------
-    found : EdgeMtf | BarMtf
-        By `measure_bar_pages` or `edge_pages.measure_pages`.
+    result : EdgeMtf or BarMtf
+        Result of `measure_bar_pages` or `edge_pages.measure_pages`.
     step : float
-        Between the grey values of a page; 0 for real numbers.
+        Step between the grey values of a page; 0 for real numbers.
     """
-    if isinstance(found, EdgeMtf):
-        assert found.pages is not None
-        same, noise = found.pages.same, min(found.pages.noise)
+    if isinstance(result, EdgeMtf):
+        assert result.pages is not None
+        same, noise = result.pages.same, min(result.pages.noise)
     else:
-        assert found.page_noise is not None
-        same, noise = found.same, min(found.page_noise)
+        assert result.page_noise is not None
+        same, noise = result.same, min(result.page_noise)
     out = []
-    if isinstance(found, BarMtf) and found.uneven:
+    if isinstance(result, BarMtf) and result.uneven:
         out.append(
-            f"the mean level in the bars is that of light {found.light:+.1%} from that on the patches (sigma"
-            f" {found.light_sigma:.1g}): uneven light, or patches that diffraction reaches. The MTF is as much too high"
-            " or low, and sigma holds it: take even fields at the place of the bars"
+            f"the mean level in the bars differs by {result.light:+.1%} from that of the light on the patches (sigma"
+            f" {result.light_sigma:.1g}): uneven light, or diffraction at the patches. The MTF has the same relative"
+            " error, which sigma includes: use even fields at the position of the bars"
         )
     if same:
-        out.append(f"{same} pages repeat another one to the bit and do not count: were they copied?")
+        out.append(f"{same} pages are identical to another one and do not count: were they copied?")
     if noise < _ROUGH * step:
         out.append(
             f"the noise of {noise:.2g} in a pixel is below {_ROUGH:g} of the step of {step:g} between grey values,"
-            " so that rounding does not average out over pixels and pages; sigma holds it. A higher gain helps"
+            " so that rounding does not average out over pixels and pages; sigma includes it. A higher gain helps"
         )
-    if isinstance(found, EdgeMtf) and found.doubt:
-        out.append(found.doubt)
-    if isinstance(found, EdgeMtf) and found.pages is not None and found.pages.aligned:
-        pages = found.pages
+    if isinstance(result, EdgeMtf) and result.doubt:
+        out.append(result.doubt)
+    if isinstance(result, EdgeMtf) and result.pages is not None and result.pages.aligned:
+        pages = result.pages
         apart = np.abs(pages.position - np.mean(pages.position))
         out.append(
             f"the edge moves from page to page, by {pages.drift:.2g} px rms and {float(apart.max()):.2g} px at most"
             f" (chi-square {pages.chi_square:.4g} for {pages.degrees_of_freedom} degrees of freedom): the pages were"
-            " laid over each other, so that the MTF is that of a single page"
+            " aligned, so that the MTF is that of a single page"
         )
     return out

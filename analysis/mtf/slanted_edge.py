@@ -1,19 +1,19 @@
-"""Modulation transfer function (MTF) from one slanted edge, after ISO 12233, with the standard deviation by theory.
+"""Modulation transfer function (MTF) from one slanted edge, after ISO 12233, with propagated standard deviations.
 
 Steps: the edge's line from row centroids (`edge_location`); all pixels projected on the edge's *normal* and a
-least-squares edge-spread function through them (`edge_fit`); angle, position and a test for curvature by
-one Gauss-Newton step on all pixels, twice; the transform of the line-spread function in closed form over the contrast.
+least-squares edge-spread function through them (`edge_fit`); angle, position and a test for curvature by one
+Gauss-Newton step on all pixels, twice; the transform of the line-spread function in closed form over the contrast.
 
 ISO 12233 projects along the rows, and its frequencies are counted along the row. Here they are counted along the
-normal: the result is the cut through the two-dimensional MTF at f (cos angle, sin angle) for axis "x".
-Along the row (axis "x") or column (axis "y") the frequency is lower by cos(angle).
+normal: the result is the cut through the two-dimensional MTF at f (cos angle, sin angle) for axis "x". Along the row
+(axis "x") or column (axis "y") the frequency is lower by cos(angle).
 
-Noise passes through a chain that is linear but for the division by the contrast, so its covariance is exact to first
-order: pixel variances -> coefficients -> transfer function with its normalisation -> modulus. The modulus is too long
-on the average (Rice); `noise_bias` says by how much and `mtf` is not corrected for it.
+The processing of noise is linear but for the division by the contrast, so its covariance is exact to first order: pixel
+variances -> coefficients -> transfer function with its normalisation -> modulus. Noise lengthens the modulus on average
+(Rice); `noise_bias` gives the amount, and `mtf` is not corrected for it.
 
-Without noise the error is below 0.0005 up to Nyquist for F/9.2 at 650 nm with pixels of 7 um and of 28 um, at 2 to
-10 deg from 64 x 64 px on (tests/analysis/test_slanted_edge.py). `sigma` does not contain it.
+Without noise the error is below 0.0005 up to Nyquist for F/9.2 at 650 nm with pixels of 7 um and of 28 um, at 2 to 10
+deg for 64 x 64 px and more (tests/analysis/test_slanted_edge.py). `sigma` does not contain it.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from analysis.mtf.edge_location import Axis, EdgeError, EdgeLine, checked_region
 from analysis.spots.noise import NoiseModel
 from analysis.statistics import chance_beyond, measured_bias, rice_sigma, signal_modulus
 
-# Block means of 4 x 4 px that stick out of the fitted edge by more than this share of the contrast.
+# Fraction of the contrast by which means of blocks of 4 x 4 px may differ from the fitted edge.
 _OTHER_STRUCTURE = 0.1
 # Blocks and strips of pixels whose means are tested for structure, px.
 _BLOCK, _STRIP = 8, 4
 FALSE_ALARM = 1e-4
-"""Rate at which independent noise of the pixels is reported as structure."""
+"""Probability that independent noise of the pixels is reported as structure."""
 _LEAST_STRUCTURE = 5e-5
 FREQUENCY = np.linspace(0.0, 1.0, 65)
 FREQUENCY.setflags(write=False)
 """Frequencies at which an MTF is given by default, cycles/pixel."""
-# Samples of the spread functions that are handed out.
+# Samples of the returned spread functions.
 _SHOWN_PER_PIXEL = 16
 
 
@@ -55,47 +55,76 @@ def slanted_edge_mtf(
     rounding: tuple[float, float] = (0.0, 0.0),
     even: bool = False,
 ) -> EdgeMtf:
-    """MTF of the one edge in a region.
+    """Measure the MTF from the one edge in a region.
 
-    Of several frames of it see `edge_pages.measure_pages`.
+    For several frames see `edge_pages.measure_pages`.
 
     Parameters
     ----------
-    region : ArrayLike
-        (H, W) grey values, linear in light.
-    noise : NoiseModel | None
-        The detector's model; its fixed pattern counts as independent from pixel to pixel. Without a model the variance
-        is estimated from the residuals on both sides of the edge and taken as linear in the grey value.
+    region : (H, W) array_like
+        Grey values, linear in light.
+    noise : NoiseModel or None
+        Noise model of the detector; its fixed pattern counts as independent from pixel to pixel. Without a model the
+        variance is estimated from the residuals on both sides of the edge and taken as linear in the grey value.
     frames : int
-        How many frames the region is the mean of, used with `noise` only.
-    saturation : float | None
-        Grey value of saturation; default the model's, else plateaus of equal values are looked for.
-    frequency : ArrayLike | None
-        (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
-    rounding : tuple[float, float]
-        Rms of what rounding leaves in the dark and in the bright level, grey values (`edge_pages.left_over`).
+        Number of frames averaged into the region, used with `noise` only.
+    saturation : float or None
+        Grey value of saturation; default the model's, otherwise plateaus of equal values count as saturated.
+    frequency : (F,) array_like or None
+        Increasing frequencies, cycles/pixel; default 0 to 1 in steps of 1/64.
+    rounding : tuple of float
+        Rms of the rounding error that remains in the dark and in the bright level, grey values
+        (`edge_pages.rounding_residual`).
     even : bool
-        The light is known to be even, as in a simulated image; else both levels are planes.
+        True if the light is known to be even, as in a simulated image; else both levels are planes.
 
     Raises
     ------
     EdgeError
         The region does not show one measurable edge.
     ValueError
-        Frequencies that make no sense.
+        The frequencies are not increasing, negative or too high.
+
+    Examples
+    --------
+    An edge at 5 deg, blurred by a Gaussian of 0.6 px, whose MTF is exp(-2 pi^2 0.6^2 f^2):
+
+    >>> import numpy as np
+    >>> from scipy.special import erf
+    >>> import analysis
+    >>> row, column = np.mgrid[:80, :80]
+    >>> angle = np.radians(5.0)
+    >>> distance = (column - 39.2) * np.cos(angle) - (row - 39.5) * np.sin(angle)
+    >>> image = 500 + 400 * erf(distance / (0.6 * np.sqrt(2)))
+    >>> edge = analysis.slanted_edge_mtf(image, frequency=[0.0, 0.25, 0.5], saturation=1000)
+    >>> np.round(edge.mtf, 3)
+    array([1.   , 0.641, 0.169])
+    >>> np.round(np.exp(-2 * np.pi**2 * 0.6**2 * edge.frequency**2), 3)
+    array([1.   , 0.641, 0.169])
+    >>> edge.axis, round(float(np.degrees(abs(edge.angle))), 2)
+    ('x', 5.0)
+
+    With 1 % of noise; `at` interpolates the value and its standard deviation:
+
+    >>> rng = np.random.default_rng(3)
+    >>> value, sigma = analysis.slanted_edge_mtf(image + 4 * rng.standard_normal(image.shape)).at(0.25)
+    >>> round(value, 2), round(sigma, 3)
+    (0.64, 0.003)
     """
-    wanted = FREQUENCY if frequency is None else _checked_frequency(frequency)
+    frequencies = FREQUENCY if frequency is None else _checked_frequency(frequency)
     if saturation is None and noise is not None:
         saturation = noise.saturation_dn
     grey = checked_region(region, saturation)
     line = locate_edge(grey)
-    up = rising(grey, line)
-    fitted = fit_edge(up, *rising_line(line, up.shape[1]), even)
-    return edge_result(up[None] - fitted.light.reshape(up.shape), line, fitted, noise, frames, wanted, rounding)
+    upright = rising(grey, line)
+    fitted = fit_edge(upright, *rising_line(line, upright.shape[1]), even)
+    return edge_result(
+        upright[None] - fitted.light.reshape(upright.shape), line, fitted, noise, frames, frequencies, rounding
+    )
 
 
 def _checked_frequency(frequency: ArrayLike) -> Array:
-    """Frequencies (F,) of `slanted_edge_mtf`. ValueError if they make no sense."""
+    """Return the frequencies (F,) of `slanted_edge_mtf`; raise ValueError if they are unsuitable."""
     wanted = np.array(frequency, dtype=np.float64)
     if wanted.ndim != 1 or wanted.size < 2 or not np.all(np.diff(wanted) > 0) or wanted[0] < 0:
         raise ValueError("frequency must be at least two increasing values >= 0, in cycles/pixel")
@@ -105,13 +134,13 @@ def _checked_frequency(frequency: ArrayLike) -> Array:
 
 
 def rising(grey: Array, line: EdgeLine) -> Array:
-    """Regions (..., H, W) turned so that the edge is near-vertical and rises to the right."""
+    """Return regions (..., H, W) transposed or mirrored so that the edge is near-vertical and rises to the right."""
     upright = grey if line.axis == "x" else np.swapaxes(grey, -1, -2)
     return upright if line.sign > 0 else upright[..., ::-1]
 
 
 def rising_line(line: EdgeLine, columns: int) -> tuple[float, float]:
-    """Column in the middle row and slope of the line in a region so turned."""
+    """Return the column in the middle row and the slope of the line in a region oriented by `rising`."""
     return line.position if line.sign > 0 else columns - 1 - line.position, math.tan(line.sign * line.angle)
 
 
@@ -124,24 +153,24 @@ def edge_result(
     frequency: Array,
     rounding: tuple[float, float],
 ) -> EdgeMtf:
-    """What a fit says, with its sigmas.
+    """Return the MTF of a fitted edge, with its sigmas.
 
     Parameters
     ----------
-    pages : Array
-        From `rising`, with equal levels, (P, H, W); P is 1 but for pages that are aligned.
+    pages : (P, H, W) ndarray
+        Regions from `rising`, with equal levels; P is 1 unless pages are aligned.
     line : EdgeLine
-        As located; its axis and sign count.
+        Line as located, for its axis and sign.
     fitted : FittedEdge
         Line and edge-spread function of all pages together.
-    noise : NoiseModel | None
-        As in `slanted_edge_mtf`.
+    noise : NoiseModel or None
+        Noise model, as in `slanted_edge_mtf`.
     frames : int
-        Each page is the mean of.
-    frequency : Array
-        (F,) cycles/pixel.
-    rounding : tuple[float, float]
-        As in `slanted_edge_mtf`.
+        Number of frames averaged into each page.
+    frequency : (F,) ndarray
+        Frequencies, cycles/pixel.
+    rounding : tuple of float
+        Rounding errors, as in `slanted_edge_mtf`.
 
     Raises
     ------
@@ -166,14 +195,14 @@ def edge_result(
     # A path that is off by e(v) blurs: 1 - mean cos(2 pi f e cosine) is a sum of k chi^2, its mean square as below.
     blurs = 0.5 * squares * (2.0 * np.pi * frequency[:, None] * cosine) ** 2
     blur = np.sqrt(blurs.sum(axis=1) ** 2 + 2.0 * np.sum(blurs**2, axis=1))
-    # pages that are laid over each other by their noise: an error of one sign, as much up as down by its size
+    # noise of the positions of aligned pages: an error of one sign, counted as a symmetric one of that size
     jitter = 0.5 * (2.0 * np.pi * frequency) ** 2 * fitted.jitter
-    # one error of the contrast, which the value 1 at frequency 0 does not have
+    # one relative error of the contrast, except at frequency 0, where the MTF is 1
     level = np.where(frequency > 0.0, math.hypot(*rounding) / spread.contrast, 0.0)
     centre = spread.design(np.zeros(1))
     steep = float(spread.slope(centre)[0])
     shift = (spread.dark + 0.5 * spread.contrast - float(spread.value(centre)[0])) / steep
-    # how each coefficient lifts the middle of the edge above half height
+    # derivatives of the edge's height in the middle above half height by the coefficients
     lift = np.insert(centre.project(np.ones(1)), spread.spline_count, np.zeros(fitted.change.size))
     lift[-3:] -= (1.0, 0.5, 0.0)
     offset = fitted.rows.middle + shift / cosine
@@ -227,7 +256,7 @@ def _check_one_edge(residual: Array, contrast: float, line: EdgeLine) -> None:
         across = across if line.sign > 0 else residual.shape[1] - 1 - across
         row, column = (along, across) if line.axis == "x" else (across, along)
         raise EdgeError(
-            f"the region holds more than one straight edge: near its row {row}, column {column} grey values differ "
+            f"the region contains more than one straight edge: near its row {row}, column {column} grey values differ "
             f"from such an edge by {blocks.max() / contrast:.0%} of its contrast (second edge, corner, bend, speck, "
             "uneven light); choose a region with one edge between two even areas"
         )
@@ -237,7 +266,12 @@ def _check_one_edge(residual: Array, contrast: float, line: EdgeLine) -> None:
 class Structure:
     """Differences between the means of blocks of pixels and the fit.
 
-    rms: beyond the noise, grey values. chance: probability of such differences by independent noise of the pixels.
+    Attributes
+    ----------
+    rms : float
+        Rms of the differences beyond the noise, grey values.
+    chance : float
+        Probability of such differences by independent noise of the pixels (p-value).
     """
 
     rms: float
@@ -247,7 +281,8 @@ class Structure:
 def _structure(fitted: FittedEdge, residual: Array, variance: Array) -> Structure:
     """Return the structure in the residuals of independent pixels (N,) with their variances (N,).
 
-    Means are taken of blocks of 8 x 8 px, of strips of 4 px along the edge, and of strips across it on either side.
+    It is tested in the means of blocks of 8 x 8 px, of strips of 4 px along the edge, and of strips across it on either
+    side.
     """
     along = np.repeat(fitted.rows.along + fitted.rows.half, fitted.rows.columns).astype(np.intp)
     across = np.tile(np.arange(fitted.rows.columns), len(fitted.rows.along))
@@ -264,8 +299,10 @@ def _structure(fitted: FittedEdge, residual: Array, variance: Array) -> Structur
 
 
 def _path_errors(fitted: FittedEdge, residual: Array, variance: Array) -> tuple[float, float, float, Array]:
-    """Return the sigma of the path's slope, its mean second derivative with sigma, 1/px, and its mean squares of error
-    along the rows by the coefficients of order 1 and up, (order,), px^2, from residuals (N,) and variances (N,).
+    """Return errors of the path: sigma of its slope, curvature with sigma, 1/px, and mean squares of error by order.
+
+    The curvature is the mean second derivative. The mean squares along the rows, (order,) px^2, are those by the
+    coefficients of order 1 and up. Residuals and variances have the shape (N,).
     """
     rows, order = fitted.rows, fitted.order
     parts, near = path_parts(fitted, max(order, 2))
@@ -274,9 +311,9 @@ def _path_errors(fitted: FittedEdge, residual: Array, variance: Array) -> tuple[
     bend = float((inverse @ (parts @ residual[near]))[2]) + float(rows.bend[:1].sum())
     # the second derivative of the second Legendre polynomial is 3
     scale = 3.0 / rows.half**2
-    # the coefficients without those that were not fitted
-    own = np.linalg.inv(normal[: order + 1, : order + 1])
-    square = np.diag(own @ scatter[: order + 1, : order + 1] @ own)[1:]
+    # covariance of the fitted coefficients alone
+    inverse_fitted = np.linalg.inv(normal[: order + 1, : order + 1])
+    square = np.diag(inverse_fitted @ scatter[: order + 1, : order + 1] @ inverse_fitted)[1:]
     bend_sigma = math.sqrt(float((inverse @ scatter @ inverse)[2, 2]))
     blur = square * np.mean(rows.polynomials(order)[1:] ** 2, axis=1)
     return math.sqrt(square[0]) / rows.half, scale * bend, scale * bend_sigma, blur
@@ -284,7 +321,7 @@ def _path_errors(fitted: FittedEdge, residual: Array, variance: Array) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class _Levels:
-    """Grey values (N,) of pages of this shape and their model, for the noise on both sides of the edge."""
+    """Grey values (N,) of pages of a shape and their model, for the noise on both sides of the edge."""
 
     shape: tuple[int, ...]
     grey: Array
@@ -295,11 +332,11 @@ class _Levels:
     def variances(
         self, noise: NoiseModel | None, frames: int, rounding: tuple[float, float]
     ) -> tuple[Array, float, float]:
-        """Variance of every pixel (N,), and of a dark and a bright one.
+        """Return the variance of every pixel (N,), and that of a dark and of a bright pixel.
 
-        What a pixel has in all pages alike does not average down. A pixel of P pages therefore counts with P times the
-        variance of its mean, as if it had fallen on the same place of the edge in all of them, which it does where
-        pages hardly move; where they do, sigma is rather too large.
+        Errors that a pixel has in all pages alike do not average down. A pixel of P pages therefore counts with P times
+        the variance of its mean, as if it had fallen on the same position of the edge in all of them, which is so where
+        pages hardly move; where they do move, sigma is rather too large.
         """
         count, spread = self.shape[0], self.spread
         ends = np.array([spread.dark, spread.dark + spread.contrast])
@@ -307,7 +344,7 @@ class _Levels:
             dark, bright = (noise.temporal_variance_dn2(ends, frames * count) + noise.fixed_variance_dn2(ends)) * count
             variance = noise.temporal_variance_dn2(self.model, frames * count) + noise.fixed_variance_dn2(self.model)
             return variance * count, float(dark), float(bright)
-        # two levels and a tail are fitted outside of the core: each side gives one degree of freedom and a half away
+        # two levels and a tail are fitted outside of the core, so that each side loses 1.5 degrees of freedom
         square = np.mean((self.grey - self.model).reshape(count, -1), axis=0) ** 2
         x, levels = self.design.x.reshape(count, -1), self.model.reshape(count, -1)
         sides = np.all(x < -spread.core, axis=0), np.all(x > spread.core, axis=0)
@@ -325,16 +362,25 @@ class _Levels:
 
 
 @dataclass(frozen=True, eq=False)
-class PagePlaces:
-    """Where the edge stands in each of P pages, frames of one image.
+class PagePositions:
+    """Position of the edge in each of P pages, frames of one image.
 
-    position, position_sigma: (P,) in the region's middle, px, as `EdgeMtf.position`; sigma by what is new in each page.
-    angle, angle_sigma: (P,) rad, as `EdgeMtf.angle`; all the same where pages do not turn.
-    chi_square, degrees_of_freedom: of places and angles of all pages being the same.
-    aligned: they are not, so that the pages were laid over each other before they were measured together.
-    same: pages that another one repeats to the bit and that do not count.
-    noise: (2,) of one pixel in one page on the dark and on the bright side, rms, grey values.
-    rounded: (2,) rms of what rounding leaves in these levels, however many pixels and pages there are, grey values.
+    Attributes
+    ----------
+    position, position_sigma : (P,) ndarray
+        Position in the region's middle, px, as `EdgeMtf.position`; sigma by the noise that is new in each page.
+    angle, angle_sigma : (P,) ndarray
+        Angle, rad, as `EdgeMtf.angle`; all equal where pages do not rotate.
+    chi_square, degrees_of_freedom : float, int
+        Test of positions and angles of all pages being the same.
+    aligned : bool
+        True if they are not the same, so that the pages were aligned before they were measured together.
+    same : int
+        Number of pages that are identical copies of another one and do not count.
+    noise : tuple of float
+        Rms noise of one pixel in one page on the dark and on the bright side, grey values.
+    rounded : tuple of float
+        Rms of the rounding error that remains in these levels, however many pixels and pages there are, grey values.
     """
 
     position: Array
@@ -358,29 +404,50 @@ class PagePlaces:
 class EdgeMtf:
     """MTF along the normal of one edge.
 
-    axis: "x" for a near-vertical edge (MTF along rows), "y" for a near-horizontal one (MTF along columns).
-    frequency: (F,) cycles/pixel along the normal.
-    mtf: (F,) modulus of the transfer function, 1 at frequency 0, not corrected for noise_bias.
-    transfer: (F,) complex transfer function, phase counted from the edge's position.
-    sigma_along, sigma_across: (F,) standard deviation of transfer along itself, and square to that.
-    sigma: (F,) standard deviation of mtf from noise, with the share of the angle's uncertainty.
-    noise_bias: (F,) how much noise lengthens mtf on the average, >= 0, from the measured mtf (`rice.measured_bias`).
-        Its mean over repeats is right to 0.03 sigma_across where the true MTF is three of them, to 0.09 down to 0.6,
-        and too small where there is hardly a signal, by up to half of one.
-    angle, angle_sigma: rad, against the grid: column (row) = position + tan(angle) (row (column) - middle).
-    position, position_sigma: column (axis "x") or row (axis "y") of the edge's half height in the region's middle, px.
-    curvature, curvature_sigma: mean second derivative of the edge's column (row) by its row (column), 1/px.
-    order: of the polynomial that the edge was followed by, 1 where it is straight within the noise.
-    light, light_sigma: (4,) change of the bright level over the region's length along the edge and over its width from
-        the dark side to the bright, and the same of the dark level, grey values; (0,) where light was taken as even.
-    structure: that the fit leaves in the region.
-    place, esf, lsf: (S,) px along the normal from the dark side to the bright, 16 to a pixel, as far as there are
-        pixels on both sides; grey values; line-spread function, 1/px, integral 1.
-    pixel_place, pixel_grey: (N,) all pixels, projected, as used.
-    dark, bright: grey values far from the edge, tails accounted for.
-    noise_dark, noise_bright: rms noise of one pixel there.
-    core: half width of the spline, px; beyond it the edge-spread function is level + tail / x.
-    pages: of what was measured from several frames by `edge_pages.measure_pages`.
+    Attributes
+    ----------
+    axis : {"x", "y"}
+        "x" for a near-vertical edge (MTF along rows), "y" for a near-horizontal one (MTF along columns).
+    frequency : (F,) ndarray
+        Frequency along the normal, cycles/pixel.
+    mtf : (F,) ndarray
+        Modulus of the transfer function, 1 at frequency 0, not corrected for `noise_bias`.
+    transfer : (F,) ndarray of complex
+        Transfer function, phase counted from the edge's position.
+    sigma_along, sigma_across : (F,) ndarray
+        Standard deviation of `transfer` along itself, and perpendicular to that.
+    sigma : (F,) ndarray
+        Standard deviation of `mtf` from noise, including the uncertainty of the angle.
+    noise_bias : (F,) ndarray
+        Mean amount by which noise lengthens `mtf`, >= 0, from the measured mtf (`statistics.measured_bias`). Its mean
+        over repeats is right to 0.03 sigma_across where the true MTF is three of them, to 0.09 down to 0.6, and too
+        small where there is hardly a signal, by up to half of one.
+    angle, angle_sigma : float
+        Angle to the grid, rad: column (row) = position + tan(angle) (row (column) - middle).
+    position, position_sigma : float
+        Column (axis "x") or row (axis "y") of the edge's half height in the region's middle, px.
+    curvature, curvature_sigma : float
+        Mean second derivative of the edge's column (row) by its row (column), 1/px.
+    order : int
+        Order of the polynomial of the edge's path, 1 where it is straight within the noise.
+    light, light_sigma : (4,) ndarray
+        Change of the bright level over the region's length along the edge and over its width from the dark side to the
+        bright, and the same of the dark level, grey values; (0,) where light was taken as even.
+    structure : Structure
+        Structure that the fit leaves in the region.
+    place, esf, lsf : (S,) ndarray
+        Distance along the normal from the dark side to the bright, px, 16 to a pixel, as far as there are pixels on
+        both sides; edge-spread function, grey values; line-spread function, 1/px, integral 1.
+    pixel_place, pixel_grey : (N,) ndarray
+        Projected distance, px, and grey value of all pixels, as used.
+    dark, bright : float
+        Grey values far from the edge, tails accounted for.
+    noise_dark, noise_bright : float
+        Rms noise of one pixel there, grey values.
+    core : float
+        Half width of the spline, px; beyond it the edge-spread function is level + tail / x.
+    pages : PagePlaces or None
+        Positions in the frames, if several were measured by `edge_pages.measure_pages`.
     """
 
     axis: Axis
@@ -411,11 +478,11 @@ class EdgeMtf:
     light: Array
     light_sigma: Array
     structure: Structure
-    pages: PagePlaces | None = None
+    pages: PagePositions | None = None
 
     @property
     def doubt(self) -> str:
-        """Return why sigma does not hold what is wrong with the MTF; empty if nothing in the region speaks against it.
+        """Warning that sigma does not cover an error of the MTF; empty if the region shows no structure.
 
         Noise-free images of diffraction at an F/9 pupil leave a structure of 2.5e-5 of the contrast.
         """
@@ -423,14 +490,14 @@ class EdgeMtf:
         if self.structure.chance >= FALSE_ALARM or share < _LEAST_STRUCTURE:
             return ""
         return (
-            f"the region holds structure of {share:.2g} of the contrast (rms of means over blocks and strips, p ="
+            f"the region contains structure of {share:.2g} of the contrast (rms of means over blocks and strips, p ="
             f" {self.structure.chance:.1g}) that an edge of order {self.order} between two planes does not explain:"
-            " light that is not a plane, a rough edge, specks, or noise that neighbouring pixels share. sigma does not"
-            " hold what it does to the MTF: take even light or a smaller region"
+            " light that is not a plane, a rough edge, specks, or noise correlated between pixels. sigma does not"
+            " include its effect on the MTF: use even light or a smaller region"
         )
 
     def at(self, frequency: float) -> tuple[float, float]:
-        """MTF and sigma at one frequency along the normal, cycles/pixel; cubic between the samples.
+        """Return MTF and sigma at one frequency along the normal, cycles/pixel; cubic between the samples.
 
         Raises
         ------
@@ -445,7 +512,10 @@ class EdgeMtf:
         return float(value), float(np.interp(frequency, self.frequency, self.sigma))
 
     def frequency_at(self, value: float) -> tuple[float, float]:
-        """Lowest frequency, cycles/pixel, where the MTF falls through the value, and sigma; (nan, nan) if nowhere."""
+        """Return the lowest frequency, cycles/pixel, at which the MTF falls below a value, and sigma.
+
+        Both are NaN if there is none.
+        """
         below = np.flatnonzero((self.mtf[1:] < value) & (self.mtf[:-1] >= value))
         if below.size == 0:
             return math.nan, math.nan

@@ -853,6 +853,29 @@ def find_jitter(
     -----
     Sine, cosine, a constant and a drift about every axis are fitted together at each frequency. The false-alarm rate
     bounds the maximum of the periodogram (Davies, Biometrika 74, 33 (1987)).
+
+    Examples
+    --------
+    An oscillation of 0.5 urad at 1.3 Hz in a minute of noise of 0.3 urad:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> rng = np.random.default_rng(9)
+    >>> time = np.sort(rng.uniform(0, 60, 150))
+    >>> angle = 0.5e-6 * np.sin(2 * np.pi * 1.3 * time) + 0.3e-6 * rng.standard_normal(150)
+    >>> lines = analysis.find_jitter(time, angle, 0.3e-6, lowest=0.1, highest=2.0)
+    >>> np.round(lines.frequency, 2), np.round(lines.amplitude[:, 0] * 1e6, 1)
+    (array([1.3]), array([0.5]))
+    >>> analysis.find_jitter(time, 0.3e-6 * rng.standard_normal(150), 0.3e-6, 0.1, 2.0).frequency.size
+    0
+
+    Two bands that see the ground 0.2 s apart show the difference of the angle:
+
+    >>> seen = 0.5e-6 * (np.sin(2 * np.pi * 1.3 * (time + 0.2)) - np.sin(2 * np.pi * 1.3 * time))
+    >>> seen = seen + 0.2e-6 * rng.standard_normal(150)
+    >>> lines = analysis.find_jitter(time, seen, 0.2e-6, 0.1, 2.0, lag=0.2)
+    >>> np.round(lines.frequency, 2), np.round(lines.amplitude[:, 0] * 1e6, 1)
+    (array([1.3]), array([0.5]))
     """
     moments, values = np.asarray(time, np.float64), np.asarray(angle, np.float64)
     values = values[:, None] if values.ndim == 1 else values

@@ -60,6 +60,21 @@ class LineModel:
     half_length : float
         Distance from the middle of the line to its ends, where a change of f moves the image most, in metres; 0 if
         unknown.
+
+    Examples
+    --------
+    A camera that looks 20 deg forward. Its axis, and a change of its pitch by 1 mrad:
+
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> import analysis
+    >>> mount = Rotation.from_euler("Y", 20, degrees=True).as_matrix()
+    >>> camera = analysis.LineModel.of(mount, interior=[1.7, 0.0, 0.0])
+    >>> np.round(camera.directions(np.zeros((1, 2))), 4)
+    array([[0.342 , 0.    , 0.9397]])
+    >>> tilted = camera.drifted([1e-3, 0, 0, 0]).directions(np.zeros((1, 2)))
+    >>> round(float(np.degrees(np.arctan2(tilted[0, 0], tilted[0, 2]))), 4)
+    20.0573
     """
 
     to_body: Array
@@ -244,6 +259,18 @@ class Rays:
         noise then counts as independent.
     spread : (n, 2, 2) ndarray or None
         Covariance of the image points in units of `Noise.image` squared; None for unit matrices.
+
+    Examples
+    --------
+    Two image points of one line at one moment, from a station on the Earth-fixed X axis:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> station = np.tile([6.878e6, 0.0, 0.0], (2, 1))
+    >>> attitude = np.tile(np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), (2, 1, 1))
+    >>> rays = analysis.Rays.of([0, 1], [[0.0, -0.02], [0.0, 0.02]], station, attitude, time=[0.0, 0.0])
+    >>> rays.image.shape, rays.taken([True, False]).point
+    ((2, 2), array([0]))
     """
 
     point: NDArray[np.intp]

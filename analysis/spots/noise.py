@@ -183,6 +183,26 @@ class NoiseModel:
     ------
     ValueError
         A value is impossible; the message names the field.
+
+    Examples
+    --------
+    A signal of 2000 electrons is recorded as 1100 DN. Its variance is that of shot noise, read noise and rounding,
+    0.25 (2000 + 100) + 1/12 DN^2 (photon transfer line):
+
+    >>> import analysis
+    >>> noise = analysis.NoiseModel(gain_dn_per_e=0.5, dark_noise_e=10.0, offset_dn=100.0)
+    >>> round(float(noise.frame_variance_dn2(1100.0)), 3)
+    525.083
+    >>> round(float(noise.temporal_variance_dn2(1100.0, frames=25)), 3)
+    21.003
+    >>> noise.dark_level_dn
+    100.0
+
+    A response that varies by 1 % from pixel to pixel does not average down:
+
+    >>> uneven = analysis.NoiseModel(prnu=0.01)
+    >>> round(float(uneven.fixed_variance_dn2(1000.0)), 3)
+    100.082
     """
 
     gain_dn_per_e: float = 1.0

@@ -165,6 +165,23 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
     ------
     FramesError
         There are too few frames, the frames differ in size, or the flat frames show no light.
+
+    Examples
+    --------
+    A detector of 0.5 DN per electron, 8 electrons of read noise and 1 % of response non-uniformity:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> rng = np.random.default_rng(2)
+    >>> response = 1 + 0.01 * rng.standard_normal((64, 64))
+    >>> def frames(electrons):
+    ...     signal = rng.poisson(electrons * response, (16, 64, 64)) + 8 * rng.standard_normal((16, 64, 64))
+    ...     return np.round(100 + 0.5 * signal)
+    >>> detector = analysis.photon_transfer(frames(0), frames(20000))
+    >>> round(detector.gain_dn_per_e, 2), round(detector.dark_noise_e, 1), round(detector.prnu, 3)
+    (0.5, 7.9, 0.01)
+    >>> abs(detector.gain_dn_per_e - 0.5) < 3 * detector.gain_sigma
+    True
     """
     night, day = _stack(dark, "dark"), _stack(flat, "flat")
     if night.shape[1:] != day.shape[1:]:

@@ -75,6 +75,25 @@ class SpotTemplate:
         Template samples per detector pixel, >= 1.
     truncation : float
         Bound on the truncation error of the factorisation, relative to the peak.
+
+    Examples
+    --------
+    Calibrate the shape of an Airy pattern, and find a spot of this shape that is shifted by (0.25, -0.4) px:
+
+    >>> import numpy as np
+    >>> from scipy.special import j1
+    >>> import analysis
+    >>> def airy(row, column, size):
+    ...     y, x = np.mgrid[:size, :size] - np.array([row, column])[:, None, None]
+    ...     r = np.pi * np.hypot(y, x) / 4.0 + 1e-9
+    ...     return (2.0 * j1(r) / r) ** 2
+    >>> template = analysis.SpotTemplate.from_image(airy(32, 32, 65), row=32, column=32, shape=(33, 33))
+    >>> template.count, template.shape
+    (1, (33, 33))
+    >>> image = 100 + 5000 * airy(16.25, 15.6, 33)
+    >>> fit = analysis.fit_spot(image, analysis.NoiseModel(), method="template", template=template)
+    >>> round(fit.row, 3), round(fit.column, 3)
+    (16.25, 15.6)
     """
 
     row_factors: Array

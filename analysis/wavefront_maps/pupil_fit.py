@@ -294,6 +294,16 @@ class Pupil:
         Row of its centre.
     radius : float
         pixels.
+
+    Examples
+    --------
+    The centre and the edge of a pupil on the unit disk:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> pupil = analysis.Pupil(x=57.0, y=60.0, radius=48.0)
+    >>> pupil.unit(np.array([57.0, 105.0]), np.array([60.0, 60.0]))
+    (array([0., 1.]), array([0., 0.]))
     """
 
     x: float
@@ -345,6 +355,18 @@ def find_pupil(values: ArrayLike) -> Pupil:
     ------
     UndeterminedError
         No light, or an edge that is round in less than half of the full angle.
+
+    Examples
+    --------
+    A pupil at row 60, column 57 with a radius of 48 px:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> row, column = np.mgrid[:120, :120]
+    >>> lit = np.hypot(row - 60, column - 57) <= 48
+    >>> pupil = analysis.find_pupil(np.where(lit, 0.0, np.nan))
+    >>> round(pupil.x, 1), round(pupil.y, 1), round(pupil.radius, 1)
+    (57.0, 60.0, 47.9)
     """
     light = np.isfinite(_checked_map(values))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(light.astype(np.uint8), connectivity=8)
@@ -417,6 +439,20 @@ def fit_wavefront_map(values: ArrayLike, terms: Sequence[int], pupil: Pupil | No
         No light in the pupil, or terms that the light does not tell apart.
     MapError
         Terms that are not ascending.
+
+    Examples
+    --------
+    Defocus and coma over a ring, whose Zernike terms are not orthogonal:
+
+    >>> import numpy as np
+    >>> import analysis
+    >>> y, x = (np.mgrid[:101, :101] - 50) / 45
+    >>> r2 = x**2 + y**2
+    >>> opd = 50e-9 * np.sqrt(3) * (2 * r2 - 1) + 20e-9 * np.sqrt(8) * (3 * r2 - 2) * y
+    >>> opd[(r2 > 1) | (r2 < 0.09)] = np.nan
+    >>> fit = analysis.fit_wavefront_map(opd, range(1, 12), analysis.Pupil(50, 50, 45))
+    >>> np.round(fit.coefficients * 1e9, 6).tolist()
+    [0.0, 0.0, 0.0, 50.0, -0.0, -0.0, 20.0, -0.0, 0.0, -0.0, 0.0]
     """
     terms = tuple(int(index) for index in terms)
     if not terms or any(b <= a for a, b in itertools.pairwise(terms)):

@@ -62,6 +62,14 @@ def nm_to_noll(n: int, m: int) -> int:
         Radial order.
     m : int
         Azimuthal order, negative of sine terms.
+
+    Examples
+    --------
+    Defocus, the two comas and primary spherical aberration (Noll, J. Opt. Soc. Am. 66, 207 (1976)):
+
+    >>> import analysis
+    >>> [analysis.nm_to_noll(n, m) for n, m in ((2, 0), (3, -1), (3, 1), (4, 0))]
+    [4, 7, 8, 11]
     """
     first = n * (n + 1) // 2 + 1
     return next(j for j in range(first, first + n + 1) if noll_to_nm(j) == (n, m))
@@ -74,6 +82,16 @@ def fringe_to_nm(index: int) -> tuple[int, int]:
     ----------
     index : int
         1 for piston, up to 37.
+
+    Examples
+    --------
+    Defocus, coma along x and y, and spherical aberration are the Fringe terms 4, 7, 8 and 9:
+
+    >>> import analysis
+    >>> [analysis.fringe_to_nm(index) for index in (4, 7, 8, 9)]
+    [(2, 0), (3, 1), (3, -1), (4, 0)]
+    >>> analysis.nm_to_noll(*analysis.fringe_to_nm(9))
+    11
     """
     if not 1 <= index <= LAST_FRINGE:
         raise ValueError(f"Fringe terms 1 to {LAST_FRINGE} are known, not {index}")
@@ -92,6 +110,14 @@ def ansi_to_nm(index: int) -> tuple[int, int]:
     ----------
     index : int
         0 for piston.
+
+    Examples
+    --------
+    Defocus and spherical aberration are the ANSI terms 4 and 12:
+
+    >>> import analysis
+    >>> analysis.ansi_to_nm(4), analysis.ansi_to_nm(12)
+    ((2, 0), (4, 0))
     """
     if not 0 <= index < MOST_TERMS:
         raise ValueError(f"ANSI terms 0 to {MOST_TERMS - 1} are known, not {index}")
