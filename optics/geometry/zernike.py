@@ -11,14 +11,39 @@ import numpy as np
 
 MAX_NOLL = 66
 """Highest supported Noll index (all terms to radial order 10); beyond it monomials lose digits."""
-HELD = 1e-6
-"""Share of their size: combinations of terms that show less on an aperture are left out of fits over it."""
+RANK_TOLERANCE = 1e-6
+"""Relative size below which combinations of terms on an aperture are excluded from fits over it."""
 
 
 def noll_to_nm(index: int) -> tuple[int, int]:
-    """Radial order n and signed azimuthal order m of a Noll index (1 = piston, 2 = x tilt, 3 = y tilt, 4 = defocus).
+    """Return radial order n and signed azimuthal order m of a Noll index.
 
-    m > 0 are cosine terms (even j), m < 0 sine terms (odd j) (Noll, JOSA 66, 207, 1976).
+    Parameters
+    ----------
+    index : int
+        Noll index, 1 to 66: 1 is piston, 2 tilt x, 3 tilt y, 4 defocus.
+
+    Returns
+    -------
+    n : int
+        Radial order.
+    m : int
+        Azimuthal order, positive for cosine terms (even indices) and negative for sine terms (Noll, JOSA 66, 207,
+        1976).
+
+    Raises
+    ------
+    ValueError
+        The index is out of its range.
+
+    Examples
+    --------
+    >>> [noll_to_nm(j) for j in (1, 4, 7, 8, 11)]
+    [(0, 0), (2, 0), (3, -1), (3, 1), (4, 0)]
+    >>> noll_to_nm(0)
+    Traceback (most recent call last):
+    ...
+    ValueError: Noll index 0 is outside 1..66
     """
     if not 1 <= index <= MAX_NOLL:
         raise ValueError(f"Noll index {index} is outside 1..{MAX_NOLL}")
@@ -37,9 +62,26 @@ _RANKS = ("", "secondary ", "tertiary ", "quaternary ", "fifth ")
 
 
 def name(index: int) -> str:
-    """What a Noll index is called: ``defocus``, ``coma x``, ``secondary astigmatism 45 deg``.
+    """Return the name of a Noll term.
 
-    The direction is that in which the term is largest at the edge: x and y of tilt and coma, else an angle from x.
+    The direction is that in which the term is largest at the edge: x or y for tilt and coma, otherwise an angle from x.
+
+    Parameters
+    ----------
+    index : int
+        Noll index, 1 to 66.
+
+    Returns
+    -------
+    str
+        Name of the aberration.
+
+    Examples
+    --------
+    >>> [zernike_name(j) for j in (4, 8, 11)]
+    ['defocus', 'coma x', 'spherical aberration']
+    >>> zernike_name(13)
+    'secondary astigmatism 45 deg'
     """
     n, signed = noll_to_nm(index)
     m = abs(signed)
@@ -58,7 +100,7 @@ def name(index: int) -> str:
 
 @cache
 def cartesian_terms(index: int) -> tuple[tuple[int, int, float], ...]:
-    """Terms (a, b, c) of Z_j(x, y) = sum c x^a y^b on the unit disk."""
+    """Return the terms (a, b, c) of Z_j(x, y) = sum c x^a y^b on the unit disk."""
     n, signed = noll_to_nm(index)
     m = abs(signed)
     norm = sqrt(n + 1) * (sqrt(2) if m else 1.0)
@@ -81,49 +123,59 @@ def cartesian_terms(index: int) -> tuple[tuple[int, int, float], ...]:
 
 
 def zernike(index: int, x: Any, y: Any) -> np.ndarray:
-    """Value of Z_j at unit-disk coordinates x, y (same shape).
+    """Return the value of a Zernike circle polynomial in Noll's order.
 
     Parameters
     ----------
     index : int
-        Noll's j.
-    x : Any
-        On the unit disk, any shape.
-    y : Any
-        Of the same shape.
+        Noll index j, 1 to 66.
+    x, y : array_like
+        Unit-disk coordinates, of one shape.
+
+    Returns
+    -------
+    ndarray
+        Z_j, of unit rms over the disk.
+
+    Examples
+    --------
+    Defocus is sqrt(3) (2 r^2 - 1), and different terms are orthonormal over the disk:
+
+    >>> zernike(4, np.array([0.0, 0.5, 1.0]), np.zeros(3)).round(4)
+    array([-1.7321, -0.866 ,  1.7321])
+    >>> nodes = pupil_quadrature(6)
+    >>> coma, spherical = zernike(8, nodes.x, nodes.y), zernike(11, nodes.x, nodes.y)
+    >>> round(float(nodes.share @ coma**2), 12), abs(round(float(nodes.share @ (coma * spherical)), 12))
+    (1.0, 0.0)
     """
     x, y = np.asarray(x), np.asarray(y)
     return np.asarray(sum(c * x**a * y**b for a, b, c in cartesian_terms(index)))
 
 
 def basis(last: int, x: Any, y: Any) -> np.ndarray:
-    """Z_1..Z_last at points (N,) as columns, shape (N, last).
+    """Return Z_1..Z_last at N points as columns, shape (N, last).
 
     Parameters
     ----------
     last : int
         Highest Noll index.
-    x : Any
-        On the unit disk, (N,).
-    y : Any
-        likewise.
+    x, y : (N,) array_like
+        Unit-disk coordinates.
     """
     return np.stack([zernike(j, x, y) * np.ones_like(x) for j in range(1, last + 1)], axis=-1)
 
 
 def gradient_basis(last: int, x: Any, y: Any, axis: int) -> np.ndarray:
-    """Derivatives of Z_1..Z_last along x (axis 0) or y (axis 1) at points (N,), shape (N, last).
+    """Return the derivatives of Z_1..Z_last along x (axis 0) or y (axis 1) at N points, shape (N, last).
 
     Parameters
     ----------
     last : int
         Highest Noll index.
-    x : Any
-        On the unit disk, (N,).
-    y : Any
-        likewise.
+    x, y : (N,) array_like
+        Unit-disk coordinates.
     axis : int
-        0: by x, 1: by y.
+        0 for the derivative by x, 1 by y.
     """
     columns = []
     for j in range(1, last + 1):
@@ -138,25 +190,32 @@ def gradient_basis(last: int, x: Any, y: Any, axis: int) -> np.ndarray:
 
 
 def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> np.ndarray:
-    """Weighted least-squares coefficients of Z_1..Z_last.
+    """Fit coefficients of Z_1..Z_last by weighted least squares.
 
     Parameters
     ----------
     last : int
         Highest Noll index.
-    x : Any
-        Unit-disk coordinates, shape (N,).
-    y : Any
-        likewise.
-    values : Any
-        Shape (..., N), e.g. optical path differences in metres.
-    weights : Any | None
-        Quadrature weights, shape (N,).
+    x, y : (N,) array_like
+        Unit-disk coordinates.
+    values : (..., N) array_like
+        Values to fit, e.g. optical path differences in metres.
+    weights : (N,) array_like, optional
+        Quadrature weights; equal by default.
 
     Returns
     -------
-    np.ndarray
-        Shape (..., last), unit of ``values`` (each coefficient is an rms).
+    (..., last) ndarray
+        Coefficients in the unit of ``values`` (each is an rms).
+
+    Examples
+    --------
+    A surface that is 20 nm rms out of focus with 5 nm rms of astigmatism:
+
+    >>> nodes = pupil_quadrature(6)
+    >>> surface = 20e-9 * zernike(4, nodes.x, nodes.y) + 5e-9 * zernike(6, nodes.x, nodes.y)
+    >>> (1e9 * fit_zernikes(6, nodes.x, nodes.y, surface, nodes.weight)).round(6) + 0.0
+    array([ 0.,  0.,  0., 20.,  0.,  5.])
     """
     root = np.sqrt(np.ones_like(x) if weights is None else weights)
     solution, *_ = np.linalg.lstsq(basis(last, x, y) * root[:, None], (np.asarray(values) * root).T, rcond=None)
@@ -164,41 +223,39 @@ def fit(last: int, x: Any, y: Any, values: Any, weights: Any | None = None) -> n
 
 
 def triangle_size(order: int) -> int:
-    """Number of monomials x^a y^b with a + b <= order."""
+    """Return the number of monomials x^a y^b with a + b <= order."""
     return (order + 1) * (order + 2) // 2
 
 
 def triangle_order(size: int) -> int:
-    """Order of which there are ``size`` monomials: the inverse of ``triangle_size``."""
+    """Return the order that has ``size`` monomials, the inverse of ``triangle_size``."""
     order = (isqrt(8 * size + 1) - 3) // 2
     if triangle_size(order) != size:
-        raise ValueError(f"{size} monomials are not all of some order")
+        raise ValueError(f"{size} is not the number of monomials up to any order")
     return order
 
 
 def triangle_index(a: int, b: int) -> int:
-    """Place of x^a y^b in the list ordered by total degree."""
+    """Return the index of x^a y^b in the list ordered by total degree."""
     d = a + b
     return d * (d + 1) // 2 + b
 
 
 def triangle_polynomial(x: Any, y: Any, coefficients: Sequence[Any], order: int) -> tuple[Any, Any, Any]:
-    """Sum of c_ab x^a y^b with a + b <= order, and its two slopes, by nested Horner schemes.
+    """Return the sum of c_ab x^a y^b with a + b <= order, and its two slopes, by nested Horner schemes.
 
     Parameters
     ----------
-    x : Any
-        Where, metres, arrays of NumPy or Dr.Jit.
-    y : Any
-        likewise.
-    coefficients : Sequence[Any]
-        m^(1-a-b), ordered by ``triangle_index``.
+    x, y : array
+        Points, metres; NumPy or Dr.Jit arrays.
+    coefficients : sequence
+        Coefficients c_ab in m^(1-a-b), ordered by ``triangle_index``.
     order : int
         Highest degree a + b.
 
     Returns
     -------
-    tuple[Any, Any, Any]
+    tuple
         Height, metres, and its derivatives by x and y.
     """
     height: Any = 0.0 * x
@@ -217,17 +274,21 @@ def triangle_polynomial(x: Any, y: Any, coefficients: Sequence[Any], order: int)
 
 
 def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.ndarray:
-    """Coefficients of x^a y^b (metres from the centre) of sum a_j Z_j(x/radius, y/radius); shape
-    (triangle_size(order),).
+    """Return the coefficients of x^a y^b (metres from the centre) of sum a_j Z_j(x/radius, y/radius).
 
     Parameters
     ----------
-    coefficients : Mapping[int, Any]
-        Noll index j -> a_j, metres rms; complex ones, too.
+    coefficients : mapping of int to number
+        Noll index j -> a_j, metres rms; may be complex.
     order : int
         Highest degree a + b, at least that of the terms.
     radius : float
-        Of the disk, metres.
+        Radius of the disk, metres.
+
+    Returns
+    -------
+    (triangle_size(order),) ndarray
+        Coefficients ordered by ``triangle_index``.
     """
     out = np.zeros(triangle_size(order), np.result_type(float, *coefficients.values()))
     for j, amplitude in coefficients.items():
@@ -238,7 +299,7 @@ def monomials(coefficients: Mapping[int, Any], order: int, radius: float) -> np.
 
 @lru_cache(maxsize=256)
 def unit_monomials(last: int, order: int, radius: float) -> np.ndarray:
-    """``monomials`` of each of Z_1..Z_last with amplitude 1, (last, triangle_size(order)); terms beyond the order: 0.
+    """Return ``monomials`` of each of Z_1..Z_last with amplitude 1; terms beyond the order are 0.
 
     Parameters
     ----------
@@ -247,7 +308,12 @@ def unit_monomials(last: int, order: int, radius: float) -> np.ndarray:
     order : int
         Highest degree a + b.
     radius : float
-        Of the disk, metres.
+        Radius of the disk, metres.
+
+    Returns
+    -------
+    (last, triangle_size(order)) ndarray
+        Read-only table of coefficients.
     """
     table = np.zeros((last, triangle_size(order)))
     for j in range(1, last + 1):
@@ -258,7 +324,7 @@ def unit_monomials(last: int, order: int, radius: float) -> np.ndarray:
 
 
 def order_of(indices: Any) -> int:
-    """Highest radial order among Noll indices, -1 for none."""
-    # it never falls along Noll's order
+    """Return the highest radial order among Noll indices; -1 for none."""
+    # the radial order never decreases with the Noll index
     last = max(indices, default=0)
     return noll_to_nm(last)[0] if last else -1

@@ -1,1 +1,1 @@
-"""Glasses, structural materials, and what surfaces do with light."""
+"""Glasses, structural materials, and the reflection and scattering of surfaces."""

@@ -1,24 +1,25 @@
-"""Light scattered by surfaces: ABg and Harvey-Shack lobes, Lambertian diffusion, and measured tables.
+"""Reflection, transmission and scattering of surfaces: Fresnel formulas, finishes, coatings, BSDF lobes and tables.
 
-Both lobes depend only on d = |beta - beta0|, the distance of the scattered from the specular direction in the plane of
-direction cosines (components of the unit vectors along the surface; Harvey 1976; Pfisterer, "Approximated scatter
-models for stray light analysis", OPN 2011). The BSDF f is taken *per power of the specular beam that it leaves*, so
-that f(d) d^2(beta) is the scattered share into d^2(beta) = cos(theta) d(Omega), and the total integrated scatter
+Lobes. The ABg and Harvey-Shack lobes depend only on d = |beta - beta0|, the distance of the scattered from the specular
+direction in the plane of direction cosines (components of the unit vectors along the surface; Harvey 1976; Pfisterer,
+"Approximated scatter models for stray light analysis", OPN 2011). The BSDF f is taken *per power of the specular beam
+that it leaves*, so that f(d) d^2(beta) is the scattered fraction into d^2(beta) = cos(theta) d(Omega), and the total
+integrated scatter
 
     TIS(beta0) = integral of f(|beta - beta0|) over |beta| < 1
 
-is the share that leaves the specular beam. Inside glass the components are those of n times the unit vector.
+is the fraction that leaves the specular beam. Inside glass the components are those of n times the unit vector.
 
-Sampling. d is drawn in closed form from the Harvey-Shack function h(x) = (1 + x^2)^(-g/2), x = d / l. A lobe of ABg has
-l = B^(1/g) and f = A/B / (1 + x^g) = A/B h(x) rho(x), where rho = (1 + x^2)^(g/2) / (1 + x^g) lies between 1 and
-2^(g/2 - 1). So d is drawn with the share of the upper bound, and a draw is kept with the probability rho / max(rho).
-What is not kept, and what falls outside the unit circle (no such direction exists), stays in the specular beam:
+Sampling of lobes. d is drawn in closed form from the Harvey-Shack function h(x) = (1 + x^2)^(-g/2), x = d / l. An ABg
+lobe has l = B^(1/g) and f = A/B / (1 + x^g) = A/B h(x) rho(x), where rho = (1 + x^2)^(g/2) / (1 + x^g) lies between 1
+and 2^(g/2 - 1). So d is drawn with the power of the upper bound, and a draw is accepted with the probability rho /
+max(rho). Rejected draws, and draws outside the unit circle (no such direction exists), stay in the specular beam:
 energy is conserved for every angle of incidence without any table.
 
-A table gives f (1/sr, scattered radiance over incident irradiance) for angles of incidence t and directions that are
-counted from the specular one: the radial angle r away from it, and the azimuth p about it, 0 where the direction leans
-toward the surface's normal, counter-clockwise for who looks against the specular light. With n the normal, s the
-specular direction, e = (n - cos t s) / sin t and h = s x e the direction is
+Tables. A table gives f (1/sr, scattered radiance over incident irradiance) for angles of incidence t and directions
+relative to the specular one: the radial angle r away from it, and the azimuth p about it, 0 where the direction leans
+toward the surface's normal, counterclockwise as seen against the specular light. With n the normal, s the specular
+direction, e = (n - cos t s) / sin t and h = s x e the direction is
 
     w = cos r s + sin r (cos p e + sin p h),        n . w = cos r cos t + sin r cos p sin t,
 
@@ -26,12 +27,14 @@ and the total integrated scatter TIS(t) is the integral of f (n . w) sin r dr dp
 linear in t, p and r between the table's numbers, constant before its first and beyond its last angle of incidence, and
 zero beyond its last radial angle.
 
-Sampling. For angles of incidence one degree apart the scattered power is summed over cells that are finer than the
-table's; a path takes one of the two angles beside its own, with the probability of the power that it has there, then a
-ring of cells, a cell in it, and a place in the cell, even in solid angle. Between two such angles what falls below the
-surface by the difference is turned up, so that all that TIS says is scattered.
+Sampling of tables. For angles of incidence one degree apart the scattered power is summed over cells that are finer
+than the table's. A path takes one of the two angles next to its own, with probability proportional to its part of the
+interpolated power, then a ring of
+cells, a cell in it, and a position in the cell, uniform in solid angle. Directions that fall below the surface because
+of the difference from the path's own angle are reflected upward, so that all of TIS is scattered.
 
-What a surface does with light in the path tracer: Fresnel's laws, finishes and measured coatings.
+Finishes. A ``Finish`` describes one side of a surface in the path tracer: Fresnel reflection, constant shares, measured
+coatings and scattering.
 """
 
 from __future__ import annotations
@@ -43,30 +46,32 @@ from math import log as real_log
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optics.numerics.array_math import exp, log, select, sqrt
 
-WIDEST = 2.0
-"""Largest distance of two directions in the plane of direction cosines."""
+MAX_DISTANCE = 2.0
+"""Largest possible distance of two directions in the plane of direction cosines."""
 
 _FLAT = 1e-9
-"""Exponents closer to 2 than twice this take the logarithmic form."""
+"""Tolerance of |1 - g/2| below which the integral takes its logarithmic form."""
 
 
 @dataclass(frozen=True)
 class Lobe:
-    """A lobe as the sampler uses it.
+    """Parameters of a lobe for the sampler.
 
     Attributes
     ----------
     share : float
-        Of the specular power for which a direction is drawn: the integral of the upper bound over d < 2.
+        Fraction of the specular power for which a direction is drawn: the integral of the upper bound over d < 2.
     scale : float
-        l, in direction cosines.
+        Width l, in direction cosines.
     exponent : float
-        g.
+        Exponent g.
     abg : bool
-        Whether draws are thinned to ABg (else Harvey-Shack as drawn).
+        True when draws are accepted with the probability of an ABg lobe; False for Harvey-Shack, where all are
+        accepted.
     """
 
     share: float
@@ -76,18 +81,18 @@ class Lobe:
 
     @property
     def numbers(self) -> tuple[float, float, float, float]:
-        """share, scale, exponent, 1 for ABg and 0 for Harvey-Shack."""
+        """Share, scale, exponent, and 1 for ABg or 0 for Harvey-Shack."""
         return self.share, self.scale, self.exponent, float(self.abg)
 
 
 @dataclass(frozen=True)
 class ABg:
-    """f(d) = A / (B + d^g).
+    """ABg lobe, f(d) = A / (B + d^g).
 
     Raises
     ------
     ValueError
-        An impossible number, or more than all of the light would be scattered.
+        A parameter is impossible, or the lobe would scatter more than all of the light.
     """
 
     a: float
@@ -101,38 +106,39 @@ class ABg:
         _check_total(self, self._upper(1.0))
 
     def bsdf(self, distance: Any) -> Any:
-        """BSDF f at distances d (NumPy arrays), per steradian."""
+        """Return the BSDF f at distances d (NumPy arrays), per steradian."""
         return self.a / (self.b + np.asarray(distance, np.float64) ** self.g)
 
     @property
     def lobe(self) -> Lobe:
-        """What the sampler uses.
+        """Parameters for the sampler.
 
         Raises
         ------
         ValueError
-            The upper bound holds more than all of the light.
+            The upper bound integrates to more than all of the light.
         """
-        return _checked(Lobe(self._upper(WIDEST), self._scale, self.g, self.g > 0.0))
+        return _require_samplable(Lobe(self._upper(MAX_DISTANCE), self._scale, self.g, self.g > 0.0))
 
     @property
     def _scale(self) -> float:
+        """Width l of the lobe, in direction cosines."""
         return self.b ** (1.0 / self.g) if self.g > 0.0 else 1.0
 
     def _upper(self, reach: float) -> float:
-        """Integral of the upper bound over d < ``reach``."""
+        """Return the integral of the upper bound over d < ``reach``."""
         bound = self.a / self.b * _largest_ratio(self.g) if self.g > 0.0 else self.a / (1.0 + self.b)
         return bound * _harvey_integral(self._scale, self.g, reach)
 
 
 @dataclass(frozen=True)
 class HarveyShack:
-    """f(d) = b0 (1 + (d / l)^2)^(s/2), s < 0.
+    """Harvey-Shack lobe, f(d) = b0 (1 + (d / l)^2)^(s/2), s < 0.
 
     Raises
     ------
     ValueError
-        An impossible number, or more than all of the light would be scattered.
+        A parameter is impossible, or the lobe would scatter more than all of the light.
     """
 
     b0: float
@@ -146,16 +152,16 @@ class HarveyShack:
         _check_total(self, self._upper(1.0))
 
     def bsdf(self, distance: Any) -> Any:
-        """BSDF f at distances d (NumPy arrays), per steradian."""
+        """Return the BSDF f at distances d (NumPy arrays), per steradian."""
         return self.b0 * (1.0 + (np.asarray(distance, np.float64) / self.l) ** 2) ** (0.5 * self.s)
 
     @property
     def lobe(self) -> Lobe:
-        """What the sampler uses."""
-        return _checked(Lobe(self._upper(WIDEST), self.l, -self.s, False))
+        """Parameters for the sampler."""
+        return _require_samplable(Lobe(self._upper(MAX_DISTANCE), self.l, -self.s, False))
 
     def _upper(self, reach: float) -> float:
-        """Integral over d < ``reach``; the function is its own upper bound."""
+        """Return the integral over d < ``reach``; the function is its own upper bound."""
         return self.b0 * _harvey_integral(self.l, -self.s, reach)
 
 
@@ -163,8 +169,8 @@ Scatter = ABg | HarveyShack
 
 
 def total_scatter(scatter: Scatter, sine: float = 0.0) -> float:
-    """Total integrated scatter by quadrature, for light that arrives with |beta0| = ``sine`` (0 to 1)."""
-    # takes a quarter of a second, and every command reads the names of finishes
+    """Return the total integrated scatter by quadrature, for light that arrives with |beta0| = ``sine`` (0 to 1)."""
+    # imported late: scipy takes 0.25 s, and every command imports this module
     from scipy.integrate import quad
 
     def ring(log_distance: float) -> float:
@@ -182,19 +188,19 @@ def total_scatter(scatter: Scatter, sine: float = 0.0) -> float:
 
 
 def sample_distance(u: Any, scale: Any, exponent: Any) -> Any:
-    """Distance d < 2 whose density in the plane is proportional to (1 + (d/l)^2)^(-g/2).
+    """Return a distance d < 2 whose density in the plane is proportional to (1 + (d/l)^2)^(-g/2).
 
     Parameters
     ----------
-    u : Any
-        Uniform in [0, 1), NumPy or Dr.Jit array, as the others.
-    scale : Any
-        l, in direction cosines.
-    exponent : Any
-        g.
+    u : array
+        Uniform random number in [0, 1), a NumPy or Dr.Jit array as the other arguments.
+    scale : array
+        Width l, in direction cosines.
+    exponent : array
+        Exponent g.
     """
     q = 1.0 - 0.5 * exponent
-    level = log(1.0 + (WIDEST / scale) * (WIDEST / scale))
+    level = log(1.0 + (MAX_DISTANCE / scale) * (MAX_DISTANCE / scale))
     flat = abs(q) < _FLAT
     safe = select(flat, 0.0 * q + 1.0, q)
     power = exp(log(1.0 + u * (exp(safe * level) - 1.0)) / safe)
@@ -203,21 +209,24 @@ def sample_distance(u: Any, scale: Any, exponent: Any) -> Any:
 
 
 def lobe_area(scale: float, exponent: float) -> float:
-    """Integral of (1 + (d/l)^2)^(-g/2) over d^2 < WIDEST^2; the function over it is the density of d^2 that
-    ``sample_distance`` draws.
+    """Return the integral of (1 + (d/l)^2)^(-g/2) over d^2 < MAX_DISTANCE^2.
+
+    The function divided by it is the density of d^2 that ``sample_distance`` draws.
 
     Parameters
     ----------
     scale : float
-        l, in direction cosines.
+        Width l, in direction cosines.
     exponent : float
-        g.
+        Exponent g.
     """
-    return _harvey_integral(scale, exponent, WIDEST) / float(np.pi)
+    return _harvey_integral(scale, exponent, MAX_DISTANCE) / float(np.pi)
 
 
 def acceptance(distance: Any, scale: Any, exponent: Any, abg: Any) -> Any:
-    """Probability of keeping a drawn distance, 0.5 or more for usual g; 1 for Harvey-Shack (``abg`` < 0.5)."""
+    """Return the probability of accepting a drawn distance: 0.5 or more for usual g; 1 for Harvey-Shack (``abg`` <
+    0.5).
+    """
     x = distance / scale
     half = 0.5 * exponent
     above = log(1.0 + x * x)
@@ -228,62 +237,65 @@ def acceptance(distance: Any, scale: Any, exponent: Any, abg: Any) -> Any:
 
 
 def _largest_ratio(g: float) -> float:
+    """Return the maximum of rho, the ratio of the ABg function to its upper bound's shape."""
     return float(2.0 ** max(0.5 * g - 1.0, 0.0))
 
 
 def _harvey_integral(scale: float, g: float, reach: float) -> float:
-    """Integral of (1 + (d/l)^2)^(-g/2) over the disk d < reach."""
+    """Return the integral of (1 + (d/l)^2)^(-g/2) over the disk d < reach."""
     q, level = 1.0 - 0.5 * g, float(np.log1p((reach / scale) ** 2))
     return float(np.pi * scale**2 * (level if abs(q) < _FLAT else np.expm1(q * level) / q))
 
 
-def _checked(lobe: Lobe) -> Lobe:
+def _require_samplable(lobe: Lobe) -> Lobe:
+    """Return the lobe; raise ValueError if its upper bound integrates to more than 1."""
     if lobe.share > 1.0:
         raise ValueError(
-            f"the scatter lobe is too strong to be sampled: its upper bound holds {lobe.share:.4g} of the light"
+            f"the scatter lobe is too strong to be sampled: its upper bound is {lobe.share:.4g} of the light, more than 1"
         )
     return lobe
 
 
 def _check_total(scatter: Scatter, upper: float) -> None:
-    if upper <= 1.0:  # the bound, which is not below the total, is enough for all but the strongest
+    """Raise ValueError if a lobe scatters more than all of the light."""
+    if upper <= 1.0:  # an upper bound below 1 settles it without quadrature
         return
-    total = total_scatter(scatter)  # a lobe that falls off scatters most at normal incidence
+    total = total_scatter(scatter)  # such lobes scatter most at normal incidence
     if total > 1.0:
         raise ValueError(f"{scatter} would scatter {total:.4g} of the light; no surface scatters more than 1")
 
 
 STEPS = 90
-"""Intervals of the angle of incidence, from 0 to 90 degrees, for which directions are drawn."""
+"""Number of intervals of the angle of incidence, from 0 to 90 degrees, for which directions are drawn."""
 LEAST_RINGS, LEAST_SECTORS = 240, 36
 MOST_CELLS = 120_000
-"""Rings times sectors of a table at most."""
+"""Largest number of cells (rings times sectors) of a table."""
 _CHECKED = np.arange(0.0, 91.0, 5.0)
-"""Angles of incidence, degrees, at which a table is asked whether it scatters more than there is, beside its own."""
+"""Angles of incidence, degrees, at which a table's total scatter is checked in addition to the table's own angles."""
 _GAUSS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
 
 
 @dataclass(frozen=True, eq=False)
 class ScatterTable:
-    """BSDF in specular-relative angles.
+    """Tabulated BSDF in angles relative to the specular direction.
 
     Attributes
     ----------
-    incidence : np.ndarray
-        Ascending, radians, (I,).
-    azimuth : np.ndarray
-        Ascending, radians, (A,): a single one for a lobe that is round, 0 to pi for one that is the same on both sides
-        of the plane of incidence, else 0 to 2 pi.
-    radial : np.ndarray
-        Ascending from 0, radians, (R,).
-    values : np.ndarray
-        1/sr, (I, A, R).
+    incidence : (I,) ndarray
+        Angles of incidence, ascending, radians.
+    azimuth : (A,) ndarray
+        Azimuths, ascending, radians: a single one for a rotationally symmetric lobe, 0 to pi for one symmetric about
+        the plane of incidence, else 0 to 2 pi.
+    radial : (R,) ndarray
+        Radial angles, ascending from 0, radians.
+    values : (I, A, R) ndarray
+        BSDF, 1/sr.
 
     Raises
     ------
     ValueError
-        Angles that do not ascend or do not span what they must, negative values, or more than all of the light
-        scattered.
+        Angles do not ascend or do not span the required range, values are negative, or more than all of the light would
+        be scattered.
     """
 
     incidence: np.ndarray
@@ -318,40 +330,40 @@ class ScatterTable:
             raise ValueError(f"{self.rings} x {self.sectors} cells are more than {MOST_CELLS}")
         largest = max(self.total(float(angle)) for angle in (*self.incidence, *np.radians(_CHECKED)))
         if largest > 1.0:
-            raise ValueError(f"it would scatter {largest:.4g} of the light; no surface scatters more than 1")
+            raise ValueError(f"the table would scatter {largest:.4g} of the light; no surface scatters more than 1")
 
     @property
     def rings(self) -> int:
-        """Cells along the radial angle: every interval of the table the same number of times."""
+        """Number of cells along the radial angle; every interval of the table is divided into the same number."""
         intervals = len(self.radial) - 1
         return intervals * -(-LEAST_RINGS // intervals)
 
     @property
     def sectors(self) -> int:
-        """Cells along the azimuth, over half a turn or the whole."""
+        """Number of cells along the azimuth, over 180 or 360 degrees."""
         intervals = max(len(self.azimuth) - 1, 1)
         return intervals * -(-LEAST_SECTORS // intervals)
 
     @property
     def mirrored(self) -> bool:
-        """Whether azimuths end at half a turn, and the other half is the same."""
+        """True when azimuths end at 180 degrees, and the other half is the mirror image."""
         return len(self.azimuth) == 1 or self.azimuth[-1] < 1.5 * np.pi
 
     def bsdf(self, incidence: float, azimuth: np.ndarray, radial: np.ndarray) -> np.ndarray:
-        """BSDF at one angle of incidence, 1/sr.
+        """Return the BSDF at one angle of incidence, 1/sr.
 
         Parameters
         ----------
         incidence : float
-            radians.
-        azimuth : np.ndarray
-            Radians, any; shape S.
-        radial : np.ndarray
-            Radians, 0 to pi; shape S.
+            Angle of incidence, radians.
+        azimuth : ndarray
+            Azimuths, radians, of any size.
+        radial : ndarray
+            Radial angles, radians, 0 to pi; of the shape of ``azimuth``.
         """
         table = self._at(incidence)
-        turn = np.mod(azimuth, 2.0 * np.pi)
-        turn = np.minimum(turn, 2.0 * np.pi - turn) if self.mirrored else turn
+        angle = np.mod(azimuth, 2.0 * np.pi)
+        angle = np.minimum(angle, 2.0 * np.pi - angle) if self.mirrored else angle
         r = np.asarray(radial, np.float64)
         k = np.clip(np.searchsorted(self.radial, r, side="right") - 1, 0, len(self.radial) - 2)
         u = (r - self.radial[k]) / (self.radial[k + 1] - self.radial[k])
@@ -359,22 +371,22 @@ class ScatterTable:
             low = high = np.zeros(r.shape, int)
             v = np.zeros(r.shape)
         else:
-            low = np.clip(np.searchsorted(self.azimuth, turn, side="right") - 1, 0, len(self.azimuth) - 2)
+            low = np.clip(np.searchsorted(self.azimuth, angle, side="right") - 1, 0, len(self.azimuth) - 2)
             high = low + 1
-            v = (turn - self.azimuth[low]) / (self.azimuth[high] - self.azimuth[low])
+            v = (angle - self.azimuth[low]) / (self.azimuth[high] - self.azimuth[low])
         f = (1.0 - v) * ((1.0 - u) * table[low, k] + u * table[low, k + 1])
         f += v * ((1.0 - u) * table[high, k] + u * table[high, k + 1])
         return np.where(r <= self.radial[-1] * (1.0 + 1e-12), f, 0.0)
 
     def _at(self, incidence: float) -> np.ndarray:
-        """The table at one angle of incidence, (A, R)."""
-        place = np.interp(incidence, self.incidence, np.arange(len(self.incidence)))
-        k = min(int(place), max(len(self.incidence) - 2, 0))
-        w = place - k
+        """Return the table at one angle of incidence, (A, R)."""
+        position = np.interp(incidence, self.incidence, np.arange(len(self.incidence)))
+        k = min(int(position), max(len(self.incidence) - 2, 0))
+        w = position - k
         return (1.0 - w) * self.values[k] + (w * self.values[k + 1] if w > 0.0 else 0.0)
 
     def total(self, incidence: float) -> float:
-        """Total integrated scatter at an angle of incidence in radians, share of the incident power."""
+        """Return the total integrated scatter at an angle of incidence in radians, as a fraction of the incident power."""
         return float(np.sum(self._power(incidence)))
 
     @cached_property
@@ -383,27 +395,27 @@ class ScatterTable:
         span = self.azimuth if len(self.azimuth) > 1 else np.array([0.0, np.pi])
         out = []
         for axis, count in ((self.radial, self.rings), (span, self.sectors)):
-            place = np.linspace(0.0, len(axis) - 1, count + 1)
-            out.append(np.interp(place, np.arange(len(axis)), axis))
+            position = np.linspace(0.0, len(axis) - 1, count + 1)
+            out.append(np.interp(position, np.arange(len(axis)), axis))
         return out[0], out[1]
 
     def _power(self, incidence: float) -> np.ndarray:
-        """Scattered share into each cell, (rings, sectors), both halves together where they are the same."""
+        """Return the scattered fraction into each cell, (rings, sectors); a mirrored cell includes its mirror image."""
         table, (radial, azimuth) = self._at(incidence), self._edges
         power = np.zeros((self.rings, self.sectors))
         dr, dp = np.diff(radial)[:, None], np.diff(azimuth)[None, :]
         for a in _GAUSS:
-            along = _between(table, len(self.radial), self.rings, a)  # (A, rings)
+            along = _interpolated(table, len(self.radial), self.rings, a)  # (A, rings)
             r = radial[:-1, None] + a * dr
-            rise, lean = np.cos(r) * np.cos(incidence), np.sin(r) * np.sin(incidence)
+            along_normal, tilt = np.cos(r) * np.cos(incidence), np.sin(r) * np.sin(incidence)
             for b in _GAUSS:
-                f = _between(along.T, len(self.azimuth), self.sectors, b)
-                up = rise + lean * np.cos(azimuth[None, :-1] + b * dp)
-                power += 0.25 * f * np.maximum(up, 0.0) * np.sin(r)
+                f = _interpolated(along.T, len(self.azimuth), self.sectors, b)
+                cosine = along_normal + tilt * np.cos(azimuth[None, :-1] + b * dp)
+                power += 0.25 * f * np.maximum(cosine, 0.0) * np.sin(r)
         return power * dr * dp * (2.0 if self.mirrored else 1.0)
 
     @cached_property
-    def drawn(self) -> DrawnScatter:
+    def sampling(self) -> ScatterSampling:
         """Distributions from which directions are drawn."""
         radial, azimuth = self._edges
         share, rings, sectors = [], [], []
@@ -412,33 +424,38 @@ class ScatterTable:
             share.append(np.sum(power))
             rings.append(_cumulative(np.sum(power, axis=1)[None])[0])
             sectors.append(_cumulative(power))
-        return DrawnScatter(np.array(share), np.array(rings), np.array(sectors), np.cos(radial), azimuth, self.mirrored)
+        return ScatterSampling(
+            np.array(share), np.array(rings), np.array(sectors), np.cos(radial), azimuth, self.mirrored
+        )
 
     def reciprocity(self) -> float:
-        """Rms of the relative difference of f with its directions exchanged; 0 for a reciprocal surface.
+        """Return the rms relative difference of f with its directions exchanged; 0 for a reciprocal surface.
 
-        Of pairs of directions, even over the hemisphere and up to 80 degrees from the normal, for which the table knows
-        both; not a number where it knows none.
+        It is taken over pairs of directions, distributed evenly over the hemisphere up to 80 degrees from the normal,
+        for which the table covers both; NaN where it covers none.
         """
         rng = np.random.default_rng(1)
         low, high = self.incidence[0], max(self.incidence[-1], self.incidence[0])
         top = min(np.radians(80.0), high)
         if not top > low:
             return float("nan")
-        one, two = (np.arccos(rng.uniform(np.cos(top), np.cos(low), 400)) for _ in range(2))
-        turn = rng.uniform(0.0, np.pi, 400)
+        theta_1, theta_2 = (np.arccos(rng.uniform(np.cos(top), np.cos(low), 400)) for _ in range(2))
+        azimuth = rng.uniform(0.0, np.pi, 400)
         differences = []
-        for a, b, p in zip(one, two, turn, strict=True):
-            there, back = self._between(a, b, p), self._between(b, a, p)
-            if there is not None and back is not None and there + back > 0.0:
-                differences.append((there - back) / (0.5 * (there + back)))
-        # to 1e-9: below is the rounding of angles
+        for a, b, p in zip(theta_1, theta_2, azimuth, strict=True):
+            forward, reverse = self._bsdf_between(a, b, p), self._bsdf_between(b, a, p)
+            if forward is not None and reverse is not None and forward + reverse > 0.0:
+                differences.append((forward - reverse) / (0.5 * (forward + reverse)))
+        # rounded to 1e-9, below which it is rounding of angles
         return round(float(np.sqrt(np.mean(np.square(differences)))), 9) if differences else float("nan")
 
-    def _between(self, arriving: float, leaving: float, turn: float) -> float | None:
-        """BSDF from one polar angle to another, ``turn`` from the plane of incidence on the far side of the normal."""
+    def _bsdf_between(self, arriving: float, leaving: float, relative: float) -> float | None:
+        """Return the BSDF from one polar angle to another; None outside the table.
+
+        ``relative`` is the angle from the plane of incidence on the far side of the normal, radians.
+        """
         specular = np.array([np.sin(arriving), 0.0, np.cos(arriving)])
-        out = np.array([np.sin(leaving) * np.cos(turn), np.sin(leaving) * np.sin(turn), np.cos(leaving)])
+        out = np.array([np.sin(leaving) * np.cos(relative), np.sin(leaving) * np.sin(relative), np.cos(leaving)])
         toward = np.array([-np.cos(arriving), 0.0, np.sin(arriving)])
         side = np.cross(specular, toward)
         radial = float(np.arccos(np.clip(specular @ out, -1.0, 1.0)))
@@ -449,23 +466,23 @@ class ScatterTable:
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnScatter:
-    """What directions are drawn from, for angles of incidence from 0 to 90 degrees in ``STEPS`` intervals.
+class ScatterSampling:
+    """Sampling distributions of a table, for angles of incidence from 0 to 90 degrees in ``STEPS`` intervals.
 
     Attributes
     ----------
-    share : np.ndarray
-        TIS, (STEPS + 1,).
-    rings : np.ndarray
-        Cumulative shares of the rings, from 0 to 1, (STEPS + 1, rings + 1).
-    sectors : np.ndarray
-        In each ring those of its sectors, (STEPS + 1, rings, sectors + 1).
-    cosines : np.ndarray
-        Of the rings' edges, descending, (rings + 1,).
-    azimuths : np.ndarray
-        The sectors' edges, radians, (sectors + 1,).
+    share : (STEPS + 1,) ndarray
+        Total integrated scatter.
+    rings : (STEPS + 1, rings + 1) ndarray
+        Cumulative shares of the rings, from 0 to 1.
+    sectors : (STEPS + 1, rings, sectors + 1) ndarray
+        Cumulative shares of the sectors in each ring, from 0 to 1.
+    cosines : (rings + 1,) ndarray
+        Cosines of the rings' edges, descending.
+    azimuths : (sectors + 1,) ndarray
+        Azimuths of the sectors' edges, radians.
     mirrored : bool
-        Whether half of the draws go to the other side of the plane of incidence.
+        True when half of the draws go to the other side of the plane of incidence.
     """
 
     share: np.ndarray
@@ -476,18 +493,18 @@ class DrawnScatter:
     mirrored: bool
 
 
-def _between(table: np.ndarray, knots: int, cells: int, place: float) -> np.ndarray:
-    """Values (N, knots), linear between knots, at a place of each of the cells that divide them, (N, cells)."""
+def _interpolated(table: np.ndarray, knots: int, cells: int, fraction: float) -> np.ndarray:
+    """Return values (N, knots), linear between knots, at a relative position in each of the cells, (N, cells)."""
     if knots == 1:
         return np.broadcast_to(table, (len(table), cells))
-    at = (np.arange(cells) + place) * (knots - 1) / cells
-    k = np.minimum(at.astype(int), knots - 2)
-    u = at - k
+    position = (np.arange(cells) + fraction) * (knots - 1) / cells
+    k = np.minimum(position.astype(int), knots - 2)
+    u = position - k
     return np.asarray((1.0 - u) * table[:, k] + u * table[:, k + 1])
 
 
 def _cumulative(power: np.ndarray) -> np.ndarray:
-    """Cumulative shares along the last axis, from 0 to exactly 1, (N, K + 1); even where there is no power."""
+    """Return cumulative shares along the last axis, (N, K + 1), from 0 to exactly 1; uniform where there is no power."""
     total = np.sum(power, axis=-1, keepdims=True)
     even = np.where(total > 0.0, power, 1.0)
     sums = np.cumsum(even, axis=-1)
@@ -497,36 +514,85 @@ def _cumulative(power: np.ndarray) -> np.ndarray:
 
 
 GRAZING = 1e-12
-"""Smallest cosine of incidence that is told from zero; below it the formulas are 0/0."""
+"""Smallest cosine of incidence that is distinguished from zero; below it the formulas are 0/0."""
 
 
 def cosine_after(cosine: Any, before: Any, after: Any) -> Any:
-    """Cosine of the angle of refraction by Snell's law, 0 where the light is totally reflected.
+    """Return the cosine of the angle of refraction by Snell's law; 0 where the light is totally reflected.
 
     Parameters
     ----------
-    cosine : Any
-        Of the angle of incidence, 0 to 1; float, NumPy or Dr.Jit array, as the others.
-    before : Any
+    cosine : float or array
+        Cosine of the angle of incidence, 0 to 1; float, NumPy or Dr.Jit array, as the other arguments.
+    before : float or array
         Refractive index on the side of the incident light.
-    after : Any
-        On the side of the refracted light.
+    after : float or array
+        Refractive index on the side of the refracted light.
     """
     ratio = before / after
-    square = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
-    return sqrt(select(square > 0.0, square, 0.0 * square))
+    cosine2 = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
+    return sqrt(select(cosine2 > 0.0, cosine2, 0.0 * cosine2))
 
 
 def reflectance(cosine: Any, before: Any, after: Any) -> Any:
-    """Share of unpolarised power that is reflected, 0 to 1; exactly 1 beyond the critical angle.
+    """Return the Fresnel reflectance for unpolarised light, 0 to 1; exactly 1 beyond the critical angle.
 
-    Arguments as ``cosine_after``. What is not reflected is transmitted.
+    Arguments as for ``cosine_after``. The rest of the light is transmitted.
     """
+    s, p = _polarised(cosine, before, after)
+    return 0.5 * (s + p)
+
+
+def _polarised(cosine: Any, before: Any, after: Any) -> tuple[Any, Any]:
+    """Return the Fresnel reflectances of s and of p polarised light; arguments as for ``cosine_after``."""
     cosine = select(cosine > GRAZING, cosine, 0.0 * cosine + GRAZING)
     bent = cosine_after(cosine, before, after)
     s = (before * cosine - after * bent) / (before * cosine + after * bent)
     p = (after * cosine - before * bent) / (after * cosine + before * bent)
-    return 0.5 * (s * s + p * p)
+    return s * s, p * p
+
+
+def fresnel(angle: ArrayLike, before: float, after: float) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the Fresnel reflectances of an uncoated surface for both polarisations.
+
+    Parameters
+    ----------
+    angle : array_like
+        Angles of incidence, radians, 0 to pi/2, any shape.
+    before, after : float
+        Refractive indices on the side of the incident and of the refracted light, at least 1.
+
+    Returns
+    -------
+    s, p : ndarray
+        Fractions of the power that are reflected, polarised perpendicular (s) and parallel (p) to the plane of
+        incidence, of the shape of ``angle``; exactly 1 beyond the critical angle. The rest is transmitted.
+
+    Raises
+    ------
+    ValueError
+        An angle or an index is out of its range.
+
+    Examples
+    --------
+    Glass of index 1.5 reflects 4 % at normal incidence, and at Brewster's angle no p polarised light:
+
+    >>> s, p = fresnel([0.0, np.arctan(1.5)], 1.0, 1.5)
+    >>> s.round(4), p.round(4)
+    (array([0.04  , 0.1479]), array([0.04, 0.  ]))
+
+    Beyond the critical angle of 41.8 degrees inside the glass the reflection is total:
+
+    >>> fresnel(np.radians([41.0, 42.0]), 1.5, 1.0)[0].round(2)
+    array([0.53, 1.  ])
+    """
+    angles = np.asarray(angle, float)
+    if not np.all((angles >= 0.0) & (angles <= 0.5 * np.pi)):
+        raise ValueError("angles of incidence must be between 0 and pi/2 radians")
+    if not (1.0 <= before < np.inf and 1.0 <= after < np.inf):
+        raise ValueError(f"refractive indices must be at least 1, got {before} and {after}")
+    s, p = _polarised(np.cos(angles), before, after)
+    return np.asarray(s), np.asarray(p)
 
 
 @dataclass(frozen=True)
@@ -536,24 +602,24 @@ class Finish:
     Attributes
     ----------
     reflectance : float
-        Share reflected, specular or into the scatter lobe around the specular direction.
+        Reflected share, specular or into the scatter lobe around the specular direction.
     transmission : float
-        Share that goes through (refracted); beyond the critical angle all of it is reflected instead.
+        Transmitted (refracted) share; beyond the critical angle all of it is reflected instead.
     diffuse : float
         Share diffused by Lambert's law to the side the light came from.
-    scatter : Scatter | None
+    scatter : ABg or HarveyShack, optional
         Lobe around the specular and the refracted direction, which takes its share out of them.
     bare : bool
-        Bare glass: reflectance and transmission are Fresnel's and must be given as 0.
+        True for bare glass: reflectance and transmission follow Fresnel's formulas and must be given as 0.
     records : bool
-        Whether the light that is absorbed counts as detected.
-    coating : CoatingTable | None
-        Measured, in place of reflectance and transmission; light goes through where transmission is not 0.
-    table : ScatterTable | None
-        Measured scattering about the specular direction, in place of ``scatter``: what it scatters comes out of what is
-        reflected.
+        True when the absorbed light counts as detected.
+    coating : CoatingTable, optional
+        Measured coating, in place of reflectance and transmission; light is transmitted where transmission is not 0.
+    table : ScatterTable, optional
+        Measured scattering about the specular direction, in place of ``scatter``; it is taken out of the reflected
+        share.
     scattered_only : bool
-        Whether nothing is reflected but what the table scatters; reflectance is then given as 0.
+        True when only the table's scattered light is reflected; reflectance is then given as 0.
 
     Raises
     ------
@@ -580,87 +646,92 @@ class Finish:
                 f"reflected, transmitted and diffused shares must be 0 or more and at most 1, found {shares}"
             )
         if self.bare and any(shares):
-            raise ValueError("a bare glass surface takes its shares from Fresnel's formulas; give none")
+            raise ValueError("a bare glass surface takes its shares from Fresnel's formulas; leave them 0")
 
     def _check_table(self) -> None:
-        """Check what a table scatters against what is reflected."""
+        """Check that the table scatters no more than is reflected."""
         if self.bare and (self.coating is not None or self.table is not None):
-            raise ValueError("bare glass has neither a coating nor a table of its scattering")
+            raise ValueError("bare glass can have neither a coating nor a scatter table")
         if self.scattered_only and (self.table is None or self.reflectance > 0.0):
-            raise ValueError("only what a table scatters is reflected: give a table and no reflectance")
+            raise ValueError("a finish that reflects only scattered light needs a scatter table and a reflectance of 0")
         if self.table is None:
             return
         if self.scatter is not None or self.transmission > 0.0:
-            raise ValueError("a table of scattering stands in place of a lobe, on what light does not go through")
+            raise ValueError(
+                "a scatter table replaces the lobe, and is allowed only on a surface that transmits no light"
+            )
         for k in range(STEPS if not self.scattered_only else 0):
             angle = 0.5 * np.pi * k / STEPS
             reflected = self.reflectance if self.coating is None else self.coating.at(angle, False)[0]
-            if self.table.drawn.share[k] > reflected:
+            if self.table.sampling.share[k] > reflected:
                 raise ValueError(
-                    f"at {np.degrees(angle):.0f} deg the table scatters {self.table.drawn.share[k]:.4g} of the light, "
-                    f"and only {reflected:.4g} are reflected"
+                    f"at {np.degrees(angle):.0f} deg the table scatters {self.table.sampling.share[k]:.4g} of the light, "
+                    f"but only {reflected:.4g} is reflected"
                 )
-        if self.scattered_only and float(np.max(self.table.drawn.share)) + self.diffuse > 1.0:
-            raise ValueError("more than all of the light would come back")
+        if self.scattered_only and float(np.max(self.table.sampling.share)) + self.diffuse > 1.0:
+            raise ValueError("the scattered and diffused light together exceed the incident light")
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """reflectance, transmission, bare, diffuse, and the lobe's share, scale, exponent, kind."""
+        """Reflectance, transmission, bare, diffuse, and the lobe's share, scale, exponent and kind."""
         lobe = (0.0, 1.0, 2.0, 0.0) if self.scatter is None else self.scatter.lobe.numbers
         return (self.reflectance, self.transmission, float(self.bare), self.diffuse, *lobe)
 
 
 POLISH = ABg(2.0e-6, 1.0e-6, 2.0)
-"""A polished mirror of about 1 nm rms roughness: total integrated scatter 9e-5 (4 pi sigma / lambda squared would be
-3.7e-4 at 650 nm over all spatial periods; about a quarter of it falls into the angles the lobe covers)."""
+"""Scatter of a polished mirror of about 1 nm rms roughness: total integrated scatter 9e-5.
+
+(4 pi sigma / lambda) squared would be 3.7e-4 at 650 nm over all spatial periods; about a quarter of it falls into the
+angles that the lobe covers.
+"""
 
 PAINT = ABg(5.0e-3, 0.1, 2.0)
-"""The forward lobe of black paint around its weak gloss."""
+"""Forward lobe of black paint around its weak gloss."""
 
 MIRROR = Finish(reflectance=0.98, scatter=POLISH)
-"""A metal mirror with a protected coating."""
+"""Metal mirror with a protected coating."""
 
 COATED = Finish(reflectance=0.0025, transmission=0.9975)
-"""Glass with an anti-reflection coating: a residual reflectance of a quarter of a percent."""
+"""Glass with an anti-reflection coating: a residual reflectance of 0.25 %."""
 
 BARE = Finish(bare=True)
 """Polished bare glass."""
 
 GROUND = Finish(diffuse=0.04)
-"""Glass ground and blackened, seen from either side."""
+"""Ground and blackened glass, seen from either side."""
 
 BLACK = Finish(reflectance=0.005, diffuse=0.035, scatter=PAINT)
 """Diffuse black paint: 4 % of the light comes back, most of it by Lambert's law."""
 
 SILICON = Finish(reflectance=0.3, records=True)
-"""A bare silicon detector: what it does not reflect it records."""
+"""Bare silicon detector, which records all the light it does not reflect."""
 
 ABSORBER = Finish()
-"""Perfectly black."""
+"""Perfectly black surface."""
 
 COATING_STEPS = 360
-"""Intervals of the angle of incidence, from 0 to 90 degrees, in which a path looks a coating up."""
+"""Number of intervals of the angle of incidence, from 0 to 90 degrees, of a coating's lookup table."""
 
 
 @dataclass(frozen=True, eq=False)
 class CoatingTable:
-    """A coating at one wavelength, for unpolarised light.
+    """Measured coating at one wavelength, for unpolarised light.
+
+    Values are linear between the angles and constant beyond the last one.
 
     Attributes
     ----------
-    angles : np.ndarray
-        Of incidence on the side of air, ascending from 0, radians, (K,).
-    reflectance : np.ndarray
-        0 to 1, (K,).
-    transmittance : np.ndarray | None
-        0 to 1, (K,); None where it is not told.
-
-    Linear between the angles; constant beyond the last one.
+    angles : (K,) ndarray
+        Angles of incidence on the side of air, ascending from 0, radians.
+    reflectance : (K,) ndarray
+        Reflectance, 0 to 1.
+    transmittance : (K,) ndarray, optional
+        Transmittance, 0 to 1; None where it is not known.
 
     Raises
     ------
     ValueError
-        Angles that do not ascend, shares that are impossible.
+        Angles do not ascend, or shares are impossible.
     """
 
     angles: np.ndarray
@@ -678,19 +749,19 @@ class CoatingTable:
             raise ValueError("angles of incidence must ascend between 0 and 90 degrees")
         through = np.zeros_like(self.reflectance) if self.transmittance is None else self.transmittance
         if not self.reflectance.shape == through.shape == self.angles.shape:
-            raise ValueError("one reflectance, and one transmittance, for each angle")
+            raise ValueError("a coating needs one reflectance, and one transmittance, for each angle")
         if min(np.min(self.reflectance), np.min(through)) < 0.0 or np.max(self.reflectance + through) > 1.0 + 1e-9:
             raise ValueError("reflectance and transmittance lie between 0 and 1, also together")
 
     def at(self, angle: float, through: bool) -> tuple[float, float]:
-        """Reflectance and transmittance at an angle of incidence in radians.
+        """Return reflectance and transmittance at an angle of incidence.
 
         Parameters
         ----------
         angle : float
-            radians.
+            Angle of incidence, radians.
         through : bool
-            Whether light goes through, where no transmittance is told all that is not reflected.
+            True when light is transmitted; without a known transmittance all that is not reflected is.
         """
         reflected = float(np.interp(angle, self.angles, self.reflectance))
         if not through:
@@ -699,6 +770,6 @@ class CoatingTable:
             return reflected, 1.0 - reflected
         return reflected, float(np.interp(angle, self.angles, self.transmittance))
 
-    def drawn(self, through: bool) -> np.ndarray:
-        """Reflectance and transmittance from 0 to 90 degrees, (COATING_STEPS + 1, 2); ``through`` as for ``at``."""
+    def sampled(self, through: bool) -> np.ndarray:
+        """Return reflectance and transmittance from 0 to 90 degrees, (COATING_STEPS + 1, 2); ``through`` as for ``at``."""
         return np.array([self.at(float(angle), through) for angle in np.linspace(0.0, 0.5 * np.pi, COATING_STEPS + 1)])

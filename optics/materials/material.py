@@ -1,6 +1,6 @@
-"""Materials of mirrors, prisms, boards and structures: what thermo-elastic models need, near room temperature.
+"""Structural and optical materials near room temperature: properties for thermo-elastic models, with their sources.
 
-"Checked" in a source says that the number was compared with the named one again; the rest stands as quoted.
+"Checked" in a source means that the number was compared with the named source again; the others are as quoted.
 """
 
 from __future__ import annotations
@@ -12,29 +12,35 @@ from difflib import get_close_matches
 from optics.numerics.number_tree import FrozenMap
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> KeyError:
-    """A KeyError that names the nearest known name and lists all of them."""
+class UnknownNameError(KeyError, ValueError):
+    """A name that no catalogue has; the message lists those that are allowed."""
+
+    __str__ = ValueError.__str__
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
+    """Return an error that names the nearest known name and lists all of them."""
     names = sorted(known)
     by_lower = {n.lower(): n for n in names}
     near = get_close_matches(name.lower(), by_lower, n=1, cutoff=0.4)
     hint = f"; did you mean {by_lower[near[0]]!r}?" if near else ""
-    return KeyError(f"unknown {kind} {name!r}{hint} (known: {', '.join(names)})")
+    return UnknownNameError(f"unknown {kind} {name!r}{hint} (known: {', '.join(names)})")
 
 
 ZERO_CELSIUS = 273.15
-"""Kelvin."""
+"""Temperature of 0 C, in kelvin."""
 
 
 @dataclass(frozen=True)
 class TemperatureRange:
-    """Where a material's data may be used.
+    """Range of temperatures for which a material's data are valid.
 
     Attributes
     ----------
     coldest, hottest : float
-        kelvin.
+        Ends of the range, kelvin.
     source : str
-        Why from there and up to there.
+        Reason for these limits.
     """
 
     coldest: float
@@ -43,43 +49,43 @@ class TemperatureRange:
 
     @classmethod
     def celsius(cls, coldest: float, hottest: float, source: str) -> TemperatureRange:
-        """The range from one temperature to another, in degrees Celsius."""
+        """Return the range between two temperatures in degrees Celsius."""
         return cls(ZERO_CELSIUS + coldest, ZERO_CELSIUS + hottest, source)
 
     def holds(self, coldest: float, hottest: float) -> bool:
-        """Whether all temperatures from one to another, kelvin, are inside."""
+        """Return True when the range from ``coldest`` to ``hottest`` (kelvin) lies inside."""
         return self.coldest <= coldest and hottest <= self.hottest
 
     @property
     def text(self) -> str:
-        """In words, in kelvin as in degrees Celsius."""
+        """Range as text, in kelvin and degrees Celsius."""
         low, high = self.coldest - ZERO_CELSIUS, self.hottest - ZERO_CELSIUS
         return f"{self.coldest:.6g} K to {self.hottest:.6g} K ({low:.4g} to {high:.4g} degC)"
 
 
 @dataclass(frozen=True)
 class Material:
-    """An isotropic material near 20 C.
+    """Isotropic material near 20 C.
 
     Attributes
     ----------
     name : str
-        As in the catalogue.
+        Name in the catalogue.
     expansion : float
         Linear thermal expansion (CTE), 1/K.
     density : float
-        kg/m^3.
+        Density, kg/m^3.
     youngs_modulus : float
-        Pa.
+        Young's modulus, Pa.
     poisson_ratio : float
-        1.
+        Poisson's ratio.
     conductivity : float
-        Thermal, W/(m K).
+        Thermal conductivity, W/(m K).
     source : str
-        Where the numbers come from.
+        Source of the numbers.
     known : TemperatureRange
-        Temperatures at which the one number of its expansion stands for it: within some tenth of it, or within what
-        makers' sheets differ by.
+        Temperatures for which the constant expansion is valid: within some 10 % of it, or within the differences
+        between manufacturers' data sheets.
     """
 
     name: str
@@ -92,7 +98,7 @@ class Material:
     known: TemperatureRange
 
     def __post_init__(self) -> None:
-        """Check that the numbers can be those of a solid."""
+        """Check that the numbers are possible for a solid."""
         if not (self.density > 0.0 and self.youngs_modulus > 0.0 and self.conductivity > 0.0):
             raise ValueError(f"{self.name}: density, Young's modulus and conductivity must be positive")
         if not -1.0 < self.poisson_ratio < 0.5:
@@ -143,7 +149,7 @@ _ALL = (
         420.0e9,
         0.17,
         180.0,
-        "sintered SiC-100 (Boostec/Mersen) data sheet, room temperature; not reached for a check. Sintered SiC "
+        "sintered SiC-100 (Boostec/Mersen) data sheet, room temperature; not checked. Sintered SiC "
         "in general: E 370..490 GPa, Poisson's ratio 0.14..0.21, density 3000..3200 kg/m^3",
         TemperatureRange.celsius(0.0, 50.0, "room temperature; its CTE grows by half a per cent in 1 K (not checked)"),
     ),
@@ -155,7 +161,7 @@ _ALL = (
         0.259,
         10.4,
         "Invar 36 as in Yoder, Opto-Mechanical Systems Design; CarTech's sheet has the density and 10 W/(m K). CTE "
-        "hangs on the heat treatment: the fit of NIST's cryogenic data base gives 0.94e-6/K at 20 C (E 152 GPa, "
+        "depends on the heat treatment: the fit of NIST's cryogenic data base gives 0.94e-6/K at 20 C (E 152 GPa, "
         "13.8 W/(m K)), ASTM F1684 allows 1.2..2.7e-6/K over 30..150 C",
         TemperatureRange.celsius(-50.0, 150.0, "makers' sheets differ by more than the CTE changes by there"),
     ),
@@ -215,19 +221,19 @@ _ALL = (
     ),
 )
 MATERIALS: Mapping[str, Material] = FrozenMap({m.name: m for m in _ALL})
-"""The catalogue, by name."""
+"""Built-in materials, by name."""
 _OTHER_NAMES: Mapping[str, str] = FrozenMap(
     {"bk7": "n-bk7", "aluminum": "aluminium", "titanium": "ti-6al-4v", "al2o3": "alumina", "aluminium nitride": "aln"}
 )
 
 
 def material(name: str) -> Material:
-    """The catalogue's material of that name; a case-insensitive match is enough, and BK7 is N-BK7.
+    """Return the built-in material of a name; case does not matter, and BK7 is N-BK7.
 
     Raises
     ------
     KeyError
-        Unknown, with the nearest name.
+        The name is unknown; the message gives the nearest one.
     """
     wanted = _OTHER_NAMES.get(name.lower(), name.lower())
     for known, entry in MATERIALS.items():

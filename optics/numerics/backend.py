@@ -1,14 +1,12 @@
-"""The Dr.Jit array types that a computation runs on: CPU through LLVM or GPU through CUDA, always float64.
+"""Dr.Jit array types for a computation (CPU through LLVM or GPU through CUDA, always float64), memory and threads.
 
-Memory that arrays leave stays with the process, so that the next ones need not be cleared by the system.
+Freed arrays stay with the process, so that the system need not clear the pages of the next ones. By default the C
+library requests arrays of more than 128 kB from the system one by one, and returns them. A batch of states allocates
+and frees hundreds of them, and the system clears each page anew: a tenth of all processor time.
 
-The C library takes arrays of more than 128 kB from the system one by one, and gives them back. A batch of states makes
-and leaves hundreds of them, and the system clears each page anew: a tenth of all processor time.
-
-Threads: this program splits its batches over the cores itself, so the linear algebra under NumPy must not do so too.
-
-OpenBLAS threads that are called from several Python threads at once wait for each other actively; on a busy machine
-that costs a factor of ten and more.
+This program splits its batches over the cores itself, so the linear algebra under NumPy must not do so too. OpenBLAS
+threads that are called from several Python threads at once wait for each other actively; on a busy machine that costs a
+factor of ten and more.
 """
 
 from __future__ import annotations
@@ -30,33 +28,36 @@ from optics.numerics.llvm import ensure_llvm
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
-KEPT = 32 << 20
-"""Bytes up to which an array comes from the process's own memory; the most that the GNU C library takes."""
-IDLE = 256 << 20
-"""Bytes that may lie idle before the process gives some back."""
+ARRAY_BYTES = 32 << 20
+"""Size up to which an array is taken from the process's own memory, bytes; the largest value that the GNU C library
+takes.
+"""
+IDLE_BYTES = 256 << 20
+"""Free memory that the process keeps before it returns some to the system, bytes."""
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-_SAID = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
-"""Environment variables by which a user says it himself."""
+_MALLOC_VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
+"""Environment variables by which a user sets the memory allocation himself."""
 
 
 @cache
 def keep_freed_memory() -> None:
-    """Keep up to ``IDLE`` bytes of freed memory in this process from now on; nothing is done with another C library
-    than GNU's, or where the environment says otherwise.
+    """Keep up to ``IDLE_BYTES`` bytes of freed memory in this process from now on.
+
+    Nothing is done with another C library than GNU's, or where the environment sets the allocation.
     """
-    if sys.platform != "linux" or any(name in os.environ for name in _SAID):
+    if sys.platform != "linux" or any(name in os.environ for name in _MALLOC_VARIABLES):
         return
     with suppress(OSError, AttributeError):
         change = ctypes.CDLL("libc.so.6").mallopt
-        change(_MMAP_THRESHOLD, KEPT)
-        change(_TRIM_THRESHOLD, IDLE)
+        change(_MMAP_THRESHOLD, ARRAY_BYTES)
+        change(_TRIM_THRESHOLD, IDLE_BYTES)
 
 
 NAMES = ("llvm", "cuda")
 
 
 class BackendUnavailable(RuntimeError):
-    """The machine cannot run the asked-for backend (no GPU driver, no usable LLVM)."""
+    """The machine cannot run the requested backend (no GPU driver, no usable LLVM)."""
 
 
 @dataclass(frozen=True)
@@ -97,11 +98,11 @@ class Backend:
         return array
 
     def opaque_each(self, values: Sequence[np.ndarray]) -> list[Any]:
-        """Upload many arrays of one size, each as `opaque` does; much less work than one by one.
+        """Upload many arrays of one size, each as ``opaque`` does, with less overhead than one by one.
 
         Parameters
         ----------
-        values : Sequence[np.ndarray]
+        values : sequence of ndarray
             Arrays of n numbers each, of any shape.
         """
         import drjit as dr
@@ -109,7 +110,7 @@ class Backend:
         if not values:
             return []
         size = values[0].size
-        # every row begins at an aligned address, as each array by itself would
+        # every row begins at an aligned address, as a separate array would
         stride = -(-size * 8 // _ALIGNMENT) * _ALIGNMENT // 8
         table = _aligned(np.zeros(len(values) * stride)).reshape(len(values), stride)
         out = []
@@ -129,10 +130,10 @@ _ALIGNMENT = 128
 
 
 def _aligned(values: np.ndarray) -> np.ndarray:
-    """Flat copy of an array at an aligned address.
+    """Return a flat copy of an array at an aligned address.
 
     Dr.Jit reads a NumPy array in place and compiles the alignment of its address into the kernel; arrays that are
-    aligned only by chance would make a second kernel of the same code now and then.
+    aligned by chance only would cause a second kernel of the same code now and then.
     """
     room = np.empty(values.size + _ALIGNMENT // values.itemsize, values.dtype)
     start = (-room.ctypes.data % _ALIGNMENT) // values.itemsize
@@ -142,12 +143,12 @@ def _aligned(values: np.ndarray) -> np.ndarray:
 
 
 def load_backend(name: str = "llvm") -> Backend:
-    """Return the backend of that name.
+    """Return the backend ``llvm`` or ``cuda``.
 
     Raises
     ------
     BackendUnavailable
-        When this machine cannot run it, with the reason and the remedy.
+        This machine cannot run it; the message gives the reason and the remedy.
     """
     if name not in NAMES:
         raise BackendUnavailable(f"unknown backend {name!r}; choose one of {', '.join(NAMES)}")
@@ -168,8 +169,21 @@ def load_backend(name: str = "llvm") -> Backend:
 
 
 @cache
+def default_backend() -> Backend:
+    """Return the backend of the library's plain functions: this machine's processor.
+
+    Raises
+    ------
+    BackendUnavailable
+        The machine has no usable LLVM.
+    """
+    return load_backend("llvm")
+
+
+@cache
 def _controller() -> ThreadpoolController:
-    # a bad file is told before anything computes
+    """Return the controller of the BLAS thread pools."""
+    # imported late, so that a bad input file is reported before anything is computed
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -177,16 +191,16 @@ def _controller() -> ThreadpoolController:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Let every matrix product inside the ``with`` block run on the thread that calls it."""
+    """Run every matrix product inside the ``with`` block on the thread that calls it."""
     with _controller().limit(limits=1, user_api="blas"):
         yield
 
 
 def kernel_threads(count: int) -> None:
-    """From now on kernels of this process run on so many threads, the calling one among them.
+    """Set the number of threads of this process's kernels, the calling one included.
 
-    Small ones are faster on one: threads that wait for the next kernel do so actively, and take their cores from all
-    else.
+    Small kernels are faster on one thread: threads that wait for the next kernel do so actively, and take cores from
+    all other work.
 
     Parameters
     ----------
@@ -201,10 +215,10 @@ def kernel_threads(count: int) -> None:
 
 @contextmanager
 def one_kernel_thread() -> Iterator[None]:
-    """Let kernels inside the ``with`` block run on the thread that calls them.
+    """Run kernels inside the ``with`` block on the thread that calls them.
 
-    Threads that have run a kernel look for the next one for some milliseconds, actively. Where short kernels alternate
-    with other work, they take more time than the kernels.
+    Threads that have run a kernel wait actively for the next one for some milliseconds. Where short kernels alternate
+    with other work, this takes more time than the kernels.
     """
     import drjit as dr
 
@@ -216,10 +230,10 @@ def one_kernel_thread() -> Iterator[None]:
         kernel_threads(count)
 
 
-LIMIT = "TWIN_THREADS"
+THREADS_VARIABLE = "TWIN_THREADS"
 """Environment variable that limits ``cores``, for processes that share the machine with others of their kind."""
 ONE_THREAD = {
-    LIMIT: "1",
+    THREADS_VARIABLE: "1",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -229,10 +243,13 @@ ONE_THREAD = {
 
 
 def cores() -> int:
-    """Number of cores that this process may use: those that it is given, or fewer if the variable LIMIT says so."""
-    named = os.environ.get(LIMIT, "")
-    return min(_given(), int(named)) if named.isdecimal() and int(named) > 0 else _given()
+    """Return the number of cores that this process may use: those assigned to it, or fewer if the variable THREADS_VARIABLE says
+    so.
+    """
+    named = os.environ.get(THREADS_VARIABLE, "")
+    return min(_assigned_cores(), int(named)) if named.isdecimal() and int(named) > 0 else _assigned_cores()
 
 
-def _given() -> int:
+def _assigned_cores() -> int:
+    """Return the number of cores that the system assigns to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

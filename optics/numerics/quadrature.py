@@ -1,4 +1,4 @@
-"""Sample points with weights for integrals over a pupil."""
+"""Quadrature rules: sample points and weights for integrals over a pupil or an interval."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class PupilNodes:
-    """Quadrature over the unit disk or the square [-1, 1]^2.
+    """Quadrature rule over the unit disk or the square [-1, 1]^2.
 
     Attributes
     ----------
-    x, y : np.ndarray
-        Node coordinates, shape (N,).
-    weight : np.ndarray
-        Area weights, shape (N,), summing to the area (pi or 4).
+    x, y : (N,) ndarray
+        Node coordinates.
+    weight : (N,) ndarray
+        Area weights, summing to the area (pi or 4).
     """
 
     x: np.ndarray
@@ -26,7 +26,7 @@ class PupilNodes:
 
     @property
     def share(self) -> np.ndarray:
-        """Weights of a mean over the pupil: they sum to 1, shape (N,)."""
+        """Weights of a mean over the pupil, shape (N,), summing to 1."""
         return np.asarray(self.weight / np.sum(self.weight))
 
     @property
@@ -37,7 +37,7 @@ class PupilNodes:
 
 @cache
 def disk(rings: int, arms: int | None = None, inner: float = 0.0, turn: float = 0.0) -> PupilNodes:
-    """Gauss quadrature over the unit disk (annulus): Gauss-Legendre in r^2, equal arms in azimuth.
+    """Return Gauss quadrature over the unit disk (annulus): Gauss-Legendre in r^2, equal arms in azimuth.
 
     Exact for polynomials of degree below min(4 * rings, arms); integrals of smooth wavefronts converge exponentially,
     with no error from a jagged edge.
@@ -45,15 +45,35 @@ def disk(rings: int, arms: int | None = None, inner: float = 0.0, turn: float = 
     Parameters
     ----------
     rings : int
-        Radial nodes.
-    arms : int | None
-        Azimuthal nodes, default 4 * rings.
+        Number of radial nodes.
+    arms : int, optional
+        Number of azimuthal nodes, by default 4 * rings.
     inner : float
-        Radius of a central hole.
+        Radius of a central hole, 0 to less than 1.
     turn : float
-        Of all arms, steps from one arm to the next. With half a step an integrand that has too fine a structure in
-        azimuth gets the opposite error.
+        Rotation of all arms, in steps from one arm to the next. With half a step, an integrand whose structure in
+        azimuth is too fine gets the opposite error.
+
+    Returns
+    -------
+    PupilNodes
+        Arrays ``x``, ``y`` and ``weight``, which sums to the area; ``share`` are weights of a mean.
+
+    Raises
+    ------
+    ValueError
+        The hole is not smaller than the disk.
+
+    Examples
+    --------
+    The mean of r^2 over a ring is (1 + e^2) / 2:
+
+    >>> ring = pupil_quadrature(3, inner=0.5)
+    >>> round(float(ring.weight.sum() / np.pi), 12), round(float(ring.share @ (ring.x**2 + ring.y**2)), 12)
+    (0.75, 0.625)
     """
+    if not 0.0 <= inner < 1.0:
+        raise ValueError(f"inner must be at least 0 and less than 1, got {inner}")
     arms = 4 * rings if arms is None else arms
     s, w = gauss(rings)
     low = inner**2
@@ -66,11 +86,11 @@ def disk(rings: int, arms: int | None = None, inner: float = 0.0, turn: float = 
 
 @cache
 def even_disk(count: int) -> PupilNodes:
-    """Points spread evenly over the unit disk, all of the same weight, for integrands that hard edges cut.
+    """Return points spread evenly over the unit disk, of equal weight, for integrands that hard edges cut.
 
-    They stand on Fermat's spiral, turned by the golden angle from one to the next (Vogel, Mathematical Biosciences 44,
-    179, 1979): no edge goes along a row of them, as it does along the rings of ``disk``. An edge moves the share of the
-    points on one side of it by some count^(-3/4).
+    They lie on Fermat's spiral, each rotated by the golden angle from the one before (Vogel, Mathematical Biosciences
+    44, 179, 1979): no edge follows a row of them, as one does along the rings of ``disk``. An edge changes the fraction
+    of the points on one side of it by some count^(-3/4).
     """
     k = np.arange(count)
     r, angle = np.sqrt((k + 0.5) / count), np.pi * (3.0 - np.sqrt(5.0)) * k
@@ -78,51 +98,52 @@ def even_disk(count: int) -> PupilNodes:
 
 
 def disk_for(phase: float) -> PupilNodes:
-    """Quadrature over the disk for images of a smooth wavefront.
+    """Return quadrature over the disk for images of a smooth wavefront.
 
     Parameters
     ----------
     phase : float
-        Largest phase, radians, from the middle to the edge of the pupil at any image point that matters: 2 pi NA r /
+        Largest phase, radians, from the middle to the edge of the pupil at any image point of interest: 2 pi NA r /
         wavelength for points up to r from the spot's centre.
 
     Returns
     -------
     PupilNodes
-        The smallest rule that keeps the image of a clear disk within 1e-6 of its peak at all these points (found by
-        comparison with the Airy pattern for phases from 12 to 80).
+        The smallest rule that keeps the image of a clear disk within 1e-6 of its peak at all these points (determined
+        by comparison with the Airy pattern for phases from 12 to 80).
     """
     return disk(*disk_size(phase))
 
 
 def second_disk_for(phase: float) -> PupilNodes:
-    """A rule whose images differ from those of ``disk_for`` wherever one of the two has too few nodes.
+    """Return a rule whose images differ from those of ``disk_for`` wherever one of the two has too few nodes.
 
-    Two rings more, so that all stand at other radii, and arms that stand between: what is too fine in azimuth gets the
-    opposite error, what is too fine along the radius another one.
+    It has two rings more, so that all rings have other radii, and its arms lie between those of the first rule:
+    structure too fine in azimuth gets the opposite error, structure too fine along the radius a different one.
 
     Parameters
     ----------
     phase : float
-        As of ``disk_for``.
+        Largest phase, radians, as for ``disk_for``.
     """
     rings, arms = disk_size(phase)
     return disk(rings + 2, arms, turn=0.5)
 
 
 def disk_size(phase: float) -> tuple[int, int]:
-    """Rings and arms of ``disk_for``.
+    """Return the numbers of rings and arms of ``disk_for``.
 
     Parameters
     ----------
     phase : float
-        As there.
+        Largest phase, radians, as for ``disk_for``.
     """
     arms = int(np.ceil(phase)) + 10
     return int(np.ceil(0.25 * phase)) + 3, arms + arms % 2
 
 
 def _frozen(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> PupilNodes:
+    """Return the nodes with read-only copies of the arrays."""
     arrays = [np.array(a) for a in (x, y, weight)]
     for array in arrays:
         array.setflags(write=False)
@@ -131,7 +152,7 @@ def _frozen(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> PupilNodes:
 
 @cache
 def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss' points and weights on [-1, 1], (count,) each, read-only."""
+    """Return Gauss-Legendre points and weights on [-1, 1], (count,) each, read-only."""
     points, weights = np.polynomial.legendre.leggauss(count)
     for array in (points, weights):
         array.setflags(write=False)
@@ -139,31 +160,33 @@ def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def gauss_of(points: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss' rule for sums over given points.
+    """Return the Gauss rule for weighted sums over given points.
 
     With n points it is exact for polynomials of degree below 2 n, however rough the weights are (Golub and Welsch,
-    Mathematics of Computation 23, 221 (1969); the recurrence by Lanczos' steps, each made orthogonal to all before).
+    Mathematics of Computation 23, 221 (1969); the recurrence by Lanczos steps, each orthogonalised against all before).
 
     Parameters
     ----------
-    points : np.ndarray
-        (N,), N different ones.
-    weights : np.ndarray
-        (N,), positive.
+    points : (N,) ndarray
+        N different points.
+    weights : (N,) ndarray
+        Positive weights.
     count : int
-        n; at most N are given.
+        Number n of points of the rule, reduced to N if larger.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray]
-        The rule's points, ascending, and weights, which sum to those given, (n,) each.
+    points : (n,) ndarray
+        Points of the rule, ascending.
+    weights : (n,) ndarray
+        Weights of the rule, with the same sum as the given ones.
     """
     points, weights = np.asarray(points, float), np.asarray(weights, float)
     count = min(count, len(points))
     middle, half = 0.5 * (points.max() + points.min()), 0.5 * float(np.ptp(points)) or 1.0
     x = (points - middle) / half
     rows = np.zeros((count, len(x)))
-    diagonal, beside = np.zeros(count), np.zeros(count)
+    diagonal, off_diagonal = np.zeros(count), np.zeros(count)
     vector = np.sqrt(weights / np.sum(weights))
     for k in range(count):
         rows[k] = vector
@@ -171,18 +194,18 @@ def gauss_of(points: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.nd
         diagonal[k] = rows[k] @ vector
         for _ in range(2):
             vector = vector - (rows[: k + 1] @ vector) @ rows[: k + 1]
-        beside[k] = np.linalg.norm(vector)
-        vector = vector / (beside[k] or 1.0)
-    found, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(beside[:-1], 1) + np.diag(beside[:-1], -1))
-    return middle + half * found, np.sum(weights) * vectors[0] ** 2
+        off_diagonal[k] = np.linalg.norm(vector)
+        vector = vector / (off_diagonal[k] or 1.0)
+    nodes, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(off_diagonal[:-1], 1) + np.diag(off_diagonal[:-1], -1))
+    return middle + half * nodes, np.sum(weights) * vectors[0] ** 2
 
 
 def nodes_for(span: float, least: int) -> int:
-    """Gauss nodes for exp(i phase) with a phase that runs over +-``span`` radians, and with a smooth amplitude.
+    """Return the number of Gauss nodes for exp(i phase) whose phase spans +-``span`` radians, with a smooth amplitude.
 
-    Gauss' rule for a linear phase needs span / 2 nodes, and more that grow like the cube root of the span; with these
-    it is right to 1e-8 for spans up to 100. ``least`` serves a constant phase. At F/9 and 450 nm the transfer function
-    of a camera with 0.1 waves of aberration is then right to 3e-8 within 2 mm of its focus (7 waves at the edge), and
-    to 3e-7 at 5 mm.
+    Gauss' rule for a linear phase needs span / 2 nodes, plus a number that grows like the cube root of the span; with
+    these it is accurate to 1e-8 for spans up to 100. ``least`` is the number of nodes for a constant phase. At F/9 and
+    450 nm the transfer function of a camera with 0.1 waves of aberration is then accurate to 3e-8 within 2 mm of its
+    focus (7 waves at the edge), and to 3e-7 at 5 mm.
     """
     return least + int(np.ceil(0.5 * span + 2.0 * span ** (1 / 3)))

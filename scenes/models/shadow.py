@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from itertools import accumulate, pairwise
+from functools import lru_cache
+from itertools import pairwise
 from typing import assert_never
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from optics.geometry.aperture import Circle, Edge, Rectangle
+from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.polygon import area, hull, intersect
 from optics.geometry.tree import PlacedBodies
 from optics.numerics.backend import Backend
@@ -27,10 +27,11 @@ from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.system import SystemBatch
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.edge_shadow import StopOutlines, nodes_in_shadows, outlines_on_stop, settled_shadows
+from optics.waves.edge_shadow import StopOutlines, nodes_in_shadows, settled_shadows
 from optics.waves.imaging import ImagingRays
 from optics.waves.pupil_shadow import SMALLEST, separate
 from optics.waves.pupil_terms import products, to_terms
+from optics.waves.surface_edges import SurfaceEdges
 from scenes.models.camera_model import CameraModel
 from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import convex_bodies, imaging_segments, rays_taken
@@ -288,23 +289,8 @@ def no_shadows(count: int) -> Shadows:
     return Shadows.within(np.zeros((count, 0, 3, 2)), ())
 
 
-@dataclass(frozen=True, eq=False)
-class SeenEdges:
-    """The edges of a camera's surfaces as B images see them.
-
-    Attributes
-    ----------
-    edges : Mapping[str, tuple[Edge, ...]]
-        Of every surface that has some, in the order of the light.
-    places : Mapping[str, np.ndarray]
-        Where rays meet these surfaces, edges or not, in their own x and y, metres of nominal size, (B, N, 2).
-    nodes : PupilNodes
-        Of the stop, through which the rays go.
-    """
-
-    edges: Mapping[str, tuple[Edge, ...]]
-    places: Mapping[str, np.ndarray]
-    nodes: PupilNodes
+class SeenEdges(SurfaceEdges):
+    """Edges of a camera's surfaces as B images see them, in a state of its assembly."""
 
     @classmethod
     def of(cls, beams: TracedBeams, model: CameraModel, camera: str, backend: Backend) -> SeenEdges:
@@ -332,28 +318,6 @@ class SeenEdges:
             size = beams.placed.scale[beams.owner, beams.placed.index[body]].real
             places[name] = np.asarray(traced.hit(number) / size[:, None, None])[..., :2]
         return cls(model.edges, places, beams.nodes)
-
-    @cached_property
-    def passed(self) -> list[np.ndarray]:
-        """Which rays come through every surface and those before it, (B, N) each."""
-        through = [
-            np.all([edge.passes(place[..., 0], place[..., 1]) for edge in self.edges[name]], axis=0)
-            for name, place in self.places.items()
-        ]
-        return list(accumulate(through, np.logical_and))
-
-    def outlines(self, round_sides: int) -> StopOutlines:
-        """Outlines on the stop, with so many sides for a circle.
-
-        Raises
-        ------
-        UnphysicalError
-            Rays meet a surface at places that no polynomials follow.
-        """
-        found = StopOutlines()
-        for (name, place), lit in zip(self.places.items(), [None, *self.passed[:-1]], strict=True):
-            found += outlines_on_stop(place, self.edges[name], self.nodes, round_sides, lit)
-        return found
 
 
 @lru_cache(maxsize=8)

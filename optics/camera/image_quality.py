@@ -1,0 +1,318 @@
+"""Wavefront error, point spread function and MTF of a camera at a point of its field.
+
+Edges of all surfaces count: holes, obscurations, vanes of spiders and rims that vignette. A hole about the middle of
+the stop alone is integrated exactly; other edges are polygons of the same area on the stop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optics.camera.prescription import Camera
+from optics.camera.ray_bundle import Field, chief_point, direction_of, launch_rays, light_nodes, shadow_pieces, trace
+from optics.geometry import zernike
+from optics.geometry.aperture import Circle
+from optics.geometry.polygon import covered
+from optics.numerics.quadrature import PupilNodes, disk
+from optics.raytrace.first_order import first_order
+from optics.waves.diffraction import Grid, PupilField, image
+from optics.waves.imaging import fit_part, imaging_rays, path_to_sphere, pupil_field
+from optics.waves.optical_transfer import polychromatic_transfer, with_nodes_enough
+from optics.waves.pupil_shadow import SMALLEST
+from optics.waves.pupil_stack import CUT_RINGS, DEGREE, PupilFunction, fit_pupils
+
+_STATISTICS_PHASE = 36.0
+"""Phase for which twelve rings of nodes are taken, radians: enough for squares of smooth wavefronts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wavefront:
+    """Wavefront error of a camera at one field point, piston and tilt removed.
+
+    Attributes
+    ----------
+    x, y : (N,) ndarray
+        Points of the stop in units of its radius.
+    weight : (N,) ndarray
+        Weights of a mean over the light, which sum to 1; negative where a shadow is subtracted.
+    error : (N,) ndarray
+        Wavefront error, metres, positive where the wavefront is ahead of the reference sphere.
+    coefficients : (J,) ndarray
+        Coefficients of terms in Noll's order that are orthonormal over the light, metres rms: Zernike's over a clear
+        pupil, annular ones over a ring. Their squares and that of the residual add up to the square of ``rms``.
+    rms : float
+        Root mean square of the error, metres.
+    residual_rms : float
+        Root mean square of what the terms leave, metres.
+    strehl : float
+        Strehl ratio: intensity at the reference point over that of the same light without error.
+    light : float
+        Share of the stop's area that light comes through.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    weight: np.ndarray
+    error: np.ndarray
+    coefficients: np.ndarray
+    rms: float
+    residual_rms: float
+    strehl: float
+    light: float
+
+
+def _chief(camera: Camera, field: Field) -> tuple[np.ndarray, float]:
+    """Return where the chief ray meets the image plane, metres, and how far upstream the exit pupil lies, metres."""
+    launch, direction = (array[0] for array in launch_rays(camera, field, np.zeros((1, 2))))
+    distance = first_order(camera.matrix(launch, direction)).exit_pupil_distance
+    return chief_point(camera, field), float(distance[0])
+
+
+def wavefront(camera: Camera, field: Field = (0.0, 0.0), terms: int = 28) -> Wavefront:
+    """Compute the wavefront error against the sphere about the image of the chief ray.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera in the light of its wavelength.
+    field : (float, float)
+        Angles x and y of the far point, radians.
+    terms : int
+        Number of Zernike terms, 3 to 66.
+
+    Returns
+    -------
+    Wavefront
+        The error over the light in the stop, its terms and statistics. Defocus is part of it.
+
+    Raises
+    ------
+    ValueError
+        No light of the field comes through, or the number of terms is out of its range.
+
+    Notes
+    -----
+    The reference sphere passes through the middle of the exit pupil. The statistics are those of a Gauss quadrature,
+    which ends at the edges of the light.
+
+    Examples
+    --------
+    A mirror whose figure is wrong by 1/28 wave rms has a wavefront error of 1/14 wave and, by Marechal's rule, a Strehl
+    ratio of 0.8:
+
+    >>> wave = 550e-9
+    >>> bent = OpticalSurface(-4.0, -2.0, -1.0, "mirror", diameter=0.4, figure={11: wave / 28})
+    >>> error = wavefront(Camera([bent], wave))
+    >>> round(error.rms / wave * 14, 2), round(error.strehl, 2)
+    (1.0, 0.82)
+    >>> zernike_name(int(np.argmax(np.abs(error.coefficients))) + 1)
+    'spherical aberration'
+
+    At the rim, at r from the axis, a spherical mirror of radius R is ahead of its paraxial sphere by r^4 / (4 R^3) of
+    path, and the Zernike term of spherical aberration is 1 / (6 sqrt(5)) of that:
+
+    >>> sphere = OpticalSurface(-4.0, -2.0, 0.0, "mirror", diameter=0.2)
+    >>> w040 = 0.1**4 / (4 * 4.0**3)
+    >>> round(float(wavefront(Camera([sphere], wave)).coefficients[10] / (w040 / (6 * 5**0.5))), 2)
+    1.0
+    """
+    if not 3 <= terms <= zernike.MAX_NOLL:
+        raise ValueError(f"terms must be between 3 and {zernike.MAX_NOLL}, got {terms}")
+    nodes = light_nodes(camera, field, _STATISTICS_PHASE)
+    origin, radius = _chief(camera, field)
+    points = np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)])
+    rays = trace(camera, *launch_rays(camera, field, points))
+    path = path_to_sphere(rays.position, rays.direction, rays.path, origin, radius)
+    error = -(path[1:] - path[0]) / camera.wavelength
+    fit = fit_part(nodes.x, nodes.y, nodes.weight, error, terms)
+    flat = error - zernike.basis(3, nodes.x, nodes.y) @ fit.level
+    return Wavefront(
+        nodes.x,
+        nodes.y,
+        nodes.share,
+        camera.wavelength * flat,
+        camera.wavelength * fit.parts,
+        camera.wavelength * fit.rms,
+        camera.wavelength * fit.residual_rms,
+        fit.strehl,
+        float(np.sum(nodes.weight) / np.pi),
+    )
+
+
+def _colours(
+    camera: Camera, wavelengths: Sequence[float] | None, weights: Sequence[float] | None
+) -> list[tuple[Camera, float]]:
+    """Return the camera in light of each wavelength, and the share of that light."""
+    colours = np.atleast_1d(np.asarray([camera.wavelength] if wavelengths is None else wavelengths, float))
+    shares = np.ones(len(colours)) if weights is None else np.asarray(weights, float)
+    if shares.shape != colours.shape or not np.all(shares >= 0.0) or not np.sum(shares) > 0.0:
+        raise ValueError(f"weights must be one for each of {len(colours)} wavelengths, not negative and not all 0")
+    return [(camera.at(float(w)), float(s)) for w, s in zip(colours, shares / np.sum(shares), strict=True)]
+
+
+def _field_at(camera: Camera, field: Field, nodes: PupilNodes, origin: np.ndarray) -> PupilField:
+    """Return the plane waves about a point of the image plane (3,) from nodes of the stop, of unit power."""
+    stop = Circle(0.5 * camera.surfaces[camera.stop].diameter)
+    imaging, to_stop = camera.systems
+    rays = imaging_rays(camera.backend, imaging, to_stop, direction_of(field), camera.launch, stop, nodes)
+    return pupil_field(rays, camera.wavelength, origin - [0.0, 0.0, camera.vertices[-1]])
+
+
+def psf(
+    camera: Camera,
+    step: float,
+    count: int = 129,
+    field: Field = (0.0, 0.0),
+    wavelengths: Sequence[float] | None = None,
+    weights: Sequence[float] | None = None,
+) -> np.ndarray:
+    """Compute the point spread function on the image plane by diffraction.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera whose wavelength is used by default.
+    step : float
+        Distance between samples, metres.
+    count : int
+        Number of samples along each axis; the chief ray's image point is in the middle of the grid.
+    field : (float, float)
+        Angles x and y of the far point, radians.
+    wavelengths : sequence of float, optional
+        Wavelengths of the light, metres; the place of the image is that of ``camera.wavelength`` for all of them.
+    weights : sequence of float, optional
+        Share of the light of each wavelength; equal by default.
+
+    Returns
+    -------
+    (count, count) ndarray
+        Irradiance, 1/m^2, of unit power through the pupil: rows along y, columns along x. Times ``step**2`` it sums to
+        the share of the light that falls on the grid.
+
+    Raises
+    ------
+    ValueError
+        The grid is not positive, no light of the field comes through, or the image is too far out of focus.
+
+    Notes
+    -----
+    The sum over plane waves from all points of the pupil is a matrix Fourier transform (Soummer et al., Opt. Express
+    15, 15935, 2007) from the nodes of a Gauss quadrature, without a pixel raster in the pupil.
+
+    Examples
+    --------
+    The image of a perfect circular pupil is the Airy pattern, whose peak is pi / (4 lambda^2 N^2) for unit power and
+    whose first dark ring has the radius 1.22 lambda N:
+
+    >>> camera = Camera([OpticalSurface(-4.0, -2.0, -1.0, "mirror", diameter=0.2)], 500e-9)
+    >>> pixel = 0.1 * 500e-9 * camera.f_number
+    >>> image = psf(camera, pixel, 41)
+    >>> round(float(image.max()) * 4 / np.pi * (500e-9 * camera.f_number) ** 2, 2)
+    1.0
+    >>> x = pixel * (np.arange(41) - 20)
+    >>> bool(np.max(np.abs(image[20] / image.max() - airy(x, 500e-9, camera.f_number))) < 2e-3)
+    True
+    >>> int(np.argmin(image[20, 20:])) / 10
+    1.2
+    """
+    if not 0.0 < step < np.inf or count < 1:
+        raise ValueError(f"step must be positive, in metres, and count at least 1, got {step} and {count}")
+    origin, _ = _chief(camera, field)
+    grid = Grid(-0.5 * (count - 1) * step, step, int(count))
+    out = np.zeros((count, count))
+    for colour, share in _colours(camera, wavelengths, weights):
+        wave = wavefront(colour, field, 3)
+        nodes = light_nodes(colour, field, _phase(colour, float(np.ptp(wave.error)), step * count))
+        out += share * image(_field_at(colour, field, nodes, origin), grid, grid)[0]
+    return out
+
+
+def _phase(camera: Camera, error: float, width: float) -> float:
+    """Return how far the phase of waves runs over the pupil at the corners of an image, radians.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera in light of its wavelength.
+    error : float
+        Range of the wavefront error, metres.
+    width : float
+        Width of the image, metres.
+    """
+    aperture = 0.5 / camera.f_number
+    return float(2.0 * np.pi / camera.wavelength * (1.1 * aperture * np.sqrt(0.5) * width + error))
+
+
+def _pupil(camera: Camera, field: Field, origin: np.ndarray) -> PupilFunction:
+    """Return the exit pupil about a point of the image plane (3,) with what edges take of it."""
+    pieces = shadow_pieces(camera, field)
+    nodes = disk(CUT_RINGS if pieces is not None else 12)
+    traced = _field_at(camera, field, nodes, origin)
+    if pieces is None:
+        return fit_pupils(traced, nodes)[0]
+    lit = ~covered(pieces, np.stack([nodes.x, nodes.y], axis=-1), SMALLEST)
+    return with_nodes_enough(fit_pupils(traced, nodes, DEGREE, pieces, lit)[0], camera.wavelength)
+
+
+def mtf(
+    camera: Camera,
+    frequency: ArrayLike,
+    field: Field = (0.0, 0.0),
+    azimuth: float = 0.0,
+    wavelengths: Sequence[float] | None = None,
+    weights: Sequence[float] | None = None,
+) -> np.ndarray:
+    """Compute the modulation transfer function on the image plane.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera whose wavelength is used by default.
+    frequency : (M,) array_like
+        Spatial frequencies, cycles per metre.
+    field : (float, float)
+        Angles x and y of the far point, radians.
+    azimuth : float
+        Direction in which the pattern varies, from x toward y, radians.
+    wavelengths : sequence of float, optional
+        Wavelengths of the light, metres.
+    weights : sequence of float, optional
+        Share of the light of each wavelength; equal by default.
+
+    Returns
+    -------
+    (M,) ndarray
+        Modulation, 1 at zero frequency and 0 beyond the cut-off.
+
+    Raises
+    ------
+    ValueError
+        The frequencies are not (M,) and finite, or no light of the field comes through.
+
+    Notes
+    -----
+    The autocorrelation of the pupil (Hopkins, Proc. R. Soc. A 231, 91, 1955) is integrated over the exact overlap; with
+    edges in the beam it is right to about 1e-3.
+
+    Examples
+    --------
+    At half its cut-off 1 / (lambda N) a perfect circular pupil has an MTF of 0.391:
+
+    >>> camera = Camera([OpticalSurface(-4.0, -2.0, -1.0, "mirror", diameter=0.2)], 500e-9)
+    >>> cutoff = 1 / (500e-9 * camera.f_number)
+    >>> mtf(camera, [0, 0.5 * cutoff, 1.01 * cutoff]).round(3)
+    array([1.   , 0.391, 0.   ])
+    """
+    cycles = np.atleast_1d(np.asarray(frequency, float))
+    if cycles.ndim != 1 or not np.all(np.isfinite(cycles)):
+        raise ValueError(f"frequency must be finite and of shape (M,), got shape {np.shape(frequency)}")
+    origin, _ = _chief(camera, field)
+    both = cycles[:, None] * np.array([np.cos(azimuth), np.sin(azimuth)])
+    colours = _colours(camera, wavelengths, weights)
+    pupils = [_pupil(colour, field, origin) for colour, _ in colours]
+    waves, shares = np.array([c.wavelength for c, _ in colours]), np.array([share for _, share in colours])
+    return np.asarray(np.abs(polychromatic_transfer(pupils, both, waves, shares, np.zeros(1))[0]))

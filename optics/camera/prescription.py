@@ -1,0 +1,294 @@
+"""A camera as the list of its surfaces, as lens design programs have it, and its first-order data.
+
+Frame: z along the axis, and light from the scene travels toward +z; the origin is the vertex of the first surface. A
+radius is positive where the centre of curvature lies toward +z of the vertex. A thickness leads to the next vertex,
+that of the last surface to the image plane, and is negative where light travels toward -z, as after one mirror.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import inf, isfinite
+from typing import Literal
+
+import numpy as np
+
+from optics.geometry.aperture import Circle, Edge, Ray
+from optics.geometry.pose import Pose, rotation_matrix
+from optics.geometry.surface import Surface, ZernikeFigure, plane
+from optics.geometry.tree import Body, RigidTree
+from optics.materials.glass import refractive_index
+from optics.numerics.array_math import UnphysicalError, determinant
+from optics.numerics.backend import Backend, default_backend
+from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.first_order import Paraxial, RayMatrix, paraxial, ray_matrix
+from optics.raytrace.system import SystemBatch, assemble
+
+MIRROR = "mirror"
+"""Material of a surface that reflects."""
+
+_IMAGE = "image"
+
+
+@dataclass(frozen=True, eq=False)
+class OpticalSurface:
+    """Row of a camera's prescription: a mirror, a face of a lens or a plane that only stops light.
+
+    Attributes
+    ----------
+    radius : float
+        Radius of curvature at the vertex, metres, positive where the centre lies toward +z; infinite for a plane.
+    thickness : float
+        Distance along z to the vertex of the next surface, or to the image, metres; negative after one mirror.
+    conic : float
+        Conic constant: 0 a sphere, -1 a paraboloid.
+    material : str or float
+        ``"mirror"``, the name of a glass behind the surface, or the refractive index there. 1 is the medium in which
+        the camera stands.
+    diameter : float
+        Diameter of the clear aperture, metres; light is stopped outside.
+    inner_diameter : float
+        Diameter of a central hole or obscuration, metres; light is stopped inside.
+    vanes : sequence of (float, float)
+        Width in metres and direction from x in radians of each vane of a spider, from the axis outward.
+    asphere : sequence of float
+        Coefficients A4, A6, ... of r^4, r^6, ..., in m^-3, m^-5, ...
+    figure : mapping of int to float
+        Noll index -> error of the sag along z, metres rms over the disk of ``diameter``.
+    decenter : (float, float)
+        Shift of this surface alone along x and y, metres.
+    tilt : (float, float, float)
+        Rotation vector of this surface alone about its vertex, radians.
+
+    Raises
+    ------
+    ValueError
+        A number is out of its range; the message says what is allowed.
+
+    Examples
+    --------
+    A paraboloid of 2 m focal length whose hole has a quarter of its diameter:
+
+    >>> OpticalSurface(radius=-4.0, conic=-1.0, thickness=-2.0, material="mirror", diameter=0.4, inner_diameter=0.1)
+    OpticalSurface(radius=-4.0, thickness=-2.0, conic=-1.0, material='mirror', diameter=0.4, inner_diameter=0.1)
+    >>> OpticalSurface(radius=0.0)
+    Traceback (most recent call last):
+    ...
+    ValueError: radius must not be 0 or NaN (a plane has math.inf), got 0.0
+    """
+
+    radius: float = inf
+    thickness: float = 0.0
+    conic: float = 0.0
+    material: str | float = 1.0
+    diameter: float = inf
+    inner_diameter: float = 0.0
+    vanes: Sequence[tuple[float, float]] = ()
+    asphere: Sequence[float] = ()
+    figure: Mapping[int, float] = field(default_factory=dict)
+    decenter: tuple[float, float] = (0.0, 0.0)
+    tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not abs(self.radius) > 0.0:
+            raise ValueError(f"radius must not be 0 or NaN (a plane has math.inf), got {self.radius}")
+        if not isfinite(self.thickness) or not isfinite(self.conic):
+            raise ValueError(f"thickness and conic must be finite, got {self.thickness} and {self.conic}")
+        if not 0.0 <= self.inner_diameter < self.diameter:
+            raise ValueError(f"0 <= inner_diameter < diameter is needed, got {self.inner_diameter} and {self.diameter}")
+        if not isinstance(self.material, str) and not 1.0 <= self.material < inf:
+            raise ValueError(f"a refractive index must be at least 1, got {self.material}")
+        if self.figure and not isfinite(self.diameter):
+            raise ValueError("a figure needs a finite diameter: its Zernike terms are over that disk")
+
+    def __repr__(self) -> str:
+        """Show the numbers that are not the defaults."""
+        shown = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        default = OpticalSurface.__dataclass_fields__
+        parts = (f"{k}={v!r}" for k, v in shown.items() if v != default[k].default and not (k == "figure" and not v))
+        return f"OpticalSurface({', '.join(parts)})"
+
+    @property
+    def shape(self) -> Surface:
+        """Shape of the surface in its own frame."""
+        figure = ZernikeFigure(0.5 * self.diameter, terms=self.figure) if self.figure else None
+        return Surface(1.0 / self.radius, self.conic, tuple(self.asphere), figure)
+
+    def edges(self, outer: bool = True) -> tuple[Edge, ...]:
+        """Return what stops light at the surface, with the outer edge or without it."""
+        rim = [Edge(Circle(0.5 * self.diameter))] if outer and isfinite(self.diameter) else []
+        hole = [Edge(Circle(0.5 * self.inner_diameter), blocks=True)] if self.inner_diameter else []
+        return (*rim, *hole, *(Edge(Ray(width), blocks=True, rotation=angle) for width, angle in self.vanes))
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Camera from the numbers of its surfaces, for light of one wavelength from a scene at infinity.
+
+    Attributes
+    ----------
+    surfaces : sequence of OpticalSurface
+        Surfaces in the order in which light meets them.
+    wavelength : float
+        Wavelength of the light, metres.
+    stop : int
+        Index of the surface that is the aperture stop; its ``diameter`` sets the beam.
+    medium : {"vacuum", "air"}
+        What the camera stands in: catalogues of glasses state indices against air, which light in vacuum does not have.
+
+    Raises
+    ------
+    ValueError
+        There is no surface, the stop is none of them or has no diameter, or a glass or its wavelength is not known.
+
+    Examples
+    --------
+    A Ritchey-Chretien telescope of 0.45 m aperture at F/8. M1 is F/2.67, and M2 magnifies 3 times; the shadow of M2
+    stands for a hole in M1:
+
+    >>> m1 = OpticalSurface(-2.4, -0.88, -1.080808, "mirror", diameter=0.45, inner_diameter=0.12)
+    >>> m2 = OpticalSurface(-0.96, 0.96, -5.022727, "mirror")
+    >>> camera = Camera([m1, m2], wavelength=550e-9)
+    >>> round(camera.focal_length, 3), round(camera.f_number, 3)
+    (3.6, 8.0)
+    >>> Camera([m1, m2], wavelength=550e-9, stop=1)
+    Traceback (most recent call last):
+    ...
+    ValueError: the stop, surface 1, needs a finite diameter
+    """
+
+    surfaces: Sequence[OpticalSurface]
+    wavelength: float
+    stop: int = 0
+    medium: Literal["vacuum", "air"] = "vacuum"
+
+    def __post_init__(self) -> None:
+        """Check that the stop and all glasses are known."""
+        object.__setattr__(self, "surfaces", tuple(self.surfaces))
+        if not 0 <= self.stop < len(self.surfaces):
+            raise ValueError(f"stop must be the index of one of the {len(self.surfaces)} surfaces, got {self.stop}")
+        if not isfinite(self.surfaces[self.stop].diameter):
+            raise ValueError(f"the stop, surface {self.stop}, needs a finite diameter")
+        if not 0.0 < self.wavelength < inf:
+            raise ValueError(f"wavelength must be positive, in metres, got {self.wavelength}")
+        if self.medium not in ("vacuum", "air"):
+            raise ValueError(f"medium must be 'vacuum' or 'air', got {self.medium!r}")
+        self.indices  # noqa: B018
+
+    @cached_property
+    def indices(self) -> tuple[float, ...]:
+        """Refractive index after each surface; a mirror keeps that before it."""
+        out = [1.0]
+        for surface in self.surfaces:
+            named = surface.material
+            if isinstance(named, str):
+                named = out[-1] if named == MIRROR else float(refractive_index(named, self.wavelength, self.medium))
+            out.append(named)
+        return tuple(out[1:])
+
+    @cached_property
+    def vertices(self) -> np.ndarray:
+        """Places of the surfaces' vertices and, last, of the image plane along z, metres, (K + 1,)."""
+        return np.cumsum([0.0, *(surface.thickness for surface in self.surfaces)])
+
+    @cached_property
+    def assembly(self) -> Assembly:
+        """Camera as the ray trace takes it."""
+        bodies, elements, before = [], {}, 1.0
+        for k, (surface, index) in enumerate(zip(self.surfaces, self.indices, strict=True)):
+            place = np.array([*surface.decenter, self.vertices[k]])
+            bodies.append(Body(f"s{k}", Pose(rotation_matrix(surface.tilt), place)))
+            bends = Interaction.PASS if index == before else Interaction.REFRACT
+            light = Interaction.REFLECT if surface.material == MIRROR else bends
+            elements[f"s{k}"] = Element(
+                f"s{k}", f"s{k}", surface.shape, light, index_after=index, edges=surface.edges()
+            )
+            before = index
+        bodies.append(Body(_IMAGE, Pose(translation=np.array([0.0, 0.0, self.vertices[-1]]))))
+        elements[_IMAGE] = Element(_IMAGE, _IMAGE, plane(), Interaction.PASS, index_after=before)
+        return Assembly(RigidTree(tuple(bodies)), elements, {_IMAGE: tuple(elements)})
+
+    @cached_property
+    def systems(self) -> tuple[SystemBatch, SystemBatch]:
+        """Camera to the image plane, and as far as the stop."""
+        names = self.assembly.sequences[_IMAGE]
+        return assemble(self.assembly, [names]), assemble(self.assembly, [names[: self.stop + 1]])
+
+    @property
+    def backend(self) -> Backend:
+        """Arrays on which rays are traced."""
+        return default_backend()
+
+    @property
+    def launch(self) -> np.ndarray:
+        """Point on the axis before the first surface through which plane wavefronts start, metres, (3,)."""
+        return np.array([0.0, 0.0, -self.surfaces[self.stop].diameter])
+
+    def matrix(self, position: np.ndarray, direction: np.ndarray) -> RayMatrix:
+        """Return the derivatives of a ray (position and direction (3,)) on the image plane by its launch."""
+        axes = np.stack([np.cross(direction, [0.0, -1.0, 0.0]), [0.0, 1.0, 0.0]])
+        axes[0] /= np.linalg.norm(axes[0])
+        axes[1] = np.cross(direction, axes[0])
+        return ray_matrix(self.backend, self.systems[0], self.stop, position[None], direction[None], axes[None])
+
+    @cached_property
+    def _axial(self) -> RayMatrix:
+        return self.matrix(self.launch, np.array([0.0, 0.0, 1.0]))
+
+    @cached_property
+    def paraxial(self) -> Paraxial:
+        """Paraxial data about the axis: focal lengths and pupils, in metres."""
+        return paraxial(self._axial, -float(self.launch[2]), abs(self.surfaces[-1].thickness))
+
+    @property
+    def focal_length(self) -> float:
+        """Effective focal length, metres."""
+        return self.paraxial.focal_length
+
+    @property
+    def entrance_pupil_diameter(self) -> float:
+        """Diameter of the entrance pupil, metres."""
+        magnification = np.sqrt(np.abs(determinant(self._axial.stop_by_position[0])))
+        return float(self.surfaces[self.stop].diameter / magnification)
+
+    @property
+    def f_number(self) -> float:
+        """Focal length over the diameter of the entrance pupil."""
+        return self.focal_length / self.entrance_pupil_diameter
+
+    def at(self, wavelength: float) -> Camera:
+        """Return the camera in light of another wavelength, metres.
+
+        Examples
+        --------
+        >>> lens = [OpticalSurface(0.05, 0.004, material="N-BK7", diameter=0.02), OpticalSurface(-0.05, 0.048)]
+        >>> camera = Camera(lens, wavelength=587.6e-9)
+        >>> blue = camera.at(486.1e-9)
+        >>> round(1e3 * camera.focal_length, 2), round(1e3 * blue.focal_length, 2)
+        (49.0, 48.49)
+        """
+        return replace(self, wavelength=wavelength)
+
+    def refocused(self) -> Camera:
+        """Return the camera with the image plane at the paraxial focus.
+
+        Raises
+        ------
+        ValueError
+            The camera has no focus: parallel light leaves it parallel.
+
+        Examples
+        --------
+        >>> mirror = OpticalSurface(-4.0, -1.9, -1.0, "mirror", diameter=0.4)
+        >>> Camera([mirror], wavelength=550e-9).refocused().surfaces[0].thickness
+        -2.0
+        """
+        distance = self.paraxial.back_focal_length
+        if not isfinite(distance):
+            raise UnphysicalError("the camera is afocal: parallel light leaves it parallel, so that it has no focus")
+        *before, last = self.surfaces
+        toward = -1.0 if self._axial.direction[0, 2] < 0.0 else 1.0
+        return replace(self, surfaces=(*before, replace(last, thickness=round(toward * distance, 15))))

@@ -1,0 +1,335 @@
+"""Rays through a camera: launched at points of its stop, traced to its image plane, counted into spots and distortion.
+
+A field is a pair of angles (x, y) in radians: its light travels along (tan x, tan y, 1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optics.camera.prescription import Camera
+from optics.geometry.aperture import Edge
+from optics.numerics.array_math import PhysicalError
+from optics.numerics.quadrature import PupilNodes, disk, disk_size, nodes_for
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import make_rays
+from optics.raytrace.trace import trace as trace_systems
+from optics.waves.edge_shadow import LitStop, settled_shadows
+from optics.waves.imaging import aim_collimated
+from optics.waves.surface_edges import SurfaceEdges
+
+Field = tuple[float, float]
+"""Angles (x, y) of a far point, radians."""
+
+RINGS = 12
+"""Rings of the quadrature over the stop: exact for squares of wavefronts up to order 23."""
+
+_MOST_NODES = 4_000_000
+"""Points of the stop at which a beam is traced at most, to bound memory."""
+
+
+class LightLostError(PhysicalError, ValueError):
+    """No light of a field comes through the camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class TracedRays:
+    """Rays on the image plane of a camera.
+
+    Attributes
+    ----------
+    position : (N, 3) ndarray
+        Points on the image plane, metres, in the camera's frame.
+    direction : (N, 3) ndarray
+        Unit vectors along the light.
+    path : (N,) ndarray
+        Optical path from the launch points, metres.
+    valid : (N,) ndarray of bool
+        Rays that meet every surface within its clear aperture; other numbers of the rest mean nothing.
+    hits : (N, K, 3) ndarray
+        Points on each of the K surfaces, metres, in the surface's own frame.
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    valid: np.ndarray
+    hits: np.ndarray
+
+
+def direction_of(field: Field) -> np.ndarray:
+    """Return the unit vector (3,) along the light of a far point.
+
+    Parameters
+    ----------
+    field : (float, float)
+        Angles x and y of the light from the axis, radians.
+
+    Raises
+    ------
+    ValueError
+        The field is not a pair of angles within pi/2.
+    """
+    angles = np.asarray(field, float)
+    if angles.shape != (2,) or not np.all(np.abs(angles) < 0.5 * np.pi):
+        raise ValueError(f"field must be two angles (x, y) in radians between -pi/2 and pi/2, got {field}")
+    vector = np.array([*np.tan(angles), 1.0])
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def launch_rays(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | None = None) -> tuple[np.ndarray, ...]:
+    """Aim rays of a far point at points of the aperture stop.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera whose stop is aimed at.
+    field : (float, float)
+        Angles x and y of the far point, radians.
+    pupil : (N, 2) array_like, optional
+        Points of the stop in units of its radius; by default the 12 rings of 48 points of a quadrature.
+
+    Returns
+    -------
+    tuple of (N, 3) ndarray
+        Launch points on one plane wavefront, metres, and unit directions, in the camera's frame.
+
+    Raises
+    ------
+    ValueError
+        The points are not (N, 2) and finite, or no ray of the field reaches the stop.
+
+    Examples
+    --------
+    The rim of a stop on the first mirror, along y:
+
+    >>> mirror = OpticalSurface(-4.0, -2.0, -1.0, "mirror", diameter=0.4)
+    >>> position, direction = launch_rays(Camera([mirror], 550e-9), pupil=[(0, 1), (0, -1)])
+    >>> np.round(position, 6) + 0.0
+    array([[ 0. ,  0.2, -0.4],
+           [ 0. , -0.2, -0.4]])
+    >>> direction
+    array([[0., 0., 1.],
+           [0., 0., 1.]])
+    """
+    nodes = disk(RINGS)
+    points = np.stack([nodes.x, nodes.y], axis=-1) if pupil is None else np.asarray(pupil, float)
+    if points.ndim != 2 or points.shape[1] != 2 or not np.all(np.isfinite(points)):
+        raise ValueError(f"pupil must be finite points of shape (N, 2), got shape {points.shape}")
+    light, target = direction_of(field), 0.5 * camera.surfaces[camera.stop].diameter * points
+    try:
+        position, _ = aim_collimated(camera.backend, camera.systems[1], light, camera.launch, target)
+    except AimError as error:
+        raise LightLostError(f"no ray of the field {field} rad reaches surface {camera.stop}, the stop") from error
+    return position[0], np.tile(light, (len(points), 1))
+
+
+def trace(camera: Camera, position: ArrayLike, direction: ArrayLike) -> TracedRays:
+    """Trace rays through the surfaces of a camera to its image plane.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera to trace through.
+    position : (N, 3) array_like
+        Launch points before the first surface, metres, in the camera's frame.
+    direction : (N, 3) or (3,) array_like
+        Directions of the light; they need not have unit length.
+
+    Returns
+    -------
+    TracedRays
+        The rays on the image plane.
+
+    Raises
+    ------
+    ValueError
+        The shapes are others, or a number is not finite.
+
+    Examples
+    --------
+    A paraboloid brings light along its axis to its focus, with equal optical paths:
+
+    >>> mirror = OpticalSurface(-4.0, -2.0, -1.0, "mirror", diameter=0.4)
+    >>> camera = Camera([mirror], wavelength=550e-9)
+    >>> rays = trace(camera, [(0, 0, -1), (0, 0.1, -1), (0.2, 0, -1), (0.3, 0, -1)], (0, 0, 1))
+    >>> rays.valid
+    array([ True,  True,  True, False])
+    >>> bool(np.max(np.abs(rays.position[:3, :2])) < 1e-15)
+    True
+    >>> rays.path[:3].round(12)
+    array([3., 3., 3.])
+    """
+    start, light = np.atleast_2d(np.asarray(position, float)), np.asarray(direction, float)
+    if start.ndim != 2 or start.shape[1] != 3 or light.shape not in ((3,), start.shape):
+        raise ValueError(f"position must be (N, 3) and direction (N, 3) or (3,), got {start.shape} and {light.shape}")
+    length = np.linalg.norm(light, axis=-1, keepdims=True)
+    if not np.all(np.isfinite(start)) or not np.all(np.isfinite(length)) or not np.all(length > 0.0):
+        raise ValueError("positions must be finite, and directions finite and not zero")
+    system, elements = camera.systems[0], camera.assembly.sequence("image")
+    sent = make_rays(camera.backend, start, np.broadcast_to(light / length, start.shape))
+    traced = trace_systems(camera.backend, system, sent, keep=range(len(camera.surfaces)), world=True)
+    place, leaving, path, valid = (array[0] for array in traced.numpy(traced.world))
+    hits = np.stack([traced.hit(k)[0] for k in range(len(camera.surfaces))], axis=1)
+    for k, element in enumerate(elements[:-1]):
+        valid = valid & element.clear(hits[:, k, 0], hits[:, k, 1])
+    return TracedRays(place, leaving, path, valid, hits)
+
+
+def surface_edges(camera: Camera, field: Field, ring: bool = True) -> SurfaceEdges | None:
+    """Return the edges that light of a field meets beside the rim of the stop, or None where there are none.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera with the edges.
+    field : (float, float)
+        Angles x and y of the far point, radians.
+    ring : bool
+        Count the stop's own ``inner_diameter`` in.
+    """
+    edges: dict[str, tuple[Edge, ...]] = {}
+    for k, surface in enumerate(camera.surfaces):
+        own = surface.edges(outer=k != camera.stop)
+        own = own[1:] if k == camera.stop and surface.inner_diameter and not ring else own
+        if own:
+            edges[f"s{k}"] = own
+    if not edges:
+        return None
+    hits = trace(camera, *launch_rays(camera, field)).hits
+    return SurfaceEdges(edges, {name: hits[None, :, int(name[1:]), :2] for name in edges}, disk(RINGS))
+
+
+def shadow_pieces(camera: Camera, field: Field, ring: bool = True) -> np.ndarray | None:
+    """Return the polygons (1, K, V, 2) of the stop's unit disk in which edges stop light, None where none does."""
+    edges = surface_edges(camera, field, ring)
+    if edges is None:
+        return None
+    pieces, _ = settled_shadows(edges.outlines, 1)
+    return pieces if pieces.shape[1] else None
+
+
+def light_nodes(camera: Camera, field: Field, phase: float) -> PupilNodes:
+    """Return a quadrature over the light in the stop.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera with the stop.
+    field : (float, float)
+        Angles x and y of the far point, radians.
+    phase : float
+        Phase over which the integrand runs from the middle of the stop to its rim, radians.
+
+    Returns
+    -------
+    PupilNodes
+        Nodes in units of the stop's radius; weights may be negative where a shadow is subtracted.
+
+    Raises
+    ------
+    ValueError
+        No light of the field comes through, or the phase takes more nodes than memory allows.
+    """
+    rings, arms = disk_size(phase)
+    if rings * arms > _MOST_NODES:
+        raise ValueError(
+            f"the phase runs over {phase:.3g} rad in the pupil, which takes more than {_MOST_NODES} rays; "
+            "ask for a smaller image or a camera nearer to its focus"
+        )
+    stop = camera.surfaces[camera.stop]
+    if shadow_pieces(camera, field, ring=False) is None:
+        return disk(max(rings, RINGS), max(arms, 4 * RINGS), stop.inner_diameter / stop.diameter)
+    pieces = shadow_pieces(camera, field)
+    assert pieces is not None
+    light = LitStop.of(pieces, max(rings, arms // 4 + 1, RINGS), nodes_for(0.5 * phase, 6))
+    if not light.light[0] > 1e-6:
+        raise LightLostError(f"edges of the surfaces stop all light of the field {field} rad")
+    return PupilNodes(light.x[0], light.y[0], light.weight[0])
+
+
+def chief_point(camera: Camera, field: Field) -> np.ndarray:
+    """Return where the chief ray of a field meets the image plane, stopped or not, (3,), metres."""
+    return np.asarray(trace(camera, *launch_rays(camera, field, np.zeros((1, 2)))).position[0])
+
+
+def spot_radius(camera: Camera, field: Field = (0.0, 0.0)) -> float:
+    """Return the rms radius of the geometrical spot about its centroid, in metres.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera whose image plane the spot lies on.
+    field : (float, float)
+        Angles x and y of the far point, radians.
+
+    Returns
+    -------
+    float
+        Rms distance of the rays from their centroid, metres; the light is spread evenly over the stop.
+
+    Raises
+    ------
+    ValueError
+        No light of the field comes through.
+
+    Examples
+    --------
+    The tangential coma of a paraboloid is 3 theta / (16 F^2); its rms spot is sqrt(2/3)/3 = 0.272 of that:
+
+    >>> mirror = OpticalSurface(-4.0, -2.0, -1.0, "mirror", diameter=0.2)
+    >>> camera = Camera([mirror], wavelength=550e-9)
+    >>> theta = 1e-3
+    >>> coma = 3 * theta / (16 * camera.f_number**2) * camera.focal_length
+    >>> round(spot_radius(camera, (0, theta)) / coma, 2)
+    0.27
+    >>> bool(spot_radius(camera) < 1e-15)
+    True
+    """
+    nodes = light_nodes(camera, field, 0.0)
+    rays = trace(camera, *launch_rays(camera, field, np.stack([nodes.x, nodes.y], axis=-1)))
+    offset = rays.position[:, :2] - nodes.share @ rays.position[:, :2]
+    return float(np.sqrt(max(nodes.share @ np.sum(offset**2, axis=-1), 0.0)))
+
+
+def distortion(camera: Camera, fields: ArrayLike) -> np.ndarray:
+    """Return the distortion of chief rays, relative to the image without distortion.
+
+    Parameters
+    ----------
+    camera : Camera
+        Camera with a focal length.
+    fields : (F, 2) array_like
+        Angles x and y of far points, radians; none on the axis, where distortion is not defined.
+
+    Returns
+    -------
+    (F,) ndarray
+        (r - f tan w) / (f tan w), with r the distance of the chief ray from that of the axis on the image plane, f the
+        focal length and w the angle from the axis; positive for a pincushion.
+
+    Raises
+    ------
+    ValueError
+        The fields have another shape or lie on the axis, no light reaches the stop, or the camera is afocal.
+
+    Examples
+    --------
+    With the stop on a single mirror chief rays go on under the angle of incidence, so that there is none:
+
+    >>> mirror = OpticalSurface(-4.0, -2.0, -1.0, "mirror", diameter=0.2)
+    >>> bool(np.max(np.abs(distortion(Camera([mirror], 550e-9), [(0, 0.01), (0.02, 0)]))) < 1e-12)
+    True
+    """
+    angles = np.asarray(fields, float)
+    if angles.ndim != 2 or angles.shape[1] != 2 or not np.all(np.any(angles != 0.0, axis=-1)):
+        raise ValueError(f"fields must be (F, 2) angles off the axis, got {np.asarray(fields).tolist()}")
+    if not np.isfinite(camera.focal_length):
+        raise ValueError("the camera is afocal: distortion needs a focal length")
+    middle = chief_point(camera, (0.0, 0.0))
+    radius = np.array([np.linalg.norm(chief_point(camera, (x, y)) - middle) for x, y in angles])
+    ideal = camera.focal_length * np.hypot(*np.tan(angles.T))
+    return np.asarray(radius / ideal - 1.0)
