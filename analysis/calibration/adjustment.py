@@ -413,7 +413,7 @@ class Adjustment:
     gauge: calibration_parameters.Gauge
     open: tuple[calibration_parameters.Combination, ...]
     weak: tuple[calibration_parameters.Combination, ...]
-    from_start: Array
+    prior_share: Array
     follow: Array
     cameras: Mapping[str, LineModel]
     ground: Mapping[str, Array]
@@ -757,7 +757,7 @@ class _Problem:
         follow = self.followed(equations, covariance, held)
         pulled = rows @ covariance
         spread_all = np.diag(covariance).copy()
-        from_start = np.sum(pulled**2, axis=0) / np.where(spread_all > 0, spread_all, 1.0)
+        prior_share = np.sum(pulled**2, axis=0) / np.where(spread_all > 0, spread_all, 1.0)
         covariance_of_points = covariance
         if robust == "huber":
             covariance = covariance + covariance @ _scores(equations, standard, state.weights) @ covariance
@@ -781,7 +781,7 @@ class _Problem:
             gauge=self.gauge,
             open=freedom.opened,
             weak=calibration_parameters.combinations(names, scale, vectors, equations.reduced, equations.length),
-            from_start=from_start,
+            prior_share=prior_share,
             follow=follow,
             cameras={
                 k: c.with_interior(parts(state.state.values, f.name, k, c)[0].interior)

@@ -227,9 +227,9 @@ def test_looks_that_miss_the_earth_and_ground_on_the_180th_meridian_are_refused(
     )
     with pytest.raises(ValueError, match="no look meets the Earth"):
         ground_accuracy._places(none, np.zeros(2), np.zeros(2), 0.0)
-    with pytest.raises(ValueError, match="a look misses the Earth"):
+    with pytest.raises(ValueError, match="a line of sight misses the Earth"):
         line_scanner._error(none, None, 0.0, (0, 4))
-    with pytest.raises(ValueError, match="a look misses the Earth"):
+    with pytest.raises(ValueError, match="a line of sight misses the Earth"):
         sensor_polynomial(none, 0, 4, (0.0, 1000.0))
     across = np.array([[0.0, 0.0, 0.0, -179.9, 0.0], [9.0, 9.0, 0.1, 179.9, 100.0]])
     with pytest.raises(ValueError, match="the ground lies on the 180th meridian or a pole"):

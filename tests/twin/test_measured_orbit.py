@@ -25,7 +25,7 @@ from tests.twin.orbit_files import FIELDS, WHOLE, edit, export, flown, read_back
 from twin.orbit.angle.angle_run import run_angle
 from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
-from twin.orbit.calibration.schemes import schemes_tested
+from twin.orbit.calibration.schemes import scheme_errors
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
@@ -71,7 +71,7 @@ def test_files_give_the_estimates_of_the_simulation(campaign, files) -> None:
     for name in FIELDS:
         same(alone[0][name], alone[1][name])
     for one, other in zip(
-        *(schemes_tested(c, a).values() for c, a in zip((campaign, again), alone, strict=True)), strict=True
+        *(scheme_errors(c, a).values() for c, a in zip((campaign, again), alone, strict=True)), strict=True
     ):
         for name in FIELDS:
             assert other[name].plan_rms == pytest.approx(one[name].plan_rms, rel=1e-9)
@@ -358,7 +358,7 @@ def test_points_of_simulated_images_are_exported_where_they_were_found(tmp_path)
         off = np.median(np.abs([some.line - line, some.pixel - pixel]), axis=1)
         assert off.max() < 0.6
     nothing = done.setup.model_copy(update={"test": done.setup.test.model_copy(update={"points": None})})
-    with pytest.raises(InputError, match="images alone give no tables"):
+    with pytest.raises(InputError, match="only measured points can be exported"):
         simulation_exported(replace(done, setup=nothing, points=None))
 
 

@@ -22,20 +22,20 @@ from twin.orbit.calibration import campaign_adjustment
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import run_calibration, true_values
 from twin.orbit.calibration.campaign import Campaign, PassData, image_sigma, interior_names, line_model
-from twin.orbit.calibration.campaign_adjustment import GAUGE, fitted, rate_priors, simultaneous
+from twin.orbit.calibration.campaign_adjustment import GAUGE, fit_latitude, rate_priors, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
-from twin.orbit.calibration.influences import surprises
+from twin.orbit.calibration.influences import unexpected_changes
 from twin.orbit.calibration.schemes import (
     FieldErrors,
     adjust_field_with_readings,
+    adjust_pass_strip,
     adjust_with_readings,
-    adjusted_strip,
-    flown,
+    fly_with_drift,
     height_per_arcsec,
     with_monitor,
 )
-from twin.orbit.calibration.schemes import tested as at_checks
-from twin.orbit.calibration.schemes import tested_in_strip as in_strip
+from twin.orbit.calibration.schemes import check_point_errors as at_checks
+from twin.orbit.calibration.schemes import strip_check_errors as in_strip
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import drifted_payload
 from twin.orbit.measured.pass_measurements import ImagePoints
@@ -114,7 +114,7 @@ def test_numbers_say_what_their_sigmas_hold(full) -> None:
     assert found["pitch rate"]["truth"] == pytest.approx(rate, rel=0.05)
     # Student's distribution of two degrees of freedom has no variance
     for count in (4, 5):
-        few = fitted("yaw", np.linspace(0.5, 0.8, count), np.linspace(1e-4, 2e-4, count), 1e-12 * np.eye(count))
+        few = fit_latitude("yaw", np.linspace(0.5, 0.8, count), np.linspace(1e-4, 2e-4, count), 1e-12 * np.eye(count))
         assert len(rate_priors(full.campaign, (few,))) == (count == 5)
 
 
@@ -222,7 +222,7 @@ def test_latitude_fit_is_as_good_as_it_says() -> None:
     for _ in range(400):
         season = 1.5 * random.standard_normal(7)
         value = 4.0 * np.sin(latitude - 0.66) + 25.0 + season + root @ random.standard_normal(7)
-        fit = fitted("yaw", latitude, value, own)
+        fit = fit_latitude("yaw", latitude, value, own)
         ratios.append((fit.amplitude - 4.0) / fit.amplitude_sigma)
         rests.append(fit.remainder**2)
     assert abs(np.mean(ratios)) < 5.0 * np.sqrt(5.0 / 3.0 / 400.0)
@@ -252,9 +252,9 @@ def test_a_wrong_datum_is_taken_up_and_told(full) -> None:
     assert full.datum[2].warned > 100.0
     assert full.datum[0].after.plan_rms == pytest.approx(100.0, rel=0.02)
     assert full.datum[2].after.height_rms == pytest.approx(100.0, rel=0.03)
-    assert full.surprises == ()
+    assert full.unexpected_changes == ()
     campaign = fly_fields(setup_with(datum=(400.0, 0.0, 0.0)), np.random.SeedSequence(1))
-    found = surprises(campaign, simultaneous(campaign.independent))
+    found = unexpected_changes(campaign, simultaneous(campaign.independent))
     assert found[0].name.endswith("roll")
     # launch 40 arcsec, season 1
     assert found[0].ratio == pytest.approx((400.0 / 500e3 / ARCSEC + 25.0) / 40.0, rel=0.1)
@@ -320,7 +320,7 @@ def test_rates_that_residuals_show_are_assumed_with_their_uncertainty(monkeypatc
     found = SimpleNamespace(rates=rates, courses=SimpleNamespace(p_value=0.5), factors={"attitude walk": 4.0})
     monkeypatch.setattr(campaign_adjustment, "simultaneous", lambda *_, **__: found)
     campaign = Campaign(SETUP.test, {"nadir": SimpleNamespace(interior=(0.5,))}, Noise(1e-6), ())
-    drifts = campaign_adjustment.drift_looked_for(campaign).drifts
+    drifts = campaign_adjustment.with_detected_drift(campaign).drifts
     assert drifts.rate == pytest.approx((5e-6, 2e-6, 1e-6))
     assert drifts.walk == pytest.approx(4e-6)
 
@@ -356,7 +356,7 @@ def test_the_drifted_camera_is_the_one_of_the_analysis() -> None:
 @pytest.mark.second
 def test_exact_readings_return_everything() -> None:
     """Places of the sensor are solved to 1e-12 m; 1e-6 of the drift is 20 pm, and 1e-6 of 1 um is as good."""
-    campaign = flown(monitored_with(exact=True), 1.0, SEED)
+    campaign = fly_with_drift(monitored_with(exact=True), 1.0, SEED)
     found = adjust_with_readings(campaign)
     for one in campaign.passes:
         assert np.abs(one.truth.drift["forward"]).max() > 0.1 * ARCSEC
@@ -379,8 +379,8 @@ def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
     takes 7% off. Heights of a field differ by its d_alpha, forward less backward, against the mean of all, to the same
     few per cent of metres per arcsec over latitudes, and d_beta, d_gamma and d_f act at the ends of the line."""
     setup = monitored_with(exact=True)
-    campaign = flown(setup, 1.0, SEED)
-    metres = height_per_arcsec(flown(setup, 0.0, SEED))
+    campaign = fly_with_drift(setup, 1.0, SEED)
+    metres = height_per_arcsec(fly_with_drift(setup, 0.0, SEED))
     by_hand = setup.test.altitude / np.sin(np.radians(50.0)) * ARCSEC
     assert abs(metres) == pytest.approx(by_hand, rel=0.1)
     found = simultaneous(campaign)
@@ -395,7 +395,7 @@ def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
 def test_a_constant_error_of_the_monitor_goes_into_the_interior() -> None:
     """1 arcsec of the forward line in all readings is 3.15 um of x, f times it, and no error of heights. In the reading
     of one tested pass alone it is that pass's error, metres per arcsec."""
-    campaign = flown(monitored_with(exact=True), 1.0, SEED)
+    campaign = fly_with_drift(monitored_with(exact=True), 1.0, SEED)
     wrong = np.array([ARCSEC, 0.0, 0.0, 0.0])
 
     def off(one):
@@ -450,7 +450,7 @@ def test_slow_errors_are_taken_out_as_the_covariances_say() -> None:
     for seed in range(passes):
         campaign = fly_fields(strip_with(5.0), np.random.SeedSequence(seed))
         one = campaign.passes[0]
-        strip = adjusted_strip(campaign, one, campaign.truth, one.bias)
+        strip = adjust_pass_strip(campaign, one, campaign.truth, one.bias)
         before = at_checks(campaign, one, campaign.truth, one.bias)
         after = in_strip(campaign, one, strip, campaign.truth, one.bias)
         assert 1e-6 < strip.p_value < 1.0 - 1e-6

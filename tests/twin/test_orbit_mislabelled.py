@@ -14,7 +14,7 @@ from tests.twin.orbit_files import FIELDS, edit, export, flown, read_back, set_k
 from twin.framework.procedure import BenchError
 from twin.orbit.calibration.calibration_run import run_calibration
 from twin.orbit.calibration.campaign import campaign_of
-from twin.orbit.calibration.screening import _factors, mislabelled
+from twin.orbit.calibration.screening import _factors, mislabelled_points
 from twin.orbit.measured.measurement_tables import read_measurements
 from twin.orbit.measured.pass_measurements import duplicates
 
@@ -77,7 +77,7 @@ def test_exchanged_names_are_found_and_no_others(file: Path, table: str, share: 
     campaign = campaign_of(setup.test, setup.camera, read_measurements(setup.data, setup.camera), True)
     found = set()
     for one in campaign.passes:
-        masks, check = mislabelled(campaign, one)
+        masks, check = mislabelled_points(campaign, one)
         found |= {(one.name, str(one.control_ids[k])) for n, r in one.control_images.items() for k in r.point[masks[n]]}
         assert not check.any()
     # neighbours within 20 sigmas of an image point, 6 pixels, would be left to robust weights
@@ -93,14 +93,14 @@ def test_check_points_with_exchanged_coordinates_are_found(file: Path) -> None:
 
     edit(file.parent / FIELDS[0] / "ground.csv", change)
     _, campaign = read_back(file)
-    masks, check = mislabelled(campaign, campaign.passes[0])
+    masks, check = mislabelled_points(campaign, campaign.passes[0])
     assert check.sum() == 2
     assert not any(mask.any() for mask in masks.values())
 
 
 def test_a_refusal_of_a_measured_test_points_to_its_data(file: Path) -> None:
     swapped(file.parent, 0.2, "image_points")
-    with pytest.raises(BenchError, match="lie elsewhere than those around") as refused:
+    with pytest.raises(BenchError, match="do not lie where their ground points are") as refused:
         run_calibration(PROCEDURES["orbit calibrate"].resolve(file), None, 0)
     assert refused.value.key == ("data",)
     assert "screening: robust" in refused.value.remedy

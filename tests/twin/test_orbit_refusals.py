@@ -276,7 +276,7 @@ def test_a_scene_of_which_a_part_looks_past_the_earth_is_not_exported(tmp_path: 
     result = invoke(command.app, "export", scene, "--out", tmp_path / "run")
     assert (result.exit_code, (tmp_path / "run").exists()) == (2, False)
     told = " ".join(result.stderr.split())
-    assert "a look misses the Earth; allowed: an orbit over ground that every line sees" in told
+    assert "a line of sight misses the Earth; allowed: an orbit over ground that every line sees" in told
 
 
 @pytest.mark.parametrize(("part", "row"), FILES)
@@ -336,7 +336,7 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
     (
         lambda: optics_of(Ns(name="th1", image_of={}.get), ["nadir"], 1e-3, {}),
         ValueError,
-        "how its line nadir forms an",
+        "no image section for its line nadir",
     ),
     (lambda: angle_exported(TRACED), InputError, "camera: the lines of an instrument are traced"),
     (lambda: angle_exported(MEASURED), InputError, "data: measurements are files already"),
@@ -345,11 +345,11 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
     (lambda: command._ground("5 m", "1 m"), InputErrorText, "--lowest must be below --highest"),
     (lambda: run_export(UNMADE, UNMADE, None, changes={}), ValueError, "only the cameras of an instrument"),
     (lambda: PointWorkers(GONE, 1).results(abs, [(1,)]), ClusterError, "a worker was lost"),
-    (lambda: ground_rows(lost(), calibrated(), np.zeros(4), 0.0), ValueError, "a look misses the Earth"),
+    (lambda: ground_rows(lost(), calibrated(), np.zeros(4), 0.0), ValueError, "a line of sight misses the Earth"),
     (
         lambda: light_shift(lost(), LineModel(np.eye(3), np.ones(3), np.zeros(3)), *np.ones((3, 1))),
         UnphysicalError,
-        "a look misses",
+        "a line of sight misses",
     ),
     (
         lambda: controlled(NOWHERE, Ns(at=lambda line, sample: np.zeros((len(line), 2)))),

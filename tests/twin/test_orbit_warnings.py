@@ -106,7 +106,7 @@ def any_run(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("drift_warnings", "step_warnings"):
         monkeypatch.setattr(calibration_report, name, lambda *_: [])
     monkeypatch.setattr(calibration_report, "any_effect", lambda effects: bool(effects.names))
-    monkeypatch.setattr(calibration_report, "meeting_of", lambda campaign, *_: campaign.meeting)
+    monkeypatch.setattr(calibration_report, "intersection_fit", lambda campaign, *_: campaign.meeting)
 
 
 def warned(name: str, path: str = "", value: Any = None) -> list[str]:
@@ -176,13 +176,13 @@ def test_verdicts_among_the_numbers_warn_when_they_are_false() -> None:
     assert FIT["agrees"].of(run) is True
     run.together.p_value = 0.9e-3
     assert FIT["agrees"].of(run) is False
-    assert "a chi-square as large has a chance of 0.0009; biases" in FIT["agrees"].warning(run)
+    assert "larger than their sigmas predict (p = 0.0009): biases" in FIT["agrees"].warning(run)
     spec.errors.switched_on = False
     assert FIT["agrees"].of(run) is None
     right = Ns(agrees=True, spread=3.0, sigma=2.0, limits=(0.8, 1.2), chi_square=9.5, limit=8.25, furthest=5.0)
     wrong = Ns(**vars(right) | {"agrees": False})
     for verdict, whole, part, words in (
-        (STEPWISE["converged"], "stepwise", None, "has not settled after 7 rounds"),
+        (STEPWISE["converged"], "stepwise", None, "has not converged after 7 rounds"),
         (PROPAGATION["agrees"], "scatter", None, "ratio 1.5, limits 0.80 to 1.20"),
         (SMOOTHING["shifts_agree"], "smoothed", "consistency", "contradict the prior: chi-square 9.5, limit 8.25"),
         (SMOOTHING["agrees"], "smoothed", None, "wrong by up to 5 of their sigma, limit 8.25"),

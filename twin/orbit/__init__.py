@@ -1,1 +1,1 @@
-"""A line camera in orbit: Earth, orbit, attitude, lines of sight and where they meet the ground."""
+"""Line cameras in orbit: Earth, orbit, attitude, lines of sight and their intersections with the ground."""

@@ -1,4 +1,4 @@
-"""``python -m twin.orbit``: the camera in orbit (papers 000 and 003)."""
+"""Command line of ``python -m twin.orbit``: tests of a camera in orbit (papers 000, 003), export of camera models."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PROGRAM = "twin.orbit"
 
 
 class Correction(StrEnum):
-    """What control points correct in an image."""
+    """Correction of an image that control points determine."""
 
     shift = "shift"
     affine = "affine"
@@ -79,7 +79,7 @@ def adjust(
     ] = None,
     scheduler: cli.Scheduler = None,
 ) -> None:
-    """Adjust a block of scenes; its help is that of the test."""
+    """Adjust a block of scenes; the command's help is that of the test."""
     procedure = PROCEDURES["orbit adjust"]
 
     def reduced() -> AnyAdjust:
@@ -113,60 +113,74 @@ def export(
         str | None,
         typer.Option(
             "--lowest",
-            help="Lowest ground above the ellipsoid, '-50 m'. Default: of the run's elevation model, or 0 m.",
+            help="Lowest ground above the ellipsoid, '-50 m'. Default: that of the run's elevation model, or 0 m.",
         ),
     ] = None,
     highest: Annotated[
-        str | None, typer.Option("--highest", help="Highest ground, '2500 m'. Default likewise, or 2000 m.")
+        str | None,
+        typer.Option("--highest", help="Highest ground above the ellipsoid, '2500 m'. Default: likewise, or 2000 m."),
     ] = None,
     truth: Annotated[
-        bool, typer.Option("--truth", help="Camera and orbit as they are, not as the user of the images knows them.")
+        bool,
+        typer.Option("--truth", help="Export the true camera and orbit, not those that a user of the images knows."),
     ] = False,
-    band: Annotated[str | None, typer.Option("--band", help="Of a scene whose bands do not look alike.")] = None,
+    band: Annotated[
+        str | None,
+        typer.Option("--band", help="Band to export, for a scene whose bands have different lines of sight."),
+    ] = None,
     control: Annotated[
         Path | None,
         typer.Option(
             "--control",
             readable=False,
-            help="Control points with their places in the images, .gcp: they correct the polynomials.",
+            help="File of control points with their image positions, .gcp; they correct the polynomials.",
         ),
     ] = None,
     correction: Annotated[
-        Correction, typer.Option("--correction", help="What control points correct in the image.")
+        Correction, typer.Option("--correction", help="Correction in the image that control points determine.")
     ] = Correction.affine,
     position_sigma: Annotated[
         str | None,
-        typer.Option("--position-sigma", help="Of the orbit along each axis, '1 m'. Any sigma asks for a map."),
+        typer.Option(
+            "--position-sigma",
+            help="Sigma of the orbit along each axis, '1 m'. Any sigma option writes a map of the accuracy.",
+        ),
     ] = None,
     attitude_sigma: Annotated[
-        str | None, typer.Option("--attitude-sigma", help="Of the attitude about each axis, '2 arcsec'.")
+        str | None, typer.Option("--attitude-sigma", help="Sigma of the attitude about each axis, '2 arcsec'.")
     ] = None,
     interior_sigma: Annotated[
-        float | None, typer.Option("--interior-sigma", min=0.0, max=1e4, help="Of each line's place, pixels.")
+        float | None,
+        typer.Option(
+            "--interior-sigma", min=0.0, max=1e4, help="Sigma of each line's position in the focal plane, pixels."
+        ),
     ] = None,
     image_sigma: Annotated[
-        float | None, typer.Option("--image-sigma", min=0.0, max=1e3, help="Of a place measured in an image, pixels.")
+        float | None,
+        typer.Option("--image-sigma", min=0.0, max=1e3, help="Sigma of a position measured in an image, pixels."),
     ] = None,
     height_sigma: Annotated[
-        str | None, typer.Option("--height-sigma", help="Of the heights that points of one line have, '3 m'.")
+        str | None, typer.Option("--height-sigma", help="Sigma of the heights of points seen in a single line, '3 m'.")
     ] = None,
 ) -> None:
-    """Line cameras for other photogrammetric software: image support data (ISD) of the community sensor model for Ames
-    Stereo Pipeline and ISIS, and rational polynomials (RPC00B).
+    """Export line cameras for other photogrammetric software.
+
+    Formats: image support data (ISD) of the community sensor model, for Ames Stereo Pipeline and ISIS, and rational
+    polynomials (RPC00B).
 
         python -m twin.orbit simulate scenes/orbit/simulate.yaml --out runs/patch
 
         python -m twin.orbit export runs/patch
 
-    models/LINE.json and LINE_RPC.TXT describe each line; of a run folder LINE.tif is its image with the polynomials
-    inside. Of a YAML file the models are those of whole images. export.json says how far each model is from the
-    rigorous sensor, which neither can carry in full.
+    The files models/LINE.json and LINE_RPC.TXT describe each line. From a run folder, LINE.tif is also written: the
+    line's image with the polynomials inside. From a YAML file, the models are those of whole images. export.json
+    gives the largest difference of each model from the rigorous sensor, which neither format can represent in full.
 
         python -m twin.orbit export DIM_SCENE.XML --control points.gcp --attitude-sigma '2 arcsec'
 
-    Of a scene of Pléiades or SPOT 6 and 7 the rigorous model of its DIMAP file is exported. Control points correct the
-    polynomials, with ERR_BIAS by their covariance; they do so for NAME_RPC.TXT, RPC_NAME.XML or a GeoTIFF alone, too.
-    Sigmas of camera and orbit make a map of CE90 and LE90.
+    From a scene of Pléiades or SPOT 6 and 7, the rigorous model of its DIMAP file is exported. Control points
+    correct the polynomials and give ERR_BIAS by their covariance; they also correct a NAME_RPC.TXT, an RPC_NAME.XML
+    or a GeoTIFF alone. Sigmas of camera and orbit make a map of CE90 and LE90.
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
@@ -230,12 +244,12 @@ def export(
 
 
 def _sigma(name: str, given: str | float) -> float:
-    """A standard deviation in SI units; pixels stay pixels.
+    """Return the standard deviation that an option gives, in SI units; pixels stay pixels.
 
     Raises
     ------
     InputErrorText
-        None, or one that is too large.
+        The text is not a standard deviation with a unit, or the value is too large.
     """
     if not isinstance(given, str):
         return float(given)
@@ -250,16 +264,16 @@ def _sigma(name: str, given: str | float) -> float:
 
 
 _SIGMAS = {"position": (DISTANCE, 1e5, "1 m"), "attitude": (ANGLE, 0.1, "2 arcsec"), "height": (DISTANCE, 1e4, "3 m")}
-"""Kind of quantity, largest value, example."""
+"""Kind of quantity, largest value in SI units, and an example, by name of the option."""
 
 
 def _ground(lowest: str | None, highest: str | None) -> tuple[float, float] | None:
-    """Heights that were asked for, metres; None where none were.
+    """Return the lowest and highest ground above the ellipsoid, in metres; None where neither option is given.
 
     Raises
     ------
     InputErrorText
-        They are no heights, or only one of them is given.
+        A height cannot be read, only one of the two is given, or they are not in order and on land.
     """
     if lowest is None and highest is None:
         return None
@@ -275,7 +289,7 @@ def _ground(lowest: str | None, highest: str | None) -> tuple[float, float] | No
 
 
 _DEEPEST, _TOP = -500.0, 9000.0
-"""Metres: of land."""
+"""Lowest and highest ground that the options accept, in metres above the ellipsoid: the range of land."""
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Block of scenes of many passes: drawn from stated laws, adjusted, and what each sensor is worth on the ground."""
+"""Adjustment of a block of scenes from many passes, simulated or measured, and the contribution of each sensor."""

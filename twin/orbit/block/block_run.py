@@ -1,6 +1,6 @@
-"""Adjust a block, and adjust it again without each of its sensors: ``python -m twin.orbit adjust``.
+"""Adjustment of a block, repeated without each of its sensors: ``python -m twin.orbit adjust``.
 
-Worker processes of this machine or of a cluster that reduce the points of a block.
+The points of a block can be reduced by worker processes of this machine or of a cluster (`PointWorkers`).
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from scipy.stats import chi2
 
 from analysis.arrays import MeasurementError
 from analysis.block.block import Block
-from analysis.block.block_adjustment import BlockAdjustment, LawTest, adjust_block, kept_block, law_tests
+from analysis.block.block_adjustment import BlockAdjustment, LawTest, accepted_block, adjust_block, law_tests
 from analysis.block.error_processes import BlockError
-from analysis.block.network import DatumTest, Network, Open, datum_test, network_of, open_combinations
+from analysis.block.network import DatumTest, Network, OpenCombination, datum_test, network_of, open_combinations
 from analysis.block.point_reduction import Pool
 from analysis.orbit.forward_intersection import Accuracy, level_axes, predicted, realised
 from optics.numerics.backend import one_blas_thread
@@ -34,59 +34,82 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.adjust import OrbitAdjustSpec
 
 _LEAST_CHECK = 2
+"""Least number of check points from which errors are computed."""
 _OBSERVED = 3e3
-"""Bytes per image point of a block that is drawn and adjusted."""
+"""Memory per image point of a block that is simulated and adjusted, in bytes."""
 Rejected = tuple[tuple[str, str], ...]
+"""Point and scene of each image point that was rejected as a gross error."""
 DATUM_ALARM = 1e-3
-"""Chance below which a common shift of the control points is told."""
+"""p-value below which a common shift of the control points is reported."""
 ALL = "all"
-NOTHING = "ties alone"
-"""Of the table of sensors: image points of unknown ground alone, beside what is stated of readings and cameras."""
+"""Case of the table of sensors with all sensors."""
+TIES_ALONE = "ties alone"
+"""Case of the table of sensors with image points of unknown ground alone, beside the priors of readings and cameras."""
 
 
 @dataclass(frozen=True, eq=False)
-class Worth:
-    """The block with some of its sensors.
+class SensorContribution:
+    """Errors of a block that is adjusted with some of its sensors, relative to those with all sensors.
 
     Attributes
     ----------
-    left_out : tuple[str, ...]
+    excluded : tuple of str
         Sensors that were not used.
     predicted : Accuracy
-        Errors at check points by their covariances; at all tie points where there are no check points.
-    found : Accuracy | None
-        By their true or given places; None without check points.
-    agreement : float | None
-        Mean square of the errors over their sigmas, of the three coordinates: 1 where sigmas are right; None likewise.
+        CE90 and LE90 of the check points by their covariances; of all tie points where there are no check points.
+    observed : Accuracy or None
+        CE90 and LE90 of the errors at the check points; None without check points.
+    normalised_squared_error : float or None
+        Mean square of the errors over their sigmas, of the three coordinates (chi-square per degree of freedom): 1
+        where the sigmas are right; None without check points.
     plan, height : float
-        CE90 and LE90 by the covariances, over those with all sensors.
+        Predicted CE90 and LE90 over those with all sensors.
     """
 
-    left_out: tuple[str, ...]
+    excluded: tuple[str, ...]
     predicted: Accuracy
-    found: Accuracy | None
-    agreement: float | None
+    observed: Accuracy | None
+    normalised_squared_error: float | None
     plan: float = 1.0
     height: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class CameraChange:
-    """A camera in one scene: found, sigma, expected sigma without the block, truth, (4,) each, radians and metres.
+    """Change of a camera in one scene since its calibration.
 
-    truth: None where nobody knows it.
+    Each attribute is a (4,) ndarray of d_alpha, d_beta, d_gamma and d_f, in radians and metres.
+
+    Attributes
+    ----------
+    value : ndarray
+        Estimated change.
+    sigma : ndarray
+        Standard deviation of the estimate.
+    before : ndarray
+        Prior standard deviation, without the block.
+    truth : ndarray or None
+        True change; None for a measured block.
     """
 
-    found: np.ndarray
+    value: np.ndarray
     sigma: np.ndarray
     before: np.ndarray
     truth: np.ndarray | None
 
 
 @dataclass(frozen=True, eq=False)
-class _Known:
-    """What check points and cameras are compared with: places (m, 3) and their covariances (m, 3, 3), metres; scene ->
-    true change of its camera, empty where nobody knows.
+class _Reference:
+    """Reference with which check points and cameras are compared.
+
+    Attributes
+    ----------
+    places : (m, 3) ndarray
+        Coordinates of the points, ITRS, in metres.
+    covariance : (m, 3, 3) ndarray
+        Covariances of these coordinates, in metres^2.
+    change : Mapping[str, ndarray]
+        Scene -> true change of its camera; empty for a measured block.
     """
 
     places: np.ndarray
@@ -96,43 +119,43 @@ class _Known:
 
 @dataclass(frozen=True, eq=False)
 class BlockRun:
-    """Everything that was computed.
+    """All results of a block adjustment.
 
     Attributes
     ----------
     setup : AnyAdjust
-        What the file says.
+        Resolved test file and camera.
     seed : int
-        Of all that was drawn.
-    drawn : DrawnBlock | None
-        The block and its truth; None for a measured block.
+        Seed of all random numbers.
+    drawn : DrawnBlock or None
+        Simulated block with its truth; None for a measured block.
     adjustment : BlockAdjustment
-        With all sensors that the file does not leave out.
-    worth : Mapping[str, Worth]
-        Case -> check points: all sensors, without each, and ties alone.
+        Adjustment with all sensors that the file does not exclude.
+    contributions : Mapping[str, SensorContribution]
+        Case -> errors at check points: with all sensors, without each, and with ties alone.
     network : Network
-        How scenes hang together.
-    open : tuple[Open, ...]
-        What observations leave to the priors.
-    laws : tuple[LawTest, ...]
-        Tests of the laws in time.
-    datum : DatumTest | None
-        Of the control points against the rest; None without control points.
+        Connections between the scenes.
+    open : tuple of OpenCombination
+        Combinations of unknowns that the observations leave to the priors.
+    laws : tuple of LawTest
+        Tests of the error laws with a course in time.
+    datum : DatumTest or None
+        Test of a common shift of the control points; None without control points.
     cameras : Mapping[str, CameraChange]
-        Scene -> its camera.
-    check : tuple[np.ndarray, np.ndarray, np.ndarray]
-        (k,) check points, (k, 3) errors east, north and up, metres, and (k, 3) their sigmas.
+        Scene -> change of its camera.
+    check : tuple of ndarray
+        Indices (k,) of the check points, their errors (k, 3) east, north and up, in metres, and the sigmas (k, 3).
     rejected : Rejected
-        Point and set of observations of every gross error that was left out.
+        Point and scene of each gross error that was rejected.
     """
 
     setup: AnyAdjust
     seed: int
     drawn: DrawnBlock | None
     adjustment: BlockAdjustment
-    worth: Mapping[str, Worth]
+    contributions: Mapping[str, SensorContribution]
     network: Network
-    open: tuple[Open, ...]
+    open: tuple[OpenCombination, ...]
     laws: tuple[LawTest, ...]
     datum: DatumTest | None
     cameras: Mapping[str, CameraChange]
@@ -145,8 +168,8 @@ class BlockRun:
         return self.adjustment.assembly.block.sensors
 
     @property
-    def datum_chance(self) -> float:
-        """Chance of such a shift of the control points where there is none; 1 without control points."""
+    def datum_p_value(self) -> float:
+        """p-value of the common shift of the control points; 1 without control points."""
         return 1.0 if self.datum is None else float(chi2.sf(self.datum.chi_square, 3))
 
 
@@ -159,41 +182,41 @@ def run_adjustment(
     pool: Pool | None = None,
     monitor: MonitorSource | None = None,
 ) -> BlockRun:
-    """Draw or read a block and adjust it. Nothing is traced: the backend is not used.
+    """Simulate or read a block and adjust it. Nothing is ray-traced: the backend is not used.
 
     Parameters
     ----------
     setup : AnyAdjust
-        What the file says.
-    backend : Backend | None
+        Resolved test file and camera.
+    backend : Backend or None
         Not used.
     seed : int
-        Of all that is drawn.
+        Seed of all random numbers.
     advance : Advance
-        Told of the progress.
-    pool : Pool | None
-        Processes that reduce the points; None for this one alone.
-    monitor : MonitorSource | None
-        What a record says of the cameras, where the file names one.
+        Callback that reports the progress.
+    pool : Pool, optional
+        Processes that reduce the points; None for this process alone.
+    monitor : MonitorSource, optional
+        Source of the cameras' priors from a record of the monitor, where the file names one.
 
     Raises
     ------
     InputError
-        Tables that cannot be used.
+        Tables cannot be used.
     BenchError
-        No such orbit, or a block that cannot be adjusted.
+        No such orbit exists, or the block cannot be adjusted.
     """
     spec = setup.test
     advance("block", 0, 2)
     drawn = None
     if isinstance(setup, MeasuredAdjustSetup):
         block, places = measured_block(setup, advance, monitor)
-        known = _Known(places, block.points.covariance, {})
+        reference = _Reference(places, block.points.covariance, {})
     else:
         _require_memory(setup.test)
         drawn = draw_block(setup, np.random.SeedSequence(seed), monitor)
         block = drawn.block
-        known = _Known(drawn.ground, np.zeros((len(drawn.ground), 3, 3)), drawn.change)
+        reference = _Reference(drawn.ground, np.zeros((len(drawn.ground), 3, 3)), drawn.change)
     for sensor in spec.without:
         block = block.without(sensor)
     advance("block", 1, 2)
@@ -201,36 +224,36 @@ def run_adjustment(
         network = network_of(block)
         datum, block, rejected = _datum(block, spec.robust, pool)
         robust = spec.robust and rejected is None
-        found = adjust_block(
+        adjustment = adjust_block(
             block, robust="reject" if robust else None, variance_components=spec.components or False, pool=pool
         )
         advance("block", 2, 2)
-        worth = _worth(kept_block(found), found, known, advance, pool)
+        contributions = _contributions(accepted_block(adjustment), adjustment, reference, advance, pool)
     except (MeasurementError, np.linalg.LinAlgError) as error:
         key = "data" if drawn is None else "points"
         raise BenchError(str(error), (key,), "more points, or scenes that see the same ground") from error
-    where, wrong, spread = _check(found, known)
-    level = level_axes(found.ground[where])
+    where, wrong, spread = _check(adjustment, reference)
+    level = level_axes(adjustment.ground[where])
     sigma = np.sqrt(np.einsum("nij,njk,nik->ni", level, spread, level))
     errors = np.einsum("nij,nj->ni", level, wrong)
     return BlockRun(
         setup,
         seed,
         drawn,
-        found,
-        worth,
+        adjustment,
+        contributions,
         network,
-        open_combinations(found),
-        law_tests(found),
+        open_combinations(adjustment),
+        law_tests(adjustment),
         datum,
-        _cameras(found, known),
+        _cameras(adjustment, reference),
         (where, errors, sigma),
-        rejected or found.rejected(),
+        rejected or adjustment.rejected(),
     )
 
 
 def _require_memory(spec: OrbitAdjustSpec) -> None:
-    """See whether a block, each of whose points all scenes may see, fits into the memory."""
+    """Raise an error if a block, each of whose points all scenes may see, does not fit into the memory."""
     points = spec.points
     scenes, others = len(spec.passes) * len(spec.lines), points.control + points.check
     require_memory(
@@ -239,10 +262,11 @@ def _require_memory(spec: OrbitAdjustSpec) -> None:
 
 
 def _datum(block: Block, robust: bool, pool: Pool | None) -> tuple[DatumTest | None, Block, Rejected | None]:
-    """A common shift of the control points, the block to be adjusted, and what was left out of it already.
+    """Return the test of a common shift of the control points, the block to adjust, and points already rejected.
 
-    It is looked for first: control points of another datum would else all be taken for gross errors. Where there is
-    one, gross errors are those that stand out beside it, and the control points stay as they are given.
+    The shift is tested first because control points of another datum would otherwise all be rejected as gross errors.
+    Where there is a shift, gross errors are those that stand out beside it, and the control points keep their given
+    coordinates.
     """
     if not np.any(block.points.role == "control"):
         return None, block, None
@@ -250,115 +274,120 @@ def _datum(block: Block, robust: bool, pool: Pool | None) -> tuple[DatumTest | N
     test = datum_test(shifted)
     assert test is not None
     if robust and chi2.sf(test.chi_square, 3) < DATUM_ALARM:
-        return test, kept_block(shifted), shifted.rejected()
+        return test, accepted_block(shifted), shifted.rejected()
     return test, block, None
 
 
-def _check(found: BlockAdjustment, known: _Known) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Check points (k,) that were adjusted, their errors (k, 3), ITRS, metres, and covariances (k, 3, 3) of these."""
-    block = found.assembly.block
-    where = np.flatnonzero((block.points.role == "check") & np.isfinite(found.ground).all(axis=1))
-    spread = found.point_covariance(where) + known.covariance[where]
-    return where, found.ground[where] - known.places[where], spread
+def _check(adjustment: BlockAdjustment, reference: _Reference) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the indices (k,) of adjusted check points, their errors (k, 3), ITRS, metres, and their covariances."""
+    block = adjustment.assembly.block
+    where = np.flatnonzero((block.points.role == "check") & np.isfinite(adjustment.ground).all(axis=1))
+    spread = adjustment.point_covariance(where) + reference.covariance[where]
+    return where, adjustment.ground[where] - reference.places[where], spread
 
 
-def _worth(
-    kept: Block, found: BlockAdjustment, known: _Known, advance: Advance, pool: Pool | None
-) -> FrozenMap[str, Worth]:
-    """Check points by all sensors, without each, and by none but ties."""
-    sensors = [name for name in kept.sensors if name != "ties"]
-    # without ties the check points are all that is left to judge by
-    enough = int(np.sum(kept.points.role == "check")) >= _LEAST_CHECK
+def _contributions(
+    accepted: Block, adjustment: BlockAdjustment, reference: _Reference, advance: Advance, pool: Pool | None
+) -> FrozenMap[str, SensorContribution]:
+    """Return the errors at check points with all sensors, without each, and with tie points alone."""
+    sensors = [name for name in accepted.sensors if name != "ties"]
+    # without ties only check points show the errors
+    enough = int(np.sum(accepted.points.role == "check")) >= _LEAST_CHECK
     cases: dict[str, tuple[str, ...]] = {ALL: ()}
-    cases |= {f"without {name.replace('_', ' ')}": (name,) for name in kept.sensors if name != "ties" or enough}
+    cases |= {f"without {name.replace('_', ' ')}": (name,) for name in accepted.sensors if name != "ties" or enough}
     if len(sensors) > 1:
-        cases[NOTHING] = tuple(sensors)
-    rows: dict[str, Worth] = {}
-    for k, (case, left_out) in enumerate(cases.items()):
+        cases[TIES_ALONE] = tuple(sensors)
+    rows: dict[str, SensorContribution] = {}
+    for k, (case, excluded) in enumerate(cases.items()):
         advance("sensors", k, len(cases))
-        block = kept
-        for name in left_out:
+        block = accepted
+        for name in excluded:
             block = block.without(name)
-        one = found
-        if left_out:
-            one = adjust_block(block, pool=pool)
-        worth = _accuracy(left_out, one, known)
-        full = rows.get(ALL, worth).predicted
-        plan, height = worth.predicted.ce90 / full.ce90, worth.predicted.le90 / full.le90
-        rows[case] = replace(worth, plan=plan, height=height)
+        reduced = adjustment
+        if excluded:
+            reduced = adjust_block(block, pool=pool)
+        contributions = _accuracy(excluded, reduced, reference)
+        full = rows.get(ALL, contributions).predicted
+        plan, height = contributions.predicted.ce90 / full.ce90, contributions.predicted.le90 / full.le90
+        rows[case] = replace(contributions, plan=plan, height=height)
     advance("sensors", len(cases), len(cases))
     return FrozenMap(rows)
 
 
-def _accuracy(left_out: tuple[str, ...], one: BlockAdjustment, known: _Known) -> Worth:
-    where, error, spread = _check(one, known)
+def _accuracy(excluded: tuple[str, ...], adjustment: BlockAdjustment, reference: _Reference) -> SensorContribution:
+    where, error, spread = _check(adjustment, reference)
     if len(where) < _LEAST_CHECK:
-        role = one.assembly.block.points.role
-        ties = np.flatnonzero((role == "tie") & np.isfinite(one.ground).all(axis=1))
+        role = adjustment.assembly.block.points.role
+        ties = np.flatnonzero((role == "tie") & np.isfinite(adjustment.ground).all(axis=1))
         if not len(ties):
-            raise BlockError("block: neither check points nor tie points are left")
-        return Worth(left_out, predicted(one.ground[ties], one.point_covariance(ties)), None, None)
+            raise BlockError("block: neither check points nor tie points remain")
+        return SensorContribution(
+            excluded, predicted(adjustment.ground[ties], adjustment.point_covariance(ties)), None, None
+        )
     square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(spread), error)
-    places = one.ground[where]
-    own = one.point_covariance(where)
-    return Worth(left_out, predicted(places, own), realised(places, error), float(np.mean(square)) / 3.0)
+    places = adjustment.ground[where]
+    covariance = adjustment.point_covariance(where)
+    return SensorContribution(
+        excluded, predicted(places, covariance), realised(places, error), float(np.mean(square)) / 3.0
+    )
 
 
-def _cameras(found: BlockAdjustment, known: _Known) -> FrozenMap[str, CameraChange]:
-    block = found.assembly.block
-    order = [one.name for one in block.passes]
+def _cameras(adjustment: BlockAdjustment, reference: _Reference) -> FrozenMap[str, CameraChange]:
+    block = adjustment.assembly.block
+    order = [block_pass.name for block_pass in block.passes]
     rows = {}
     for scene in block.scenes:
-        if scene.name not in found.assembly.changes:
+        if scene.name not in adjustment.assembly.changes:
             continue
-        value, spread = found.change(scene.name)
+        value, spread = adjustment.change(scene.name)
         law = block.known[scene.camera].covariance
-        own = 4 * order.index(scene.of) + np.arange(4)
-        before = np.sqrt(np.diag(law)[own])
-        rows[scene.name] = CameraChange(value, np.sqrt(np.diag(spread)), before, known.change.get(scene.name))
+        rows_of_pass = 4 * order.index(scene.of) + np.arange(4)
+        before = np.sqrt(np.diag(law)[rows_of_pass])
+        rows[scene.name] = CameraChange(value, np.sqrt(np.diag(spread)), before, reference.change.get(scene.name))
     return FrozenMap(rows)
 
 
 _LOST = "a worker was lost with its share of the points; adjust the block again"
+"""Message for a worker that was lost."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointWorkers:
-    """Workers as `analysis.block.point_reduction` uses them: one share for each of those that there are at the start.
+    """Workers for `analysis.block.point_reduction`, with one share of the points for each worker present at the start.
 
     Attributes
     ----------
     workers : Workers
-        The processes.
+        Worker processes.
     count : int
-        Of them.
+        Number of workers.
     """
 
     workers: Workers
     count: int
 
     def hold(self, things: Sequence[Any]) -> Sequence[Any]:
-        """Give each thing to a worker, in turn."""
+        """Send each object to a worker, in turn, and return the futures."""
         client = self.workers.client
         addresses = sorted(client.scheduler_info(n_workers=-1)["workers"])
         return [
-            client.scatter(one, workers=[addresses[k % len(addresses)]], hash=False) for k, one in enumerate(things)
+            client.scatter(thing, workers=[addresses[k % len(addresses)]], hash=False) for k, thing in enumerate(things)
         ]
 
     def results(self, work: Callable[[tuple[Any, ...]], Any], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Work done with each of the arguments, in their order.
+        """Return the results of `work` for each tuple of arguments, in their order.
 
         Raises
         ------
         MeasurementError
-            a share that cannot be reduced.
+            A share of the points cannot be reduced.
         ClusterError
-            a worker or the scheduler is gone.
+            A worker or the scheduler is lost.
         """
-        futures = [self.workers.submit(_on_one_thread, (work, *one)) for one in arguments]
+        futures = [self.workers.submit(_on_one_thread, (work, *future)) for future in arguments]
 
         def look() -> None:
-            if any(one.status in ("lost", "cancelled") for one in futures):
+            if any(future.status in ("lost", "cancelled") for future in futures):
                 raise ClusterError(_LOST)
 
         for _ in futures:
@@ -369,36 +398,36 @@ class PointWorkers:
             if isinstance(error, MeasurementError):
                 raise error
             raise ClusterError(f"{_LOST} ({type(error).__name__}: {error})")
-        return [one.result() for one in futures]
+        return [future.result() for future in futures]
 
 
-def _on_one_thread(given: tuple[Any, ...]) -> Any:
-    work, *rest = given
+def _on_one_thread(call: tuple[Any, ...]) -> Any:
+    work, *arguments = call
     with one_blas_thread():
-        return work(tuple(rest))
+        return work(tuple(arguments))
 
 
 @contextmanager
 def point_workers(
     count: int | None, scheduler: str | None, warn: Callable[[str], None]
 ) -> Iterator[PointWorkers | None]:
-    """Workers inside the block; none where neither a number nor a scheduler is given.
+    """Provide workers inside a ``with`` block; None where neither a number nor a scheduler is given.
 
     Parameters
     ----------
-    count : int | None
-        Of processes of this machine.
-    scheduler : str | None
+    count : int, optional
+        Number of processes on this machine.
+    scheduler : str, optional
         Address of a running cluster.
     warn : Callable[[str], None]
-        Told what the user should know.
+        Callback for warnings to the user.
 
     Raises
     ------
     InputErrorText
-        Both are given, or a cluster that cannot be used.
+        Both are given, or the cluster cannot be used.
     ClusterError
-        a cluster without workers.
+        The cluster has no workers.
     """
     if scheduler is None and (count is None or count < 2):
         yield None

@@ -1,8 +1,8 @@
-"""A block of scenes with everything that is measured of it, drawn from stated laws.
+"""Simulated block of scenes with all its measurements, drawn from stated laws of errors.
 
-The readings of orbit and attitude are a smooth orbit; the true platform departs from them by processes that are drawn
-as what they are: readings with a cubic spline through them, sums of steps, amplitudes. The images are those of the
-rigorous sensor on the true platform with cameras that have changed.
+The readings of orbit and attitude are those of a smooth orbit; the true platform departs from them by random processes,
+each drawn by its own definition: readings interpolated by a cubic spline, sums of steps, amplitudes. The images are
+those of the rigorous sensor on the true platform, with cameras that have changed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from analysis.block import block as known
+from analysis.block import block as model
 from analysis.block.error_processes import STEPPED, Law
 from analysis.orbit.calibration_parameters import level_covariance, vertical
 from analysis.orbit.three_line_model import Rays
@@ -30,7 +30,7 @@ from twin.orbit.block.measured_block import (
     change_covariance,
     law_of,
     monitored_camera,
-    seconds_after_the_first,
+    seconds_from_first,
 )
 from twin.orbit.calibration.campaign import PassData, line_model, pass_data, passing_orbit
 from twin.orbit.flight.earth import Earth, east_north_up
@@ -42,82 +42,86 @@ from twin.orbit.flight.trajectory import Attitude, Trajectory
 from twin.orbit.measured.pass_measurements import ImagePoints, point_names
 
 Course = Callable[[np.ndarray], np.ndarray]
-Monitored = dict[str, known.CameraKnowledge] | known.CamerasKnowledge
+Monitored = dict[str, model.CameraPrior] | model.JointCameraPrior
 _BEYOND = 30
-"""Readings beyond the ends of a course: a cubic spline forgets its ends by a factor of 0.27 a reading."""
+"""Number of readings drawn beyond the ends of a course: the influence of the ends on a cubic spline falls by a factor
+of 0.27 per reading.
+"""
 _SPARE = 4.0
-"""Places drawn for each point: those that fewer than two scenes see are left out."""
+"""Number of candidates drawn per point; those that fewer than two scenes see are dropped."""
 _DAY = 86400.0
 _MOST_STEPS = 1e5
-"""Of a law with a course in time."""
+"""Largest number of values of a law with a course in time."""
 _PLACES, _IMAGES, _LASER, _TERRAIN, _CONTROL, _COURSES, _CAMERAS, _GROSS = range(8)
-"""Streams of the seed."""
+"""Random streams of the seed."""
 
 
 @dataclass(frozen=True, eq=False)
 class TruePlatform:
-    """What the readings depart from, on the readings' own time.
+    """True platform of a pass, which departs from the smooth readings by a rotation and a shift.
 
     Attributes
     ----------
     readings : Platform
-        a smooth orbit.
-    axes : np.ndarray
-        (3, 3) body axes in the middle of the pass as columns, ITRS.
-    turn : Course
-        Of times of the block (n,) to rotation vectors (n, 3), radians. shift: likewise, metres along `axes`.
+        Smooth orbit and attitude that the readings give.
+    axes : (3, 3) ndarray
+        Body axes in the middle of the pass as columns, ITRS.
+    rotation : Course
+        Function of times of the block (n,), in seconds, that returns rotation vectors (n, 3), in radians.
+    shift : Course
+        Function of times of the block (n,), in seconds, that returns shifts (n, 3) along `axes`, in metres.
     begin : float
-        Of the readings' time on that of the block, seconds.
+        Zero of the readings' time on that of the block, in seconds.
     """
 
     readings: Platform
     axes: np.ndarray
-    turn: Course
+    rotation: Course
     shift: Course
     begin: float
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """See `Platform`."""
-        found: np.ndarray = self.readings.position(seconds) + self.shift(seconds + self.begin) @ self.axes.T
-        return found
+        """Return positions; see `Platform`."""
+        position: np.ndarray = self.readings.position(seconds) + self.shift(seconds + self.begin) @ self.axes.T
+        return position
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """See `Platform`."""
+        """Return velocities; see `Platform`."""
         return self.readings.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:
-        """See `Platform`."""
-        turn = Rotation.from_rotvec(self.turn(seconds + self.begin)).as_matrix()
-        return np.asarray(self.readings.body_to_itrs(seconds) @ turn)
+        """Return attitudes; see `Platform`."""
+        rotation = Rotation.from_rotvec(self.rotation(seconds + self.begin)).as_matrix()
+        return np.asarray(self.readings.body_to_itrs(seconds) @ rotation)
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnBlock:
-    """A block and its truth.
+    """Simulated block with its truth.
 
     Attributes
     ----------
-    block : known.Block
-        What is known and measured.
-    ground : np.ndarray
-        (m, 3) true points, ITRS, metres.
-    change : Mapping[str, np.ndarray]
-        Scene -> (4,) true changes of its camera, radians and metres.
+    block : analysis.block.block.Block
+        Priors and measurements.
+    ground : (m, 3) ndarray
+        True points, ITRS, in metres.
+    change : Mapping[str, ndarray]
+        Scene -> (4,) true change of its camera, in radians and metres.
     platforms : Mapping[str, TruePlatform]
-        Pass -> the true one.
-    gross : Mapping[str, np.ndarray]
-        Scene -> (k,) image points that are wrong.
+        Pass -> true platform.
+    gross : Mapping[str, ndarray]
+        Scene -> (k,) indices of points whose image points are wrong.
     """
 
-    block: known.Block
+    block: model.Block
     ground: np.ndarray
     change: Mapping[str, np.ndarray]
     platforms: Mapping[str, TruePlatform]
     gross: Mapping[str, np.ndarray]
 
 
-def drawn_course(law: Law, first: float, last: float, random: np.random.Generator) -> Course:
-    """One draw of a law between two times, seconds."""
+def draw_course(law: Law, first: float, last: float, random: np.random.Generator) -> Course:
+    """Draw one course of a law of errors between two times, in seconds."""
     sigma, middle = np.array(law.sigma), 0.5 * (first + last)
     if law.kind in ("constant", "rate"):
         value = sigma * random.standard_normal(3)
@@ -141,34 +145,34 @@ def drawn_course(law: Law, first: float, last: float, random: np.random.Generato
     if law.kind == "jitter":
         both = np.concatenate([values, _slow(random.standard_normal(steps.shape), law)], axis=1)
         amplitude: Course = make_interp_spline(law.interval * number, np.tile(sigma, 2) * both, k=1)
-        turn = 2.0 * np.pi * law.frequency
+        omega = 2.0 * np.pi * law.frequency
         return lambda t: (
-            np.cos(turn * t)[:, None] * amplitude(t)[:, :3] + np.sin(turn * t)[:, None] * amplitude(t)[:, 3:]
+            np.cos(omega * t)[:, None] * amplitude(t)[:, :3] + np.sin(omega * t)[:, None] * amplitude(t)[:, 3:]
         )
     line: Course = make_interp_spline(law.interval * number, sigma * values, k=1)
     return line
 
 
 def _slow(steps: np.ndarray, law: Law) -> np.ndarray:
-    """(k, 3) values of a stationary process of unit size from independent normals (k, 3)."""
-    kept = np.exp(-law.interval / law.time)
+    """Return (k, 3) values of a stationary first-order process of unit variance from independent normals (k, 3)."""
+    correlation = np.exp(-law.interval / law.time)
     values = steps.copy()
     for k in range(1, len(steps)):
-        values[k] = kept * values[k - 1] + np.sqrt(1.0 - kept**2) * steps[k]
+        values[k] = correlation * values[k - 1] + np.sqrt(1.0 - correlation**2) * steps[k]
     return values
 
 
 def _courses(
     spec: OrbitAdjustSpec, laws: ReadingLawsSpec, begin: Mapping[str, float], seed: np.random.SeedSequence
 ) -> tuple[dict[str, list[Course]], dict[str, list[Course]], dict[str, np.ndarray]]:
-    """Pass -> courses of its attitude and of its station; star tracker -> its constant turn."""
-    turns: dict[str, list[Course]] = {name: [] for name in begin}
-    shifts: dict[str, list[Course]] = {name: [] for name in begin}
+    """Draw the courses of attitude and station of each pass, and the constant rotation of each star tracker."""
+    attitudes: dict[str, list[Course]] = {name: [] for name in begin}
+    stations: dict[str, list[Course]] = {name: [] for name in begin}
     constants: dict[str, np.ndarray] = {}
     number = 0
-    for kept, named in ((turns, laws.attitude), (shifts, laws.orbit)):
-        for name, one in named.items():
-            term = law_of(name, one)
+    for courses, named in ((attitudes, laws.attitude), (stations, laws.orbit)):
+        for name, law_spec in named.items():
+            term = law_of(name, law_spec)
             scopes: dict[str, list[str]] = {}
             for of, single in spec.passes.items():
                 scope = {"pass": of, "tracker": single.tracker, "block": ""}[term.scope]
@@ -180,38 +184,39 @@ def _courses(
                 number += 1
                 if (last - first) / term.law.interval > _MOST_STEPS and term.law.kind in STEPPED:
                     problem = (
-                        f"{name}: more than {_MOST_STEPS:.0e} values of a course; are passes too far apart to share it?"
+                        f"{name}: a course has more than {_MOST_STEPS:.0e} values; are passes too far apart to share "
+                        "it?"
                     )
                     raise BenchError(problem, ("errors",), "`shared_by: pass`, or a longer interval")
-                course = drawn_course(term.law, first, last, random)
+                course = draw_course(term.law, first, last, random)
                 if term.scope == "tracker" and term.law.kind == "constant":
                     constants[scope] = constants.get(scope, np.zeros(3)) + course(np.zeros(1))[0]
                 for m in members:
-                    kept[m].append(course)
-    return turns, shifts, constants
+                    courses[m].append(course)
+    return attitudes, stations, constants
 
 
 def _summed(parts: list[Course]) -> Course:
-    return lambda t: np.asarray(sum((one(t) for one in parts), np.zeros((len(t), 3))))
+    return lambda t: np.asarray(sum((part(t) for part in parts), np.zeros((len(t), 3))))
 
 
 def _cameras(
-    spec: OrbitAdjustSpec, days: np.ndarray, random: np.random.Generator, recorded: known.CamerasKnowledge | None
-) -> tuple[dict[str, np.ndarray], dict[str, known.CameraKnowledge], Monitored | None]:
-    """Line -> true changes (T, 4), what is expected of them, and what is known after the monitor's readings."""
+    spec: OrbitAdjustSpec, days: np.ndarray, random: np.random.Generator, recorded: model.JointCameraPrior | None
+) -> tuple[dict[str, np.ndarray], dict[str, model.CameraPrior], Monitored | None]:
+    """Draw the true changes (T, 4) of each line; return them with the priors before and after monitor readings."""
     if recorded is not None:
         drawn = covariance_root(recorded.covariance) @ random.standard_normal(len(recorded.covariance))
         changes = recorded.mean + drawn.reshape(recorded.mean.shape)
         laws = {line: change_covariance(spec.changes[line], days) for line in spec.lines}
         nothing = np.zeros((len(days), 4))
-        before = {line: known.CameraKnowledge(nothing, law) for line, law in laws.items()}
+        before = {line: model.CameraPrior(nothing, law) for line, law in laws.items()}
         return dict(zip(recorded.cameras, changes, strict=True)), before, recorded
     true, expected, monitored = {}, {}, {}
     for line in spec.lines:
         law = change_covariance(spec.changes[line], days)
         drawn = covariance_root(law) @ random.standard_normal(len(law))
         true[line] = drawn.reshape(-1, 4)
-        expected[line] = known.CameraKnowledge(np.zeros((len(days), 4)), law)
+        expected[line] = model.CameraPrior(np.zeros((len(days), 4)), law)
         noise = random.standard_normal(len(drawn))
         if spec.monitor is not None:
             sigma = np.tile(camera_sigmas(spec.monitor), len(days))
@@ -219,13 +224,13 @@ def _cameras(
     return true, expected, monitored if spec.monitor is not None else None
 
 
-def _trajectory(spec: OrbitAdjustSpec, name: str, one: BlockPassSpec, earth: Earth) -> Trajectory:
-    longitude = spec.area.longitude if one.longitude is None else one.longitude
-    latitude = spec.area.latitude if one.latitude is None else one.latitude
-    orbit = passing_orbit(one.epoch, spec.span, spec.altitude, longitude, latitude, one.direction)
+def _trajectory(spec: OrbitAdjustSpec, name: str, pass_spec: BlockPassSpec, earth: Earth) -> Trajectory:
+    longitude = spec.area.longitude if pass_spec.longitude is None else pass_spec.longitude
+    latitude = spec.area.latitude if pass_spec.latitude is None else pass_spec.latitude
+    orbit = passing_orbit(pass_spec.epoch, spec.span, spec.altitude, longitude, latitude, pass_spec.direction)
     roll, pitch, yaw = spec.attitude.offset
     held = AttitudeSpec(nadir=spec.attitude.nadir, steering=spec.attitude.steering)
-    attitude = Attitude.from_spec(held.model_copy(update={"offset": (roll + one.roll, pitch, yaw)}))
+    attitude = Attitude.from_spec(held.model_copy(update={"offset": (roll + pass_spec.roll, pitch, yaw)}))
     try:
         return Trajectory(propagate(orbit, earth), attitude)
     except ValueError as error:
@@ -233,34 +238,34 @@ def _trajectory(spec: OrbitAdjustSpec, name: str, one: BlockPassSpec, earth: Ear
 
 
 def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence, monitor: MonitorSource | None = None) -> DrawnBlock:
-    """Fly all passes and measure.
+    """Simulate all passes and their measurements.
 
     Parameters
     ----------
     setup : AdjustSetup
-        What the file says.
+        Resolved test file and camera.
     seed : np.random.SeedSequence
-        Of all that is drawn.
-    monitor : MonitorSource | None
-        What a record says of the cameras, from which the true ones are drawn.
+        Seed of all random numbers.
+    monitor : MonitorSource, optional
+        Source of the cameras' priors from a record of the monitor; the true cameras are drawn from them.
 
     Raises
     ------
     BenchError
-        No such orbit, or too few places that two scenes see.
+        No such orbit exists, or too few points are seen by two scenes.
     """
     spec, payload = setup.test, setup.camera
     earth = Earth.from_spec(spec.earth)
-    readings = {name: _trajectory(spec, name, one, earth) for name, one in spec.passes.items()}
-    epochs = {name: one.epoch for name, one in spec.passes.items()}
-    begin = seconds_after_the_first(epochs)
-    turns, shifts, constants = _courses(spec, spec.truth or spec.errors, begin, stream(seed, _COURSES))
+    readings = {name: _trajectory(spec, name, spec_of, earth) for name, spec_of in spec.passes.items()}
+    epochs = {name: spec_of.epoch for name, spec_of in spec.passes.items()}
+    begin = seconds_from_first(epochs)
+    attitudes, stations, constants = _courses(spec, spec.truth or spec.errors, begin, stream(seed, _COURSES))
     days = np.array(list(begin.values())) / _DAY
     recorded = monitor(epochs, spec.lines) if monitor else None
     true, expected, monitored = _cameras(spec, days, np.random.default_rng(stream(seed, _CAMERAS)), recorded)
     platforms = {
         name: TruePlatform(
-            path, path.body_to_itrs(np.zeros(1))[0], _summed(turns[name]), _summed(shifts[name]), begin[name]
+            path, path.body_to_itrs(np.zeros(1))[0], _summed(attitudes[name]), _summed(stations[name]), begin[name]
         )
         for name, path in readings.items()
     }
@@ -285,13 +290,13 @@ def draw_block(setup: AdjustSetup, seed: np.random.SeedSequence, monitor: Monito
     footprints = _footprints(spec, shots, readings, begin, first)
     points = _known_points(spec, ground, role, earth, np.random.default_rng(stream(seed, _CONTROL)))
     angles = _angles(spec, constants, np.random.default_rng(stream(seed, _CAMERAS, 1)))
-    block = known.Block(
-        passes=tuple(known.Pass(name, one.tracker, begin[name]) for name, one in spec.passes.items()),
+    block = model.Block(
+        passes=tuple(model.Pass(name, spec_of.tracker, begin[name]) for name, spec_of in spec.passes.items()),
         scenes=scenes,
         cameras={line: line_model(payload, line) for line in spec.lines},
         known=expected,
-        attitude=tuple(law_of(name, one) for name, one in spec.errors.attitude.items()),
-        station=tuple(law_of(name, one) for name, one in spec.errors.orbit.items()),
+        attitude=tuple(law_of(name, spec_of) for name, spec_of in spec.errors.attitude.items()),
+        station=tuple(law_of(name, spec_of) for name, spec_of in spec.errors.orbit.items()),
         image=1.0,
         points=points,
         monitored=monitored,
@@ -308,7 +313,7 @@ Seen = Mapping[str, tuple[np.ndarray, np.ndarray]]
 def _points(
     setup: AdjustSetup, sensors: Mapping[str, Sensor], earth: Earth, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Seen]:
-    """Places (m, 3), their roles, and scene -> line and pixel of each, NaN where it does not see one."""
+    """Draw points (m, 3) and roles; return them with line and pixel by scene, NaN where a point is not seen."""
     spec = setup.test
     area, wanted = spec.area, spec.points.control + spec.points.tie + spec.points.check
     count = int(np.ceil(_SPARE * wanted))
@@ -321,7 +326,7 @@ def _points(
     views = np.sum([np.isfinite(line) for line, _ in seen.values()], axis=0)
     good = np.flatnonzero(views >= 2)[:wanted]
     if len(good) < wanted:
-        problem = f"only {len(good)} of {count} places of the area are seen by two scenes"
+        problem = f"only {len(good)} of {count} candidate points of the area are seen by two scenes"
         raise BenchError(problem, ("area",), "an area inside the strips of two scenes or more, and a longer `span`")
     role = np.repeat(
         np.array(["control", "tie", "check"], object), [spec.points.control, spec.points.tie, spec.points.check]
@@ -336,36 +341,38 @@ def _scenes(
     role: np.ndarray,
     begin: Mapping[str, float],
     seed: np.random.SeedSequence,
-) -> tuple[tuple[known.Scene, ...], dict[str, np.ndarray]]:
-    """Image points with their errors as rays, and scene -> points whose image points are wrong."""
+) -> tuple[tuple[model.Scene, ...], dict[str, np.ndarray]]:
+    """Return the scenes with the rays of their noisy image points, and the gross errors by scene."""
     scenes, gross = [], {}
     for k, (scene, (line, pixel)) in enumerate(seen.items()):
         name, camera = scene.rsplit("/", 1)
-        one = data[name]
+        pass_info = data[name]
         random = np.random.default_rng(stream(seed, _IMAGES, k))
-        here = np.flatnonzero(np.isfinite(line))
-        unit = np.array([1.0 / one.pixels_per_line(camera), 1.0])
-        noise = spec.points.image * unit * random.standard_normal((len(here), 2))
-        spoilt = np.random.default_rng(stream(seed, _GROSS, k))
-        wrong = (spoilt.random(len(here)) < spec.points.gross) & (role[here] == "tie")
-        way = spoilt.uniform(0.0, 2.0 * np.pi, len(here))
-        noise += wrong[:, None] * spec.points.gross_size * unit * np.stack([np.cos(way), np.sin(way)], axis=1)
-        sensor = one.sensors[camera]
+        visible = np.flatnonzero(np.isfinite(line))
+        unit = np.array([1.0 / pass_info.pixels_per_line(camera), 1.0])
+        noise = spec.points.image * unit * random.standard_normal((len(visible), 2))
+        random_gross = np.random.default_rng(stream(seed, _GROSS, k))
+        wrong = (random_gross.random(len(visible)) < spec.points.gross) & (role[visible] == "tie")
+        direction = random_gross.uniform(0.0, 2.0 * np.pi, len(visible))
+        noise += (
+            wrong[:, None] * spec.points.gross_size * unit * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+        )
+        sensor = pass_info.sensors[camera]
         lowest, highest = -0.49, np.array([sensor.lines, sensor.camera.pixels]) - 0.51
-        place = np.clip(np.stack([line[here], pixel[here]], axis=1) + noise, lowest, highest)
+        position = np.clip(np.stack([line[visible], pixel[visible]], axis=1) + noise, lowest, highest)
         spread = np.diag((spec.points.image * unit) ** 2)
-        rays = one.rays({camera: ImagePoints.of(here, place[:, 0], place[:, 1], spread)})[camera]
+        rays = pass_info.rays({camera: ImagePoints.of(visible, position[:, 0], position[:, 1], spread)})[camera]
         assert rays.time is not None
-        own = np.tile((spec.points.image * one.pitch[camera]) ** 2 * np.eye(2), (len(here), 1, 1))
-        moved = Rays(rays.point, rays.image, rays.station, rays.attitude, rays.time + begin[name], own)
-        scenes.append(known.Scene(scene, name, camera, moved))
-        gross[scene] = here[wrong]
+        covariance = np.tile((spec.points.image * pass_info.pitch[camera]) ** 2 * np.eye(2), (len(visible), 1, 1))
+        moved = Rays(rays.point, rays.image, rays.station, rays.attitude, rays.time + begin[name], covariance)
+        scenes.append(model.Scene(scene, name, camera, moved))
+        gross[scene] = visible[wrong]
     return tuple(scenes), gross
 
 
 @dataclass(frozen=True, eq=False)
 class _Shots:
-    """Laser shots of a pass: times on the readings, true points, what was measured."""
+    """Laser shots of a pass: times on the readings, true ground points, measured aims and distances."""
 
     of: str
     seconds: np.ndarray
@@ -379,7 +386,7 @@ def _shots(
 ) -> list[_Shots]:
     if spec.laser is None:
         return []
-    found = []
+    shots = []
     for k, (name, platform) in enumerate(platforms.items()):
         random = np.random.default_rng(stream(seed, k))
         speed = float(np.linalg.norm(np.diff(platform.position(np.array([0.0, 1.0])), axis=0)))
@@ -392,12 +399,15 @@ def _shots(
         pointing = _pointing(spec)
         aim = np.array([0.0, 0.0, 1.0]) + pointing * random.standard_normal((len(seconds), 3)) * [1.0, 1.0, 0.0]
         aim = aim / np.linalg.norm(aim, axis=1, keepdims=True)
-        found.append(_Shots(name, seconds, ground, aim, far + spec.laser.range * random.standard_normal(len(far))))
-    return found
+        shots.append(_Shots(name, seconds, ground, aim, far + spec.laser.range * random.standard_normal(len(far))))
+    return shots
 
 
 def _pointing(spec: OrbitAdjustSpec) -> float:
-    """Standard deviation of the place within the beam from which a range comes, about each axis, radians."""
+    """Return the standard deviation of the direction from which a range comes, about each axis, in radians.
+
+    It combines the pointing error with the position of the echo within the beam.
+    """
     assert spec.laser is not None
     # an even disk has a standard deviation of half its radius along each axis
     return float(np.hypot(spec.laser.pointing, 0.25 * spec.laser.beam))
@@ -409,24 +419,24 @@ def _footprints(
     readings: Mapping[str, Trajectory],
     begin: Mapping[str, float],
     first: int,
-) -> tuple[known.Footprints, ...]:
-    found = []
-    for one in shots:
-        path = readings[one.of]
-        which = first + np.arange(len(one.seconds))
-        first += len(one.seconds)
-        station, body = path.position(one.seconds), path.body_to_itrs(one.seconds)
+) -> tuple[model.Footprints, ...]:
+    footprints = []
+    for shot in shots:
+        path = readings[shot.of]
+        which = first + np.arange(len(shot.seconds))
+        first += len(shot.seconds)
+        station, body = path.position(shot.seconds), path.body_to_itrs(shot.seconds)
         assert spec.laser is not None
         sigma = (spec.laser.range, _pointing(spec))
-        when = one.seconds + begin[one.of]
-        found.append(known.Footprints(one.of, which, when, station, body, one.aim, one.distance, sigma))
-    return tuple(found)
+        when = shot.seconds + begin[shot.of]
+        footprints.append(model.Footprints(shot.of, which, when, station, body, shot.aim, shot.distance, sigma))
+    return tuple(footprints)
 
 
 def _known_points(
     spec: OrbitAdjustSpec, ground: np.ndarray, role: np.ndarray, earth: Earth, random: np.random.Generator
-) -> known.Points:
-    """Control points with their errors, first guesses of the others, names."""
+) -> model.Points:
+    """Return the points with names: control points with their errors, first coordinates of the others."""
     plan, height = spec.points.control_sigma
     covariance = level_covariance(ground, plan, height)
     noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), random.standard_normal(ground.shape))
@@ -436,27 +446,27 @@ def _known_points(
     rough = earth.ecef(lon, lat, np.full(len(lon), spec.area.height))
     start = np.where((role == "control")[:, None], ground + noise + shift, rough)
     ids = np.array(point_names(role), object)
-    return known.Points(ids, start, role, covariance)
+    return model.Points(ids, start, role, covariance)
 
 
 def _terrain(
     spec: OrbitAdjustSpec, ground: np.ndarray, role: np.ndarray, random: np.random.Generator
-) -> known.Terrain | None:
+) -> model.Terrain | None:
     if spec.terrain is None:
         return None
-    here = np.flatnonzero(role != "control")
-    up = vertical(ground[here])
-    error = spec.terrain.sigma * random.standard_normal(len(here)) + spec.terrain.common * random.standard_normal()
-    place = ground[here] + error[:, None] * up
-    return known.Terrain(here, place, up, np.full(len(here), spec.terrain.sigma), spec.terrain.common)
+    free = np.flatnonzero(role != "control")
+    up = vertical(ground[free])
+    error = spec.terrain.sigma * random.standard_normal(len(free)) + spec.terrain.common * random.standard_normal()
+    position = ground[free] + error[:, None] * up
+    return model.Terrain(free, position, up, np.full(len(free), spec.terrain.sigma), spec.terrain.common)
 
 
 def _angles(
     spec: OrbitAdjustSpec, constants: Mapping[str, np.ndarray], random: np.random.Generator
-) -> tuple[known.TrackerAngle, ...]:
-    found = []
-    for one in spec.angles:
-        first, second = (constants.get(name, np.zeros(3)) for name in one.between)
-        a, b, c = (first - second + np.array(one.sigma) * random.standard_normal(3)).tolist()
-        found.append(known.TrackerAngle(one.between, (a, b, c), one.sigma))
-    return tuple(found)
+) -> tuple[model.TrackerAngle, ...]:
+    angles = []
+    for angle_spec in spec.angles:
+        first, second = (constants.get(name, np.zeros(3)) for name in angle_spec.between)
+        a, b, c = (first - second + np.array(angle_spec.sigma) * random.standard_normal(3)).tolist()
+        angles.append(model.TrackerAngle(angle_spec.between, (a, b, c), angle_spec.sigma))
+    return tuple(angles)

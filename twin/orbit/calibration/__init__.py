@@ -1,1 +1,1 @@
-"""Calibration over test fields: the campaign, image points drawn or measured, the procedure, report (paper 003)."""
+"""Calibration in orbit over test fields (paper 003): campaign, image points, adjustment and report."""

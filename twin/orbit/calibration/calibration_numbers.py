@@ -1,4 +1,4 @@
-"""Numbers of an in-orbit calibration, as calibration.json has them: metres and radians."""
+"""Numbers of an in-orbit calibration as calibration.json holds them, in metres and radians."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from twin.framework.record import Quantity, Record
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
 from twin.orbit.calibration.campaign import Campaign, FieldImages, FieldPass, Screening, interior_names
 from twin.orbit.calibration.campaign_adjustment import LatitudeFit
-from twin.orbit.calibration.influences import AttitudeDrift, ChipStep, DatumRow, LightRow, Surprise
+from twin.orbit.calibration.influences import AttitudeDrift, ChipStep, DatumRow, LightRow, UnexpectedChange
 from twin.orbit.calibration.schemes import (
     DriftSize,
     FieldErrors,
@@ -29,26 +29,26 @@ from twin.orbit.calibration.schemes import (
     Treatment,
     meets,
 )
-from twin.orbit.calibration.screening import ground_sample, meeting_of
+from twin.orbit.calibration.screening import ground_sample, intersection_fit
 from twin.orbit.images.patch import LineJudgement
 from twin.orbit.images.simulate_run import MATCH_COUNTS
 
 # --- errors at check points, by scheme -------------------------------------------------------------------
 
 ERRORS: Record[CheckErrors | FieldErrors] = Record(
-    "RMS errors at check points.",
-    Quantity("plan_rms_m", lambda e: e.plan_rms, "in plan, east and north together"),
-    Quantity("height_rms_m", lambda e: e.height_rms, "in height"),
+    "RMS errors at check points, in metres.",
+    Quantity("plan_rms_m", lambda e: e.plan_rms, "RMS error in plan, east and north together"),
+    Quantity("height_rms_m", lambda e: e.height_rms, "RMS error in height"),
 )
 MEANS: Record[SchemeMeans] = Record(
-    "RMS errors over the fields, of each scheme of averaged parameters.",
+    "RMS errors over the fields, for each scheme of averaged parameters.",
     Quantity("plan_mean_m", lambda means: means.plan, "mean over the fields in plan"),
     Quantity("plan_spread_m", lambda means: means.plan_spread, "standard deviation over the fields in plan"),
     Quantity("height_mean_m", lambda means: means.height, "mean over the fields in height"),
     Quantity("height_spread_m", lambda means: means.height_spread, "standard deviation over the fields in height"),
 )
 REPEATED: Record[tuple[Array, Array, float]] = Record(
-    "A scheme over the repeated campaigns.",
+    "Errors of a scheme over the repeated campaigns.",
     Quantity("plan_rms_m", lambda r: r[0].mean(axis=1), "mean of the fields' RMS in plan, campaign by campaign"),
     Quantity("plan_spread_m", lambda r: r[0].std(axis=1), "standard deviation over the fields in plan"),
     Quantity("height_rms_m", lambda r: r[1].mean(axis=1), "mean of the fields' RMS in height, campaign by campaign"),
@@ -69,40 +69,40 @@ def _repeated(run: CalibrationRun) -> dict[str, tuple[Array, Array, float]]:
 
 
 CAMPAIGNS: Record[CalibrationRun] = Record(
-    "Campaigns repeated with everything drawn anew.",
+    "Campaigns repeated with all errors drawn anew.",
     Quantity("count", lambda run: len(_repeats(run).plan), "number of campaigns"),
-    Quantity("schemes", _repeated, record=REPEATED),
+    Quantity("schemes", _repeated, "errors by scheme", record=REPEATED),
 )
 TREATMENT: Record[Treatment] = Record(
-    "Drifting cameras, adjusted with the monitor's readings or without.",
-    Quantity("all_fields", lambda one: one.together, "all fields adjusted at once", record=ERRORS),
-    Quantity("p_value", lambda one: one.p_value, "chance of a chi-square as large in that adjustment"),
-    Quantity("schemes", lambda one: one.schemes, "without ground control, by scheme", record=ERRORS),
+    "Errors of drifting cameras, adjusted with the monitor's readings or without.",
+    Quantity("all_fields", lambda t: t.together, "errors with all fields adjusted at once", record=ERRORS),
+    Quantity("p_value", lambda t: t.p_value, "probability of a chi-square at least as large in that adjustment"),
+    Quantity("schemes", lambda t: t.schemes, "errors without ground control, by scheme", record=ERRORS),
 )
 CAMERA_DRIFT: Record[tuple[Monitoring, DriftSize]] = Record(
-    "One size of the cameras' drift from field to field.",
-    Quantity("factor", lambda d: d[1].factor, "size against that of the file"),
+    "Errors for one size of the cameras' drift from field to field.",
+    Quantity("factor", lambda d: d[1].factor, "size of the drift relative to that of the file"),
     Quantity("d_alpha_rad_sigma", lambda d: d[1].factor * d[0].angle, "standard deviation of Δα of an outer line"),
-    Quantity("without_monitor", lambda d: d[1].without, "as if no camera drifted", record=TREATMENT),
-    Quantity("with_monitor", lambda d: d[1].monitored, "with the monitor's readings", record=TREATMENT),
+    Quantity("without_monitor", lambda d: d[1].without, "adjusted as if no camera drifted", record=TREATMENT),
+    Quantity("with_monitor", lambda d: d[1].monitored, "adjusted with the monitor's readings", record=TREATMENT),
 )
 MONITORING: Record[Monitoring] = Record(
     "Cameras that drift from field to field, with and without the on-board monitor.",
-    Quantity("d_alpha_rad_sigma", lambda found: found.angle, "standard deviation of Δα of an outer line in the file"),
-    Quantity("height_for_1_arcsec_m", lambda found: found.metres, "height change for 1 arcsec of Δα of the first line"),
-    Quantity("noise_counts_as", lambda found: "independent", "how the noise of orbit and attitude enters"),
-    Quantity("sizes", lambda found: [(found, size) for size in found.sizes], record=CAMERA_DRIFT),
+    Quantity("d_alpha_rad_sigma", lambda m: m.angle, "standard deviation of Δα of an outer line in the file"),
+    Quantity("height_for_1_arcsec_m", lambda m: m.metres, "height change for 1 arcsec of Δα of the forward line"),
+    Quantity("noise_counts_as", lambda m: "independent", "model of the noise of orbit and attitude"),
+    Quantity("sizes", lambda m: [(m, size) for size in m.sizes], "errors by size of the drift", record=CAMERA_DRIFT),
 )
 TIES: Record[tuple[Mapping[str, CheckErrors], Mapping[str, CheckErrors]]] = Record(
-    "A scheme without tie points and with them, over the check points of all fields.",
+    "Errors of a scheme without and with tie points, over the check points of all fields.",
     Quantity("without_ties", lambda e: FieldErrors.pooled(e[0].values()), record=ERRORS),
     Quantity("with_ties", lambda e: FieldErrors.pooled(e[1].values()), record=ERRORS),
 )
 DATUM_SIGMA: Record[Datum] = Record(
-    "How well a turn of the whole pass is known.",
+    "Uncertainty of a rotation of the whole pass.",
     Quantity("sigma_before", lambda d: d.before, "standard deviation from the readings alone"),
     Quantity("sigma_after", lambda d: d.after, "standard deviation with the tie points"),
-    Quantity("unit", lambda d: "rad/s" if "rate" in d.name else "rad", "of both"),
+    Quantity("unit", lambda d: "rad/s" if "rate" in d.name else "rad", "unit of both sigmas"),
 )
 
 
@@ -113,20 +113,22 @@ def _strips(run: CalibrationRun) -> Strips:
 
 STRIPS: Record[CalibrationRun] = Record(
     "Passes adjusted on tie points.",
-    Quantity("ties", lambda run: _strips(run).ties, "tie points that two lines or more see, by field"),
-    Quantity("p_value", lambda run: _strips(run).p_values, "chance of a chi-square as large, by field"),
+    Quantity("ties", lambda run: _strips(run).ties, "number of tie points that two lines or more see, by field"),
+    Quantity("p_value", lambda run: _strips(run).p_values, "probability of a chi-square at least as large, by field"),
     Quantity(
         "schemes", lambda run: {k: (run.schemes[k], tied) for k, tied in _strips(run).schemes.items()}, record=TIES
     ),
     Quantity("datum", lambda run: {d.name: d for d in _strips(run).datum}, record=DATUM_SIGMA),
 )
 MAP_LIMITS: Record[CalibrationRun] = Record(
-    "Which schemes meet the limits of a map in every field.",
-    Quantity("scale", lambda run: "1:50000", "of the map"),
+    "Compliance of the schemes with the limits of a map in every field.",
+    Quantity("scale", lambda run: "1:50000", "scale of the map"),
     Quantity("plan_limit_m", lambda run: run.setup.test.limits.plan, "largest RMS error in plan"),
     Quantity("height_limit_m", lambda run: run.setup.test.limits.height, "largest RMS error in height"),
-    Quantity("source", lambda run: "of the file", "of the limits"),
-    Quantity("before", lambda run: meets(run.before, run.setup.test.limits), "whether the laboratory's camera does"),
+    Quantity("source", lambda run: "of the file", "source of the limits"),
+    Quantity(
+        "before", lambda run: meets(run.before, run.setup.test.limits), "true if the laboratory's camera meets it"
+    ),
     Quantity("schemes", lambda run: {k: meets(e, run.setup.test.limits) for k, e in run.schemes.items()}),
 )
 
@@ -134,31 +136,32 @@ MAP_LIMITS: Record[CalibrationRun] = Record(
 
 
 _SCREENED = {
-    "entered": "image points of control and tie points that enter the adjustment",
-    "left": "image points that the adjustment keeps",
-    "wrong_entered": "wrong places among those that enter",
-    "wrong_left": "wrong places among those that are kept",
+    "entered": "image points of control and tie points before screening",
+    "left": "image points after screening",
+    "wrong_entered": "wrong positions before screening",
+    "wrong_left": "wrong positions after screening",
     "check_entered": "check points before the test of their intersection",
     "check_left": "check points after the test of their intersection",
-    "wrong_check_left": "kept check points with a wrong place in a line",
+    "wrong_check_left": "check points after that test with a wrong position in a line",
 }
+"""Counts of image points and check points before and after screening: attribute of `Screening` -> meaning."""
 
 
 def _sums(meanings: Mapping[str, str], parts: Callable[[Any], Any] = lambda parts: parts) -> list[Quantity[Any]]:
-    """Counts that are sums over line images or fields.
+    """Return quantities that are sums of a count over line images or fields.
 
     Parameters
     ----------
     meanings : Mapping[str, str]
-        Attribute of a part, which is the key, too -> what it counts.
-    parts : Callable[[Any], Any]
-        Of a source; the source itself if not given.
+        Attribute of a part, which is also the key of the result -> what it counts.
+    parts : Callable
+        Function that returns the parts of a source; by default the source itself is the sequence of parts.
     """
 
     def total(name: str) -> Callable[[Any], int]:
-        return lambda source: sum(getattr(one, name) for one in parts(source))
+        return lambda source: sum(getattr(part, name) for part in parts(source))
 
-    return [Quantity(name, total(name), said) for name, said in meanings.items()]
+    return [Quantity(name, total(name), meaning) for name, meaning in meanings.items()]
 
 
 SCREENED: Record[Screening] = Record("Image points of a field in the adjustment.", *_sums(_SCREENED, lambda one: [one]))
@@ -169,30 +172,30 @@ def _degrees(parts: Sequence[LineJudgement]) -> Array:
 
 
 def _rms(parts: Sequence[LineJudgement]) -> Array:
-    """(2,) along the track and along the line, over the places of all parts."""
+    """Return the (2,) RMS error of the correct positions, along the track and along the line, in pixels."""
     degrees = _degrees(parts)
     square = np.sum([np.nan_to_num(j.rms) ** 2 * n for j, n in zip(parts, degrees, strict=True)], axis=0)
     return np.asarray(np.sqrt(square / max(degrees.sum(), 1.0)))
 
 
 MATCHING: Record[Sequence[LineJudgement]] = Record(
-    "Points of one sort in the images of one line, over the patches of a field.",
+    "Matches of one sort of points in the images of one line, over the patches of a field.",
     *_sums(MATCH_COUNTS),
-    Quantity("rms_lines_px", lambda parts: _rms(parts)[0], "RMS error along track of right places", "RMS track"),
-    Quantity("rms_pixels_px", lambda parts: _rms(parts)[1], "RMS error along line of right places", "RMS line"),
+    Quantity("rms_lines_px", lambda parts: _rms(parts)[0], "RMS error along track of correct positions", "RMS track"),
+    Quantity("rms_pixels_px", lambda parts: _rms(parts)[1], "RMS error along line of correct positions", "RMS line"),
     Quantity(
         "chi_square_ratio",
         lambda parts: sum(j.chi_square for j in parts) / max(_degrees(parts).sum(), 1.0),
-        "chi-square of the errors of these places over its degrees of freedom",
+        "chi-square of the errors of these positions over its degrees of freedom",
         "χ²/dof",
     ),
 )
 
 
-def _by_line(one: FieldImages) -> dict[str, dict[str, list[LineJudgement]]]:
-    """Sort of points -> line -> judgements of the patches."""
+def _by_line(images: FieldImages) -> dict[str, dict[str, list[LineJudgement]]]:
+    """Return the judgements of all patches of a field: sort of points -> line -> one judgement per patch."""
     parts: dict[str, dict[str, list[LineJudgement]]] = {}
-    for patch in one.patches:
+    for patch in images.patches:
         for sort, lines in patch.judgements.items():
             for line, judgement in lines.items():
                 parts.setdefault(sort, {}).setdefault(line, []).append(judgement)
@@ -200,27 +203,27 @@ def _by_line(one: FieldImages) -> dict[str, dict[str, list[LineJudgement]]]:
 
 
 def _judgements(campaign: Campaign) -> list[LineJudgement]:
-    every = [lines for one in campaign.images or () for lines in _by_line(one).values()]
-    return [judgement for lines in every for parts in lines.values() for judgement in parts]
+    by_line = [lines for images in campaign.images or () for lines in _by_line(images).values()]
+    return [judgement for lines in by_line for parts in lines.values() for judgement in parts]
 
 
 def _screenings(campaign: Campaign) -> list[Screening]:
-    return [one.screening for one in campaign.images or () if one.screening is not None]
+    return [images.screening for images in campaign.images or () if images.screening is not None]
 
 
 TOTAL: Record[Campaign] = Record(
-    "Points in images, over all fields and lines; what is wrong is known from the truth.",
+    "Counts of points in images, over all fields and lines; wrong positions are known from the truth.",
     *_sums(MATCH_COUNTS, _judgements),
     *_sums(_SCREENED, _screenings),
     Quantity(
         "right_rejected_by_adjustment",
         lambda campaign: sum(s.right_lost for s in _screenings(campaign)),
-        "right places that the adjustment left out",
+        "correct positions that the adjustment rejected",
     ),
 )
 IMAGES: Record[Campaign] = Record(
     "Points measured in rendered images.",
-    Quantity("total", lambda campaign: campaign, record=TOTAL),
+    Quantity("total", lambda campaign: campaign, "sums over all fields and lines", record=TOTAL),
     Quantity(
         "fields",
         lambda campaign: {one.name: _by_line(one) for one in campaign.images or ()},
@@ -233,85 +236,86 @@ IMAGES: Record[Campaign] = Record(
 
 UNKNOWN: Record[Unknown] = Record(
     "An unknown of the adjustment of all fields.",
-    Quantity("value", lambda one: one.value, "estimated"),
-    Quantity("sigma", lambda one: one.sigma, "standard deviation with the gauge's held unknowns exact"),
+    Quantity("value", lambda u: u.value, "estimated value"),
+    Quantity("sigma", lambda u: u.sigma, "standard deviation with the held unknowns of the gauge taken as exact"),
     Quantity(
-        "sigma_with_gauge", lambda one: one.sigma_with_gauge, "with what launch leaves to expect of the held unknowns"
+        "sigma_with_gauge", lambda u: u.sigma_with_gauge, "standard deviation with the held unknowns' launch sigmas"
     ),
     Quantity(
         "share_from_launch",
-        lambda one: one.from_start,
+        lambda u: u.prior_share,
         "share of its variance that comes from the sigmas of launch and season and not from the points, 0 to 1",
     ),
-    Quantity("held", lambda one: one.held, "whether the gauge holds it"),
-    Quantity("truth", lambda one: one.truth, "true value, where a simulation knows it"),
-    Quantity("unit", lambda one: one.unit, "of value, sigmas and truth"),
+    Quantity("held", lambda u: u.held, "true if the gauge holds it"),
+    Quantity("truth", lambda u: u.truth, "true value, where a simulation knows it"),
+    Quantity("unit", lambda u: u.unit, "unit of value, sigmas and truth"),
 )
 
 
 def _conditions(run: CalibrationRun) -> str:
     names = run.together.names
     rates = any(name in RATE for name in names)
-    own = any(name.endswith(RATE) for name in names) and not rates
+    by_pass = any(name.endswith(RATE) for name in names) and not rates
     return (
-        "with the gauge's held unknowns exact"
-        + ", and with the drift of the biases during the passes as the latitude fit tells it" * rates
-        + ", and with a drift of the attitude in each pass as it is stated or was found" * own
+        "with the held unknowns of the gauge taken as exact"
+        + ", and with the drift of the biases during the passes predicted by the latitude fit" * rates
+        + ", and with the stated or detected drift of the attitude in each pass" * by_pass
     )
 
 
 SIGMAS: Record[CalibrationRun] = Record(
-    "What the sigmas hold.",
+    "Conditions under which the sigmas hold.",
     Quantity("sigma", _conditions),
-    Quantity(
-        "sigma_with_gauge",
-        lambda run: "with what launch leaves to expect of the held unknowns, and all that follows them",
-    ),
-    Quantity("held_start_m_sigma", lambda run: run.setup.test.launch.interior, "of held unknowns after a launch"),
-    Quantity("fields", lambda run: "of each field by itself: without the drift of the biases during the pass"),
+    Quantity("sigma_with_gauge", lambda run: "with the launch sigmas of the held unknowns, propagated to all others"),
+    Quantity("held_start_m_sigma", lambda run: run.setup.test.launch.interior, "sigma of held unknowns after a launch"),
+    Quantity("fields", lambda run: "for each field by itself: without the drift of the biases during the pass"),
 )
 
 
-def _free(found: Adjustment) -> list[int]:
-    """Numbers of the unknowns that are not held."""
-    sigma = found.sigma
-    return [k for k, name in enumerate(found.names) if sigma[name] > 0.0]
+def _free(adjustment: Adjustment) -> list[int]:
+    """Return the indices of the unknowns that the gauge does not hold."""
+    sigma = adjustment.sigma
+    return [k for k, name in enumerate(adjustment.names) if sigma[name] > 0.0]
 
 
 CORRELATIONS: Record[Adjustment] = Record(
     "Correlations of the unknowns that are not held.",
-    Quantity("names", lambda found: [found.names[k] for k in _free(found)], "of rows and columns"),
-    Quantity("matrix", lambda found: np.round(found.correlation[np.ix_(_free(found), _free(found))], 6)),
+    Quantity("names", lambda a: [a.names[k] for k in _free(a)], "unknowns of rows and columns"),
+    Quantity("matrix", lambda a: np.round(a.correlation[np.ix_(_free(a), _free(a))], 6), "correlation matrix"),
 )
 COMBINATION: Record[Combination] = Record(
-    "A change of unknowns together that the measurements do not see, or hardly.",
+    "A combination of unknowns that the measurements do not determine, or only weakly.",
     Quantity(
         "change",
-        lambda one: dict(zip(one.names, one.change, strict=True)),
-        "of each unknown, for an image motion of any one of them of at most 1 mm",
+        lambda c: dict(zip(c.names, c.change, strict=True)),
+        "change of each unknown, scaled so that none of them moves an image point by more than 1 mm",
     ),
-    Quantity("strength", lambda one: one.strength, "how much less well it is known than its unknowns alone would be"),
-    Quantity("sigma_m", lambda one: one.sigma, "what one sigma of the data allows it, as motion in the image"),
+    Quantity("strength", lambda c: c.strength, "its uncertainty over that of its unknowns alone"),
+    Quantity("sigma_m", lambda c: c.sigma, "standard deviation, as motion in the image"),
 )
 ATTITUDE_DRIFT: Record[AttitudeDrift] = Record(
-    "Drift of the attitude within the passes.",
-    Quantity("seconds", lambda d: d.seconds, "from when the first line sees a field to when the last one does"),
+    "Test of a drift of the attitude within the passes.",
+    Quantity("seconds", lambda d: d.seconds, "time from when the first line sees a field to when the last one does"),
     Quantity(
         "sigmas_per_arcsec",
         lambda d: d.sigmas_per_arcsec,
-        "change of each unknown in its sigmas for a drift of 1 arcsec in these seconds that is no unknown",
+        "change of each unknown, in its sigmas, for a drift of 1 arcsec in these seconds that is not estimated",
         converted=False,
     ),
-    Quantity("seen_arcsec", lambda d: d.seen, "drift about body X, Y, Z that residuals show in half of all cases"),
-    Quantity("unseen_sigmas", lambda d: d.unseen_sigmas, "sigmas by which the most sensitive unknown is then wrong"),
-    Quantity("rate_p_value", lambda d: d.rate_p_value, "chance of the residuals without rates of the attitude"),
-    Quantity("course_p_value", lambda d: d.course_p_value, "chance of the residuals without slow errors of the lines"),
-    Quantity("false_alarm", lambda d: FALSE_ALARM, "of either test"),
-    Quantity("assumed_rate_rad_s", lambda d: d.assumed and d.assumed.rate, "sigma of the rates that are assumed since"),
-    Quantity("assumed_walk_rad", lambda d: d.assumed and d.assumed.walk, "likewise of a random walk, in one second"),
+    Quantity("detectable_arcsec", lambda d: d.detectable, "drift about body X, Y, Z detected in half of all cases"),
+    Quantity("undetected_sigmas", lambda d: d.undetected_sigmas, "error of the most sensitive unknown then, in sigmas"),
+    Quantity("rate_p_value", lambda d: d.rate_p_value, "p-value of the residuals without rates of the attitude"),
+    Quantity("course_p_value", lambda d: d.course_p_value, "p-value of the residuals without slow errors of the lines"),
+    Quantity("false_alarm", lambda d: FALSE_ALARM, "false-alarm probability of either test"),
+    Quantity(
+        "assumed_rate_rad_s", lambda d: d.assumed and d.assumed.rate, "sigma of the rates assumed after detection"
+    ),
+    Quantity(
+        "assumed_walk_rad", lambda d: d.assumed and d.assumed.walk, "sigma of the random walk assumed, in one second"
+    ),
 )
 UNLIKELY = 1e-3
-"""Chance of a chi-square as large below which the adjustment does not fit."""
+"""p-value of chi-square below which the adjustment is reported not to fit."""
 
 
 def _fits(run: CalibrationRun) -> bool | None:
@@ -321,141 +325,147 @@ def _fits(run: CalibrationRun) -> bool | None:
 def _misfit(run: CalibrationRun) -> str:
     drifts = run.truth is not None and bool(run.campaign.simulated.drift)
     return (
-        f"the adjustment does not fit: a chi-square as large has a chance of {run.together.p_value:.1g}; biases may "
-        f"drift during a pass{', and the cameras drift from field to field' * drifts}"
+        f"the residuals of the adjustment are larger than their sigmas predict (p = {run.together.p_value:.1g}): "
+        f"biases may drift during a pass{', and the cameras drift from field to field' * drifts}"
     )
 
 
 FIT: Record[CalibrationRun] = Record(
-    "How the adjustment of all fields fits.",
-    Quantity("chi_square", lambda run: run.together.chi_square, "of the residuals"),
-    Quantity("degrees_of_freedom", lambda run: run.together.degrees_of_freedom, "of chi-square"),
-    Quantity("p_value", lambda run: run.together.p_value, "chance of a chi-square as large"),
-    Quantity("agrees", _fits, "whether residuals are as their sigmas say; null of exact points", warning=_misfit),
-    Quantity("iterations", lambda run: run.together.iterations, "steps of the adjustment"),
-    Quantity("attitude_drift", lambda run: run.drift, record=ATTITUDE_DRIFT),
+    "Fit of the adjustment of all fields.",
+    Quantity("chi_square", lambda run: run.together.chi_square, "chi-square of the residuals"),
+    Quantity("degrees_of_freedom", lambda run: run.together.degrees_of_freedom, "degrees of freedom of chi-square"),
+    Quantity("p_value", lambda run: run.together.p_value, "probability of a chi-square at least as large"),
+    Quantity("agrees", _fits, "true if residuals agree with their sigmas; null for exact points", warning=_misfit),
+    Quantity("iterations", lambda run: run.together.iterations, "number of iterations of the adjustment"),
+    Quantity("attitude_drift", lambda run: run.drift, "test of a drift", record=ATTITUDE_DRIFT),
 )
 CHIP_STEP: Record[ChipStep] = Record(
     "A step of x (along the track) or y within a line, at a joint between chips.",
-    Quantity("line", lambda step: step.line, "camera"),
-    Quantity("axis", lambda step: step.axis, "x or y"),
-    Quantity("place_m", lambda step: step.place, "y of the joint in the focal plane", shown="mm"),
-    Quantity("step_m", lambda step: step.step, "what the residuals say of it", shown="um"),
-    Quantity("sigma_m", lambda step: step.sigma, "its standard deviation, all steps together", shown="um"),
-    Quantity("seen_from_m", lambda step: step.seen_from, "step that is told in half of all cases", shown="um"),
-    Quantity("found", lambda step: step.found, "whether this one is told, false alarm 1e-4 for all together"),
+    Quantity("line", lambda step: step.line, "line camera"),
+    Quantity("axis", lambda step: step.axis, "direction of the step, x or y"),
+    Quantity("place_m", lambda step: step.place, "position y of the joint in the focal plane", shown="mm"),
+    Quantity("step_m", lambda step: step.step, "step estimated from the residuals", shown="um"),
+    Quantity("sigma_m", lambda step: step.sigma, "its standard deviation, all steps estimated together", shown="um"),
+    Quantity("detectable_m", lambda step: step.detectable, "step that is detected in half of all cases", shown="um"),
+    Quantity("detected", lambda step: step.detected, "true if it is significant, false alarm 1e-4 for all together"),
 )
 STEPWISE: Record[CalibrationRun] = Record(
-    "One field by turns of interior orientation and biases.",
-    Quantity("field", lambda run: run.setup.test.schemes[0][0], "its name"),
-    Quantity("rounds", lambda run: run.stepwise.rounds, "until the steps are small"),
-    Quantity("rate", lambda run: run.stepwise.rate, "what a round leaves of the slowest error"),
+    "Stepwise solution of one field, interior orientation and biases in turn.",
+    Quantity("field", lambda run: run.setup.test.schemes[0][0], "name of the field"),
+    Quantity("rounds", lambda run: run.stepwise.rounds, "number of rounds until the steps are small"),
+    Quantity("rate", lambda run: run.stepwise.rate, "convergence rate: remaining part of the slowest error per round"),
     Quantity(
         "converged",
         lambda run: run.stepwise.converged,
-        "whether the steps become small",
-        warning=lambda run: f"the stepwise solution has not settled after {run.stepwise.rounds} rounds",
+        "true if the steps become small",
+        warning=lambda run: f"the stepwise solution has not converged after {run.stepwise.rounds} rounds",
     ),
 )
 BIAS_OF_FIELD: Record[tuple[float, float, float | None]] = Record(
-    "A bias of a field by itself.",
-    Quantity("value", lambda bias: bias[0], "estimated"),
+    "Attitude bias of a field calibrated by itself.",
+    Quantity("value", lambda bias: bias[0], "estimated value"),
     Quantity("sigma", lambda bias: bias[1], "standard deviation"),
     Quantity("truth", lambda bias: bias[2], "true value, where a simulation knows it"),
-    Quantity("unit", lambda bias: "rad", "of all of them"),
+    Quantity("unit", lambda bias: "rad", "unit of value, sigma and truth"),
 )
 INTERIOR_OF_FIELD: Record[tuple[float, float]] = Record(
-    "A parameter of the interior orientation by one field.",
-    Quantity("value", lambda found: found[0], "estimated"),
-    Quantity("sigma", lambda found: found[1], "standard deviation"),
-    Quantity("unit", lambda found: "m", "of both"),
+    "Parameter of the interior orientation from one field.",
+    Quantity("value", lambda parameter: parameter[0], "estimated value"),
+    Quantity("sigma", lambda parameter: parameter[1], "standard deviation"),
+    Quantity("unit", lambda parameter: "m", "unit of both"),
 )
 
 
-def _biases(one: tuple[FieldPass, FieldResult]) -> dict[str, tuple[float, float, float | None]]:
-    here, found = one[0], one[1].adjustment
-    truth = [None] * len(BIAS) if here.known_truth is None else here.bias.tolist()
-    sigma = found.sigma
+def _biases(result: tuple[FieldPass, FieldResult]) -> dict[str, tuple[float, float, float | None]]:
+    field, adjustment = result[0], result[1].adjustment
+    truth = [None] * len(BIAS) if field.known_truth is None else field.bias.tolist()
+    sigma = adjustment.sigma
     return {
-        name: (float(value), sigma[f"{here.name} {name}"], true)
-        for name, value, true in zip(BIAS, found.bias(here.name), truth, strict=True)
+        name: (float(value), sigma[f"{field.name} {name}"], true)
+        for name, value, true in zip(BIAS, adjustment.bias(field.name), truth, strict=True)
     }
 
 
-def _interior(one: tuple[FieldPass, FieldResult]) -> dict[str, tuple[float, float]]:
-    found = one[1].adjustment
-    sigma, inner = found.sigma, interior_names(tuple(found.cameras))
-    return {name: (found.value(name), sigma[name]) for name in found.names if name in inner}
+def _interior(result: tuple[FieldPass, FieldResult]) -> dict[str, tuple[float, float]]:
+    adjustment = result[1].adjustment
+    sigma, inner = adjustment.sigma, interior_names(tuple(adjustment.cameras))
+    return {name: (adjustment.value(name), sigma[name]) for name in adjustment.names if name in inner}
 
 
 FIELD: Record[tuple[FieldPass, FieldResult]] = Record(
     "A field calibrated by itself.",
-    Quantity("latitude_rad", lambda one: one[0].latitude, "mean of the control points"),
-    Quantity("bias", _biases, record=BIAS_OF_FIELD),
-    Quantity("interior", _interior, record=INTERIOR_OF_FIELD),
-    Quantity("p_value", lambda one: one[1].adjustment.p_value, "chance of a chi-square as large"),
-    Quantity("orbit_third_difference_rms_m", lambda f: f[1].orbit and f[1].orbit.rms, "of positions, x, y, z"),
-    Quantity("attitude_third_difference_rms_rad", lambda f: f[1].attitude and f[1].attitude.rms, "roll, pitch, yaw"),
+    Quantity("latitude_rad", lambda f: f[0].latitude, "mean latitude of the control points"),
+    Quantity("bias", _biases, "roll, pitch and yaw of the attitude bias", record=BIAS_OF_FIELD),
+    Quantity("interior", _interior, "interior orientation", record=INTERIOR_OF_FIELD),
+    Quantity("p_value", lambda f: f[1].adjustment.p_value, "probability of a chi-square at least as large"),
+    Quantity("orbit_third_difference_rms_m", lambda f: f[1].orbit and f[1].orbit.rms, "RMS for positions x, y, z"),
+    Quantity(
+        "attitude_third_difference_rms_rad", lambda f: f[1].attitude and f[1].attitude.rms, "RMS for roll, pitch, yaw"
+    ),
 )
 MEASURED: Record[tuple[Campaign, FieldPass, Adjustment]] = Record(
-    "A measured pass: its points, what screening left out, ground sample distance.",
-    Quantity("control_points", lambda m: int(m[1].is_control.sum()), "that calibrate"),
-    Quantity("tie_points", lambda m: m[1].tie_count, "that calibrate or tie the strip"),
-    Quantity("check_points", lambda m: len(m[1].check_ground), "that test"),
+    "Points of a measured pass, points rejected by screening, and ground sample distance.",
+    Quantity("control_points", lambda m: int(m[1].is_control.sum()), "number of control points"),
+    Quantity("tie_points", lambda m: m[1].tie_count, "number of tie points of calibration and strip"),
+    Quantity("check_points", lambda m: len(m[1].check_ground), "number of check points"),
     Quantity(
-        "image_points", lambda m: {name: len(row.point) for name, row in m[1].measurements.images.items()}, "by line"
+        "image_points", lambda m: {k: len(row.point) for k, row in m[1].measurements.images.items()}, "number by line"
     ),
     Quantity(
         "gsd_m",
         lambda m: {name: ground_sample(m[1], name) for name in m[1].data.sensors},
         "ground sample distance along and across the track, by line camera",
     ),
-    Quantity("rejected", lambda m: _rejected(m, "points", []), "points with a rejected image point, and its line"),
-    Quantity("rejected_check_points", lambda m: _rejected(m, "check_points", []), "whose rays do not meet"),
-    Quantity("sigma_factor", lambda m: _rejected(m, "factors"), "by line, on the sigmas of its image points"),
-    Quantity("check_chi_square", lambda m: meeting_of(*m).chi_square, "of the rays of the check points"),
-    Quantity("check_degrees_of_freedom", lambda m: meeting_of(*m).degrees_of_freedom, "of this chi-square"),
+    Quantity(
+        "rejected",
+        lambda m: _rejected(m, "points", []),
+        "points with a rejected image point, and the line of that image point",
+    ),
+    Quantity("rejected_check_points", lambda m: _rejected(m, "check_points", []), "those whose rays do not intersect"),
+    Quantity("sigma_factor", lambda m: _rejected(m, "factors"), "factor on the sigmas of image points, by line"),
+    Quantity("check_chi_square", lambda m: intersection_fit(*m).chi_square, "chi-square of the check points' rays"),
+    Quantity("check_degrees_of_freedom", lambda m: intersection_fit(*m).degrees_of_freedom, "its degrees of freedom"),
 )
 
 
 def _rejected(measured: tuple[Campaign, FieldPass, Adjustment], what: str, none: Any = None) -> Any:
-    campaign, one, _ = measured
-    gone = campaign.rejected.get(one.name)
-    return none if gone is None else getattr(gone, what)
+    campaign, field, _ = measured
+    rejected = campaign.rejected.get(field.name)
+    return none if rejected is None else getattr(rejected, what)
 
 
 LATITUDE: Record[LatitudeFit] = Record(
-    "Amplitude x sin(latitude - reference) + constant, of one axis of the biases.",
-    Quantity("amplitude_rad", lambda fit: fit.amplitude, "of the drift with latitude", shown="arcsec"),
-    Quantity("amplitude_rad_sigma", lambda fit: fit.amplitude_sigma, "with what remains", "σ", shown="arcsec"),
+    "Fit of one axis of the biases: amplitude x sin(latitude - reference) + constant.",
+    Quantity("amplitude_rad", lambda fit: fit.amplitude, "amplitude of the drift with latitude", shown="arcsec"),
+    Quantity("amplitude_rad_sigma", lambda fit: fit.amplitude_sigma, "includes the remainder", "σ", shown="arcsec"),
     Quantity("constant_rad", lambda fit: fit.constant, "bias at the reference", shown="arcsec"),
-    Quantity("constant_rad_sigma", lambda fit: fit.constant_sigma, "with what remains", "σ", shown="arcsec"),
+    Quantity("constant_rad_sigma", lambda fit: fit.constant_sigma, "includes the remainder", "σ", shown="arcsec"),
     Quantity("reference_rad", lambda fit: fit.reference, "latitude in the middle of the fields"),
-    Quantity("remainder_rad", lambda fit: fit.remainder, "what remains, 1 sigma: the season", shown="arcsec"),
-    Quantity("chi_square", lambda fit: fit.chi_square, "by the biases' own covariance"),
-    Quantity("degrees_of_freedom", lambda fit: fit.degrees_of_freedom, "of this chi-square"),
-    Quantity("p_value", lambda fit: fit.p_value, "chance of a chi-square as large if latitude is all that matters"),
+    Quantity("remainder_rad", lambda fit: fit.remainder, "standard deviation beyond the fit: season", shown="arcsec"),
+    Quantity("chi_square", lambda fit: fit.chi_square, "chi-square with the biases' own covariance"),
+    Quantity("degrees_of_freedom", lambda fit: fit.degrees_of_freedom, "degrees of freedom of this chi-square"),
+    Quantity("p_value", lambda fit: fit.p_value, "probability of a chi-square at least as large by latitude alone"),
 )
 REPEATABILITY: Record[Repeatability] = Record(
     "Scatter of a parameter from field to field.",
-    Quantity("name", lambda one: one.name, "of the parameter"),
-    Quantity("unit", lambda one: unit(one.name), "of scatter and sigma"),
-    Quantity("scatter", lambda one: one.scatter, "standard deviation over the fields"),
-    Quantity("sigma", lambda one: one.sigma, "that the adjustments of single fields claim, root mean square"),
-    Quantity("p_value", lambda one: one.p_value, "chance of such a scatter if the parameter is the same in all fields"),
+    Quantity("name", lambda r: r.name, "name of the parameter"),
+    Quantity("unit", lambda r: unit(r.name), "unit of scatter and sigma"),
+    Quantity("scatter", lambda r: r.scatter, "standard deviation over the fields"),
+    Quantity("sigma", lambda r: r.sigma, "sigma predicted by the adjustments of single fields, root mean square"),
+    Quantity("p_value", lambda r: r.p_value, "p-value of this scatter if the parameter is the same in all fields"),
 )
 
 # --- errors that the fit hardly shows --------------------------------------------------------------------
 
 CHANGE: Record[tuple[str, float]] = Record(
     "Change of a parameter.",
-    Quantity("value", lambda change: change[1], "the change"),
-    Quantity("unit", lambda change: unit(change[0]), "its unit"),
+    Quantity("value", lambda change: change[1], "change"),
+    Quantity("unit", lambda change: unit(change[0]), "unit of the change"),
 )
 LIGHT: Record[LightRow] = Record(
-    "Effects on the light that are left in the image points, and what they do.",
-    Quantity("left_in", lambda row: row.left, "the effects"),
-    Quantity("moved_rms_m", lambda row: row.moved, "RMS of how far they move image points, x and y, by line camera"),
+    "Errors caused by effects on the light that are left in the image points.",
+    Quantity("left_in", lambda row: row.left, "effects that are not corrected"),
+    Quantity("moved_rms_m", lambda row: row.moved, "RMS displacement of image points, x and y, by line camera"),
     Quantity("before", lambda row: row.before, "with the laboratory's camera, mean of the fields", record=ERRORS),
     Quantity("after", lambda row: row.after, "with each field's own parameters, mean of the fields", record=ERRORS),
     Quantity("parameter_change", lambda row: {n: (n, v) for n, v in row.shift.items()}, record=CHANGE),
@@ -464,34 +474,34 @@ LIGHT: Record[LightRow] = Record(
         lambda row: {n: v / row.sigma[n] for n, v in row.shift.items() if row.sigma[n] > 0.0},
         "changes in sigmas of the parameter",
     ),
-    Quantity("p_value", lambda row: row.p_value, "chance of a chi-square as large"),
+    Quantity("p_value", lambda row: row.p_value, "probability of a chi-square at least as large"),
 )
 DATUM: Record[DatumRow] = Record(
-    "What a datum does that is off by a shift, or a clock of the lines that is late.",
-    Quantity("shift_east_north_up_m", lambda row: row.shift, "of all control points"),
-    Quantity("late_s", lambda row: row.late, "by how much the clock is late"),
+    "Errors caused by a shift of the datum, or by a delay of the lines' clock.",
+    Quantity("shift_east_north_up_m", lambda row: row.shift, "shift of all control points"),
+    Quantity("late_s", lambda row: row.late, "delay of the clock"),
     Quantity("bias_change_rad", lambda row: dict(zip(BIAS, row.bias, strict=True)), "mean over the fields"),
     Quantity("interior_change_m", lambda row: row.interior, "by element of the interior orientation"),
     Quantity("offset_change_m", lambda row: dict(zip(OFFSET, row.offset, strict=True)), "mean over the fields"),
-    Quantity("most", lambda row: row.most_sigmas[0], "the element that moves by the most of its sigmas"),
-    Quantity("most_sigmas", lambda row: row.most_sigmas[1], "by how many"),
+    Quantity("most", lambda row: row.most_sigmas[0], "element that moves by the most of its sigmas"),
+    Quantity("most_sigmas", lambda row: row.most_sigmas[1], "change of that element in its sigmas"),
     Quantity(
         "one_sigma_at",
         lambda row: row.size / row.most_sigmas[1] if row.most_sigmas[1] else None,
         "shift or delay that moves it by one sigma, metres or seconds",
     ),
-    Quantity("warned_from", lambda row: row.warned, "shift or delay from which on there is a warning; null for never"),
-    Quantity("chi_square_change", lambda row: row.fit, "of the adjustment"),
-    Quantity("p_value", lambda row: row.p_value, "chance of a chi-square as large"),
+    Quantity("warned_from", lambda row: row.warned, "smallest shift or delay that raises a warning; null for never"),
+    Quantity("chi_square_change", lambda row: row.fit, "change of the adjustment's chi-square"),
+    Quantity("p_value", lambda row: row.p_value, "probability of a chi-square at least as large"),
     Quantity("after", lambda row: row.after, "with each field's own parameters, mean of the fields", record=ERRORS),
 )
-SURPRISE: Record[Surprise] = Record(
-    "An estimate beyond what launch and orbit leave to expect.",
-    Quantity("name", lambda one: one.name, "of the unknown"),
-    Quantity("change", lambda one: one.change, "from the value that is expected"),
-    Quantity("expected_sigma", lambda one: one.expected, "standard deviation that is expected"),
-    Quantity("ratio", lambda one: one.ratio, "of both"),
-    Quantity("unit", lambda one: unit(one.name), "of change and sigma"),
+UNEXPECTED_CHANGE: Record[UnexpectedChange] = Record(
+    "Estimate that differs from its prior by more than launch and orbit explain.",
+    Quantity("name", lambda u: u.name, "name of the unknown"),
+    Quantity("change", lambda u: u.change, "estimated minus expected value"),
+    Quantity("expected_sigma", lambda u: u.expected, "expected standard deviation of the change"),
+    Quantity("ratio", lambda u: u.ratio, "absolute change over the expected sigma"),
+    Quantity("unit", lambda u: unit(u.name), "unit of change and sigma"),
 )
 
 # --- the file --------------------------------------------------------------------------------------------
@@ -508,30 +518,30 @@ def _scheme_fields(run: CalibrationRun) -> dict[str, Sequence[str] | str]:
 
 
 CALIBRATION: Record[CalibrationRun] = Record(
-    "calibration.json. Metres and radians; what is not defined is null.",
-    Quantity("seed", lambda run: run.seed, "of all random numbers"),
-    Quantity("parameters", unknowns, "of the adjustment of all fields", record=UNKNOWN),
+    "Content of calibration.json, in metres and radians; undefined values are null.",
+    Quantity("seed", lambda run: run.seed, "seed of all random numbers"),
+    Quantity("parameters", unknowns, "unknowns of the adjustment of all fields", record=UNKNOWN),
     Quantity("sigmas", lambda run: run, record=SIGMAS),
     Quantity("correlations", lambda run: run.together, record=CORRELATIONS),
-    Quantity("null_vectors", lambda run: run.together.open, "what the points cannot tell", record=COMBINATION),
-    Quantity("weak_vectors", lambda run: run.together.weak, "what the points tell badly", record=COMBINATION),
-    Quantity("gauge", lambda run: str(run.together.gauge), "what is held"),
+    Quantity("null_vectors", lambda run: run.together.open, "unobservable combinations", record=COMBINATION),
+    Quantity("weak_vectors", lambda run: run.together.weak, "weakly observable combinations", record=COMBINATION),
+    Quantity("gauge", lambda run: str(run.together.gauge), "unknowns that are held"),
     Quantity("images", lambda run: None if run.campaign.images is None else run.campaign, record=IMAGES),
-    Quantity("measured", _measured, "by pass, of a calibration on measurements", record=MEASURED),
+    Quantity("measured", _measured, "measured points by pass; null for a simulation", record=MEASURED),
     Quantity("fit", lambda run: run, record=FIT),
     Quantity("chip_steps", lambda run: run.chip_steps, record=CHIP_STEP),
     Quantity("stepwise", lambda run: run, record=STEPWISE),
     Quantity("fields", lambda run: {p.name: (p, run.fields[p.name]) for p in run.campaign.passes}, record=FIELD),
-    Quantity("schemes", lambda run: run.schemes, "by scheme and field, without ground control", record=ERRORS),
-    Quantity("scheme_fields", _scheme_fields, "whose parameters each scheme averages"),
-    Quantity("before", lambda run: run.before, "with the laboratory's camera, by field", record=ERRORS),
+    Quantity("schemes", lambda run: run.schemes, "errors by scheme and field, without ground control", record=ERRORS),
+    Quantity("scheme_fields", _scheme_fields, "fields whose parameters each scheme averages"),
+    Quantity("before", lambda run: run.before, "errors with the laboratory's camera, by field", record=ERRORS),
     Quantity("finding", lambda run: run.scheme_means, record=MEANS),
     Quantity("bias_latitude", lambda run: {fit.axis: fit for fit in run.latitude}, record=LATITUDE),
     Quantity("repeatability", lambda run: run.repeatability, record=REPEATABILITY),
     Quantity("light", lambda run: run.light, record=LIGHT),
-    Quantity("light_corrected", lambda run: bool(run.setup.test.effects.corrected), "whether effects are taken out"),
+    Quantity("light_corrected", lambda run: bool(run.setup.test.effects.corrected), "true if effects are corrected"),
     Quantity("datum", lambda run: run.datum, record=DATUM),
-    Quantity("surprises", lambda run: run.surprises, "the largest first", record=SURPRISE),
+    Quantity("unexpected_changes", lambda run: run.unexpected_changes, "largest ratio first", record=UNEXPECTED_CHANGE),
     Quantity("campaigns", lambda run: None if run.repeats is None else run, record=CAMPAIGNS),
     Quantity("monitoring", lambda run: run.monitoring, record=MONITORING),
     Quantity("strips", lambda run: None if run.strips is None else run, record=STRIPS),

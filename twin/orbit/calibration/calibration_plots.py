@@ -1,4 +1,4 @@
-"""Figures of an in-orbit calibration."""
+"""Figures of the report of an in-orbit calibration."""
 
 from __future__ import annotations
 
@@ -14,52 +14,53 @@ from twin.orbit.calibration.flown_campaign import true_bias
 from twin.orbit.calibration.schemes import RMS, FieldErrors, Monitoring, values_of
 
 
-def _expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray) -> np.ndarray:
-    """Height RMS (n,) for drifts of these sizes without a monitor that many campaigns would have, metres.
+def _expected_height(run: CalibrationRun, study: Monitoring, factor: np.ndarray) -> np.ndarray:
+    """Return the (n,) mean height RMS of many campaigns without a monitor, in metres, for drifts scaled by `factor`.
 
-    All fields adjusted at once, each with one drift; the outer lines' d_alpha and the mean of it taken out.
+    All fields are adjusted at once and each has one drift. The mean over the fields of the outer lines' d_alpha goes
+    into the parameters and is therefore taken out.
     """
     spec = run.campaign.simulated
-    square = sum(one.angles[0] ** 2 for name, one in spec.drift.items() if name != "nadir")
-    metres = found.metres * np.sqrt(square * (1.0 - 1.0 / len(spec.fields))) / ARCSEC
-    return np.asarray(np.hypot(found.at(0.0).without.together.height_rms, factor * metres))
+    square = sum(drift.angles[0] ** 2 for name, drift in spec.drift.items() if name != "nadir")
+    metres = study.metres * np.sqrt(square * (1.0 - 1.0 / len(spec.fields))) / ARCSEC
+    return np.asarray(np.hypot(study.at(0.0).without.together.height_rms, factor * metres))
 
 
 def _drift_figure(run: CalibrationRun) -> Figure:
-    found = run.monitoring
-    assert found is not None
+    study = run.monitoring
+    assert study is not None
     figure = svg.new_figure(4.3)
     left, right = figure.subplots(1, 2)
-    angle = found.angle / ARCSEC or 1.0
-    size = np.array([s.factor for s in found.sizes])
+    angle = study.angle / ARCSEC or 1.0
+    size = np.array([s.factor for s in study.sizes])
     fine = np.linspace(0.0, size[-1], 101)
     left.plot(
-        fine * angle, _expected_height(run, found, fine), "--", color=svg.GREY, lw=1.0, label="mean of many campaigns"
+        fine * angle, _expected_height(run, study, fine), "--", color=svg.GREY, lw=1.0, label="mean of many campaigns"
     )
     cases = {"without monitor": (svg.VERMILION, "o"), "with monitor": (svg.BLUE, "s")}
-    monitored = [s.monitored for s in found.sizes if s.monitored is not None]
+    monitored = [s.monitored for s in study.sizes if s.monitored is not None]
     for (label, (colour, marker)), rows in zip(
-        cases.items(), ([s.without for s in found.sizes], monitored), strict=True
+        cases.items(), ([s.without for s in study.sizes], monitored), strict=True
     ):
         if rows:
             height = [row.together.height_rms for row in rows]
             left.plot(size * angle, height, f"{marker}-", color=colour, lw=1.4, ms=5, label=label)
-    unit = "σ of Δα of an outer line [arcsec]" if found.angle else "size of the drift against the file's"
+    unit = "σ of Δα of an outer line [arcsec]" if study.angle else "size of the drift against the file's"
     left.set(title="All fields adjusted at once", xlabel=unit, ylabel="height RMS at check points [m]")
-    names = list(found.sizes[0].without.schemes)
-    here = found.at(1.0)
+    names = list(study.sizes[0].without.schemes)
+    nominal = study.at(1.0)
     bars: list[tuple[str, str, list[FieldErrors]]] = [
-        ("no drift", svg.GREY, list(found.at(0.0).without.schemes.values())),
-        ("without monitor", svg.VERMILION, list(here.without.schemes.values())),
+        ("no drift", svg.GREY, list(study.at(0.0).without.schemes.values())),
+        ("without monitor", svg.VERMILION, list(nominal.without.schemes.values())),
     ]
-    if here.monitored is not None:
-        bars.append(("with monitor", svg.BLUE, list(here.monitored.schemes.values())))
-    place, width = np.arange(len(names)), 0.8 / len(bars)
+    if nominal.monitored is not None:
+        bars.append(("with monitor", svg.BLUE, list(nominal.monitored.schemes.values())))
+    position, width = np.arange(len(names)), 0.8 / len(bars)
     for k, (label, colour, values) in enumerate(bars):
-        at = place + (k - 0.5 * (len(bars) - 1)) * width
+        at = position + (k - 0.5 * (len(bars) - 1)) * width
         right.bar(at, [v.height_rms for v in values], 0.92 * width, color=colour, label=label)
     title = "Without ground control, the file's drift"
-    right.set(title=title, xticks=place, xlabel="scheme", ylabel="height RMS at check points [m]")
+    right.set(title=title, xticks=position, xlabel="scheme", ylabel="height RMS at check points [m]")
     right.set_xticklabels([*names[:-1], f"{names[-1]}\neach its own"])
     for axes in (left, right):
         axes.set_ylim(0.0, None)
@@ -76,17 +77,17 @@ MARKERS = "osD^vP"
 
 
 def figure_svg(name: str, run: CalibrationRun) -> str:
-    """One figure of `FIGURES` as SVG."""
+    """Draw one of the `FIGURES` and return it as SVG."""
     with svg.look(f"calibration-{name}"):
         return svg.to_svg(FIGURES[name](run))
 
 
 def _schemes_figure(run: CalibrationRun) -> Figure:
-    """RMS of every field over the schemes, plan and height."""
+    """Draw the RMS in plan and in height of every field, by scheme."""
     figure = svg.new_figure(4.3)
     panels = figure.subplots(1, 2)
     names, spec = list(run.schemes), run.campaign.spec
-    place = np.arange(len(names))
+    position = np.arange(len(names))
     labels = [
         f"{k}\n{len(s)} field{'s' * (len(s) > 1)}" for k, s in zip(names, run.campaign.spec.schemes, strict=False)
     ]
@@ -98,13 +99,13 @@ def _schemes_figure(run: CalibrationRun) -> Figure:
         for k, field in enumerate(run.before):
             style = MARKERS[k // len(COLOURS) % len(MARKERS)]
             colour = COLOURS[k % len(COLOURS)]
-            axes.plot(place, table[:, k], f"{style}-", color=colour, lw=0.9, ms=4, label=field)
-        axes.plot(place, table.mean(axis=1), "-", color=svg.INK, lw=2.2, label="mean of the fields")
+            axes.plot(position, table[:, k], f"{style}-", color=colour, lw=0.9, ms=4, label=field)
+        axes.plot(position, table.mean(axis=1), "-", color=svg.INK, lw=2.2, label="mean of the fields")
         before = values_of(run.before, what)
         low, high = before.min(), before.max()
         axes.set_ylim(0.0, 1.35 * table.max())
         label = f"before calibration {low:.0f} to {high:.0f} m; limit for 1:50 000 {limit:g} m"
-        axes.set(title=f"RMS in {title} [m]", xticks=place, xlabel="scheme")
+        axes.set(title=f"RMS in {title} [m]", xticks=position, xlabel="scheme")
         axes.text(0.5, 0.97, label, transform=axes.transAxes, ha="center", va="top", color=svg.GREY, fontsize=8.5)
         if limit < 1.35 * table.max():
             axes.axhline(limit, color=svg.GREY, lw=0.9, ls="--")
@@ -115,21 +116,19 @@ def _schemes_figure(run: CalibrationRun) -> Figure:
 
 
 def _latitude_figure(run: CalibrationRun) -> Figure:
-    """Bias of every field with sigma, truth, and the fit."""
+    """Draw the bias of every field with its sigma, the truth where it is known, and the fit against latitude."""
     figure = svg.new_figure(3.9)
     campaign, passes = run.campaign, run.campaign.passes
     latitude = np.array([p.latitude for p in passes])
-    reach = np.linspace(latitude.min() - 0.03, latitude.max() + 0.03, 101)
+    span = np.linspace(latitude.min() - 0.03, latitude.max() + 0.03, 101)
     for k, (axes, axis) in enumerate(zip(figure.subplots(1, 3), BIAS, strict=True)):
         value = np.array([run.together.value(f"{p.name} {axis}") for p in passes]) / ARCSEC
         sigma = np.array([run.together.sigma[f"{p.name} {axis}"] for p in passes]) / ARCSEC
         if campaign.known_truth is not None:
-            truth = true_bias(campaign.simulated, reach)
-            axes.plot(
-                np.degrees(reach), truth[:, k] / ARCSEC, color=svg.GREY, lw=1.0, ls="--", label="truth, no season"
-            )
+            truth = true_bias(campaign.simulated, span)
+            axes.plot(np.degrees(span), truth[:, k] / ARCSEC, color=svg.GREY, lw=1.0, ls="--", label="truth, no season")
         for fit in run.latitude[k : k + 1]:
-            axes.plot(np.degrees(reach), fit.curve(reach) / ARCSEC, color=svg.VERMILION, lw=1.3, label="fit")
+            axes.plot(np.degrees(span), fit.curve(span) / ARCSEC, color=svg.VERMILION, lw=1.3, label="fit")
         if campaign.known_truth is not None:
             true = np.array([p.bias[k] for p in passes]) / ARCSEC
             axes.plot(np.degrees(latitude), true, "x", color=svg.INK, ms=6, label="truth of the field", zorder=4)
@@ -144,14 +143,14 @@ def _latitude_figure(run: CalibrationRun) -> Figure:
 
 
 def _correlation_figure(run: CalibrationRun) -> Figure:
-    """Matrix of the simultaneous adjustment."""
-    found = run.together
-    sigma = found.sigma
-    free = [k for k, name in enumerate(found.names) if sigma[name] > 0.0]
-    names = [found.names[k] for k in free]
+    """Draw the correlation matrix of the simultaneous adjustment, held unknowns excluded."""
+    adjustment = run.together
+    sigma = adjustment.sigma
+    free = [k for k, name in enumerate(adjustment.names) if sigma[name] > 0.0]
+    names = [adjustment.names[k] for k in free]
     figure = svg.new_figure(min(9.2, 2.6 + 0.14 * len(names)))
     axes = figure.subplots()
-    shown = svg.signed_map(axes, found.correlation[np.ix_(free, free)], 1.0)
+    shown = svg.signed_map(axes, adjustment.correlation[np.ix_(free, free)], 1.0)
     size = 6.5 if len(names) > 40 else 8.0
     axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=size)
     axes.set_yticks(np.arange(len(names)), names, fontsize=size)
@@ -166,30 +165,40 @@ def _correlation_figure(run: CalibrationRun) -> Figure:
 
 
 def _residual_figure(run: CalibrationRun) -> Figure:
-    """Residuals of one field's control points in the images of the lines, in pixels."""
-    one = run.campaign.passes[0]
-    found = run.together
-    offset = [found.value(n) if n in found.names else 0.0 for n in (f"{one.name} offset {axis}" for axis in OFFSET)]
+    """Draw the residuals of the first field's control points in the images of the lines, in pixels."""
+    field_pass = run.campaign.passes[0]
+    adjustment = run.together
+    offset = [
+        adjustment.value(n) if n in adjustment.names else 0.0
+        for n in (f"{field_pass.name} offset {axis}" for axis in OFFSET)
+    ]
     figure = svg.new_figure(3.9)
-    shown = tuple(one.control.rays)
+    shown = tuple(field_pass.control.rays)
     panels = figure.subplots(1, len(shown), sharex=True, squeeze=False)[0]
     for axes, line in zip(panels, shown, strict=True):
-        rays, pitch = one.control.rays[line], one.data.pitch[line]
-        left = misclosure(
-            found.cameras[line],
+        rays, pitch = field_pass.control.rays[line], field_pass.data.pitch[line]
+        residual = misclosure(
+            adjustment.cameras[line],
             rays,
-            found.ground[one.name][rays.point],
-            found.bias(one.name),
-            one.control.axes @ np.array(offset),
+            adjustment.ground[field_pass.name][rays.point],
+            adjustment.bias(field_pass.name),
+            field_pass.control.axes @ np.array(offset),
         )
-        left = left / pitch
-        images = one.control_images[line]
+        residual = residual / pitch
+        images = field_pass.control_images[line]
         arrows = axes.quiver(
-            images.pixel, images.line / 1e3, left[:, 1], left[:, 0], color=svg.BLUE, width=0.004, scale=14.0, zorder=3
+            images.pixel,
+            images.line / 1e3,
+            residual[:, 1],
+            residual[:, 0],
+            color=svg.BLUE,
+            width=0.004,
+            scale=14.0,
+            zorder=3,
         )
         axes.plot(images.pixel, images.line / 1e3, ".", color=svg.GREY, ms=2)
         axes.quiverkey(arrows, 0.86, 1.04, 1.0, "1 px", labelpos="E", coordinates="axes")
-        rms = np.sqrt(np.mean(left**2, axis=0))
+        rms = np.sqrt(np.mean(residual**2, axis=0))
         axes.set_title(f"{line}: x {rms[0]:.2f} px, y {rms[1]:.2f} px", loc="left")
         axes.set(xlabel="pixel")
         axes.margins(0.12)
@@ -199,23 +208,26 @@ def _residual_figure(run: CalibrationRun) -> Figure:
 
 
 def _check_figure(run: CalibrationRun) -> Figure:
-    """Errors at one field's check points before calibration and with its own parameters; arrows plan, colour height."""
-    one = run.campaign.passes[0]
-    _, lat, _ = (float(v) for v in one.data.earth.geodetic(one.check_ground.mean(axis=0)))
-    lon, latitude, _ = one.data.earth.geodetic(one.check_ground)
+    """Draw the errors at the first field's check points before calibration and with the field's own parameters.
+
+    Arrows show the error in plan, colours the error in height.
+    """
+    field_pass = run.campaign.passes[0]
+    _, lat, _ = (float(v) for v in field_pass.data.earth.geodetic(field_pass.check_ground.mean(axis=0)))
+    lon, latitude, _ = field_pass.data.earth.geodetic(field_pass.check_ground)
     east = (lon - lon.mean()) * 6.378e3 * np.cos(lat)
     north = (latitude - latitude.mean()) * 6.357e3
     figure = svg.new_figure(5.2)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     cases = (
-        ("laboratory's camera", run.before[one.name]),
-        ("its own parameters", list(run.schemes.values())[-1][one.name]),
+        ("laboratory's camera", run.before[field_pass.name]),
+        ("its own parameters", list(run.schemes.values())[-1][field_pass.name]),
     )
     for axes, (title, errors) in zip(panels, cases, strict=True):
         size = float(f"{np.sqrt(np.nanmean(np.sum(errors.error[:, :2] ** 2, axis=1))):.1g}")
         tall = errors.error[:, 2]
         middle = float(np.median(tall))
-        reach = float(np.abs(tall - middle).max())
+        extent = float(np.abs(tall - middle).max())
         arrows = axes.quiver(
             east,
             north,
@@ -223,7 +235,7 @@ def _check_figure(run: CalibrationRun) -> Figure:
             errors.error[:, 1],
             tall,
             cmap="viridis",
-            clim=(middle - reach, middle + reach),
+            clim=(middle - extent, middle + extent),
             width=0.004,
             scale=16.0 * size,
         )

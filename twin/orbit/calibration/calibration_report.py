@@ -1,4 +1,4 @@
-"""Report of an in-orbit calibration: lead, the main table, facts."""
+"""Report of an in-orbit calibration: verdict, lead, facts and warnings."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from twin.orbit.calibration import calibration_sections
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import CalibrationRun, unit
 from twin.orbit.calibration.campaign import any_effect, light_effects
-from twin.orbit.calibration.influences import SURPRISE, drift_warnings, step_warnings
+from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, drift_warnings, step_warnings
 from twin.orbit.calibration.schemes import values_of
-from twin.orbit.calibration.screening import meeting_of
+from twin.orbit.calibration.screening import intersection_fit
 from twin.orbit.images.simulate_report import changes_text
 from twin.orbit.measured.pass_measurements import duplicates, listed
 
@@ -24,16 +24,17 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
 
 _FEW = 30
-"""Image points of which a chance is hardly worth a warning."""
+"""Least degrees of freedom of the check points' intersections for which a small p-value is worth a warning."""
 _LEAST_CHANCE = 1e-3
+"""p-value of the check points' intersections below which there is a warning."""
 _WIDE = 2.0
-"""Factor on the sigmas of a line beyond which there is a warning."""
+"""Factor on the sigmas of a line's image points above which there is a warning."""
 _MANY = 0.1
-"""Share of image points that may be left out without a warning."""
+"""Share of image points above which rejections raise a warning."""
 
 
 def calibration_report(run: CalibrationRun) -> Report:
-    """Report of a calibration."""
+    """Return the report of a calibration in orbit."""
     setup = run.setup
     plan, height = (values_of(run.before, what).mean() for what in ("plan_rms", "height_rms"))
     limits = setup.test.limits
@@ -42,11 +43,11 @@ def calibration_report(run: CalibrationRun) -> Report:
     scheme = list(run.schemes)[-2:][0]
     after = [values_of(run.schemes[scheme], what).mean() for what in ("plan_rms", "height_rms")]
     verdict, more = answer(
-        f"Calibration changes the errors from {plan:.0f} m in plan and {height:.0f} m in height to {after[0]:.2f} m "
-        f"and {after[1]:.2f} m (scheme {scheme}, mean of the fields' RMS)",
+        f"Calibration reduces the errors at check points from {plan:.0f} m in plan and {height:.0f} m in height to "
+        f"{after[0]:.2f} m and {after[1]:.2f} m (scheme {scheme}, mean of the fields' RMS)",
         f"{('schemes ' if len(good) > 1 else 'scheme ') + ', '.join(good) if good else 'no scheme'} "
         f"{'meet' if len(good) > 1 else 'meets'} the limits of {limits.plan:g} m in plan and {limits.height:g} m in "
-        "height, assumed for 1:50 000, in every field: see the schemes",
+        "height, assumed for 1:50 000, in every field: see the table of schemes",
     )
     lead = (
         *more,
@@ -75,8 +76,8 @@ def _facts(setup: CalibrationSetup) -> tuple[tuple[str, str], ...]:
         ("Bias of the star trackers", f"[{bias}]"),
         ("Passes", f"descending, {test.altitude / 1e3:g} km, one over each of {len(test.fields)} fields"),
         ("Points", _points(setup)),
-        ("Errors, σ of a coordinate", noise if errors.switched_on else "none but biases"),
-        ("Image points", "drawn, not matched in images" if test.images is None else "matched in rendered images"),
+        ("Errors, σ of a coordinate", noise if errors.switched_on else "none except biases"),
+        ("Image points", "simulated, not matched in images" if test.images is None else "matched in rendered images"),
         ("Effects on the light", _light(setup)),
         ("Description", test.description),
     )
@@ -87,9 +88,9 @@ def _points(setup: CalibrationSetup) -> str:
     if images is None:
         assert points is not None
         return f"{points.control} control and {points.check} check points in each field"
-    some = images.points
+    wanted = images.points
     return (
-        f"{some.control} control, {some.check} check and {some.tie} tie points sought in each of "
+        f"{wanted.control} control, {wanted.check} check and {wanted.tie} tie points sought in each of "
         f"{len(images.patches)} patches of {images.lines} x {images.pixels} pixels in each field"
     )
 
@@ -99,33 +100,33 @@ def _light(setup: CalibrationSetup) -> str:
     if not any_effect(light_effects(effects)):
         return "none"
     on = [name.replace("_", " ") for name in ("light_time", "aberration", "refraction") if getattr(effects, name)]
-    return f"{', '.join(on)}; {'taken out of' if effects.corrected else 'left in'} the image points"
+    return f"{', '.join(on)}; {'corrected' if effects.corrected else 'not corrected'} in the image points"
 
 
 def _warnings(run: CalibrationRun) -> tuple[str, ...]:
-    found, spec, assumptions = run.together, run.campaign.spec, list(CALIBRATION.warnings(run))
-    if run.surprises:
-        first = run.surprises[0]
+    adjustment, spec, assumptions = run.together, run.campaign.spec, list(CALIBRATION.warnings(run))
+    if run.unexpected_changes:
+        first = run.unexpected_changes[0]
         scale, shown = (ARCSEC, "arcsec") if unit(first.name) == "rad" else (1e-6, "µm")
         if "offset" in first.name:
             scale, shown = 1.0, "m"
-        others = len(run.surprises) - 1
-        more = f", and {others} other{'s' * (others > 1)} beyond {SURPRISE:g}" if others else ""
+        others = len(run.unexpected_changes) - 1
+        more = f", and {others} more by over {UNEXPECTED_SIGMAS:g} times" if others else ""
         assumptions.append(
-            f"{first.name} has changed by {first.change / scale:.3g} {shown}, {first.ratio:.1f} times what is "
-            f"expected (launch, errors.gps.drift){more}: check the datum of the control points, the camera file and "
-            "the times, for the fit need not show such an error"
+            f"{first.name} has changed by {first.change / scale:.3g} {shown}, {first.ratio:.1f} times its expected "
+            f"sigma (launch, errors.gps.drift){more}: check the datum of the control points, the camera file and "
+            "the times; the residuals need not show such an error"
         )
     assumptions += drift_warnings(run.campaign, run.drift)
     assumptions += step_warnings(run.chip_steps)
-    if resting := calibration_sections.rests_on_launch(found):
+    if resting := calibration_sections.prior_dominated(adjustment):
         assumptions.append(
-            f"{', '.join(resting)}: known from launch.bias and launch.interior, not from the points; these sigmas are "
-            "as good as that statement. More points, or a longer and wider field, would tell them"
+            f"{', '.join(resting)}: determined by the priors launch.bias and launch.interior, not by the points; the "
+            "sigmas are only as good as these priors. More points, or a longer and wider field, would determine them"
         )
     if any_effect(run.campaign.effects) and not spec.effects.corrected:
         assumptions.append(
-            "light time, aberration and refraction are left in the image points and go into the parameters"
+            "light time, aberration and refraction are left in the image points; the parameters absorb them"
         )
     if run.truth is None:
         assumptions += _measured_warnings(run)
@@ -133,18 +134,18 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
 
 
 def _measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tuple[tuple[str, str], ...]:
-    """What was given."""
-    test, said = setup.test, setup.data.conventions
+    """Return the rows of the table of facts of a calibration on measurements."""
+    test, conventions = setup.test, setup.data.conventions
     errors, gps = test.errors.star_tracker, test.errors.gps
     angles = ", ".join(format_quantity(v, ANGLE) for v in errors.noise)
     lengths = ", ".join(format_quantity(v, LENGTH) for v in gps.noise)
-    quaternion = "as the files of the platform say"
-    if said.quaternion is not None and said.body_axes is not None:
-        turns = said.quaternion.turns.replace("_", " ")
-        quaternion = f"scalar {said.quaternion.scalar}, {turns}, body {', '.join(said.body_axes)}"
-    paths = {one.measured.interpolation for one in run.campaign.passes}
-    joined = {"spline": "cubic spline", "lagrange": "Lagrange's polynomial of ten readings"}
-    light = "none" if not any_effect(run.campaign.effects) else "taken out" if test.effects.corrected else "left in"
+    quaternion = "as declared in the platform's files"
+    if conventions.quaternion is not None and conventions.body_axes is not None:
+        turns = conventions.quaternion.turns.replace("_", " ")
+        quaternion = f"scalar {conventions.quaternion.scalar}, {turns}, body {', '.join(conventions.body_axes)}"
+    paths = {field_pass.measured.interpolation for field_pass in run.campaign.passes}
+    joined = {"spline": "cubic splines", "lagrange": "Lagrange polynomials of ten readings"}
+    light = "none" if not any_effect(run.campaign.effects) else f"{'' if test.effects.corrected else 'not '}corrected"
     held = " and ".join(run.together.gauge.held)
     return (
         ("Camera", f"{setup.camera.name}, {setup.camera.description}"),
@@ -152,51 +153,54 @@ def _measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tup
         ("Line cameras", ", ".join(run.campaign.lines)),
         (
             "Frame and time",
-            f"{said.frame}; epochs in {said.time_scale.upper()}; a line's time is the {said.line_moment}",
+            f"{conventions.frame}; epochs in {conventions.time_scale.upper()}; a line's time is the "
+            f"{conventions.line_moment}",
         ),
         ("Quaternions", quaternion),
         (
             "Pixels",
-            f"middle of pixel n at {'n' if said.centre == 'integer' else 'n + 0.5'}, the first is {said.first_pixel}",
+            f"middle of pixel n at {'n' if conventions.centre == 'integer' else 'n + 0.5'}, the first is "
+            f"{conventions.first_pixel}",
         ),
-        ("First pixel sees", f"the {said.first_pixel_sees} side of the track"),
+        ("First pixel sees", f"the {conventions.first_pixel_sees} side of the track"),
         ("Noise of the attitude, 1σ", f"[{angles}], slow {max(errors.slow.noise) / ARCSEC:.3g} arcsec"),
-        ("Noise of the orbit, 1σ", f"[{lengths}], joined by {' and '.join(joined[p] for p in sorted(paths))}"),
+        ("Noise of the orbit, 1σ", f"[{lengths}], interpolated by {' and '.join(joined[p] for p in sorted(paths))}"),
         ("Effects on the light", light),
-        ("Held", held),
-        ("Not estimated", "distortion, mounting, what the camera's file says of single CCDs"),
+        ("Held (gauge)", held),
+        ("Not estimated", "distortion, mounting, positions of single CCDs in the camera's file"),
         ("Description", test.description),
     )
 
 
 def _measured_warnings(run: CalibrationRun) -> list[str]:
-    """What speaks against the result."""
-    found = []
-    for name, gone in run.campaign.rejected.items():
-        lost = gone.entered - gone.left
-        if gone.points or gone.check_points:
-            names = [*(f"{point} in {line}" for point, line in gone.points), *gone.check_points]
-            found.append(f"{name}: left out as gross errors: {listed(names)}")
-        if lost > _MANY * gone.entered:
-            found.append(
-                f"{name}: {lost} of {gone.entered} image points were left out, more than {100.0 * _MANY:.0f}%: are the "
-                "conventions right, and the points matched well?"
+    """Return the warnings of a calibration on measurements: rejections, residuals, duplicates, poor intersections."""
+    warnings = []
+    for name, rejected in run.campaign.rejected.items():
+        lost = rejected.entered - rejected.left
+        if rejected.points or rejected.check_points:
+            names = [*(f"{point} in {line}" for point, line in rejected.points), *rejected.check_points]
+            warnings.append(f"{name}: rejected as gross errors: {listed(names)}")
+        if lost > _MANY * rejected.entered:
+            warnings.append(
+                f"{name}: {lost} of {rejected.entered} image points were rejected, more than {100.0 * _MANY:.0f}%: "
+                "check the conventions and the matching of the points"
             )
-        wide = {line: factor for line, factor in gone.factors.items() if factor > _WIDE}
+        wide = {line: factor for line, factor in rejected.factors.items() if factor > _WIDE}
         if wide:
             factors = ", ".join(f"{line} {factor:.1f}" for line, factor in wide.items())
-            found.append(
+            warnings.append(
                 f"{name}: image points scatter more than their sigmas predict, by factors of {factors}; their sigmas "
                 "were multiplied by these factors"
             )
-    for one in run.campaign.passes:
-        places = np.concatenate([one.control_ground, one.check_ground])
-        if twice := duplicates(np.concatenate([one.control_ids, one.check_ids]), places):
-            found.append(f"{one.name}: {twice}")
-        meeting = meeting_of(run.campaign, one, run.fields[one.name].adjustment)
-        if meeting.degrees_of_freedom >= _FEW and meeting.p_value < _LEAST_CHANCE:
-            found.append(
-                f"{one.name}: rays of the check points do not meet within their sigmas (chance {meeting.p_value:.1g}): "
-                "sigmas of image points or of the attitude are too small, or it has slow errors"
+    for field_pass in run.campaign.passes:
+        places = np.concatenate([field_pass.control_ground, field_pass.check_ground])
+        if twice := duplicates(np.concatenate([field_pass.control_ids, field_pass.check_ids]), places):
+            warnings.append(f"{field_pass.name}: {twice}")
+        fit = intersection_fit(run.campaign, field_pass, run.fields[field_pass.name].adjustment)
+        if fit.degrees_of_freedom >= _FEW and fit.p_value < _LEAST_CHANCE:
+            warnings.append(
+                f"{field_pass.name}: rays of the check points do not intersect within their sigmas (p = "
+                f"{fit.p_value:.1g}): the sigmas of image points or attitude are too small, or the attitude has slow "
+                "errors"
             )
-    return found
+    return warnings

@@ -1,7 +1,8 @@
-"""Calibration over fields by simultaneous adjustment, and each field by itself as in paper 003; all that is computed
-from the measurements of a campaign. Truth enters only where an estimate is compared with it.
+"""Calibration of a camera in orbit over fields of points (paper 003).
 
-What a calibration was made from, as a folder of tables with a test file that reads them back.
+All fields are calibrated in one simultaneous adjustment, and each field by itself as in paper 003, from the
+measurements of a campaign alone; the truth enters only where an estimate is compared with it. `exported` writes the
+measurements as a folder of tables with a test file that reads them back.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
 from twin.orbit.calibration.campaign_adjustment import (
     LatitudeFit,
     calibrated_alone,
-    drift_looked_for,
     gauge_of,
     latitude_fits,
     rate_priors,
     simultaneous,
+    with_detected_drift,
 )
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import (
@@ -40,10 +41,10 @@ from twin.orbit.calibration.influences import (
     ChipStep,
     DatumRow,
     LightRow,
-    Surprise,
+    UnexpectedChange,
     datum_rows,
     light_rows,
-    surprises,
+    unexpected_changes,
 )
 from twin.orbit.calibration.schemes import (
     Monitoring,
@@ -51,15 +52,15 @@ from twin.orbit.calibration.schemes import (
     Repeats,
     SchemeMeans,
     Strips,
+    adjust_strips,
+    laboratory_errors,
     meets,
-    monitored,
+    repeat_campaigns,
     repeatability,
-    repeated,
-    schemes_tested,
-    strips_adjusted,
-    tested_before,
+    scheme_errors,
+    study_monitoring,
 )
-from twin.orbit.calibration.screening import require_labelled, screened
+from twin.orbit.calibration.screening import require_correct_names, screen_campaign
 from twin.orbit.measured.measurement_tables import CAMERA_FILE, TEST_FILE, campaign_files, read_measurements
 
 if TYPE_CHECKING:
@@ -67,28 +68,30 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import AnyCalibration, CalibrationSetup
 
 _EVEN = 1e-3
-"""Largest deviation of an interval between readings from their median interval, relative, for even times."""
+"""Largest deviation of an interval between readings from their median interval, relative, for which the readings count
+as evenly spaced.
+"""
 _LEAST_EVEN = 5
-"""Readings that third differences take."""
+"""Least number of evenly spaced readings from which third differences are computed."""
 STEPWISE_TOLERANCE = 1e-3
-"""Largest last step of a round of the stepwise solution, in sigmas."""
+"""Largest step of the last round of the stepwise solution, in sigmas, at which it counts as converged."""
 _TIE = 1.7e5
-"""Bytes per tie point of a strip, in each line and field, with the splines that it determines."""
+"""Memory per tie point of a strip, in each line and field, with the splines that it determines, in bytes."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldResult:
-    """A field calibrated by itself, with paper 003's twelve unknowns.
+    """Calibration of a single field, with paper 003's twelve unknowns.
 
     Attributes
     ----------
     adjustment : Adjustment
-        simultaneous.
-    orbit : ThirdDifference | None
-        Third differences of the measured positions, ITRS; None for fewer than five even readings.
-    attitude : ThirdDifference | None
-        Third differences of the measured attitude against the orbital frame, roll, pitch, yaw, by readings within the
-        orbit's; None likewise.
+        Adjustment of this field alone.
+    orbit : ThirdDifference or None
+        Third differences of the measured positions, in ITRS; None for fewer than five evenly spaced readings.
+    attitude : ThirdDifference or None
+        Third differences of the measured attitude against the orbital frame (roll, pitch, yaw), from readings within
+        those of the orbit; None for fewer than five evenly spaced readings.
     """
 
     adjustment: Adjustment
@@ -98,51 +101,52 @@ class FieldResult:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationRun:
-    """All that was computed.
+    """All results of a calibration in orbit.
 
     Attributes
     ----------
     setup : AnyCalibration
-        What its file says.
+        Resolved test file and camera.
     seed : int
-        Of all random numbers.
+        Seed of all random numbers.
     campaign : Campaign
-        Truth and measurements.
+        Measurements of all passes, and their truth where it is known.
     together : Adjustment
-        Simultaneous adjustment of all fields, with the orbit's offsets and, where the latitude fit tells it, the drift
-        of the biases during the passes.
-    truth : np.ndarray | None
-        (P,) true values of its unknowns; None where nobody knows them.
+        Simultaneous adjustment of all fields, with the offsets of the orbit and, where the fit against latitude
+        determines it, the drift of the biases during the passes.
+    truth : (P,) ndarray or None
+        True values of the unknowns of `together`, in metres and radians; None for measured passes.
     fields : Mapping[str, FieldResult]
-        Name -> that field by itself.
+        Calibration of each field by itself, by name of the field.
     stepwise : Stepwise
-        The first scheme's first field by the stepwise solution, bias and interior in turn.
+        Stepwise solution of the first field of the first scheme, bias and interior orientation in turn.
     before : Mapping[str, CheckErrors]
-        Field -> errors with the laboratory's camera.
+        Errors at the check points with the laboratory's camera, by field.
     schemes : Mapping[str, Mapping[str, CheckErrors]]
-        Scheme, "1" on -> field -> errors; the last lets each field use its own parameters.
-    scheme_means : SchemeMeans | None
-        Over the fields; None for a single scheme of averaged parameters.
-    latitude : tuple[LatitudeFit, ...]
-        The biases against latitude, roll, pitch, yaw; empty for too few fields.
-    repeatability : tuple[Repeatability, ...]
-        Of the parameters from field to field; empty for one field.
-    light : tuple[LightRow, ...]
-        What effects on the light do where they are left in.
-    datum : tuple[DatumRow, ...]
-        What a wrong datum does.
-    surprises : tuple[Surprise, ...]
-        Estimates beyond what is expected of them.
+        Scheme, counted from "1" -> field -> errors at its check points; in the last scheme each field uses its own
+        parameters.
+    scheme_means : SchemeMeans or None
+        Means of the errors over the fields; None where there is only one scheme of averaged parameters.
+    latitude : tuple of LatitudeFit
+        Fits of the biases against latitude: roll, pitch, yaw; empty for too few fields.
+    repeatability : tuple of Repeatability
+        Scatter of the parameters from field to field; empty for a single field.
+    light : tuple of LightRow
+        Errors that effects on the light cause where they are not corrected.
+    datum : tuple of DatumRow
+        Errors that a wrong datum of the control points, or a late clock, causes.
+    unexpected_changes : tuple of UnexpectedChange
+        Estimates that differ from their expected values by more than `UNEXPECTED_SIGMAS` sigmas.
     drift : AttitudeDrift
-        Of the attitude within the passes, by the residuals.
-    chip_steps : tuple[ChipStep, ...]
-        Within the lines, by the residuals.
-    repeats : Repeats | None
-        Campaigns repeated with everything drawn anew; None for none.
-    monitoring : Monitoring | None
-        What a monitor of drifting cameras buys; None for cameras that keep.
-    strips : Strips | None
-        Passes adjusted on tie points; None for none.
+        Drift of the attitude within the passes, tested on the residuals.
+    chip_steps : tuple of ChipStep
+        Steps between the chips of a line, tested on the residuals.
+    repeats : Repeats or None
+        Campaigns repeated with all errors drawn anew; None where the file asks for none.
+    monitoring : Monitoring or None
+        Comparison of calibrations with and without the on-board monitor; None for cameras without drift.
+    strips : Strips or None
+        Passes adjusted on tie points; None where the file asks for none.
     """
 
     setup: AnyCalibration
@@ -159,7 +163,7 @@ class CalibrationRun:
     repeatability: tuple[Repeatability, ...]
     light: tuple[LightRow, ...]
     datum: tuple[DatumRow, ...]
-    surprises: tuple[Surprise, ...]
+    unexpected_changes: tuple[UnexpectedChange, ...]
     drift: AttitudeDrift
     chip_steps: tuple[ChipStep, ...]
     repeats: Repeats | None
@@ -168,12 +172,12 @@ class CalibrationRun:
 
     @property
     def within_limits(self) -> list[str]:
-        """Schemes with which every field meets the limits of the test's file."""
+        """Names of the schemes with which every field meets the limits of the test's file."""
         return [name for name, errors in self.schemes.items() if meets(errors, self.setup.test.limits)]
 
 
 def unit(name: str) -> str:
-    """SI unit of an unknown."""
+    """Return the SI unit of an unknown by its name."""
     if name.endswith(RATE):
         return "rad/s"
     return "rad" if name.split()[-1] in BIAS else "m"
@@ -181,50 +185,50 @@ def unit(name: str) -> str:
 
 @dataclass(frozen=True)
 class Unknown:
-    """An unknown of the adjustment of all fields, in SI units.
+    """Unknown of the adjustment of all fields, in SI units.
 
     Attributes
     ----------
     name : str
-        Of the unknown.
+        Name of the unknown.
     value : float
-        estimated.
+        Estimated value.
     sigma : float
-        With the gauge's held unknowns exact; 0 where held.
+        Standard deviation with the unknowns that the gauge holds taken as exact; 0 where held.
     sigma_with_gauge : float
-        With what launch leaves to expect of the held unknowns.
-    from_start : float
-        Share of its variance that comes from the sigmas of launch and season, not from the points, 0 to 1.
+        Standard deviation that includes the uncertainty of the held unknowns after the launch.
+    prior_share : float
+        Share of the variance that comes from the sigmas of launch and season and not from the points, 0 to 1.
     held : bool
-        By the gauge.
-    truth : float | None
-        None where nobody knows it.
+        True where the gauge holds the unknown.
+    truth : float or None
+        True value; None for measured passes.
     """
 
     name: str
     value: float
     sigma: float
     sigma_with_gauge: float
-    from_start: float
+    prior_share: float
     held: bool
     truth: float | None
 
     @property
     def unit(self) -> str:
-        """SI unit."""
+        """SI unit of value, sigmas and truth."""
         return unit(self.name)
 
 
 def unknowns(run: CalibrationRun) -> dict[str, Unknown]:
-    """Name -> unknown of the adjustment of all fields."""
-    found = run.together
-    sigma, held = found.sigma, found.gauge.held
-    whole = found.sigma_with(dict.fromkeys(held, run.campaign.spec.launch.interior))
-    truth = [None] * len(found.names) if run.truth is None else run.truth.tolist()
+    """Return the unknowns of the adjustment of all fields, by name."""
+    adjustment = run.together
+    sigma, held = adjustment.sigma, adjustment.gauge.held
+    whole = adjustment.sigma_with(dict.fromkeys(held, run.campaign.spec.launch.interior))
+    truth = [None] * len(adjustment.names) if run.truth is None else run.truth.tolist()
     return {
         name: Unknown(name, value, sigma[name], whole[name], share, name in held, true)
         for name, value, share, true in zip(
-            found.names, found.values.tolist(), found.from_start.tolist(), truth, strict=True
+            adjustment.names, adjustment.values.tolist(), adjustment.prior_share.tolist(), truth, strict=True
         )
     }
 
@@ -233,17 +237,19 @@ def unknowns(run: CalibrationRun) -> dict[str, Unknown]:
 def run_calibration(
     setup: AnyCalibration, backend: Backend | None, seed: int, advance: Advance = silent
 ) -> CalibrationRun:
-    """Fly or read, calibrate, test: ``python -m twin.orbit calibrate``. Nothing is traced: the backend is not used.
+    """Simulate or read the passes, calibrate, and test on the check points: ``python -m twin.orbit calibrate``.
+
+    Nothing is ray-traced: the backend is not used.
 
     Raises
     ------
     BenchError
-        The orbit, the points or the adjustment do not allow it.
+        The orbit, the points or the adjustment do not allow a calibration.
     """
     try:
         return _run(setup, seed, advance)
     except ValueError as error:
-        key, remedy = _what_to_do(error, isinstance(setup, MeasuredCalibrationSetup))
+        key, remedy = _key_and_remedy(error, isinstance(setup, MeasuredCalibrationSetup))
         raise BenchError(str(error), key, remedy) from error
 
 
@@ -252,30 +258,32 @@ _NOISE_KEYS = {
     "slow attitude": ("errors", "star_tracker", "slow"),
     "station": ("errors", "gps", "noise"),
 }
-"""Source of noise -> its key; image and control points have keys of their own in a simulation, sigmas in tables."""
+"""Source of noise -> its key in the file. Image and control points have keys of their own in a simulation, and sigmas
+in tables of measurements.
+"""
 
 
-def _what_to_do(error: ValueError, measured: bool) -> tuple[tuple[str, ...], str]:
-    """Key and remedy of an error of the adjustment, in a test on measurements or in a simulation."""
+def _key_and_remedy(error: ValueError, measured: bool) -> tuple[tuple[str, ...], str]:
+    """Return the key of the file and the remedy for an error of the adjustment, of measurements or of a simulation."""
     if isinstance(error, RankError):
         return ("data" if measured else "points",), "a field with width and length, and more points"
     if isinstance(error, NoiseError):
         tables = {"image": "image_points", "control": "ground"}
-        own = ("data",) if measured else ("errors", error.largest)
+        key = ("data",) if measured else ("errors", error.largest)
         table = f"in the table {tables[error.largest]}" if measured and error.largest in tables else "there"
-        return _NOISE_KEYS.get(error.largest, own), f"smaller sigmas {table}; are their units right?"
+        return _NOISE_KEYS.get(error.largest, key), f"smaller sigmas {table}; are their units right?"
     if isinstance(error, FarPointsError):
         if measured:
             remedy = "check the points' names and datum, the epoch, the conventions (`twin.orbit check`)"
-            return ("data",), f"{remedy}, state a larger launch.bias, or leave points out (`screening: robust`)"
-        return ("errors",), "a datum and biases within what launch.bias leaves to expect"
+            return ("data",), f"{remedy}, state a larger launch.bias, or reject points (`screening: robust`)"
+        return ("errors",), "a datum and biases within the range that launch.bias allows"
     if measured:
         return ("data",), "points whose names, images and coordinates belong together, and more of them"
     return ("errors",), "errors that an adjustment can take, and more points"
 
 
 def _require_memory(setup: CalibrationSetup) -> None:
-    """See whether the adjustments of all strips, which take the most, fit into the memory."""
+    """Raise an error if the adjustments of all strips, which need the most memory, do not fit."""
     test, strip = setup.test, setup.test.strip
     if strip is not None:
         each = len(setup.camera.lines) * len(test.fields) * _TIE
@@ -291,12 +299,12 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     advance("calibration", 1, parts)
     latitude = latitude_fits(campaign, simultaneous(campaign))
     rates = rate_priors(campaign, latitude)
-    campaign = drift_looked_for(campaign, rates)
+    campaign = with_detected_drift(campaign, rates)
     together = simultaneous(campaign, rates)
     advance("calibration", 2, parts)
     fields = {}
-    for k, one in enumerate(campaign.passes):
-        fields[one.name] = FieldResult(calibrated_alone(campaign, one), *third_differences(one))
+    for k, field_pass in enumerate(campaign.passes):
+        fields[field_pass.name] = FieldResult(calibrated_alone(campaign, field_pass), *third_differences(field_pass))
         advance("calibration", 3 + k, parts)
     first = campaign.spec.schemes[0][0]
     control = next(p.control for p in campaign.passes if p.name == first)
@@ -304,7 +312,7 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
         [control], campaign.laboratory, campaign.noise, held=gauge_of(campaign).held, tolerance=STEPWISE_TOLERANCE
     )
     alone = {name: result.adjustment for name, result in fields.items()}
-    schemes = schemes_tested(campaign, alone)
+    schemes = scheme_errors(campaign, alone)
     advance("calibration", parts - 3, parts)
     light = light_rows(campaign, together.sigma)
     advance("calibration", parts - 1, parts)
@@ -318,75 +326,79 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
         None if campaign.known_truth is None else true_values(campaign, together.names),
         FrozenMap(fields),
         in_turn,
-        tested_before(campaign),
+        laboratory_errors(campaign),
         schemes,
         SchemeMeans.of(schemes),
         latitude,
         repeatability(campaign, alone),
         light,
         datum,
-        surprises(campaign, together),
+        unexpected_changes(campaign, together),
         AttitudeDrift.of(campaign, together),
         ChipStep.of(campaign, together),
-        None if isinstance(setup, MeasuredCalibrationSetup) else repeated(setup, others, advance),
-        None if isinstance(setup, MeasuredCalibrationSetup) else monitored(setup, shown, advance),
-        strips_adjusted(campaign, advance),
+        None if isinstance(setup, MeasuredCalibrationSetup) else repeat_campaigns(setup, others, advance),
+        None if isinstance(setup, MeasuredCalibrationSetup) else study_monitoring(setup, shown, advance),
+        adjust_strips(campaign, advance),
     )
 
 
 def source_of(setup: AnyCalibration, seed: np.random.SeedSequence, advance: Advance = silent) -> Campaign:
-    """The campaign of a test: read from its files where it names measurements, else flown; and screened where points
-    were measured in images.
+    """Return the campaign of a test: read from its files where it names measurements, else simulated.
+
+    Points measured in images are screened for gross errors.
 
     Parameters
     ----------
     setup : AnyCalibration
-        The test.
+        Resolved test file and camera.
     seed : np.random.SeedSequence
-        Of a simulation.
+        Seed of a simulation.
     advance : Advance
-        How far it is.
+        Callback that reports the progress.
 
     Raises
     ------
     InputError
-        Files that cannot be used.
+        Files cannot be used.
     BenchError, CalibrationError
-        As `fly_fields`.
+        See `fly_fields`.
     """
     if isinstance(setup, MeasuredCalibrationSetup):
         measured = read_measurements(setup.data, setup.camera, advance)
         campaign = campaign_of(setup.test, setup.camera, measured, setup.test.ties == "apart")
         if setup.test.screening == "robust":
-            return screened(campaign)
-        require_labelled(campaign)
+            return screen_campaign(campaign)
+        require_correct_names(campaign)
         return campaign
     campaign = fly_fields(setup, seed, advance)
-    return screened(campaign) if campaign.images is not None else campaign
+    return screen_campaign(campaign) if campaign.images is not None else campaign
 
 
 def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
-    """True values of unknowns (P,) by name, metres and radians; of biases and offsets, those at the field's middle, of
-    rates the mean of the fields.
+    """Return the (P,) true values of unknowns by name, in metres and radians.
+
+    Biases and offsets are those at the middle of the field, rates the mean of the fields.
     """
     known = {
         f"{line} {name}": value
         for line, camera in campaign.truth.items()
         for name, value in zip(INTERIOR, camera.interior, strict=True)
     }
-    for one in campaign.passes:
-        known |= {f"{one.name} {name}": v for name, v in zip(BIAS, one.bias, strict=True)}
-        known |= {f"{one.name} offset {name}": v for name, v in zip(OFFSET, one.truth.offset, strict=True)}
-    rates = [(one.truth.bias_at(1.0) - one.truth.bias_at(-1.0)) / 2.0 for one in campaign.passes]
+    for field_pass in campaign.passes:
+        known |= {f"{field_pass.name} {name}": v for name, v in zip(BIAS, field_pass.bias, strict=True)}
+        known |= {
+            f"{field_pass.name} offset {name}": v for name, v in zip(OFFSET, field_pass.truth.offset, strict=True)
+        }
+    rates = [(field_pass.truth.bias_at(1.0) - field_pass.truth.bias_at(-1.0)) / 2.0 for field_pass in campaign.passes]
     known |= dict(zip(RATE, np.mean(rates, axis=0), strict=True))
-    for one, own in zip(campaign.passes, rates, strict=True):
-        known |= {f"{one.name} {name}": v for name, v in zip(RATE, own, strict=True)}
+    for field_pass, rate in zip(campaign.passes, rates, strict=True):
+        known |= {f"{field_pass.name} {name}": v for name, v in zip(RATE, rate, strict=True)}
     return np.array([known[name] for name in names])
 
 
-def third_differences(one: FieldPass) -> tuple[ThirdDifference | None, ThirdDifference | None]:
-    """Return the third differences of orbit and attitude of a pass; None for fewer than five even readings."""
-    measured, table = one.measured, one.measured.table
+def third_differences(field_pass: FieldPass) -> tuple[ThirdDifference | None, ThirdDifference | None]:
+    """Return the third differences of orbit and attitude of a pass; None for fewer than five evenly spaced readings."""
+    measured, table = field_pass.measured, field_pass.measured.table
     fixes, looks = _even(table.orbit_time), _even(table.attitude_time[measured.known(table.attitude_time)])
     places = table.position[np.isin(table.orbit_time, fixes)]
     turned = np.swapaxes(measured.orbital_to_itrs(looks), 1, 2) @ measured.body_to_itrs(looks)
@@ -401,7 +413,7 @@ def third_differences(one: FieldPass) -> tuple[ThirdDifference | None, ThirdDiff
 
 
 def _even(time: np.ndarray) -> np.ndarray:
-    """Return the longest run of readings that are evenly spaced."""
+    """Return the times of the longest run of evenly spaced readings."""
     if len(time) < 2:
         return time
     step = np.diff(time)
@@ -412,21 +424,21 @@ def _even(time: np.ndarray) -> np.ndarray:
 
 
 def exported(run: CalibrationRun) -> dict[str, str]:
-    """Path -> text of the files. Points that screening left out are in them, as they were measured."""
+    """Return the files of a calibration's measurements, path -> text, including points that screening rejected."""
     return files_of(run.setup, run.campaign)
 
 
 def files_of(setup: AnyCalibration, campaign: Campaign) -> dict[str, str]:
-    """Path -> text of the files of a campaign, which need not be calibrated."""
-    files = campaign_files([one.measurements for one in campaign.passes], setup.camera.plain())
+    """Return the files of a campaign, path -> text; the campaign need not be calibrated."""
+    files = campaign_files([field_pass.measurements for field_pass in campaign.passes], setup.camera.plain())
     return files | {TEST_FILE: dump_yaml(_test(setup))}
 
 
 def _test(setup: AnyCalibration) -> dict[str, Any]:
-    """The test file: the same schemes, sigmas of readings, effects and limits."""
+    """Return the content of the test file, with the schemes, sigmas of readings, effects and limits of the test."""
     spec = setup.test
     plain: Mapping[str, Any] = spec.plain()
-    given = plain["errors"]
+    given_errors = plain["errors"]
     common = {
         "name": spec.name,
         "description": spec.description,
@@ -437,12 +449,12 @@ def _test(setup: AnyCalibration) -> dict[str, Any]:
         "strip": bool(spec.strip),
     }
     if isinstance(setup, MeasuredCalibrationSetup):
-        return common | {"errors": given, "screening": setup.test.screening, "ties": setup.test.ties}
-    gps, tracker = given["gps"], given["star_tracker"]
+        return common | {"errors": given_errors, "screening": setup.test.screening, "ties": setup.test.ties}
+    gps, tracker = given_errors["gps"], given_errors["star_tracker"]
     errors = {
         "gps": {key: gps[key] for key in ("noise", "drift", "interval")},
         "star_tracker": {key: tracker[key] for key in ("noise", "slow", "interval")},
-        "season": given["season"],
+        "season": given_errors["season"],
     }
     if not setup.test.errors.switched_on:
         nothing = {"noise": ["0 m"] * 3, "interval": gps["interval"]}

@@ -1,6 +1,6 @@
-"""Sections of the report of an in-orbit calibration: schemes, parameters, fields, biases, influences, observability.
+"""Sections of the report of an in-orbit calibration: schemes, parameters, fields, biases, influences and observability.
 
-docs/orbit.md explains what averaging, drifting cameras, tie points and effects on the light do to the result.
+docs/orbit.md explains how averaging, drifting cameras, tie points and effects on the light change the result.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from twin.framework.report import Section
 from twin.orbit.calibration.calibration_numbers import CHIP_STEP, LATITUDE, MATCHING, SCREENED
 from twin.orbit.calibration.calibration_plots import figure_svg
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
-from twin.orbit.calibration.influences import SURPRISE, LightRow
+from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, LightRow
 from twin.orbit.calibration.schemes import RMS, FieldErrors, SchemeMeans, meets, values_of
-from twin.orbit.calibration.screening import ground_sample, meeting_of
+from twin.orbit.calibration.screening import ground_sample, intersection_fit
 from twin.orbit.images.image_points import BEYOND
 from twin.orbit.images.patch import WRONG
 from twin.orbit.images.point_report import SORTS, points_png
 
 _SCALES = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}
-"""Unit of an unknown in files -> its size in the unit of tables, and that unit."""
+"""Unit of an unknown in files -> size of the unit of tables, and its name."""
 MOSTLY = 0.5
-"""Share of an unknown's variance beyond which it rests on the launch's prior and not on the points."""
+"""Share of an unknown's variance above which the prior of the launch determines it, not the points."""
 Rows = list[tuple[Cell, ...]]
 
 
 def sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[Section, ...]:
-    """Return the sections that a calibration has.
+    """Return the sections of a calibration's report.
 
     Parameters
     ----------
     run : CalibrationRun
-        The calibration.
+        Results of the calibration.
     data : Mapping[str, Any]
-        Of calibration.json.
+        Content of calibration.json.
     """
-    found = (
+    candidates = (
         _schemes(run),
         None if run.repeats is None else _repeats(run),
         _measured(run) if run.truth is None else None,
@@ -60,7 +60,7 @@ def sections(run: CalibrationRun, data: Mapping[str, Any]) -> tuple[Section, ...
         _rank(run),
         _data(run),
     )
-    return tuple(section for section in found if section is not None)
+    return tuple(section for section in candidates if section is not None)
 
 
 def _figure(run: CalibrationRun, name: str, title: str, caption: str) -> SvgFigure:
@@ -68,13 +68,13 @@ def _figure(run: CalibrationRun, name: str, title: str, caption: str) -> SvgFigu
 
 
 def scheme_names(run: CalibrationRun) -> list[str]:
-    """Schemes with the fields that they average; the last one averages nothing."""
+    """Return the names of the schemes with the fields that they average; the last scheme averages nothing."""
     names = [f"{k + 1}: {', '.join(s)}" for k, s in enumerate(run.campaign.spec.schemes)]
     return [*names, f"{len(names) + 1}: each field its own"]
 
 
 def summary(run: CalibrationRun) -> Table:
-    """Return the table of the schemes, tested on all fields."""
+    """Return the table of the schemes' errors at the check points of all fields."""
     rows: Rows = []
     for name, errors in zip(["laboratory", *scheme_names(run)], (run.before, *run.schemes.values()), strict=True):
         values = [values_of(errors, what) for what in RMS]
@@ -84,22 +84,22 @@ def summary(run: CalibrationRun) -> Table:
         "schemes",
         "Schemes of parameters, tested on all fields without ground control",
         "RMS at check points, metres: mean, standard deviation and largest of the fields.",
-        ("parameters", "plan [m]", "spread", "largest", "height [m]", "spread", "largest", "1:50 000"),
+        ("parameters", "plan [m]", "spread", "largest", "height [m]", "spread", "largest", "meets 1:50 000"),
         rows,
         (None, 2, 2, 2, 2, 2, 2, None),
     )
 
 
 def scheme_summary(means: SchemeMeans | None) -> str:
-    """What averaging does to plan and height, in a sentence."""
+    """Return a sentence on how averaging changes the errors in plan and height."""
     if means is None:
-        return "With one scheme of averaged parameters there is nothing to compare."
+        return "There is only one scheme of averaged parameters, so schemes are not compared."
     plan, spread, height = means.plan, means.plan_spread, means.height
     return (
-        f"The mean RMS in plan goes from {plan[0]:.2f} m with the first scheme to {plan[-1]:.2f} m with the last of "
-        f"averaged parameters, its spread over the fields from {spread[0]:.2f} m to {spread[-1]:.2f} m; in height it "
-        f"goes from {height[0]:.2f} m to {height[-1]:.2f} m and changes by "
-        f"{100.0 * means.height_change:.1f}% at most."
+        f"From the first to the last scheme of averaged parameters, the mean RMS in plan changes from {plan[0]:.2f} m "
+        f"to {plan[-1]:.2f} m and its spread over the fields from {spread[0]:.2f} m to {spread[-1]:.2f} m; the mean "
+        f"RMS in height changes from {height[0]:.2f} m to {height[-1]:.2f} m, by "
+        f"{100.0 * means.height_change:.1f}% at most between any two schemes."
     )
 
 
@@ -118,14 +118,14 @@ def _schemes(run: CalibrationRun) -> Section:
     ]
     text = (
         f"Every field is calibrated by itself (three attitude biases and {len(run.campaign.inner)} elements of the "
-        f"interior orientation, of which two are held), and each scheme uses the mean of the parameters of its "
+        f"interior orientation, of which two are held). Each scheme uses the mean of the parameters of its "
         f"fields: {'; '.join(scheme_names(run))}.",
         scheme_summary(run.scheme_means),
     )
-    check = "Arrows in plan, colour in height: before calibration and with the field's own parameters."
+    check = "Arrows: errors in plan; colours: errors in height. Before calibration and with the field's own parameters."
     title = f"Errors at check points of {run.campaign.passes[0].name}"
     figures = (
-        _figure(run, "schemes-of-fields", "Schemes", "Each line is a field."),
+        _figure(run, "schemes-of-fields", "Schemes", "RMS errors at check points; each line is a field."),
         _figure(run, "check-points", title, check),
     )
     return Section("Schemes of averaged parameters", text, (figures[0], *tables, figures[1]))
@@ -148,8 +148,9 @@ def _repeats(run: CalibrationRun) -> Section:
         "campaigns",
         f"{count} campaigns over the same fields",
         "RMS at check points, metres: mean of the fields, averaged over the campaigns, with its standard deviation "
-        "from campaign to campaign; spread over the fields; in how many campaigns every field meets 1:50 000. Biases, "
-        "orbits, points and noise are drawn anew; the camera, the fields and the drift with latitude stay.",
+        "from campaign to campaign; spread over the fields; share of campaigns in which every field meets 1:50 000. "
+        "Biases, orbits, points and noise are drawn anew; the camera, the fields and the drift with latitude are the "
+        "same.",
         ("parameters", *heads, "1:50 000"),
         rows,
         (None, 2, 2, 2, 2, 2, 2, None),
@@ -161,63 +162,63 @@ def _measured(run: CalibrationRun) -> Section:
     campaign = run.campaign
     rows: Rows = []
     sizes: Rows = []
-    for one in campaign.passes:
-        gone, alone = campaign.rejected.get(one.name), run.fields[one.name].adjustment
-        meeting, errors = meeting_of(campaign, one, alone), list(run.schemes.values())[-1][one.name]
-        factors = {} if gone is None else {line: f"{factor:.2f}" for line, factor in gone.factors.items()}
+    for field_pass in campaign.passes:
+        rejected, alone = campaign.rejected.get(field_pass.name), run.fields[field_pass.name].adjustment
+        fit, errors = intersection_fit(campaign, field_pass, alone), list(run.schemes.values())[-1][field_pass.name]
+        factors = {} if rejected is None else {line: f"{factor:.2f}" for line, factor in rejected.factors.items()}
         alike = len(set(factors.values())) == 1
         factor = factors.popitem()[1] if alike else ", ".join(f"{line} {v}" for line, v in factors.items())
-        lost = (None, None, None) if gone is None else (len(gone.points), len(gone.check_points), factor)
-        points = (int(one.is_control.sum()), one.tie_count, len(one.check_ground))
-        ratio, check = (v.chi_square / max(v.degrees_of_freedom, 1) for v in (alone, meeting))
-        rows.append((one.name, *points, *lost, ratio, alone.p_value, check))
-        for line in one.data.sensors:
-            along, across = ground_sample(one, line)
+        lost = (None, None, None) if rejected is None else (len(rejected.points), len(rejected.check_points), factor)
+        points = (int(field_pass.is_control.sum()), field_pass.tie_count, len(field_pass.check_ground))
+        ratio, check = (v.chi_square / max(v.degrees_of_freedom, 1) for v in (alone, fit))
+        rows.append((field_pass.name, *points, *lost, ratio, alone.p_value, check))
+        for line in field_pass.data.sensors:
+            along, across = ground_sample(field_pass, line)
             pixel = float(np.sqrt(along * across))
             both = errors.plan_rms / pixel, errors.height_rms / pixel
-            sizes.append((one.name, line, along, across, *both, errors.count))
-    heads = ("image points left out", "check left out", "factor", "χ²/dof", "chance", "check χ²/dof")
+            sizes.append((field_pass.name, line, along, across, *both, errors.count))
+    heads = ("image points rejected", "check rejected", "factor", "χ²/dof", "p", "check χ²/dof")
     tables = (
         Table(
             "measured-points",
             "Points of every pass",
-            "Left out: image points that robust weights gave up, check points whose rays do not meet. Factor: on the "
-            "given sigmas of image points of the lines, by the residuals of those that remain. Chi-square over its "
-            "degrees of freedom, of the pass by itself and of the rays of its check points with these parameters.",
+            "Rejected: image points by robust weights, and check points whose rays do not intersect. Factor: applied "
+            "to the given sigmas of image points by line, from the remaining residuals. Chi-square over its degrees of "
+            "freedom: of the pass adjusted by itself, and of the rays of its check points with these parameters.",
             ("pass", "control", "ties", "check", *heads),
             rows,
             (None, None, None, None, None, None, None, 2, 3, 2),
         ),
         Table(
             "measured-pixels",
-            "Pixels on the ground, and errors of check points in them",
-            "Ground sample distance of the middle of each line, metres; RMS errors of the check points by the pass's "
-            "own parameters, in ground pixels (root of along times across).",
+            "Ground sample distance, and errors of check points in ground pixels",
+            "Ground sample distance of the middle of each line, metres; RMS errors of the check points with the pass's "
+            "own parameters, in ground pixels (geometric mean of along and across).",
             ("pass", "line", "along the track [m]", "across [m]", "plan [px]", "height [px]", "check points"),
             sizes,
             (None, None, 3, 3, 2, 2, None),
         ),
     )
-    none = () if campaign.rejected else ("No image point was left out: the file says `screening: none`.",)
+    none = () if campaign.rejected else ("No image point was rejected: the file has `screening: none`.",)
     return Section("Measurements", (*none, _limits(run)), tables)
 
 
 def _limits(run: CalibrationRun) -> str:
-    noise, one = run.campaign.noise, run.campaign.passes[0]
-    ground = one.altitude / float(np.mean([m.interior[0] for m in run.campaign.laboratory.values()]))
-    control = np.trace(one.control_covariance[one.is_control], axis1=1, axis2=2)
+    noise, field_pass = run.campaign.noise, run.campaign.passes[0]
+    ground = field_pass.altitude / float(np.mean([m.interior[0] for m in run.campaign.laboratory.values()]))
+    control = np.trace(field_pass.control_covariance[field_pass.is_control], axis1=1, axis2=2)
     # white noise of the readings by their spline, in metres on the ground, beside that of the image
     parts = {
         "image points": noise.image * ground,
-        "readings of the attitude": noise.attitude * one.altitude,
-        "slow errors of the attitude": noise.slow_attitude * one.altitude,
+        "readings of the attitude": noise.attitude * field_pass.altitude,
+        "slow errors of the attitude": noise.slow_attitude * field_pass.altitude,
         "readings of the orbit": noise.station,
         "control points": float(np.sqrt(np.mean(control / 3.0))),
     }
     texts = ", ".join(f"{name} {value:.2g} m" for name, value in sorted(parts.items(), key=lambda v: -v[1]) if value)
     return (
-        f"One standard deviation on the ground at nadir, of a single ray to a single point of {one.name}: {texts}. "
-        "The first of these limits the result; more points make it smaller but for slow errors of the attitude."
+        f"Error budget on the ground at nadir (1σ) of a single ray to a single point of {field_pass.name}: {texts}. "
+        "The largest of these limits the result. More points reduce it, except for slow errors of the attitude."
     )
 
 
@@ -228,41 +229,43 @@ def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
     screened = SCREENED.table(
         "image-points",
         "Image points in the adjustment",
-        "Of points that every line has; left: by robust weights (IGG), and check points whose rays meet.",
-        {one.name: SCREENED(one.screening) for one in campaign.images if one.screening is not None},
+        "Points that every line sees, before and after screening by robust weights (IGG) and, for check points, by the "
+        "intersection of their rays.",
+        {images.name: SCREENED(images.screening) for images in campaign.images if images.screening is not None},
         label="field",
     )
-    found = {
+    judgements = {
         f"{field}, {SORTS[sort]}, {line}": numbers
         for field, sorts in data["fields"].items()
         for sort, lines in sorts.items()
         for line, numbers in lines.items()
     }
     caption = (
-        f"Wrong: {WRONG}; before any test, after the thresholds of matching, after consensus. RMS and chi-square of "
-        "right places."
+        f"Wrong: {WRONG}; before any test, after the thresholds of matching, after consensus with the neighbours. RMS "
+        "and chi-square of correct positions."
     )
     counts = ("wrong_found", "found", "wrong_matched", "matched", "wrong_accepted", "accepted")
     keys = (*counts, "right_rejected_by_consensus", "rms_lines_px", "rms_pixels_px", "chi_square_ratio")
-    matching = MATCHING.table("image-matching", "Matching", caption, found, keys, "field, points, line", digits=4)
-    left = " and ".join(str(int(p.control.control.sum())) for p in campaign.passes)
+    matching = MATCHING.table("image-matching", "Matching", caption, judgements, keys, "field, points, line", digits=4)
+    remaining = " and ".join(str(int(p.control.control.sum())) for p in campaign.passes)
     text = (
         f"In each field {len(spec.patches)} patches of {spec.lines} x {spec.pixels} pixels are rendered by every line. "
-        f"Of {total['found']} places that matching found, {total['wrong_found']} are wrong "
-        f"({100.0 * total['wrong_found'] / total['found']:.1f}%), mostly on fields that look different in the "
-        f"orthophoto; thresholds of the matching leave {total['wrong_matched']} of {total['matched']}, the "
-        f"neighbours' agreement {total['wrong_accepted']} of {total['accepted']}, the adjustment "
-        f"{total['wrong_left']} of {total['left']} image points ({total['check_left']} check points: "
-        f"{total['wrong_check_left']}). The neighbours' test costs {total['right_rejected_by_consensus']} right ones, "
-        f"the adjustment {total['right_rejected_by_adjustment']}. {left} control points are left. Their image "
-        f"points weigh by the covariances of the matching and {BEYOND:g} px beyond them, for what no fit shows.",
+        f"Of {total['found']} matched positions, {total['wrong_found']} are wrong "
+        f"({100.0 * total['wrong_found'] / total['found']:.1f}%), mostly on parcels that look different in the "
+        f"orthophoto. After the thresholds of matching {total['wrong_matched']} of {total['matched']} are wrong, after "
+        f"the test of the neighbours {total['wrong_accepted']} of {total['accepted']}, after the adjustment "
+        f"{total['wrong_left']} of {total['left']} image points and {total['wrong_check_left']} of "
+        f"{total['check_left']} check points. The test of the neighbours rejects "
+        f"{total['right_rejected_by_consensus']} correct positions, the adjustment "
+        f"{total['right_rejected_by_adjustment']}. {remaining} control points remain. Their image points are weighted "
+        f"by the covariances of the matching, with {BEYOND:g} px added for errors that the fit does not show.",
     )
     first = campaign.images[0]
     figures = [
         PngFigure(
             f"points-{sort}",
-            f"From predicted to found, {SORTS[sort]} points, first patch of {first.name}",
-            "Arrows: what is left after the median displacement, enlarged as the title says; crosses: rejected by the "
+            f"Predicted to matched positions, {SORTS[sort]} points, first patch of {first.name}",
+            "Arrows: displacement less its median, enlarged as the title says; crosses: rejected by the test of the "
             "neighbours; points: not matched.",
             points_png(first.shown, points),
         )
@@ -272,23 +275,24 @@ def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
 
 
 def monitor_gain(run: CalibrationRun) -> str:
-    """What the monitor is worth, in a sentence."""
+    """Return a sentence on the height error with and without the on-board monitor."""
     assert run.monitoring is not None
-    none, here = run.monitoring.at(0.0), run.monitoring.at(1.0)
+    none, nominal = run.monitoring.at(0.0), run.monitoring.at(1.0)
     scheme = list(none.without.schemes)[-2]
-    still, blind = none.without.schemes[scheme].height_rms, here.without.schemes[scheme].height_rms
+    still, blind = none.without.schemes[scheme].height_rms, nominal.without.schemes[scheme].height_rms
     text = (
-        f"With cameras that drift by {run.monitoring.angle / ARCSEC:.2g} arcsec (Δα, 1σ) from field to field, heights "
-        f"without ground control (scheme {scheme}) are wrong by {blind:.2f} m RMS, {still:.2f} m without drift"
+        f"With cameras that drift by {run.monitoring.angle / ARCSEC:.2g} arcsec (Δα, 1σ) from field to field, the "
+        f"height error without ground control (scheme {scheme}) is {blind:.2f} m RMS, against {still:.2f} m without "
+        "drift"
     )
-    if here.monitored is None:
+    if nominal.monitored is None:
         return f"{text}."
-    return f"{text}; with the on-board monitor's readings, {here.monitored.schemes[scheme].height_rms:.2f} m."
+    return f"{text}; with the on-board monitor's readings, {nominal.monitored.schemes[scheme].height_rms:.2f} m."
 
 
 def _monitoring(run: CalibrationRun) -> Section:
-    found, spec = run.monitoring, run.campaign.simulated
-    assert found is not None
+    study, spec = run.monitoring, run.campaign.simulated
+    assert study is not None
     drifts = "; ".join(
         f"{name} {', '.join(format_quantity(v, ANGLE) for v in one.angles)}, "
         f"Δf {format_quantity(one.principal_distance, LENGTH)}"
@@ -296,38 +300,38 @@ def _monitoring(run: CalibrationRun) -> Section:
     )
     text = [
         f"Each line camera differs in every field from its reference state, 1σ of Δα, Δβ, Δγ: {drifts}. "
-        f"1 arcsec of Δα of the forward line is {abs(found.metres):.2f} m of height."
+        f"1 arcsec of Δα of the forward line is {abs(study.metres):.2f} m of height."
     ]
     if spec.monitor is not None:
         angles = ", ".join(format_quantity(v, ANGLE) for v in spec.monitor.angles)
         length = format_quantity(spec.monitor.principal_distance, LENGTH)
         text.append(f"The monitor reads each camera in each pass with {angles} and Δf {length}, 1σ.")
     rows: Rows = []
-    for size in found.sizes:
-        cells: list[Cell] = [size.factor, size.factor * found.angle / ARCSEC]
+    for size in study.sizes:
+        cells: list[Cell] = [size.factor, size.factor * study.angle / ARCSEC]
         for one in (size.without, size.monitored):
             cells += (None,) * 3 if one is None else (*astuple(one.together), one.p_value)
         rows.append(tuple(cells))
-    none, here = found.at(0.0).without, found.at(1.0)
-    cases = {"no drift": none.schemes, "no monitor": here.without.schemes}
-    cases["monitor"] = {} if here.monitored is None else here.monitored.schemes
+    none, nominal = study.at(0.0).without, study.at(1.0)
+    cases = {"no drift": none.schemes, "no monitor": nominal.without.schemes}
+    cases["monitor"] = {} if nominal.monitored is None else nominal.monitored.schemes
     figure = _figure(
         run,
         "monitor-heights",
         "Height errors and the drift of the cameras",
-        "Left: one campaign, its drift drawn once and scaled; the dashed line is what many campaigns would have "
-        "on average. Right: RMS over all fields.",
+        "Left: one campaign, its drift drawn once and scaled; the dashed line is the mean of many campaigns. "
+        "Right: RMS over all fields.",
     )
     by_size = Table(
         "monitor-sizes",
         "All fields adjusted at once",
-        "RMS at check points of all fields, metres, each field with its own bias; chance of the fit, with the noise of "
-        "the readings of attitude and orbit counted as independent (which makes it too near to 1).",
-        ("drift × file's", "σ Δα [arcsec]", "plan", "height", "chance", "plan, told", "height, told", "chance"),
+        "RMS at check points of all fields, metres, each field with its own bias; p-value of the fit, with the noise "
+        "of the readings of attitude and orbit treated as independent (which brings it too near to 1).",
+        ("drift × file's", "σ Δα [arcsec]", "plan", "height", "p", "plan, monitor", "height, monitor", "p, monitor"),
         rows,
         (1, 2, 2, 2, 3, 2, 2, 3),
     )
-    by_scheme = Table(
+    evaluate_schemes = Table(
         "monitor-schemes",
         "Schemes without ground control, with the file's drift",
         "RMS at check points of all fields, metres; the last scheme lets each field use its own parameters.",
@@ -338,45 +342,45 @@ def _monitoring(run: CalibrationRun) -> Section:
         ],
         (None, 2, 2, 2, 2, 2, 2),
     )
-    return Section("Cameras that drift, and the on-board monitor", tuple(text), (figure, by_size, by_scheme))
+    return Section("Cameras that drift, and the on-board monitor", tuple(text), (figure, by_size, evaluate_schemes))
 
 
 def strip_gain(run: CalibrationRun) -> str:
-    """What tie points are worth, in a sentence."""
+    """Return a sentence on the errors with and without tie points."""
     assert run.strips is not None
     scheme = list(run.schemes)[-2]
     old, new = (FieldErrors.pooled(e[scheme].values()) for e in (run.schemes, run.strips.schemes))
     return (
-        f"Calibrating with {min(run.strips.ties.values())} tie points of each pass or more, and adjusting each pass on "
-        f"them, takes the height RMS of scheme {scheme} from {old.height_rms:.2f} m to {new.height_rms:.2f} m and the "
-        f"plan RMS from {old.plan_rms:.2f} m to {new.plan_rms:.2f} m."
+        f"With at least {min(run.strips.ties.values())} tie points per pass in the calibration and in an adjustment of "
+        f"each pass, the height RMS of scheme {scheme} changes from {old.height_rms:.2f} m to {new.height_rms:.2f} m "
+        f"and the plan RMS from {old.plan_rms:.2f} m to {new.plan_rms:.2f} m."
     )
 
 
 def _strips(run: CalibrationRun) -> Section:
-    found = run.strips
-    assert found is not None
+    strips = run.strips
+    assert strips is not None
     rows: Rows = []
-    for scheme, fields in found.schemes.items():
+    for scheme, fields in strips.schemes.items():
         old, new = (FieldErrors.pooled(e.values()) for e in (run.schemes[scheme], fields))
         rows.append((scheme, old.plan_rms, new.plan_rms, old.height_rms, new.height_rms))
     table = Table(
         "strips",
         "Check points with and without tie points",
-        "RMS at check points of all fields without ground control, metres: calibrated on control points and "
-        "intersected as measured; calibrated on control and tie points and intersected with the adjusted attitude and "
-        "orbit. The last scheme lets each field use its own parameters.",
+        "RMS at check points of all fields without ground control, metres. Without ties: calibrated on control points, "
+        "intersected with the measured attitude and orbit. With ties: calibrated on control and tie points, "
+        "intersected with the adjusted attitude and orbit. In the last scheme each field uses its own parameters.",
         ("scheme", "plan", "plan, with ties", "height", "height, with ties"),
         rows,
         (None, 2, 2, 2, 2),
     )
     common = Table(
         "strip-datum",
-        f"What the tie points tell of turns of a whole pass, {run.campaign.passes[0].name}",
-        "Sigma from the readings' noise alone and with the ties, arcseconds, of rates arcseconds per second. A ratio "
-        "near 1 means that ties say nothing of it.",
-        ("turn", "before", "after", "ratio"),
-        [(d.name, d.before / ARCSEC, d.after / ARCSEC, d.after / d.before) for d in found.datum],
+        f"Rotations of a whole pass, {run.campaign.passes[0].name}",
+        "Sigma from the readings' noise alone and with tie points, in arcseconds, or arcseconds per second for rates. "
+        "A ratio near 1 means that tie points do not determine the rotation.",
+        ("rotation", "before", "after", "ratio"),
+        [(d.name, d.before / ARCSEC, d.after / ARCSEC, d.after / d.before) for d in strips.datum],
         (None, 4, 4, 3),
     )
     tracker = run.campaign.spec.errors.star_tracker
@@ -384,11 +388,11 @@ def _strips(run: CalibrationRun) -> Section:
     noise = f"{max(tracker.noise) / ARCSEC:g} arcsec from reading to reading"
     if slow:
         noise += f" and {slow:g} arcsec that change within {tracker.slow.interval:g} s"
-    counts = ", ".join(f"{k} {n}" for k, n in found.ties.items())
+    counts = ", ".join(f"{k} {n}" for k, n in strips.ties.items())
     text = (
-        f"Every pass is adjusted on points that three lines see ({counts}) without coordinates on the ground; check "
-        f"points, which are no ties, are then intersected with the adjusted attitude and orbit. The attitude's noise "
-        f"here is {noise}.",
+        f"Every pass is adjusted on points that the lines see in common ({counts}), without ground coordinates. Check "
+        f"points, which are not among them, are then intersected with the adjusted attitude and orbit. The attitude's "
+        f"noise is {noise}.",
     )
     return Section("Adjustment of the strips", text, (table, common))
 
@@ -399,65 +403,72 @@ def _parameters(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
     start = dict(zip(campaign.inner, interior, strict=True))
     drift = run.drift.sigmas_per_arcsec or {}
     rows: Rows = []
-    for name, one in data["parameters"].items():
-        scale, shown = (1e-6, "µm") if name in start else _SCALES[one["unit"]]
-        first, held = start.get(name, 0.0), one["sigma"] == 0.0
-        cells: list[Cell] = [(one["value"] - first) / scale, None if held else one["sigma"] / scale, drift.get(name)]
+    for name, unknown in data["parameters"].items():
+        scale, shown = (1e-6, "µm") if name in start else _SCALES[unknown["unit"]]
+        first, held = start.get(name, 0.0), unknown["sigma"] == 0.0
+        cells: list[Cell] = [
+            (unknown["value"] - first) / scale,
+            None if held else unknown["sigma"] / scale,
+            drift.get(name),
+        ]
         if run.truth is not None:
-            z = None if held else (one["value"] - one["truth"]) / one["sigma"]
-            cells += [(one["truth"] - first) / scale, z]
+            z = None if held else (unknown["value"] - unknown["truth"]) / unknown["sigma"]
+            cells += [(unknown["truth"] - first) / scale, z]
         rows.append((name, shown, *cells))
     apart = f"The lines see a field up to {campaign.passes[0].seconds_apart:.0f} s apart, and"
     if any(name in RATE for name in names):
-        text = f"{apart} the fit of the biases against latitude tells their drift in this time, with its sigma."
+        text = f"{apart} the fit of the biases against latitude predicts their drift in this time, with its sigma."
     elif any(name.endswith(RATE) for name in names):
-        text = f"{apart} a rate of the attitude in each pass is solved for, with the stated or found sigma as prior."
+        text = f"{apart} a rate of the attitude is estimated in each pass, with the stated or detected sigma as prior."
     else:
-        text = f"{apart} nothing tells a drift of the biases: it goes into the outer lines' principal points."
+        text = f"{apart} a drift of the biases is not observable: the outer lines' principal points absorb it."
     table = Table(
         "parameters",
         "Unknowns of all fields at once",
         "Elements of the interior orientation: changes from the laboratory; biases and offsets: from measured to true. "
-        "Without sigma: held (gauge). Drift: by how many of its sigmas an unknown moves where the attitude drifts by "
-        f"1 arcsec in {run.drift.seconds:.0f} s and the adjustment does not know of it; empty where rates are "
-        "unknowns. z: the error in sigmas.",
+        "Without sigma: held (gauge). Drift: change of an unknown, in its sigmas, if the attitude drifts by 1 arcsec "
+        f"in {run.drift.seconds:.0f} s and the adjustment does not model it; empty where rates are "
+        "unknowns. z: error in sigmas.",
         ("unknown", "unit", "value", "σ", "σ per arcsec of drift", *(("truth", "z") if run.truth is not None else ())),
         rows,
         (None, None, 3, 3, 2, *((3, 2) if run.truth is not None else ())),
     )
     steps = CHIP_STEP.table(
         "chip-steps",
-        "Steps between chips that these points would show",
-        "Steps are no unknowns: what the residuals say of one at each joint of the camera's file, at the middle of a "
-        "line of one chip. Seen from: told in half of all cases, one false alarm in 10 000 runs.",
+        "Steps between chips",
+        "Steps are not unknowns of the adjustment: each is estimated from the residuals, at the joints of the camera's "
+        "file or, for a line of one chip, at its middle. Detectable: size that is detected in half of all cases, with "
+        "one false alarm in 10 000 runs.",
         data["chip_steps"],
-        ("line", "axis", "place_m", "step_m", "sigma_m", "seen_from_m"),
+        ("line", "axis", "place_m", "step_m", "sigma_m", "detectable_m"),
         digits=4,
     )
     title = f"Residuals of the control points in the images, {campaign.passes[0].name}"
-    caption = "RMS of x and y in each line's title. What is left is noise of the image and of the attitude."
+    caption = "Titles: RMS of x and y. The residuals contain noise of the image and of the attitude."
     return Section("Parameters", (text,), (table, steps, _figure(run, "residuals", title, caption)))
 
 
 def _fields(run: CalibrationRun) -> Section:
     rows: Rows = []
-    for one in run.campaign.passes:
-        alone = run.fields[one.name].adjustment
-        bias = alone.bias(one.name) / ARCSEC
-        errors = [] if one.known_truth is None else (bias - one.bias / ARCSEC).tolist()
-        rows.append((one.name, float(np.degrees(one.latitude)), *map(float, bias), *errors, alone.p_value))
+    for field_pass in run.campaign.passes:
+        alone = run.fields[field_pass.name].adjustment
+        bias = alone.bias(field_pass.name) / ARCSEC
+        errors = [] if field_pass.known_truth is None else (bias - field_pass.bias / ARCSEC).tolist()
+        rows.append(
+            (field_pass.name, float(np.degrees(field_pass.latitude)), *map(float, bias), *errors, alone.p_value)
+        )
     truth = ("Δ roll", "Δ pitch", "Δ yaw") if run.truth is not None else ()
     table = Table(
         "fields",
         "Each field by itself",
         f"Roll, pitch and yaw of the bias, arcseconds{', and minus the truth at the middle' * bool(truth)}. "
-        "An offset of the orbit, which these unknowns do not have, goes into roll and pitch: 0.3 m are 0.1 arcsec.",
-        ("field", "latitude [deg]", *BIAS, *truth, "chance of the fit"),
+        "Offsets of the orbit are not among these unknowns; roll and pitch absorb them: 0.3 m are 0.1 arcsec.",
+        ("field", "latitude [deg]", *BIAS, *truth, "p of the fit"),
         rows,
         (None, 1, *(3,) * (len(BIAS) + len(truth) + 1)),
     )
     if not run.repeatability:
-        return Section("Fields", ("One field alone does not repeat.",), (table,))
+        return Section("Fields", ("Repeatability needs two fields or more.",), (table,))
     scatter: Rows = []
     for r in run.repeatability:
         scale, shown = (ARCSEC, "arcsec") if r.name in BIAS else (1e-3, "mm")
@@ -465,20 +476,21 @@ def _fields(run: CalibrationRun) -> Section:
         scatter.append((r.name, shown, *(None if held else v / scale for v in (r.scatter, r.sigma)), r.p_value))
     inner = [r for r in run.repeatability if r.name not in BIAS and r.sigma > 0.0]
     worst, largest = (
-        max(some, key=lambda r: r.scatter) for some in (inner, [r for r in run.repeatability if r.name in BIAS])
+        max(rows_of_sort, key=lambda r: r.scatter)
+        for rows_of_sort in (inner, [r for r in run.repeatability if r.name in BIAS])
     )
     text = (
-        f"From field to field the interior orientation repeats to {1e3 * worst.scatter:.4f} mm or better (standard "
-        f"deviation, {worst.name}). The biases scatter by up to {largest.scatter / ARCSEC:.2f} arcsec "
+        f"From field to field the interior orientation repeats to {1e3 * worst.scatter:.4f} mm or better (largest "
+        f"standard deviation, {worst.name}). The biases scatter by up to {largest.scatter / ARCSEC:.2f} arcsec "
         f"({largest.name}).",
     )
     repeats = Table(
         "repeatability",
         "Repeatability over the fields",
-        "Standard deviation over the fields, sigma that a field's adjustment claims, chance of such a scatter by this "
-        "sigma alone. Small for a bias means that it really differs from field to field. Without numbers: held "
-        "(gauge).",
-        ("parameter", "unit", "scatter", "claimed σ", "chance"),
+        "Standard deviation over the fields, sigma predicted by a field's adjustment, and p-value of the scatter under "
+        "this sigma. A small p-value for a bias means that it really differs from field to field. Without numbers: "
+        "held (gauge).",
+        ("parameter", "unit", "scatter", "predicted σ", "p"),
         scatter,
         (None, None, 4, 4, 3),
     )
@@ -490,18 +502,18 @@ def _biases(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         run,
         "bias-latitude",
         "Bias of the attitude against latitude",
-        "From the adjustment of all fields, which knows of the orbit's offsets. The error bars of yaw are common to "
-        "all fields (y of the outer lines); its differences are known far better.",
+        "From the adjustment of all fields, which includes the orbit's offsets. The errors of yaw are mostly common to "
+        "all fields (y of the outer lines); differences between fields are determined far better.",
     )
     if not run.latitude:
-        few = "There are too few fields, or all at one latitude, to tell a drift with latitude from the season."
+        few = "There are too few fields, or all at one latitude, to separate a drift with latitude from the season."
         return Section("Biases against latitude", (few,), (figure,))
     keys = ("amplitude_rad", "amplitude_rad_sigma", "constant_rad", "constant_rad_sigma", "chi_square")
     table = LATITUDE.table(
         "bias-fits",
         "Amplitude × sin(latitude − reference) + constant",
-        f"The reference is the middle of the fields, {np.degrees(run.latitude[0].reference):.1f}°. Chi-square with "
-        "the biases' own covariance; what remains beside it is the season, and the sigmas contain it.",
+        f"The reference is the middle of the fields, {np.degrees(run.latitude[0].reference):.1f}°. Chi-square: with "
+        "the biases' own covariance. The remainder is the season; the sigmas include it.",
         data["bias_latitude"],
         (*keys, "degrees_of_freedom", "p_value", "remainder_rad"),
         "axis",
@@ -512,45 +524,46 @@ def _biases(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         # measured to true is the inverse of the drift of the measured attitude
         errors = run.campaign.simulated.errors
         drift = -np.array(errors.star_tracker.thermal.amplitude) * errors.switched_on
-        drawn = (", ".join(f"{v / ARCSEC:.3g}" for v in some) for some in (drift, errors.season))
-        truth = " In truth they are {} arcsec, and the season's standard deviations {} arcsec.".format(*drawn)
+        drawn = (", ".join(f"{v / ARCSEC:.3g}" for v in values_drawn) for values_drawn in (drift, errors.season))
+        truth = " The true amplitudes are {} arcsec, the season's standard deviations {} arcsec.".format(*drawn)
     values = np.array([[run.together.value(f"{p.name} {axis}") for p in run.campaign.passes] for axis in BIAS[:2]])
     spread = float(np.hypot(*values.std(axis=1, ddof=1)))
-    metres, most = spread * run.campaign.passes[0].altitude, max(len(s) for s in run.campaign.spec.schemes)
+    metres, largest = spread * run.campaign.passes[0].altitude, max(len(s) for s in run.campaign.spec.schemes)
     weak = [f.axis for f in run.latitude if abs(f.amplitude) < 2.0 * f.amplitude_sigma]
-    seen = f"in this campaign the drift does not show in {', '.join(weak)}" if weak else "the drift shows in all axes"
-    reach = np.ptp(np.sin(run.latitude[0].latitude - run.latitude[0].reference))
-    rest = ", ".join(f"{f.remainder / ARCSEC:.2f} arcsec in {f.axis}" for f in run.latitude)
+    seen = f"the drift is not significant in {', '.join(weak)}" if weak else "the drift is significant in all axes"
+    change = np.ptp(np.sin(run.latitude[0].latitude - run.latitude[0].reference))
+    remainders = ", ".join(f"{f.remainder / ARCSEC:.2f} arcsec in {f.axis}" for f in run.latitude)
     text = (
         f"The fields lie within {np.degrees(np.ptp(run.latitude[0].latitude)):.0f}° of latitude, where the sine "
-        f"changes by {reach:.2f}. Beside the drift there remain {rest}, the season of each field: {seen} at two "
+        f"changes by {change:.2f}. Beside the drift, the season of each field remains, {remainders}: {seen} at two "
         f"sigmas.{truth}",
         f"Roll and pitch of the fields scatter by {spread / ARCSEC:.2f} arcsec together, {metres:.1f} m on the "
-        f"ground. By the rules of a mean, one field's bias leaves another field {np.sqrt(2.0) * metres:.1f} m RMS in "
-        f"plan, and the mean of {most} fields {np.sqrt(1.0 + 1.0 / most) * metres:.1f} m, beside the noise of its own.",
+        f"ground. The bias of one field therefore causes errors of {np.sqrt(2.0) * metres:.1f} m RMS in plan in "
+        f"another field, and the mean bias of {largest} fields {np.sqrt(1.0 + 1.0 / largest) * metres:.1f} m, beside "
+        "noise.",
     )
     return Section("Biases against latitude", text, (figure, table))
 
 
 def _left(row: LightRow) -> str:
     if not row.left:
-        return "nothing left in"
+        return "all corrected"
     return "all" if len(row.left) > 2 else " and ".join(name.replace("_", " ") for name in row.left)
 
 
 def _light(run: CalibrationRun) -> Section:
     if len(run.light) < 2:
-        return Section("Effects on the light", ("None is on.",))
+        return Section("Effects on the light", ("All effects are switched off.",))
     lines, pitch = run.campaign.lines, run.campaign.passes[0].data.pitch
     rows: Rows = []
     for row in run.light:
         inner, turned = row.most(run.campaign.inner), row.most(tuple(n for n in row.shift if n.split()[-1] in BIAS))
         shifts = [f"{who} {by:+.1f} σ" if row.left else "" for who, by in (inner, turned)]
-        name = f"{_left(row)} left in" if row.left else _left(row)
+        name = f"{_left(row)} not corrected" if row.left else _left(row)
         rows.append((name, *astuple(row.before), *astuple(row.after), *shifts, row.p_value))
     pixels = Table(
         "light-pixels",
-        "How far image points move",
+        "Displacement of image points",
         "RMS over the check points, pixels, x along the track and y along the line.",
         ("effect", *(f"{line} {axis}" for line in lines for axis in "xy")),
         [
@@ -562,21 +575,21 @@ def _light(run: CalibrationRun) -> Section:
     )
     effects = Table(
         "light",
-        "What is not taken out of the image points",
-        "RMS at check points, mean of the fields, metres: by the laboratory's camera, and by each field's own "
-        "parameters; the unknowns of the simultaneous adjustment that move by the most of their sigmas; chance of the "
-        "fit, with the noise of the readings counted as independent.",
-        ("case", "plan before", "height before", "plan after", "height after", "interior", "bias", "chance of the fit"),
+        "Effects that are not corrected in the image points",
+        "RMS at check points, mean of the fields, metres: with the laboratory's camera, and with each field's own "
+        "parameters; the unknowns of the simultaneous adjustment that move by the most of their sigmas; p-value of the "
+        "fit, with the noise of the readings treated as independent.",
+        ("case", "plan before", "height before", "plan after", "height after", "interior", "bias", "p of the fit"),
         rows,
         (None, 2, 2, 2, 2, None, None, 3),
     )
-    left = run.light[-1]
-    most, ratio = left.most(run.campaign.inner)
+    last_case = run.light[-1]
+    parameter, ratio = last_case.most(run.campaign.inner)
     text = (
-        "Left in, they do hardly any harm where a camera is used as it was calibrated: biases and principal points "
-        f"take them up, the mean error in plan goes from {run.light[0].after.plan_rms:.3f} m to "
-        f"{left.after.plan_rms:.3f} m. But parameters are then "
-        f"wrong ({most} by {1e6 * left.shift[most]:+.1f} µm, {abs(ratio):.1f} sigmas), which the fit need not show.",
+        "Left uncorrected, they hardly change the errors of a camera that is used as it was calibrated: biases and "
+        f"principal points absorb them, and the mean error in plan changes from {run.light[0].after.plan_rms:.3f} m to "
+        f"{last_case.after.plan_rms:.3f} m. But the parameters are then wrong ({parameter} by "
+        f"{1e6 * last_case.shift[parameter]:+.1f} µm, {abs(ratio):.1f} sigmas), which the residuals need not show.",
     )
     return Section("Effects on the light", text, (pixels, effects))
 
@@ -591,67 +604,68 @@ def _datum(run: CalibrationRun) -> Section:
         warned = "never" if row.warned is None else f"{scale * row.warned:.3g} {unit}"
         sizes = f"{sure} {sigmas:.1f} σ", f"{scale * row.size / max(sigmas, 1e-9):.3g} {unit}", warned
         moved = [OwnDecimals(v / ARCSEC, 2) for v in row.bias]
-        rest = (*map(float, row.offset), row.fit, row.p_value, *astuple(row.after))
-        rows.append((where, *moved, f"{name} {1e6 * change:+.1f} µm", *sizes, *rest))
+        others = (*map(float, row.offset), row.fit, row.p_value, *astuple(row.after))
+        rows.append((where, *moved, f"{name} {1e6 * change:+.1f} µm", *sizes, *others))
     table = Table(
         "datum",
         "All control points in a wrong datum",
-        "Mean changes of the fields' biases, arcseconds; the element of the interior that changes most; the one that "
-        "changes by the most of its sigmas, what makes one sigma of it, and from what on an unknown is beyond what "
-        "launch leaves to expect, which gives a warning; mean changes of the orbit's offsets, metres; change of the "
-        "chi-square and chance of the fit; RMS at check points in the right datum, each field with its own parameters, "
-        "metres.",
+        "Mean changes of the fields' biases, arcseconds; the element of the interior orientation that changes most; "
+        "the one that changes by the most of its sigmas, the error of the datum that changes it by one sigma, and the "
+        "error that raises a warning of an unexpected change; mean changes of the orbit's offsets, metres; change of "
+        "the chi-square and p-value of the fit; RMS at check points in the right datum, each field with its own "
+        "parameters, metres.",
         (
-            *("wrong by", *BIAS, "interior", "in sigmas", "one sigma at", "warned from", *OFFSET),
-            *("Δ chi-square", "chance of the fit", "plan after [m]", "height after [m]"),
+            *("error", *BIAS, "interior", "in sigmas", "one sigma at", "warning from", *OFFSET),
+            *("Δ chi-square", "p of the fit", "plan after [m]", "height after [m]"),
         ),
         rows,
         (*(None,) * 8, 3, 3, 3, 1, 3, 2, 2),
     )
     launch = run.campaign.spec.launch
     roll, inner = (format_quantity(v, k) for v, k in ((launch.bias[0], ANGLE), (launch.interior, LENGTH)))
-    metres = SURPRISE * launch.bias[0] * run.campaign.passes[0].altitude
-    beyond = ", ".join(f"{s.name} ({s.ratio:.1f}σ)" for s in run.surprises[:6])
+    metres = UNEXPECTED_SIGMAS * launch.bias[0] * run.campaign.passes[0].altitude
+    beyond = ", ".join(f"{s.name} ({s.ratio:.1f}σ)" for s in run.unexpected_changes[:6])
     text = (
-        "A shift that all control points share goes into biases and interior orientation, and the fit need not show "
-        f"it. The file expects {roll} (roll) and {inner} (interior) of a launch; beyond {SURPRISE:g} times this there "
-        f"is a warning, which is {metres:.0f} m of shift across the track.",
-        f"Beyond what is expected here: {beyond or 'nothing'}.",
+        "Biases and interior orientation absorb a shift that all control points share; the residuals need not show "
+        f"it. The file expects changes by a launch of {roll} (roll) and {inner} (interior), 1σ. There is a warning "
+        f"above {UNEXPECTED_SIGMAS:g} times these, {metres:.0f} m of shift across the track.",
+        f"Unexpected changes in this run: {beyond or 'none'}.",
     )
     return Section("Datum of the control points", text, (table,))
 
 
-def rests_on_launch(found: Adjustment) -> dict[str, float]:
-    """Unknowns whose prior is worth more than the points, with its share of their variance."""
-    shares = zip(found.names, found.from_start.tolist(), strict=True)
+def prior_dominated(adjustment: Adjustment) -> dict[str, float]:
+    """Return the unknowns that the prior determines more than the points, with the prior's share of their variance."""
+    shares = zip(adjustment.names, adjustment.prior_share.tolist(), strict=True)
     return {name: share for name, share in shares if share > MOSTLY}
 
 
 def _rank(run: CalibrationRun) -> Section:
-    found, way = run.together, run.stepwise
-    size = np.nan_to_num(np.abs(np.triu(found.correlation, 1)), posinf=0.0)
+    adjustment, stepwise = run.together, run.stepwise
+    size = np.nan_to_num(np.abs(np.triu(adjustment.correlation, 1)), posinf=0.0)
     pairs = zip(*np.unravel_index(np.argsort(size, axis=None)[::-1][:10], size.shape), strict=True)
-    text = [f"Gauge: {found.gauge}."]
-    text += [f"Not observable: {c}." for c in found.open]
-    text += [f"Weak, but solved for: {c}." for c in found.weak]
-    if resting := rests_on_launch(found):
+    text = [f"Gauge: {adjustment.gauge}."]
+    text += [f"Not observable: {c}." for c in adjustment.open]
+    text += [f"Weak, but solved for: {c}." for c in adjustment.weak]
+    if resting := prior_dominated(adjustment):
         shares = ", ".join(f"{name} ({100.0 * share:.0f}% of its variance)" for name, share in resting.items())
-        text.append(f"Determined by the prior on the launch, not by the points: {shares}.")
+        text.append(f"Determined mainly by the launch prior, not by the points: {shares}.")
     text.append(
-        f"The stepwise solution, bias and interior in turn, {'converges' if way.converged else 'does not converge'} "
-        f"for {run.campaign.spec.schemes[0][0]} in {way.rounds} rounds to steps of {STEPWISE_TOLERANCE:g} sigma; a "
-        f"round leaves {way.rate:.4f} of the slowest error. The simultaneous adjustment of all fields takes "
-        f"{found.iterations} steps."
+        "The stepwise solution, bias and interior in turn, "
+        f"{'converges' if stepwise.converged else 'does not converge'} for {run.campaign.spec.schemes[0][0]} in "
+        f"{stepwise.rounds} rounds to steps of {STEPWISE_TOLERANCE:g} sigma; its convergence rate is "
+        f"{stepwise.rate:.4f} per round. The simultaneous adjustment of all fields takes {adjustment.iterations} "
+        "iterations."
     )
     table = Table(
         "correlations",
         "Largest correlations",
-        "Of the simultaneous adjustment; all of them are in calibration.json.",
+        "Largest correlations of the simultaneous adjustment; calibration.json has all of them.",
         ("unknown", "unknown", "correlation"),
-        [(found.names[int(i)], found.names[int(j)], float(found.correlation[i, j])) for i, j in pairs],
+        [(adjustment.names[int(i)], adjustment.names[int(j)], float(adjustment.correlation[i, j])) for i, j in pairs],
         (None, None, 4),
     )
-    caption = "Of the simultaneous adjustment, held unknowns left out."
+    caption = "Correlations of the simultaneous adjustment, held unknowns excluded."
     return Section("Observability", tuple(text), (table, _figure(run, "correlation-matrix", "Correlations", caption)))
 
 
@@ -659,13 +673,13 @@ def _data(run: CalibrationRun) -> Section:
     rows: Rows = []
     for name, result in run.fields.items():
         sizes = ((result.orbit, 1.0), (result.attitude, ARCSEC))
-        cells = [[None] * 3 if one is None else (one.rms / unit).tolist() for one, unit in sizes]
+        cells = [[None] * 3 if difference is None else (difference.rms / unit).tolist() for difference, unit in sizes]
         rows.append((name, *cells[0], *cells[1]))
     table = Table(
         "third-differences",
         "RMS of third differences",
         "Measured positions in the Earth-fixed frame, metres; measured attitude against the orbital frame, arcseconds. "
-        "White noise of one sigma gives the square root of 20. Biases and drifts do not show.",
+        "White noise of sigma 1 gives the square root of 20. Third differences do not contain biases and drifts.",
         ("field", "x", "y", "z", "roll", "pitch", "yaw"),
         rows,
         (None, 4, 4, 4, 4, 4, 4),

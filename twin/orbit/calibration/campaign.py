@@ -1,19 +1,15 @@
-"""Passes over fields of points as an analysis has them, whoever flew them: a satellite, or the simulation.
+"""Passes over fields of points as an analysis has them, simulated or measured.
 
-Each pass is what was measured (`twin.orbit.measured.pass_measurements`): readings of orbit and attitude, line times,
-ground and image points. The camera is that of the laboratory, and the effects on the light are taken out of the image
-points by it (`twin.orbit.calibration.campaign`). The truth is there where a simulation knows it, for comparisons
-alone.
+Each pass holds what was measured (`twin.orbit.measured.pass_measurements`): readings of orbit and attitude, line times,
+ground and image points. The camera is that of the laboratory. The truth is present only where a simulation knows it,
+for comparisons.
 
-From image points of a pass to what a calibration takes, with the effects on the light taken out.
-
-The adjustment's rays are straight lines in Earth-fixed axes. A pixel's look is where the light seems to come from; the
-straight line to the place on the ground that this look really sees, through the measured station, is where the place
-is. The image point is moved from the one to the other. Camera and trajectory are those that the analysis has: the
-laboratory's and the measured one. The camera's error of 100 m on the ground, 2e-4 rad, changes an aberration of 4
-pixels by a thousandth of a pixel.
-
-Image points may be drawn, as `twin.orbit.calibration.campaign` does, or measured in images: nothing here knows which.
+The effects on the light are taken out of the image points. The adjustment's rays are straight lines in Earth-fixed
+axes: the look of a pixel is the direction from which the light seems to come, and the straight line from the measured
+station to the ground point that this look really sees is the direction in which the point lies. The image point is
+moved from the one to the other. Camera and trajectory are those that the analysis has, the laboratory's and the
+measured one: a camera error of 100 m on the ground, 2e-4 rad, changes an aberration of 4 pixels by a thousandth of a
+pixel. Image points may be drawn or measured in images; the code does not distinguish them.
 """
 
 from __future__ import annotations
@@ -51,53 +47,54 @@ if TYPE_CHECKING:
     from twin.orbit.images.patch import LineJudgement, Patch
 
 EFFECTS = ("light_time", "aberration", "refraction")
+"""Names of the effects on the light, as attributes of `LightEffects`."""
 _DISTORTION_STEPS = 8
-"""Fixed-point steps; each makes the error smaller by the distortion, 1e-3 of the image or less."""
+"""Number of fixed-point steps. Each step reduces the error by the size of the distortion, 1e-3 of the image or less."""
 
 
 def light_effects(spec: EffectsSpec) -> LightEffects:
-    """Effects on the light that a file switches on."""
+    """Return the effects on the light that a file switches on."""
     return LightEffects(spec.light_time, spec.aberration, spec.refraction, spec.wavelength)
 
 
 def any_effect(effects: LightEffects) -> bool:
-    """Whether one of them is on."""
+    """Return True if at least one effect on the light is on."""
     return any(getattr(effects, name) for name in EFFECTS)
 
 
 def light_shift(
     sensor: Sensor, model: LineModel, line: np.ndarray, pixel: np.ndarray, height: np.ndarray
 ) -> np.ndarray:
-    """From image points as they are measured to where they would lie if nothing happened to the light.
+    """Return the displacements that take the effects on the light out of measured image points.
 
     Parameters
     ----------
     sensor : Sensor
         The laboratory's line on the measured trajectory, with the effects that are to be taken out.
     model : LineModel
-        The same line as the adjustment has it.
-    line : np.ndarray
-        Of the image points, (n,).
-    pixel : np.ndarray
-        likewise.
-    height : np.ndarray
-        Of the ground that they show, above the ellipsoid, metres, (n,).
+        The same line as the adjustment models it.
+    line : (n,) ndarray
+        Image lines of the points.
+    pixel : (n,) ndarray
+        Pixels of the points.
+    height : (n,) ndarray
+        Height of the imaged ground above the ellipsoid, in metres.
 
     Returns
     -------
-    np.ndarray
-        (n, 2) x and y in the focal plane, metres, to be added.
+    (n, 2) ndarray
+        Displacements x and y in the focal plane, in metres, to be added to the measured points.
 
     Raises
     ------
     ValueError
-        a point outside the image, or a look that misses the Earth.
+        A point lies outside the image, or a line of sight misses the Earth.
     """
     if sensor.effects == NO_EFFECTS or not any_effect(sensor.effects):
         return np.zeros((len(line), 2))
     ground = sensor.ground(line, pixel, height)
     if not np.all(np.isfinite(ground)):
-        raise UnphysicalError("a look misses the Earth")
+        raise UnphysicalError("a line of sight misses the Earth")
     seconds = sensor.time(line)
     arm = ground - sensor.trajectory.position(seconds)
     geometric = np.einsum("nji,nj->ni", sensor.trajectory.body_to_itrs(seconds), arm) - model.position
@@ -105,43 +102,45 @@ def light_shift(
 
 
 def _place(direction: np.ndarray, model: LineModel) -> np.ndarray:
-    """Image (n, 2) of directions (n, 3) in the body frame, from the principal point, metres."""
+    """Return the (n, 2) images of directions (n, 3) in the body frame, from the principal point, in metres."""
     a, b, c = (direction @ model.to_body).T
     ideal = -model.interior[0] * np.stack([a / c, b / c], axis=-1)
-    found = ideal
+    distorted = ideal
     for _ in range(_DISTORTION_STEPS):
-        square = np.sum(found**2, axis=1, keepdims=True)
-        found = ideal / (1.0 + square * (model.k1 + model.k2 * square))
-    return np.asarray(found)
+        square = np.sum(distorted**2, axis=1, keepdims=True)
+        distorted = ideal / (1.0 + square * (model.k1 + model.k2 * square))
+    return np.asarray(distorted)
 
 
 _SAME_PHASE = 1e-6
-"""Phase that counts as zero, as a share of the interval between readings: times of readings are rounded."""
+"""Phase that counts as zero, as a share of the interval between readings, because the times of readings are rounded."""
 _HEIGHTS = (-500.0, 9000.0)
-"""Metres: of land. A control point outside of them is refused by the calibration, not here."""
+"""Range of heights of land above the ellipsoid, in metres. The calibration refuses control points outside of it, not
+this module.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class PassData:
-    """What is known of a pass beside its image points; nothing of it is the truth.
+    """Sensors and camera models of a pass as the analysis knows them, without any truth.
 
     Attributes
     ----------
     name : str
-        Of the field.
+        Name of the field.
     sensors : Mapping[str, Sensor]
-        Line -> the laboratory's camera on the measured trajectory. Its effects do not matter.
+        Line -> the laboratory's camera on the measured trajectory. The effects of these sensors are not used.
     models : Mapping[str, LineModel]
-        Line -> the same camera as the adjustment has it.
+        Line -> the same camera as the adjustment models it.
     pitch : Mapping[str, float]
-        Line -> of its pixels, metres.
+        Line -> pixel pitch, in metres.
     height : float
-        Mean of the ground above the ellipsoid, metres.
+        Mean height of the ground above the ellipsoid, in metres.
     lines : Mapping[str, LineCameraSpec]
-        Line -> what the payload's file says of it.
-    unit : float | None
-        Metres in the focal plane; every ray carries the covariance of its own image point in units of it squared. None:
-        rays carry none.
+        Line -> its section of the payload's file.
+    unit : float or None
+        Sigma of an image point of weight 1, in metres in the focal plane: every ray carries the covariance of its image
+        point in units of its square. None: rays carry no covariance.
     """
 
     name: str
@@ -153,15 +152,15 @@ class PassData:
     unit: float | None = None
 
     def places(self, name: str, pixel: np.ndarray) -> np.ndarray:
-        """Where pixels (n,) of a line lie in its focal plane, (n, 2), metres."""
+        """Return the (n, 2) positions of pixels (n,) of a line in its focal plane, in metres."""
         return pixel_places(self.lines[name], pixel, self.sensors[name].camera.pixels, self.pitch[name])
 
     @property
     def phase(self) -> float:
-        """Time of a reading of the attitude from the next whole multiple of their interval, seconds.
+        """Time from a whole multiple of the attitude's reading interval to a reading, in seconds.
 
-        Readings of the orbit are as far from their multiples at most, half of their interval, which shared noise does
-        not know: its variance then is that of another place between two readings.
+        Readings of the orbit can differ from their own multiples by half their interval at most. The model of shared
+        noise neglects this: its variance is then that of another place between two readings.
         """
         path = next(iter(self.sensors.values())).trajectory
         if not isinstance(path, TabulatedTrajectory):
@@ -174,14 +173,15 @@ class PassData:
 
     @property
     def earth(self) -> Earth:
-        """The ellipsoid."""
+        """Ellipsoid of the sensors."""
         return next(iter(self.sensors.values())).earth
 
     def pixels_per_line(self, name: str) -> float:
-        """What one image line of the middle of a line's image is in x of the focal plane, pixels.
+        """Return the displacement in x of the focal plane per image line, in pixels, at the middle of an image.
 
-        It is where the ground that the next line sees, at the pass' mean height, lies in the focal plane at one moment.
-        Where lines are spaced as pixels are, 1 at nadir and about cos^2 of the look angle in a line that looks ahead.
+        It is the distance in the focal plane, at one moment, between the ground points that neighbouring lines see
+        at the pass's mean height. Where lines are spaced as pixels are, it is 1 at nadir and about cos^2 of the look
+        angle for a line that looks ahead.
         """
         sensor, model = self.sensors[name], self.models[name]
         middle = np.full(2, 0.5 * (sensor.lines - 1))
@@ -196,14 +196,14 @@ class PassData:
         return abs(float(x[1] - x[0])) / self.pitch[name]
 
     def rays(self, images: Mapping[str, ImagePoints]) -> dict[str, Rays]:
-        """Rays of image points with what happened to the light left in.
+        """Return the rays of image points, by line, with the effects on the light left in.
 
         Raises
         ------
         ValueError
-            a line outside the image.
+            A line number lies outside the image.
         """
-        found = {}
+        rays_by_line = {}
         for name, row in images.items():
             sensor = self.sensors[name]
             seconds = sensor.time(row.line)
@@ -211,11 +211,16 @@ class PassData:
             station, attitude = sensor.trajectory.position(seconds), sensor.trajectory.body_to_itrs(seconds)
             # the noise of readings is shared by its own clock, which ticks at the readings
             rays = Rays.of(row.point, image, station, attitude, seconds - self.phase)
-            found[name] = rays if self.unit is None else replace(rays, spread=self.spread(name, row) / self.unit**2)
-        return found
+            rays_by_line[name] = (
+                rays if self.unit is None else replace(rays, spread=self.spread(name, row) / self.unit**2)
+            )
+        return rays_by_line
 
     def spread(self, name: str, row: ImagePoints) -> np.ndarray:
-        """(n, 2, 2) of image points in the focal plane, metres^2. A later line acts as a smaller x."""
+        """Return the (n, 2, 2) covariances of image points in the focal plane, in metres^2.
+
+        A later line acts as a smaller x.
+        """
         scale = self.pitch[name] * np.array([-self.pixels_per_line(name), 1.0])
         return row.covariance * scale[:, None] * scale
 
@@ -227,45 +232,45 @@ class PassData:
         removed: LightEffects,
         control: np.ndarray | None = None,
     ) -> CalibrationField:
-        """Control points for the calibration.
+        """Return the control points, with their corrected rays, as the calibration takes them.
 
         Parameters
         ----------
         images : Mapping[str, ImagePoints]
-            Line -> their image points.
-        ground : np.ndarray
-            (m, 3) given coordinates, ITRS, metres.
-        covariance : float | tuple[float, float] | np.ndarray
-            (m, 3, 3) of the coordinates, m^2, of ties not used; or a sigma of each coordinate, or of each axis in plan
-            and of the height, metres.
+            Line -> image points.
+        ground : (m, 3) ndarray
+            Given coordinates, ITRS, in metres.
+        covariance : float, tuple of float, or (m, 3, 3) ndarray
+            Covariances of the coordinates, in m^2 (not used for tie points); or one sigma of each coordinate; or one
+            sigma of each axis in plan and one of the height, in metres.
         removed : LightEffects
             Effects on the light that are taken out.
-        control : np.ndarray | None
-            (m,) which of them are control, the others are ties; None for all.
+        control : (m,) ndarray of bool, optional
+            True for control points, False for tie points; None if all are control points.
 
         Raises
         ------
         CalibrationError
-            Coordinates that cannot be used, such as geodetic ones.
+            Coordinates cannot be used, such as geodetic ones.
         ValueError
-            a point outside the image.
+            A point lies outside the image.
         """
         # the calibration's own check comes first: a place without a height has no refraction
         field = CalibrationField.of(self.name, self.rays(images), ground, covariance, control)
         return replace(field, rays=self.corrected(field.rays, images, removed, self._heights(ground)))
 
     def check_rays(self, images: Mapping[str, ImagePoints], removed: LightEffects, noise: Noise) -> dict[str, Rays]:
-        """Rays of points without ground control.
+        """Return the rays of points without ground control, by line, with effects on the light taken out.
 
-        Refraction depends on the height of the ground, 8% of it on 700 m. It is taken from a first intersection by the
-        laboratory's camera, 100 m wrong, of the rays as they are.
+        Refraction depends on the height of the ground, by 8% of it on 700 m. The height comes from a first intersection
+        of the uncorrected rays with the laboratory's camera, which is 100 m wrong.
 
         Raises
         ------
         CalibrationError
             The rays cannot be intersected.
         ValueError
-            a point outside the image.
+            A point lies outside the image.
         """
         rays = self.rays(images)
         return self.corrected(rays, images, removed, self._heights(intersect(rays, self.models, noise).ground))
@@ -273,57 +278,57 @@ class PassData:
     def corrected(
         self, rays: Mapping[str, Rays], images: Mapping[str, ImagePoints], removed: LightEffects, height: np.ndarray
     ) -> dict[str, Rays]:
-        """The rays without these effects.
+        """Return the rays with effects on the light taken out, by line.
 
         Parameters
         ----------
         rays : Mapping[str, Rays]
             Line -> rays of the image points.
         images : Mapping[str, ImagePoints]
-            Line -> the image points.
+            Line -> image points.
         removed : LightEffects
             Effects on the light that are taken out.
-        height : np.ndarray
-            Of the ground points, (m,), NaN where not known, metres.
+        height : (m,) ndarray
+            Heights of the ground points above the ellipsoid, in metres; NaN where unknown.
 
         Raises
         ------
         ValueError
-            a point outside the image.
+            A point lies outside the image.
         """
-        known = np.clip(np.where(np.isfinite(height), height, self.height), *_HEIGHTS)
-        found = {}
+        clipped = np.clip(np.where(np.isfinite(height), height, self.height), *_HEIGHTS)
+        corrected = {}
         for name, row in images.items():
             sensor = replace(self.sensors[name], effects=removed)
-            shift = light_shift(sensor, self.models[name], row.line, row.pixel, known[row.point])
-            found[name] = replace(rays[name], image=rays[name].image + shift)
-        return found
+            shift = light_shift(sensor, self.models[name], row.line, row.pixel, clipped[row.point])
+            corrected[name] = replace(rays[name], image=rays[name].image + shift)
+        return corrected
 
     def _heights(self, ground: np.ndarray) -> np.ndarray:
-        found = np.full(len(ground), np.nan)
+        heights = np.full(len(ground), np.nan)
         good = np.all(np.isfinite(ground), axis=1)
-        found[good] = self.earth.geodetic(ground[good])[2]
-        return found
+        heights[good] = self.earth.geodetic(ground[good])[2]
+        return heights
 
 
 @dataclass(frozen=True, eq=False)
 class FieldPoints:
-    """What was measured of a field's points.
+    """Simulated measurements of a field's points.
 
     Attributes
     ----------
     control_images : Mapping[str, ImagePoints]
-        Line -> image points of the control points, and of the tie points after them.
-    control_ground : np.ndarray
-        (n, 3) given coordinates of control points, first guesses of ties, ITRS, metres.
-    control : np.ndarray
-        (n,) bool: which are control.
-    sigma : tuple[float, float]
-        Of given coordinates, of each axis in plan and of the height, metres.
+        Line -> image points of the control points, followed by those of the tie points.
+    control_ground : (n, 3) ndarray
+        Given coordinates of control points and first guesses of tie points, ITRS, in metres.
+    control : (n,) ndarray of bool
+        True for control points.
+    sigma : tuple of float
+        Standard deviations of the given coordinates, of each axis in plan and of the height, in metres.
     check_images : Mapping[str, ImagePoints]
         Line -> image points of the check points.
-    check_ground : np.ndarray
-        (m, 3) true coordinates of the check points, ITRS, metres.
+    check_ground : (m, 3) ndarray
+        True coordinates of the check points, ITRS, in metres.
     """
 
     control_images: Mapping[str, ImagePoints]
@@ -335,27 +340,27 @@ class FieldPoints:
 
 
 def image_sigma(images: Mapping[str, ImagePoints], data: PassData) -> float:
-    """One standard deviation of x and y in the focal plane for all image points, root mean square, metres."""
+    """Return the root mean square standard deviation of all image points, of x and y in the focal plane, in metres."""
     variances = [np.diagonal(data.spread(name, row), axis1=1, axis2=2) for name, row in images.items()]
     return float(np.sqrt(np.mean(np.concatenate(variances))))
 
 
 @dataclass(frozen=True, eq=False)
 class PassTruth:
-    """What a simulation knows of a pass.
+    """Truth of a simulated pass.
 
     Attributes
     ----------
-    bias : np.ndarray
-        (3,) true roll, pitch, yaw at the field's middle, radians: from measured to true attitude.
-    offset : np.ndarray
-        (3,) true minus measured station at the field's middle, along X, Y, Z of the orbital frame, metres.
+    bias : (3,) ndarray
+        True roll, pitch and yaw at the field's middle, in radians, from measured to true attitude.
+    offset : (3,) ndarray
+        True minus measured station at the field's middle, along X, Y, Z of the orbital frame, in metres.
     trajectory : Trajectory
-        The true one.
+        True orbit and attitude.
     errors : MeasurementErrors
-        Of the readings.
-    drift : Mapping[str, np.ndarray]
-        Line -> (4,) true d_alpha, d_beta, d_gamma, d_f of its camera, radians and metres; empty for no drift.
+        Errors of the readings.
+    drift : Mapping[str, ndarray]
+        Line -> (4,) true d_alpha, d_beta, d_gamma, d_f of its camera, in radians and metres; empty for no drift.
     """
 
     bias: np.ndarray
@@ -365,24 +370,30 @@ class PassTruth:
     drift: Mapping[str, np.ndarray] = FrozenMap({})
 
     def bias_at(self, time: float) -> np.ndarray:
-        """(3,) true roll, pitch, yaw at a time, seconds from the field's middle, radians, without slow errors."""
+        """Return the (3,) true roll, pitch and yaw at a time, in radians, without slow errors.
+
+        Parameters
+        ----------
+        time : float
+            Seconds from the field's middle.
+        """
         latitude = self.trajectory.orbit.earth.geodetic(self.trajectory.position(time))[1]
-        turn = (
+        rotation = (
             self.errors.bias + np.sin(latitude - self.errors.reference) * self.errors.thermal + time * self.errors.rate
         )
-        return np.asarray(Rotation.from_rotvec(turn).inv().as_euler("XYZ"))
+        return np.asarray(Rotation.from_rotvec(rotation).inv().as_euler("XYZ"))
 
 
 @dataclass(frozen=True, eq=False)
 class PatchRecord:
-    """One patch and how its points were matched.
+    """Measured points of one patch, and their matching errors by the truth.
 
     Attributes
     ----------
     points : PatchPoints
-        measured.
+        Measured points.
     judgements : Mapping[str, Mapping[str, LineJudgement]]
-        ``control`` (with the check points) or ``tie`` -> line -> against the truth.
+        ``control`` (with the check points) or ``tie`` -> line -> comparison with the truth.
     """
 
     points: PatchPoints
@@ -391,22 +402,22 @@ class PatchRecord:
 
 @dataclass(frozen=True, eq=False)
 class FieldImages:
-    """What became of a field's points.
+    """Image measurements of a field's points, with the matches that are wrong by the truth.
 
     Attributes
     ----------
     name : str
-        Of the field.
-    patches : tuple[PatchRecord, ...]
-        One by one.
+        Name of the field.
+    patches : tuple of PatchRecord
+        Patches in the file's order.
     shown : Patch
-        The first patch itself, for a figure.
-    wrong : Mapping[str, np.ndarray]
-        Line -> (n,) whether the place of a control or tie point is wrong, by number of the point.
-    wrong_check : Mapping[str, np.ndarray]
-        Line -> (m,) likewise for check points.
-    screening : Screening | None
-        What the adjustment has left out; None before it.
+        First patch itself, for a figure.
+    wrong : Mapping[str, ndarray]
+        Line -> (n,) bool, True where the position of a control or tie point is wrong, by number of the point.
+    wrong_check : Mapping[str, ndarray]
+        Line -> (m,) bool, True where the position of a check point is wrong.
+    screening : Screening or None
+        Points that the adjustment rejected; None before the adjustment.
     """
 
     name: str
@@ -419,20 +430,20 @@ class FieldImages:
 
 @dataclass(frozen=True)
 class Screening:
-    """What the adjustment has left out of a field; counts are of image points, by truth where wrong or right.
+    """Counts of a field's points before and after screening; wrong and right are known from the truth.
 
     Attributes
     ----------
     entered, left : int
-        Image points of control and tie points before and after.
+        Image points of control and tie points before and after screening.
     wrong_entered, wrong_left : int
-        Wrong ones among them.
+        Wrong image points among them.
     right_lost : int
-        Right ones that were left out.
+        Right image points that were rejected.
     check_entered, check_left : int
         Check points before and after the test of their intersection.
     wrong_check_left : int
-        Of these, with a wrong place in a line.
+        Check points that passed the test although their position in a line is wrong.
     """
 
     entered: int
@@ -452,39 +463,39 @@ class FieldPass:
     Attributes
     ----------
     measurements : PassMeasurements
-        As they came.
+        Measurements as they were read or simulated.
     data : PassData
-        What is known of the pass beside its points.
+        Sensors and camera models of the pass.
     latitude : float
-        Mean of the control points, radians.
+        Mean latitude of the control points, in radians.
     control_images : Mapping[str, ImagePoints]
-        Line -> image points of control points, and of tie points that calibrate with them.
-    control_ground : np.ndarray
-        (n, 3) their given coordinates, of ties those of a first intersection, ITRS, metres.
-    control_covariance : np.ndarray
-        (n, 3, 3) of given coordinates, m^2.
-    is_control : np.ndarray
-        (n,) which of them are control.
-    control_ids : np.ndarray
-        (n,) names.
+        Line -> image points of control points, and of tie points that are used in the calibration.
+    control_ground : (n, 3) ndarray
+        Given coordinates of control points and, for tie points, those of a first intersection; ITRS, in metres.
+    control_covariance : (n, 3, 3) ndarray
+        Covariances of the given coordinates, in m^2.
+    is_control : (n,) ndarray of bool
+        True for control points.
+    control_ids : (n,) ndarray
+        Names of these points.
     check_images : Mapping[str, ImagePoints]
         Line -> image points of the check points.
-    check_ground : np.ndarray
-        (m, 3) given coordinates of the check points, ITRS, metres.
-    check_ids : np.ndarray
-        (m,) names.
+    check_ground : (m, 3) ndarray
+        Given coordinates of the check points, ITRS, in metres.
+    check_ids : (m,) ndarray
+        Names of the check points.
     tie_images : Mapping[str, ImagePoints]
-        Line -> image points of tie points that are kept apart for the strip; empty for none.
+        Line -> image points of tie points that are reserved for the strip; empty for none.
     control : CalibrationField
-        What the calibration gets.
+        Control points and rays that the calibration uses.
     check : Mapping[str, Rays]
         Line -> rays of the check points.
     ties : Mapping[str, Rays]
-        Line -> rays of the ties apart.
-    readings : Mapping[str, np.ndarray]
-        Line -> (4,) what a monitor reads of its camera; empty for no monitor.
-    known_truth : PassTruth | None
-        Of a simulated pass.
+        Line -> rays of the tie points that are reserved for the strip.
+    readings : Mapping[str, ndarray]
+        Line -> (4,) reading of the monitor of its camera; empty for no monitor.
+    known_truth : PassTruth or None
+        Truth of a simulated pass; None for a measured one.
     """
 
     measurements: PassMeasurements
@@ -512,35 +523,36 @@ class FieldPass:
 
     @property
     def measured(self) -> TabulatedTrajectory:
-        """Orbit and attitude by their readings."""
+        """Orbit and attitude interpolated between their readings."""
         return TabulatedTrajectory(self.measurements.platform)
 
     @property
     def truth(self) -> PassTruth:
-        """What a simulation knows of the pass. AssertionError for a measured one."""
-        assert self.known_truth is not None, "nobody knows the truth of a measured pass"
+        """Truth of a simulated pass; AssertionError for a measured one."""
+        assert self.known_truth is not None, "the truth of a measured pass is not known"
         return self.known_truth
 
     @property
     def bias(self) -> np.ndarray:
-        """True bias; see `PassTruth`."""
+        """True (3,) roll, pitch and yaw from measured to true attitude, in radians; see `PassTruth`."""
         return self.truth.bias
 
     @property
     def trajectory(self) -> Trajectory:
-        """The true one."""
+        """True orbit and attitude of a simulated pass."""
         return self.truth.trajectory
 
     @property
     def tie_count(self) -> int:
-        """Number of tie points: those that calibrate, and those that are kept apart for the strip."""
+        """Number of tie points, both those used in the calibration and those reserved for the strip."""
         apart = {int(number) for row in self.tie_images.values() for number in row.point}
         return int((~self.is_control).sum()) + len(apart)
 
     @property
     def middle(self) -> float:
-        """Mean time at which control points were seen, seconds of the trajectory; where that lies in a gap of the
-        readings, the time of the point nearest to it.
+        """Mean time at which control points were seen, in seconds of the trajectory.
+
+        Where it lies in a gap of the readings, it is the time of the point nearest to it.
         """
         sensors = self.data.sensors
         times = np.concatenate([sensors[k].time(r.line) for k, r in self.control_images.items()])
@@ -549,7 +561,7 @@ class FieldPass:
 
     @property
     def seconds_apart(self) -> float:
-        """From when the first line sees the control points, in the mean, to when the last does."""
+        """Mean time from when the first line sees the control points to when the last line does, in seconds."""
         times = [
             float(np.mean(self.data.sensors[k].time(r.line))) for k, r in self.control_images.items() if len(r.line)
         ]
@@ -557,25 +569,25 @@ class FieldPass:
 
     @property
     def altitude(self) -> float:
-        """Height of the satellite above the ellipsoid in the middle of the pass, metres."""
+        """Height of the satellite above the ellipsoid in the middle of the pass, in metres."""
         path = self.measured
         return float(self.data.earth.geodetic(path.position(self.middle))[2])
 
     def shifted(self, datum: tuple[float, float, float]) -> FieldPass:
-        """The pass with control points given farther east, north and up, metres; rays stay as they are."""
+        """Return the pass with control points shifted by `datum` (east, north, up), in metres; rays do not change."""
         lon, lat, _ = self.data.earth.geodetic(self.control_ground.mean(axis=0))
         ground = self.control_ground + np.array(datum) @ east_north_up(lon, lat)
         return replace(self, control_ground=ground, control=replace(self.control, ground=ground))
 
     def later(self, seconds: float) -> FieldPass:
-        """The pass with rays of the station and attitude so many seconds later; image points stay as they are.
+        """Return the pass with rays of the station and attitude `seconds` later; image points are not changed.
 
-        Where readings end before that, what lies beyond them is what lies before the exposure, reversed.
+        Beyond the end of the readings, the motion is continued by reflecting that before the exposure.
         """
         path = self.measured
 
         def moved(rays: Mapping[str, Rays]) -> FrozenMap[str, Rays]:
-            found = {}
+            rays_by_line = {}
             for name, row in rays.items():
                 assert row.time is not None
                 time = row.time + self.data.phase
@@ -583,11 +595,11 @@ class FieldPass:
                 there = time + np.where(beyond, -seconds, seconds)
                 station, attitude = path.position(there), path.body_to_itrs(there)
                 if np.any(beyond):  # the motion goes on as it came
-                    here = path.body_to_itrs(time[beyond])
+                    at_exposure = path.body_to_itrs(time[beyond])
                     station[beyond] = 2.0 * path.position(time[beyond]) - station[beyond]
-                    attitude[beyond] = here @ np.swapaxes(attitude[beyond], 1, 2) @ here
-                found[name] = replace(row, station=station, attitude=attitude)
-            return FrozenMap(found)
+                    attitude[beyond] = at_exposure @ np.swapaxes(attitude[beyond], 1, 2) @ at_exposure
+                rays_by_line[name] = replace(row, station=station, attitude=attitude)
+            return FrozenMap(rays_by_line)
 
         control = replace(self.control, rays=moved(self.control.rays))
         return replace(self, control=control, check=moved(self.check), ties=moved(self.ties))
@@ -595,26 +607,26 @@ class FieldPass:
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
-    """All passes, and the camera as the laboratory knows it.
+    """All passes of a calibration, and the camera as the laboratory measured it.
 
     Attributes
     ----------
-    spec : OrbitCalibrationSpec | MeasuredCalibrationSpec
-        The test.
+    spec : OrbitCalibrationSpec or MeasuredCalibrationSpec
+        Content of the test file.
     laboratory : Mapping[str, LineModel]
-        Line -> camera as it was measured before launch; what the analysis starts from.
+        Line -> camera as it was measured before launch, from which the analysis starts.
     noise : Noise
-        What the analysis is told of the independent errors.
-    passes : tuple[FieldPass, ...]
-        In the file's order.
-    images : tuple[FieldImages, ...] | None
-        What became of points measured in simulated images, by field; None otherwise.
-    known_truth : Mapping[str, LineModel] | None
-        Line -> camera as it is, without the drift of single fields; None where nobody knows.
+        Independent errors that the analysis assumes.
+    passes : tuple of FieldPass
+        Passes in the file's order.
+    images : tuple of FieldImages or None
+        Points measured in simulated images, by field; None otherwise.
+    known_truth : Mapping[str, LineModel] or None
+        Line -> true camera, without the drift of single fields; None for measured passes.
     rejected : Mapping[str, Rejected]
-        Field -> what the adjustment has left out; empty where nothing was looked for.
-    drifts : FoundDrift | None
-        What residuals showed of a drift of the attitude that nobody stated; None where they show none.
+        Field -> points that the screening rejected; empty where there was no screening.
+    drifts : DetectedDrift or None
+        Unstated drift of the attitude that the residuals show; None where they show none.
     """
 
     spec: OrbitCalibrationSpec | MeasuredCalibrationSpec
@@ -624,17 +636,17 @@ class Campaign:
     images: tuple[FieldImages, ...] | None = None
     known_truth: Mapping[str, LineModel] | None = None
     rejected: Mapping[str, Rejected] = FrozenMap({})
-    drifts: FoundDrift | None = None
+    drifts: DetectedDrift | None = None
 
     @property
     def truth(self) -> Mapping[str, LineModel]:
-        """Line -> camera as it is. AssertionError where nobody knows."""
-        assert self.known_truth is not None, "nobody knows the truth of a measured campaign"
+        """True cameras by line; AssertionError for measured passes."""
+        assert self.known_truth is not None, "the truth of a measured campaign is not known"
         return self.known_truth
 
     @property
     def simulated(self) -> OrbitCalibrationSpec:
-        """The test of a simulation. AssertionError for measurements."""
+        """Content of the test file of a simulation; AssertionError for measured passes."""
         from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 
         assert isinstance(self.spec, OrbitCalibrationSpec), "this campaign was measured"
@@ -642,43 +654,43 @@ class Campaign:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Line cameras, in the payload's order."""
+        """Names of the line cameras, in the payload's order."""
         return tuple(self.laboratory)
 
     @property
     def inner(self) -> tuple[str, ...]:
-        """Names of the interior's unknowns."""
+        """Names of the unknowns of the interior orientation."""
         return interior_names(self.lines)
 
     @property
     def reference(self) -> str:
-        """The line whose principal point is the gauge: the nadir line, or that which looks down most steeply."""
+        """Line whose principal point the gauge holds: the nadir line, or the line that looks down most steeply."""
         if "nadir" in self.laboratory:
             return "nadir"
         return max(self.lines, key=lambda name: float(self.laboratory[name].to_body[2, 2]))
 
     @property
     def effects(self) -> LightEffects:
-        """On the light."""
+        """Effects on the light that the file switches on."""
         return light_effects(self.spec.effects)
 
     @property
     def independent(self) -> Campaign:
-        """The campaign in which each exposure has noise of attitude and orbit of its own.
+        """Campaign in which the noise of attitude and orbit is independent from exposure to exposure.
 
         Estimates are hardly worse and ten times faster; their sigmas are too small where points are exposed within a
         few readings.
         """
-        own = replace(self.noise, attitude_interval=None, station_interval=None, slow_interval=None)
-        return replace(self, noise=own)
+        noise = replace(self.noise, attitude_interval=None, station_interval=None, slow_interval=None)
+        return replace(self, noise=noise)
 
     def without_effects(self, removed: LightEffects) -> Campaign:
-        """The campaign with these effects on the light taken out of its image points.
+        """Return the campaign with these effects on the light taken out of its image points.
 
         Raises
         ------
         CalibrationError
-            Control coordinates that cannot be used, or check points that cannot be intersected.
+            Control coordinates cannot be used, or check points cannot be intersected.
         """
         passes = tuple(
             replace(
@@ -694,26 +706,26 @@ class Campaign:
         return replace(self, passes=passes)
 
     def later(self, seconds: float) -> Campaign:
-        """All lines exposed so many seconds later than they were."""
+        """Return the campaign with all lines exposed `seconds` later."""
         return replace(self, passes=tuple(p.later(seconds) for p in self.passes))
 
     def shifted(self, datum: tuple[float, float, float]) -> Campaign:
-        """All control points given farther east, north and up, metres."""
+        """Return the campaign with all control points shifted by `datum` east, north and up, in metres."""
         return replace(self, passes=tuple(p.shifted(datum) for p in self.passes))
 
 
 @dataclass(frozen=True)
-class FoundDrift:
-    """A drift of the attitude during the passes that nobody stated and residuals show.
+class DetectedDrift:
+    """Unstated drift of the attitude during the passes that the residuals show.
 
     Attributes
     ----------
-    rate : tuple[float, float, float]
-        Standard deviation of the rates about body X, Y, Z that is assumed since, radians per second.
+    rate : tuple of float
+        Standard deviations of the rates about body X, Y, Z that the adjustment then assumes, in radians per second.
     walk : float
-        Likewise of a random walk, what it gains in a second, radians.
+        Standard deviation of a random walk's increment in one second that the adjustment then assumes, in radians.
     rate_p_value, course_p_value : float
-        Chance of such residuals without rates, and without errors that change slowly.
+        p-values of the residuals without rates, and without errors that change slowly.
     """
 
     rate: tuple[float, float, float]
@@ -724,20 +736,20 @@ class FoundDrift:
 
 @dataclass(frozen=True, eq=False)
 class Rejected:
-    """What the adjustment has left out of a pass.
+    """Points of a pass that the screening rejected.
 
     Attributes
     ----------
     entered, left : int
-        Image points of control and tie points before and after.
-    points : tuple[tuple[str, str], ...]
-        Names of control and tie points with a rejected image point, and its line camera.
+        Image points of control and tie points before and after screening.
+    points : tuple of (str, str)
+        Names of control and tie points with a rejected image point, and the line camera of that image point.
     check_entered, check_left : int
         Check points before and after the test of their intersection.
-    check_points : tuple[str, ...]
-        Names of those that were left out.
+    check_points : tuple of str
+        Names of the rejected check points.
     factors : Mapping[str, float]
-        Line -> on the sigmas of its image points, by the residuals of those that remain; 1 where they are right.
+        Line -> factor on the sigmas of its image points, from the remaining residuals; 1 where the sigmas are right.
     """
 
     entered: int
@@ -749,18 +761,18 @@ class Rejected:
     factors: Mapping[str, float]
 
     def after(self, first: Rejected) -> Rejected:
-        """Return what was left out in two rounds, the first of which had factors of 1."""
+        """Return the points rejected in two rounds, `first` and this one; the factors of the first are 1."""
         points, checks = first.points + self.points, first.check_points + self.check_points
         return Rejected(first.entered, self.left, points, first.check_entered, self.check_left, checks, self.factors)
 
 
 def interior_names(lines: Sequence[str]) -> tuple[str, ...]:
-    """Names of the unknowns f, x, y of these line cameras."""
+    """Return the names of the unknowns f, x, y of line cameras."""
     return tuple(f"{line} {name}" for line in lines for name in INTERIOR)
 
 
 def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:
-    """A line of the payload as the analysis models it."""
+    """Return the analysis's model of a line of the payload."""
     line = payload.lines[name]
     to_body = about_axis(1, line.look) @ rotation_matrix(np.array(line.rotate))
     half = 0.5 * payload.pixels_of(name) * payload.pitch_of(name)
@@ -777,7 +789,7 @@ def passing_orbit(
     latitude: float,
     direction: Literal["descending", "ascending"] = "descending",
 ) -> OrbitSpec:
-    """Return the orbit that passes a place at its epoch, followed for a span before and after; SI units."""
+    """Return the orbit that passes over a place at its epoch, propagated for `span` before and after, in SI units."""
     passing = PassingSpec.model_construct(
         longitude=longitude, latitude=latitude, altitude=altitude, direction=direction, inclination=None
     )
@@ -792,22 +804,22 @@ def pass_data(
     height: float,
     unit: float | None = None,
 ) -> PassData:
-    """Return what is known of a pass: its lines by the laboratory's camera and the readings of the platform.
+    """Return the sensors and camera models of a pass, from the laboratory's camera and the platform's readings.
 
     Parameters
     ----------
     name : str
-        Of the pass.
+        Name of the pass.
     payload : ThreeLineCameraSpec
         Camera as the laboratory measured it.
     platform : Platform
         Orbit and attitude as they were read.
     times : Mapping[str, LineTimes]
-        Line camera -> when its lines were exposed.
+        Line camera -> exposure times of its lines.
     height : float
-        Of the ground above the ellipsoid, metres.
-    unit : float | None
-        Sigma of an image point of weight 1, metres; None for points that weigh alike.
+        Mean height of the ground above the ellipsoid, in metres.
+    unit : float, optional
+        Sigma of an image point of weight 1, in metres; None for points of equal weight.
     """
     cameras, earth = line_cameras(payload), Earth()
     sensors = {line: Sensor.of_lines(cameras[line], platform, earth, at, NO_EFFECTS) for line, at in times.items()}
@@ -822,45 +834,45 @@ def campaign_of(
     measured: Sequence[PassMeasurements],
     ties_apart: bool,
 ) -> Campaign:
-    """The campaign of measured passes, with the effects on the light taken out where the test says so.
+    """Return the campaign of measured passes, with effects on the light taken out where the test asks for it.
 
     Parameters
     ----------
-    spec : OrbitCalibrationSpec | MeasuredCalibrationSpec
-        The test.
+    spec : OrbitCalibrationSpec or MeasuredCalibrationSpec
+        Content of the test file.
     payload : ThreeLineCameraSpec
-        As the laboratory knows it.
-    measured : Sequence[PassMeasurements]
-        The passes.
+        Camera as the laboratory measured it.
+    measured : sequence of PassMeasurements
+        Measurements of the passes.
     ties_apart : bool
-        Whether tie points are kept for the strip, and do not calibrate.
+        True to reserve tie points for the strip, so that they are not used in the calibration.
 
     Raises
     ------
     CalibrationError
-        Points that cannot be used.
+        Points cannot be used.
     """
-    seen = {name for one in measured for name in one.images}
+    seen = {name for row in measured for name in row.images}
     laboratory = FrozenMap({name: line_model(payload, name) for name in payload.lines if name in seen})
-    passes = [_field_pass(one, payload, ties_apart) for one in measured]
+    passes = [_field_pass(row, payload, ties_apart) for row in measured]
     unit = image_sigma(passes[0].control_images, passes[0].data)
-    noise = _noise_of(spec.errors, unit, [one.measured for one in passes])
+    noise = _noise_of(spec.errors, unit, [row.measured for row in passes])
     weighed = tuple(replace(p, data=replace(p.data, unit=unit)) for p in passes)
     campaign = Campaign(spec, laboratory, noise, tuple(_with_ties(p, noise) for p in weighed))
     return campaign.without_effects(campaign.effects if spec.effects.corrected else NO_EFFECTS)
 
 
 def _noise_of(errors: ErrorsSpec | ReadingErrorsSpec, image: float, paths: Sequence[TabulatedTrajectory] = ()) -> Noise:
-    """Sigmas of readings as given, root mean square over axes, and their intervals.
+    """Return the noise of the readings, root mean square over the axes, with their intervals.
 
     Parameters
     ----------
-    errors : ErrorsSpec | ReadingErrorsSpec
-        Of the readings.
+    errors : ErrorsSpec or ReadingErrorsSpec
+        Sigmas of the readings in the file.
     image : float
-        Unit of the image points, metres.
-    paths : Sequence[TabulatedTrajectory]
-        Their tables, for intervals that are not given.
+        Sigma of an image point of weight 1, in metres.
+    paths : sequence of TabulatedTrajectory
+        Tables of readings, for intervals that the file does not give.
     """
     if not getattr(errors, "switched_on", True):
         return Noise(image)
@@ -876,35 +888,35 @@ def _noise_of(errors: ErrorsSpec | ReadingErrorsSpec, image: float, paths: Seque
     return Noise(image, attitude, station, *between, slow, tracker.slow.interval, walk, between[0])
 
 
-def _field_pass(one: PassMeasurements, payload: ThreeLineCameraSpec, ties_apart: bool) -> FieldPass:
-    role = one.ground.role
+def _field_pass(measured: PassMeasurements, payload: ThreeLineCameraSpec, ties_apart: bool) -> FieldPass:
+    role = measured.ground.role
     rays = np.zeros(len(role), int)
-    for row in one.images.values():
+    for row in measured.images.values():
         np.add.at(rays, row.point, 1)
-    known = (role == "control") & (rays > 0)
-    _, latitude, height = Earth().geodetic(one.ground.itrs[known])
-    times = {name: one.line_times[name] for name in one.images}
-    data = pass_data(one.name, payload, TabulatedTrajectory(one.platform), times, float(np.mean(height)))
+    is_control = (role == "control") & (rays > 0)
+    _, latitude, height = Earth().geodetic(measured.ground.itrs[is_control])
+    times = {name: measured.line_times[name] for name in measured.images}
+    data = pass_data(measured.name, payload, TabulatedTrajectory(measured.platform), times, float(np.mean(height)))
     check = (role == "check") & (rays > 1)
     tie = (role == "tie") & (rays > 1)
     # control points first, ties after them
-    calibrating = np.concatenate([np.flatnonzero(known), np.flatnonzero(tie & (not ties_apart))])
-    where = one.ground.taken(calibrating)
+    calibrating = np.concatenate([np.flatnonzero(is_control), np.flatnonzero(tie & (not ties_apart))])
+    where = measured.ground.taken(calibrating)
     checks = np.flatnonzero(check)
-    empty = CalibrationField(one.name, {}, where.itrs, where.covariance, where.role == "control")
+    empty = CalibrationField(measured.name, {}, where.itrs, where.covariance, where.role == "control")
     return FieldPass(
-        measurements=one,
+        measurements=measured,
         data=data,
         latitude=float(np.mean(latitude)),
-        control_images=_numbered(one.images, calibrating, len(role)),
+        control_images=_numbered(measured.images, calibrating, len(role)),
         control_ground=where.itrs,
         control_covariance=where.covariance,
         is_control=where.role == "control",
         control_ids=where.ids,
-        check_images=_numbered(one.images, checks, len(role)) if len(checks) else FrozenMap({}),
-        check_ground=one.ground.itrs[checks],
-        check_ids=one.ground.ids[checks],
-        tie_images=_numbered(one.images, np.flatnonzero(tie), len(role))
+        check_images=_numbered(measured.images, checks, len(role)) if len(checks) else FrozenMap({}),
+        check_ground=measured.ground.itrs[checks],
+        check_ids=measured.ground.ids[checks],
+        tie_images=_numbered(measured.images, np.flatnonzero(tie), len(role))
         if ties_apart and np.any(tie)
         else FrozenMap({}),
         control=empty,
@@ -914,21 +926,21 @@ def _field_pass(one: PassMeasurements, payload: ThreeLineCameraSpec, ties_apart:
 
 
 def _numbered(images: Mapping[str, ImagePoints], chosen: np.ndarray, count: int) -> FrozenMap[str, ImagePoints]:
-    """Line -> image points of the chosen ground points, which are counted anew from 0."""
+    """Return the image points of the chosen ground points by line, with the points renumbered from 0."""
     number = np.full(count, -1)
     number[chosen] = np.arange(len(chosen))
-    found = {}
+    images_by_line = {}
     for name, row in images.items():
-        some = row.taken(number[row.point] >= 0)
-        found[name] = replace(some, point=number[some.point])
-    return FrozenMap(found)
+        selected = row.taken(number[row.point] >= 0)
+        images_by_line[name] = replace(selected, point=number[selected.point])
+    return FrozenMap(images_by_line)
 
 
-def _with_ties(one: FieldPass, noise: Noise) -> FieldPass:
-    """First coordinates of the tie points, by the laboratory's camera."""
-    tie = ~one.is_control
+def _with_ties(field_pass: FieldPass, noise: Noise) -> FieldPass:
+    """Return the pass with first coordinates of its tie points, intersected with the laboratory's camera."""
+    tie = ~field_pass.is_control
     if not np.any(tie):
-        return one
-    rays = one.data.rays(one.control_images)
-    found = intersect(rays, one.data.models, noise, count=len(tie)).ground
-    return replace(one, control_ground=np.where(tie[:, None], found, one.control_ground))
+        return field_pass
+    rays = field_pass.data.rays(field_pass.control_images)
+    ground = intersect(rays, field_pass.data.models, noise, count=len(tie)).ground
+    return replace(field_pass, control_ground=np.where(tie[:, None], ground, field_pass.control_ground))

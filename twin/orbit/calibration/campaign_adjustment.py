@@ -1,16 +1,14 @@
-"""The adjustment of a campaign, of one field by itself and of all at once: what is solved for, what is held, what is
-known beforehand.
+"""Adjustment of a campaign, of one field by itself and of all fields at once: unknowns, gauge and priors.
 
-How the attitude bias differs from field to field: with latitude, and by what is left over, the season.
-
-An adjustment of all fields gives each field's bias with covariance, the orbit's offsets within. For each axis
+Fit of the attitude bias against latitude. An adjustment of all fields gives each field's bias with its covariance,
+which includes the offsets of the orbit. For each axis
 
     bias(field) = amplitude sin(latitude - reference) + constant + season
 
-is fitted by generalised least squares. The reference is the middle of the fields: another one only goes into the
-constant. What remains is first judged against the biases' own covariance (chi-square), then its standard deviation is
-estimated as the one with which the chi-square equals the degrees of freedom (Paule and Mandel, J. Res. NBS 87, 377
-(1982)), and the sigmas of amplitude and constant contain it.
+is fitted by generalised least squares. The reference is the middle of the fields; another one only changes the
+constant. What remains is first tested against the biases' own covariance (chi-square). Then its standard deviation is
+estimated as the value with which the chi-square equals the degrees of freedom (Paule and Mandel, J. Res. NBS 87, 377
+(1982)), and is included in the sigmas of amplitude and constant.
 """
 
 from __future__ import annotations
@@ -28,21 +26,25 @@ from analysis.calibration.adjustment import FALSE_ALARM, Adjustment, adjust
 from analysis.orbit.calibration_parameters import OFFSET, RATE, Gauge, Prior, Unknowns, index
 from analysis.orbit.three_line_model import BIAS
 from optics.numerics.number_tree import FrozenMap
-from twin.orbit.calibration.campaign import Campaign, FieldPass, FoundDrift
+from twin.orbit.calibration.campaign import Campaign, DetectedDrift, FieldPass
 
 GAUGE = Gauge(held=("nadir x", "nadir y"))
-"""Gauge of three lines. The nadir line's principal point keeps its laboratory value: x is not observable against pitch,
-and y against roll so weakly that one field would not determine it to a pixel.
+"""Gauge of three lines: the nadir line's principal point keeps its laboratory value. Its x cannot be separated from
+pitch, and its y from roll so weakly that one field would not determine it to a pixel.
 """
 _LEAST_OFFSET = 1e-3
-"""Metres; sigma of an orbit without a drift along one axis."""
+"""Smallest sigma of an orbit's offset along an axis, in metres, where the file gives no drift along that axis."""
 _LEAST_RATE = 1e-11
-"""Radians per second; sigma of a rate about an axis that has none, where another one has: 1e-4 arcsec in a minute."""
+"""Smallest sigma of a rate about an axis, in radians per second, where only other axes have rates: 1e-4 arcsec in a
+minute.
+"""
 
 
 def gauge_of(campaign: Campaign) -> Gauge:
-    """The principal point of one line is held; see `GAUGE`. What the points know less well than launch leaves to expect
-    keeps near the laboratory's values, to the sigmas of launch and season.
+    """Return the gauge: the principal point of one line is held, see `GAUGE`.
+
+    Unknowns that the points determine less well than the prior stay near the laboratory's values, within the sigmas of
+    launch and season.
     """
     launch, season = campaign.spec.launch, np.array(campaign.spec.errors.season)
     start = dict.fromkeys(campaign.inner, launch.interior)
@@ -52,54 +54,56 @@ def gauge_of(campaign: Campaign) -> Gauge:
 
 
 def _rates_of(campaign: Campaign) -> np.ndarray:
-    """(3,) standard deviations of the attitude's rate in each pass, stated or found in residuals, rad/s."""
-    stated = campaign.spec.errors.star_tracker.drift if campaign.spec.errors.switched_on else None
-    found = (0.0, 0.0, 0.0) if campaign.drifts is None else campaign.drifts.rate
-    return np.asarray(np.hypot(stated or (0.0, 0.0, 0.0), found))
+    """Return the (3,) standard deviations of the attitude's rate in each pass, stated and detected, in rad/s."""
+    prior = campaign.spec.errors.star_tracker.drift if campaign.spec.errors.switched_on else None
+    detected = (0.0, 0.0, 0.0) if campaign.drifts is None else campaign.drifts.rate
+    return np.asarray(np.hypot(prior or (0.0, 0.0, 0.0), detected))
 
 
 def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequence[Prior] = ()) -> tuple[Prior, ...]:
-    """Priors on the rate of each pass; empty where none drifts by itself.
+    """Return the priors on the attitude rate of each pass; only the common ones where no pass drifts by itself.
 
     Parameters
     ----------
     campaign : Campaign
-        For what is stated.
-    passes : Sequence[FieldPass]
-        That are adjusted.
-    common : Sequence[Prior]
-        What is known of a rate that all of them have; its error then counts as one of each.
+        Campaign with the stated or detected drift.
+    passes : sequence of FieldPass
+        Passes that are adjusted.
+    common : sequence of Prior
+        Prior of a rate that all passes share. Its error is then treated as independent from pass to pass.
     """
     sigma = _rates_of(campaign)
     if not np.any(sigma):
         return tuple(common)
     known = {next(iter(p.weights)): (p.value, p.sigma) for p in common}
-    found = []
-    for one in passes:
-        for name, own in zip(RATE, np.maximum(sigma, _LEAST_RATE).tolist(), strict=True):
+    priors = []
+    for field_pass in passes:
+        for name, scatter in zip(RATE, np.maximum(sigma, _LEAST_RATE).tolist(), strict=True):
             value, error = known.get(name, (0.0, 0.0))
-            found.append(Prior({f"{one.name} {name}": 1.0}, value, float(np.hypot(own, error)), "bias rate"))
-    return tuple(found)
+            priors.append(
+                Prior({f"{field_pass.name} {name}": 1.0}, value, float(np.hypot(scatter, error)), "bias rate")
+            )
+    return tuple(priors)
 
 
-def calibrated_alone(campaign: Campaign, one: FieldPass) -> Adjustment:
-    """A field by itself, with paper 003's twelve unknowns less the gauge, and its rate where the attitude drifts.
+def calibrated_alone(campaign: Campaign, field_pass: FieldPass) -> Adjustment:
+    """Calibrate one field by itself: paper 003's twelve unknowns less the gauge, and a rate where the attitude drifts.
 
     Parameters
     ----------
     campaign : Campaign
-        For the laboratory's camera and the noise.
-    one : FieldPass
-        The field.
+        Campaign with the laboratory's camera and the noise.
+    field_pass : FieldPass
+        Pass over the field.
 
     Raises
     ------
     CalibrationError
-        It cannot be solved.
+        The adjustment cannot be solved.
     """
-    rates = _rate_priors(campaign, [one])
+    rates = _rate_priors(campaign, [field_pass])
     return adjust(
-        [one.control],
+        [field_pass.control],
         campaign.laboratory,
         campaign.noise,
         unknowns=Unknowns(rate="field" if rates else "none"),
@@ -108,29 +112,33 @@ def calibrated_alone(campaign: Campaign, one: FieldPass) -> Adjustment:
     )
 
 
-def drift_looked_for(campaign: Campaign, rates: tuple[Prior, ...] = ()) -> Campaign:
-    """The campaign, or where residuals show a drift of the attitude that nobody stated, with this among its noise: a
-    random walk by its variance component, and a rate of each pass. False alarms: `FALSE_ALARM` for either test.
+def with_detected_drift(campaign: Campaign, rates: tuple[Prior, ...] = ()) -> Campaign:
+    """Return the campaign, with an unstated drift of the attitude in its noise model if the residuals show one.
+
+    The drift is a random walk, sized by its variance component, and a rate of each pass. The false-alarm rate of
+    either test is `FALSE_ALARM`.
 
     Parameters
     ----------
     campaign : Campaign
-        As it is stated.
-    rates : tuple[Prior, ...]
-        What is known of a rate that all passes have.
+        Campaign with the stated noise.
+    rates : tuple of Prior
+        Priors of a rate that all passes share.
 
     Raises
     ------
     CalibrationError
-        It cannot be solved.
+        The adjustment cannot be solved.
     """
-    found = simultaneous(campaign, rates)
-    rate_chance = 1.0 if found.rates is None else found.rates.p_value
-    if min(rate_chance, found.courses.p_value) >= FALSE_ALARM:
+    adjustment = simultaneous(campaign, rates)
+    rate_p_value = 1.0 if adjustment.rates is None else adjustment.rates.p_value
+    if min(rate_p_value, adjustment.courses.p_value) >= FALSE_ALARM:
         return campaign
     sigma = np.zeros(3)
-    if found.rates is not None:
-        size = np.where(np.isfinite(found.rates.sigma), np.hypot(found.rates.estimate, found.rates.sigma), 0.0)
+    if adjustment.rates is not None:
+        size = np.where(
+            np.isfinite(adjustment.rates.sigma), np.hypot(adjustment.rates.estimate, adjustment.rates.sigma), 0.0
+        )
         sigma = size.reshape(-1, 3).max(axis=0)
     focal = min(float(m.interior[0]) for m in campaign.laboratory.values())
     trial = max(campaign.noise.image / focal, campaign.noise.attitude_walk)
@@ -138,7 +146,7 @@ def drift_looked_for(campaign: Campaign, rates: tuple[Prior, ...] = ()) -> Campa
     factor = simultaneous(walking, rates, components=("attitude walk",)).factors["attitude walk"]
     walk = float(trial * np.sqrt(factor))
     roll, pitch, yaw = sigma.tolist()
-    drifts = FoundDrift((roll, pitch, yaw), walk, rate_chance, found.courses.p_value)
+    drifts = DetectedDrift((roll, pitch, yaw), walk, rate_p_value, adjustment.courses.p_value)
     return replace(walking, noise=replace(walking.noise, attitude_walk=walk), drifts=drifts)
 
 
@@ -150,27 +158,29 @@ def simultaneous(
     monitor: tuple[Prior, ...] = (),
     components: Sequence[str] = (),
 ) -> Adjustment:
-    """All fields at once: one interior, a bias and, where the orbit drifts, an offset with its prior for each field.
+    """Adjust all fields at once, with one interior orientation for all and a bias for each field.
+
+    Where the orbit drifts, each field also has an offset with its prior.
 
     Parameters
     ----------
     campaign : Campaign
-        The fields.
-    rates : tuple[Prior, ...]
-        What is known of a drift of the bias that all passes have.
-    robust : Robust | None
-        Weights of the image points.
+        Campaign to adjust.
+    rates : tuple of Prior
+        Priors of a drift of the bias that all passes share.
+    robust : Robust, optional
+        Robust weight function of the image points.
     drift : bool
-        Whether the cameras' changes in each pass are unknowns, too; `monitor` must tell them.
-    monitor : tuple[Prior, ...]
-        What an on-board monitor tells of these.
-    components : Sequence[str]
-        Groups whose variance is estimated.
+        True to estimate the cameras' changes in each pass, which `monitor` must then observe.
+    monitor : tuple of Prior
+        Readings of an on-board monitor as observations of these changes.
+    components : sequence of str
+        Groups of observations whose variance is estimated.
 
     Raises
     ------
     CalibrationError
-        It cannot be solved.
+        The adjustment cannot be solved.
     """
     errors = campaign.spec.errors
     offsets = bool(errors.switched_on and any(errors.gps.drift))
@@ -196,31 +206,43 @@ def simultaneous(
 
 
 LEAST_FIELDS = 4
-"""Two are spent on the fit; one degree of freedom is no estimate of what remains."""
+"""Least number of fields of a fit against latitude: the fit uses two degrees of freedom, and a single further one does
+not estimate the remainder.
+"""
 _LEAST_FREEDOM = 3
+"""Least degrees of freedom of a fit against latitude from which rates during the passes are predicted; Student's
+variance needs three.
+"""
 _ONE_LATITUDE = np.radians(1.0)
+"""Range of latitudes, in radians, below which fields count as lying at one latitude."""
 
 
 @dataclass(frozen=True, eq=False)
 class LatitudeFit:
-    """One axis.
+    """Fit of one axis of the attitude bias against latitude.
 
     Attributes
     ----------
     axis : str
-        Of roll, pitch, yaw.
-    latitude : np.ndarray
-        (K,) of the fields, radians. reference: where the sine vanishes, radians.
-    value, sigma : np.ndarray
-        (K,) biases of the fields, radians.
-    fit : np.ndarray
-        (K,) fitted.
+        Axis of the bias: roll, pitch or yaw.
+    latitude : (K,) ndarray
+        Latitudes of the fields, in radians.
+    reference : float
+        Latitude at which the sine vanishes, in radians.
+    value, sigma : (K,) ndarray
+        Biases of the fields and their standard deviations, in radians.
+    fit : (K,) ndarray
+        Fitted biases, in radians.
     amplitude, constant : float
-        Radians, with their sigmas, which contain what remains.
+        Parameters of the fit, in radians.
+    amplitude_sigma, constant_sigma : float
+        Their standard deviations, in radians, which include the remainder.
     chi_square : float
-        With the biases' own covariance. degrees_of_freedom: K - 2.
+        Chi-square of the fit with the biases' own covariance.
+    degrees_of_freedom : int
+        K - 2.
     remainder : float
-        Standard deviation of what remains beside the biases' own sigmas, radians; 0 when these explain it.
+        Standard deviation of the scatter beyond the biases' own sigmas, in radians; 0 when these explain all of it.
     """
 
     axis: str
@@ -239,31 +261,35 @@ class LatitudeFit:
 
     @property
     def p_value(self) -> float:
-        """Chance of such a chi-square if latitude is all that matters."""
+        """Probability of a chi-square at least as large if the bias depends on latitude alone."""
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     def curve(self, latitude: np.ndarray) -> np.ndarray:
-        """Fitted bias, radians."""
+        """Return the fitted bias at latitudes in radians, in radians."""
         return np.asarray(self.amplitude * np.sin(latitude - self.reference) + self.constant)
 
 
 def latitude_fits(campaign: Campaign, together: Adjustment) -> tuple[LatitudeFit, ...]:
-    """Roll, pitch and yaw; empty for fewer than `LEAST_FIELDS` fields, or fields within one degree of latitude."""
+    """Fit roll, pitch and yaw of the fields against latitude.
+
+    Returns an empty tuple for fewer than `LEAST_FIELDS` fields, or for fields within one degree of latitude.
+    """
     latitude = np.array([p.latitude for p in campaign.passes])
     if len(latitude) < LEAST_FIELDS or np.ptp(latitude) < _ONE_LATITUDE:
         return ()
-    found = []
+    fits = []
     for axis in BIAS:
         where = [index(together.names, f"{p.name} {axis}") for p in campaign.passes]
-        found.append(fitted(axis, latitude, together.values[where], together.covariance[np.ix_(where, where)]))
-    return tuple(found)
+        fits.append(fit_latitude(axis, latitude, together.values[where], together.covariance[np.ix_(where, where)]))
+    return tuple(fits)
 
 
 def rate_priors(campaign: Campaign, fits: tuple[LatitudeFit, ...]) -> tuple[Prior, ...]:
-    """How fast the biases drift during the passes, as they do from field to field: amplitude times the change of the
-    sine of latitude in a second, mean of the passes. Empty for fits of fewer than `_LEAST_FREEDOM` degrees of freedom.
+    """Return priors of the biases' rates during the passes, predicted from their change with latitude.
 
-    The outer lines see a field half a minute before and after the nadir line, so that their x and y take up the drift.
+    A rate is the amplitude times the change of the sine of latitude in a second, mean of the passes. The outer lines
+    see a field half a minute before and after the nadir line, so that otherwise their x and y take up the drift. The
+    result is empty for fits of fewer than `_LEAST_FREEDOM` degrees of freedom.
     """
     if not fits or fits[0].degrees_of_freedom < _LEAST_FREEDOM:
         return ()
@@ -276,37 +302,37 @@ def rate_priors(campaign: Campaign, fits: tuple[LatitudeFit, ...]) -> tuple[Prio
     )
 
 
-def _sine_rate(one: FieldPass, reference: float) -> float:
-    """Change of sin(latitude - reference) at a pass's middle by the measured orbit, 1/s."""
-    path, middle, step = one.measured, one.middle, np.array([-1.0, 1.0])
+def _sine_rate(field_pass: FieldPass, reference: float) -> float:
+    """Return the rate of sin(latitude - reference) at a pass's middle, from the measured orbit, in 1/s."""
+    path, middle, step = field_pass.measured, field_pass.middle, np.array([-1.0, 1.0])
     known = path.known(middle + step)[:, None]
     # by the velocity where a second farther there are no readings
     on = path.position(middle) + step[:, None] * path.velocity(middle)
     ends = np.where(known, path.position(middle + np.where(known[:, 0], step, 0.0)), on)
-    latitude = one.data.earth.geodetic(ends)[1]
+    latitude = field_pass.data.earth.geodetic(ends)[1]
     return float(np.diff(np.sin(latitude - reference))[0] / 2.0)
 
 
-def fitted(axis: str, latitude: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> LatitudeFit:
-    """Fit biases (K,) with covariance (K, K) at latitudes (K,), radians."""
+def fit_latitude(axis: str, latitude: np.ndarray, value: np.ndarray, covariance: np.ndarray) -> LatitudeFit:
+    """Fit biases (K,) with covariance (K, K) against latitudes (K,), all in radians."""
     reference = float(0.5 * (latitude.min() + latitude.max()))
     design = np.stack([np.sin(latitude - reference), np.ones_like(latitude)], axis=1)
     freedom = len(value) - 2
 
     def solved(extra: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """Values (2,), covariance (2, 2), chi-square."""
+        """Solve with an extra standard deviation of each field: parameters (2,), covariance (2, 2) and chi-square."""
         weight = np.linalg.inv(covariance + extra**2 * np.eye(len(value)))
         spread = np.linalg.inv(design.T @ weight @ design)
         best = spread @ design.T @ weight @ value
-        rest = value - design @ best
-        return best, spread, float(rest @ weight @ rest)
+        residual = value - design @ best
+        return best, spread, float(residual @ weight @ residual)
 
     chi_square = solved(0.0)[2]
     remainder = 0.0
     if chi_square > freedom:
         # with this much extra the chi-square is below a thousandth of the degrees of freedom
-        most = float(np.linalg.norm(value - value.mean())) * 100.0
-        remainder = float(brentq(lambda s: solved(s)[2] - freedom, 0.0, most, xtol=1e-12))
+        upper = float(np.linalg.norm(value - value.mean())) * 100.0
+        remainder = float(brentq(lambda s: solved(s)[2] - freedom, 0.0, upper, xtol=1e-12))
     best, spread, _ = solved(remainder)
     sigma = np.sqrt(np.diag(spread))
     return LatitudeFit(

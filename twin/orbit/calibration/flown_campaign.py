@@ -1,14 +1,13 @@
-"""Passes over test fields, with a three-line camera that has changed since the laboratory and may drift.
+"""Simulated passes over test fields, with a three-line camera that has changed since the laboratory and may drift.
 
-Ground points come from the nadir line's image and terrain of given relief; every line sees them through the rigorous
+Ground points are drawn in the nadir line's image, on terrain of given relief. Every line sees them through the rigorous
 sensor of `twin.orbit.flight.sensor`, from the true orbit and attitude, with light time, aberration and refraction. The
 analysis gets image points, control coordinates and the measured orbit and attitude, and takes the effects on the light
-out of the image points by the laboratory's camera (`twin.orbit.calibration.campaign`).
+out of the image points with the laboratory's camera (`twin.orbit.calibration.campaign`).
 
-Image points of a field that are measured in rendered images of some patches of its ground, instead of drawn.
-
-Every patch is rendered through the true sensors and measured with what the user has (`twin.orbit.images.image_points`).
-The truth enters the record of wrong matches and the true places of check points, which only test.
+Instead of drawn points, the image points of a field can be measured in rendered images of patches of its ground. Every
+patch is rendered through the true sensors and measured with what a user has (`twin.orbit.images.image_points`). The
+truth enters only the record of wrong matches and the true coordinates of check points.
 """
 
 from __future__ import annotations
@@ -65,9 +64,11 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
 
 _OFFSET = 9000.0
-"""Metres. As far from the middle of the real terrain model, east and north, a patch may lie; 30 km x 32 km are real."""
+"""Largest offset of a patch from the middle of the real terrain model, east and north, in metres; the model covers 30
+km x 32 km.
+"""
 _LEAST_CONTROL = 6
-"""Control points of a field that must be left; twelve unknowns take three."""
+"""Least number of control points of a field that must be matched in every line; twelve unknowns need three."""
 _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
     {
         "span": (("span",), "a longer pass, or patches nearer to the field's middle"),
@@ -80,22 +81,22 @@ _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
 
 @dataclass(eq=False)
 class Imager:
-    """Renders and measures fields, and says how far it is.
+    """Renderer of patches that measures their points and reports its progress.
 
     Attributes
     ----------
     setup : CalibrationSetup
-        Test and camera.
+        Resolved test file and camera.
     spec : CalibrationImagesSpec
-        Of the images.
+        Section `images` of the file.
     optics : Mapping[str, LineOptics]
         Line -> lens and CCD.
     pattern : np.random.SeedSequence
-        Seed of the pixels' differences, the same over all fields.
+        Seed of the pixels' non-uniformity, the same in all fields.
     advance : Advance
-        Told of each patch.
+        Callback that is called after each patch.
     done : int
-        Patches so far.
+        Number of patches finished.
     """
 
     setup: CalibrationSetup
@@ -107,7 +108,7 @@ class Imager:
 
     @classmethod
     def of(cls, setup: CalibrationSetup, pattern: np.random.SeedSequence, advance: Advance) -> Imager:
-        """For a test with a section `images`."""
+        """Return the renderer of a test with a section `images`."""
         spec = setup.test.images
         assert spec is not None
         optics = optics_of(setup.camera, tuple(setup.camera.lines), setup.test.line_time, setup.detectors)
@@ -115,47 +116,47 @@ class Imager:
 
     def measured(
         self,
-        place: FieldSpec,
+        field: FieldSpec,
         sensors: Mapping[str, Sensor],
         data: PassData,
         effects: LightEffects,
         seed: np.random.SeedSequence,
     ) -> tuple[FieldPoints, FieldImages]:
-        """Points of one field.
+        """Render the patches of one field and measure their points.
 
         Parameters
         ----------
-        place : FieldSpec
-            The field.
+        field : FieldSpec
+            Field of the test file.
         sensors : Mapping[str, Sensor]
-            The true ones.
+            True sensors by line.
         data : PassData
-            What is known of the pass.
+            Sensors and camera models that the analysis has.
         effects : LightEffects
-            On the light, which the user knows as well.
+            Effects on the light, which the analysis knows as well.
         seed : np.random.SeedSequence
-            Of the ground, of the control's errors and of the frames' noise.
+            Seed of the ground, of the control points' errors and of the frames' noise.
 
         Raises
         ------
         BenchError
-            a patch that cannot be imaged, points that cannot be measured, too few of them.
+            A patch cannot be imaged, its points cannot be measured, or too few points are matched.
         """
         users = {name: replace(sensor, effects=effects) for name, sensor in data.sensors.items()}
         lines = imaged_lines(sensors, users, {name: self.optics[name] for name in sensors}, self.pattern)
         total = len(self.setup.test.fields) * len(self.spec.patches)
         self.advance("patches", self.done, total)
         patches, records = [], []
-        for k, one in enumerate(self.spec.patches):
-            own = stream(seed, k)
+        for k, patch_spec in enumerate(self.spec.patches):
+            patch_seed = stream(seed, k)
             try:
                 patch = fly_patch(
                     lines,
-                    _middle(one, sensors["nadir"], place.height),
+                    _middle(patch_spec, sensors["nadir"], field.height),
                     (self.spec.lines, self.spec.pixels),
-                    self._ground(place, stream(own, 1)),
+                    self._ground(field, stream(patch_seed, 1)),
                     self.spec.control,
-                    stream(own, 0),
+                    stream(patch_seed, 0),
                     self.spec.oversampling,
                 )
                 points = measure_points(patch, self.spec.points)
@@ -166,16 +167,16 @@ class Imager:
                 problem = f"{data.name}, patch {k + 1}: {error}"
                 raise BenchError(problem, ("images", "points"), POINTS_REMEDY) from error
             patches.append(patch)
-            judgements = {sort: judged(patch, some) for sort, some in points.sorts.items()}
+            judgements = {sort: judged(patch, points_of_sort) for sort, points_of_sort in points.sorts.items()}
             records.append(PatchRecord(points, FrozenMap(judgements)))
             self.done += 1
             self.advance("patches", self.done, total)
         return self._collected(data, patches, records)
 
-    def _ground(self, place: FieldSpec, seed: np.random.SeedSequence) -> GroundSpec:
+    def _ground(self, field: FieldSpec, seed: np.random.SeedSequence) -> GroundSpec:
         terrain = self.spec.ground.terrain
         offset = np.random.default_rng(seed).uniform(-_OFFSET, _OFFSET, 2) + terrain.offset
-        terrain = terrain.model_copy(update={"height": place.height, "offset": tuple(offset.tolist())})
+        terrain = terrain.model_copy(update={"height": field.height, "offset": tuple(offset.tolist())})
         return self.spec.ground.model_copy(update={"terrain": terrain})
 
     def _collected(
@@ -185,42 +186,42 @@ class Imager:
         for patch, record in zip(patches, records, strict=True):
             maps = record.points.control
             assert maps is not None
-            control.append(_Chosen.of(maps, maps.in_all & ~maps.check, record.judgements["control"]))
-            check.append(_Chosen.of(maps, maps.in_all & maps.check, record.judgements["control"]))
+            control.append(_SelectedPoints.of(maps, maps.in_all & ~maps.check, record.judgements["control"]))
+            check.append(_SelectedPoints.of(maps, maps.in_all & maps.check, record.judgements["control"]))
             truth.append(true_ground(patch, maps)[maps.in_all & maps.check])
             if record.points.ties is not None:
                 tied = record.points.ties
-                ties.append(_Chosen.of(tied, tied.in_all, record.judgements["tie"]))
-        known, held_back, tie = (_joined(parts, data) for parts in (control, check, ties))
-        if known.count < _LEAST_CONTROL or held_back.count < 2:
+                ties.append(_SelectedPoints.of(tied, tied.in_all, record.judgements["tie"]))
+        control_points, check_points, tie = (_joined(parts, data) for parts in (control, check, ties))
+        if control_points.count < _LEAST_CONTROL or check_points.count < 2:
             raise BenchError(
-                f"{data.name}: only {known.count} control and {held_back.count} check points were matched in every "
-                f"line; {_lost(records)}",
+                f"{data.name}: only {control_points.count} control and {check_points.count} check points were matched "
+                f"in every line; {_match_counts(records)}",
                 ("images", "points"),
                 f"{_LEAST_CONTROL} control and 2 check points or more: {POINTS_REMEDY}",
             )
         # one error in plan moves all points of a patch: each of n weighs as if it had n times the variance
-        share = np.sqrt(known.count / len(patches))
+        share = np.sqrt(control_points.count / len(patches))
         sigma = self.spec.control.sigma * share, self.spec.points.height_sigma
-        both = known.followed_by(tie)
+        both = control_points.followed_by(tie)
         points = FieldPoints(
             both.images,
             both.ground,
-            np.arange(both.count) < known.count,
+            np.arange(both.count) < control_points.count,
             sigma if min(sigma) > 0.0 else (max(sigma[0], _EXACT), max(sigma[1], _EXACT)),
-            held_back.images,
+            check_points.images,
             np.concatenate(truth),
         )
-        return points, FieldImages(data.name, tuple(records), patches[0], both.wrong, held_back.wrong)
+        return points, FieldImages(data.name, tuple(records), patches[0], both.wrong, check_points.wrong)
 
 
 _EXACT = 1e-3
-"""Metres; of control without errors."""
+"""Sigma of control points without errors, in metres: an adjustment needs weights."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Chosen:
-    """Points of a patch or a field, seen by every line: image points, given ground, which places are wrong."""
+class _SelectedPoints:
+    """Points of a patch or field that every line sees: image points, ground coordinates, flags of wrong matches."""
 
     images: Mapping[str, ImagePoints]
     ground: np.ndarray
@@ -231,7 +232,7 @@ class _Chosen:
         return len(self.ground)
 
     @classmethod
-    def of(cls, points: MatchedPoints, chosen: np.ndarray, judgements: Mapping[str, LineJudgement]) -> _Chosen:
+    def of(cls, points: MatchedPoints, chosen: np.ndarray, judgements: Mapping[str, LineJudgement]) -> _SelectedPoints:
         images, wrong = {}, {}
         number = np.arange(int(chosen.sum()))
         for name, line in points.lines.items():
@@ -239,25 +240,25 @@ class _Chosen:
             wrong[name] = judgements[name].wrong[chosen] if name in judgements else np.zeros(len(number), bool)
         return cls(images, points.ground[chosen], wrong)
 
-    def followed_by(self, other: _Chosen) -> _Chosen:
+    def followed_by(self, other: _SelectedPoints) -> _SelectedPoints:
         images = {
             name: ImagePoints.joined([row, other.images[name].numbered(-self.count)])
             for name, row in self.images.items()
         }
         wrong = {name: np.concatenate([w, other.wrong[name]]) for name, w in self.wrong.items()}
-        return _Chosen(images, np.concatenate([self.ground, other.ground]), wrong)
+        return _SelectedPoints(images, np.concatenate([self.ground, other.ground]), wrong)
 
 
-def _joined(parts: list[_Chosen], data: PassData) -> _Chosen:
+def _joined(parts: list[_SelectedPoints], data: PassData) -> _SelectedPoints:
     none = {name: ImagePoints.of(np.zeros(0, int), [], [], np.zeros((0, 2, 2))) for name in data.sensors}
-    whole = _Chosen(none, np.zeros((0, 3)), {name: np.zeros(0, bool) for name in data.sensors})
+    whole = _SelectedPoints(none, np.zeros((0, 3)), {name: np.zeros(0, bool) for name in data.sensors})
     for part in parts:
         whole = whole.followed_by(part)
     return whole
 
 
-def _lost(records: list[PatchRecord]) -> str:
-    """Numbers of points that were sought, matched and agreed with by their neighbours, in words."""
+def _match_counts(records: list[PatchRecord]) -> str:
+    """Return a text with the numbers of points sought, matched, and consistent with their neighbours, by line."""
     words = []
     for name in records[0].judgements["control"]:
         lines = [r.points.control.lines[name] for r in records if r.points.control is not None]
@@ -265,59 +266,59 @@ def _lost(records: list[PatchRecord]) -> str:
             sum(int(np.sum(v)) for v in values)
             for values in zip(*((np.ones(len(x.status)), x.matched, x.accepted) for x in lines), strict=True)
         )
-        words.append(f"{name}: {sought} sought, {matched} matched, {accepted} agree with their neighbours")
+        words.append(f"{name}: {sought} sought, {matched} matched, {accepted} consistent with their neighbours")
     return "; ".join(words)
 
 
-def _middle(place: PatchPlaceSpec, nadir: Sensor, height: float) -> tuple[float, float]:
-    """Longitude and latitude of a patch's middle, radians."""
+def _middle(patch: PatchPlaceSpec, nadir: Sensor, height: float) -> tuple[float, float]:
+    """Return the longitude and latitude of a patch's middle, in radians."""
     at = (0.0 - nadir.first_line_time) / nadir.line_time
-    step = nadir.ground(np.array([at, at + 1.0]), np.array([place.pixel]), height)
-    line = at + place.track / float(np.linalg.norm(step[1] - step[0]))
+    step = nadir.ground(np.array([at, at + 1.0]), np.array([patch.pixel]), height)
+    line = at + patch.track / float(np.linalg.norm(step[1] - step[0]))
     if not 0.0 <= line <= nadir.lines - 1.0:
-        problem = f"the patch at {place.track / 1e3:g} km along the track lies beyond the pass"
+        problem = f"the patch at {patch.track / 1e3:g} km along the track lies beyond the pass"
         raise PatchError(problem, "span")
-    point = nadir.ground(np.array([line]), np.array([place.pixel]), height)
+    point = nadir.ground(np.array([line]), np.array([patch.pixel]), height)
     longitude, latitude, _ = nadir.earth.geodetic(point[0])
     return float(longitude), float(latitude)
 
 
 _DRIFT, _READING = 6, 7
-"""Streams of a field's seed. What else is drawn of a field does not change with them."""
+"""Random streams of a field's seed for drift and monitor readings; its other draws do not change with them."""
 
 
 def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
-    """Line -> (4,) true d_alpha, d_beta, d_gamma (radians) and d_f (metres) during one field; empty for no drift.
+    """Draw the true (4,) d_alpha, d_beta, d_gamma and d_f of each line during one field, in radians and metres.
 
-    The draws of a line are the same whatever their sigmas are.
+    The result is empty for cameras without drift. The draws of a line do not depend on the sigmas of the others.
 
     Parameters
     ----------
     spec : OrbitCalibrationSpec
-        The test.
+        Content of the test file.
     seed : np.random.SeedSequence
-        Of the field.
+        Seed of the field.
     """
     if not spec.drift:
         return FrozenMap({})
     unit = np.random.default_rng(stream(seed, _DRIFT)).standard_normal((len(LINES), 4))
-    sigma = {name: np.array([*one.angles, one.principal_distance]) for name, one in spec.drift.items()}
+    sigma = {name: np.array([*drift.angles, drift.principal_distance]) for name, drift in spec.drift.items()}
     return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(LINES, unit, strict=True)})
 
 
 def _sample_readings(
     spec: OrbitCalibrationSpec, drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
 ) -> FrozenMap[str, np.ndarray]:
-    """Line -> (4,) what the monitor reads, in the same units; empty for no monitor.
+    """Draw the (4,) monitor reading of each line, in radians and metres; empty for no monitor.
 
     Parameters
     ----------
     spec : OrbitCalibrationSpec
-        The test.
-    drift : Mapping[str, np.ndarray]
-        The true one.
+        Content of the test file.
+    drift : Mapping[str, ndarray]
+        True drift by line.
     seed : np.random.SeedSequence
-        Of the field.
+        Seed of the field.
     """
     if spec.monitor is None:
         return FrozenMap({})
@@ -327,30 +328,33 @@ def _sample_readings(
 
 
 def reading_sigma(spec: OrbitCalibrationSpec) -> np.ndarray:
-    """(4,) standard deviation of the monitor's readings of a camera, radians and metres. The test has a monitor."""
+    """Return the (4,) standard deviations of the monitor's readings of a camera, in radians and metres.
+
+    The test must have a monitor.
+    """
     assert spec.monitor is not None
     return np.array([*spec.monitor.angles, spec.monitor.principal_distance])
 
 
 _LEAST_IMAGE = 0.02
-"""Pixels. Image points without errors are given this sigma, for an adjustment needs weights."""
+"""Sigma of image points without errors, in pixels: an adjustment needs weights."""
 _SPARE = 1.25
-"""Candidates for each ground point; those that a line does not see are left out."""
+"""Number of candidates drawn per ground point; those that a line does not see are dropped."""
 _PICTURES = 5
-"""Stream of a field's seed for its images; the others are of what is drawn without them."""
+"""Random stream of a field's seed for its images, separate from the draws of fields without images."""
 _TIES = 8
-"""Stream of a field's seed for the tie points of its strip; `twin.orbit.calibration.campaign` has two before."""
+"""Random stream of a field's seed for the tie points of its strip; `_DRIFT` and `_READING` are the two before it."""
 _MARGIN = 6.0
-"""Sigmas. No point is taken so near to the end of an image that its measured place could lie outside."""
+"""Least distance of a point from the edge of an image, in sigmas, so that its measured position cannot lie outside."""
 
 
 def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance = silent) -> Campaign:
-    """Pass over every field once; image points are drawn or, where the file has a section `images`, measured.
+    """Simulate one pass over every field; image points are drawn or, where the file has a section `images`, measured.
 
     Raises
     ------
     BenchError
-        No such orbit, or the lines do not all see enough points.
+        No such orbit exists, or the lines do not all see enough points.
     CalibrationError
         The measured points cannot be used.
     """
@@ -359,14 +363,14 @@ def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: A
     earth = Earth.from_spec(spec.earth)
     imager = Imager.of(setup, stream(seed, len(spec.fields)), advance) if spec.images is not None else None
     flown = [
-        _pass(name, field, spec, payload, changed, earth, own, imager)
-        for (name, field), own in zip(spec.fields.items(), seed.spawn(len(spec.fields)), strict=True)
+        _pass(name, field, spec, payload, changed, earth, field_seed, imager)
+        for (name, field), field_seed in zip(spec.fields.items(), seed.spawn(len(spec.fields)), strict=True)
     ]
     measured, readings, pictures, truths = zip(*flown, strict=True)
     campaign = campaign_of(spec, payload, measured, spec.images is None)
     passes = tuple(
-        replace(one, known_truth=truth, readings=told)
-        for one, truth, told in zip(campaign.passes, truths, readings, strict=True)
+        replace(one, known_truth=truth, readings=reading)
+        for one, truth, reading in zip(campaign.passes, truths, readings, strict=True)
     )
     images = tuple(one for one in pictures if one is not None)
     truth = FrozenMap({k: line_model(changed, k) for k in LINES})
@@ -374,11 +378,11 @@ def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: A
 
 
 def true_bias(spec: OrbitCalibrationSpec, latitude: np.ndarray) -> np.ndarray:
-    """Roll, pitch and yaw (n, 3) from measured to true attitude at latitudes (n,), radians, without the season."""
+    """Return (n, 3) roll, pitch, yaw from measured to true attitude at latitudes (n,), radians, without season."""
     tracker = spec.errors.star_tracker
     drift = np.array(tracker.thermal.amplitude) * spec.errors.switched_on
-    turn = np.array(tracker.bias) + np.sin(latitude - tracker.thermal.reference)[:, None] * drift
-    return np.asarray(Rotation.from_rotvec(turn).inv().as_euler("XYZ"))
+    rotation = np.array(tracker.bias) + np.sin(latitude - tracker.thermal.reference)[:, None] * drift
+    return np.asarray(Rotation.from_rotvec(rotation).inv().as_euler("XYZ"))
 
 
 def _pass(
@@ -391,15 +395,15 @@ def _pass(
     seed: np.random.SeedSequence,
     imager: Imager | None,
 ) -> tuple[PassMeasurements, Mapping[str, np.ndarray], FieldImages | None, PassTruth]:
-    """Return what was measured of a pass, what a monitor reads, what became of points in images, and the truth."""
+    """Simulate a pass: its measurements, the monitor's readings, the points measured in images, and the truth."""
     pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, seed)
     readings = _sample_readings(spec, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
     place, image, ground, season, data = (np.random.default_rng(s) for s in seed.spawn(5))
     trajectory = _trajectory(name, field, spec, earth, seed)
     errors = spec.errors
-    turn = np.array(errors.star_tracker.bias) + np.array(errors.season) * season.standard_normal(3)
-    tracker = errors.star_tracker.model_copy(update={"bias": tuple(turn.tolist())})
+    rotation = np.array(errors.star_tracker.bias) + np.array(errors.season) * season.standard_normal(3)
+    tracker = errors.star_tracker.model_copy(update={"bias": tuple(rotation.tolist())})
     terms = TERMS if errors.switched_on else ("attitude_bias",)
     measured = trajectory.with_errors(
         errors.model_copy(update={"star_tracker": tracker}), int(data.integers(2**31)), terms
@@ -410,22 +414,22 @@ def _pass(
     times = LineTimes.even(trajectory.first + 0.5 * spec.line_time, spec.line_time, lines)
     sensors = {k: Sensor.of_lines(cameras[k], trajectory, earth, times, effects) for k in LINES}
     path, at = TabulatedTrajectory(platform), dict.fromkeys(LINES, times)
-    known = pass_data(name, payload, path, at, field.height)
+    pass_info = pass_data(name, payload, path, at, field.height)
     images = None
     if imager is None:
         assert spec.points is not None
-        points = _simulated_points(field, spec, spec.points, sensors, known, (place, image, ground))
+        points = _simulated_points(field, spec, spec.points, sensors, pass_info, (place, image, ground))
     else:
-        points, images = imager.measured(field, sensors, known, effects, pictures)
+        points, images = imager.measured(field, sensors, pass_info, effects, pictures)
     ties: Mapping[str, ImagePoints] = {}
     if spec.strip is not None and spec.points is not None:
         tie_points = spec.points.model_copy(
             update={"control": 0, "check": spec.strip.ties, "length": spec.strip.length}
         )
-        own = stream(seed, _TIES)
-        a, b, c = (np.random.default_rng(s) for s in own.spawn(3))
+        tie_seed = stream(seed, _TIES)
+        a, b, c = (np.random.default_rng(s) for s in tie_seed.spawn(3))
         try:
-            ties = _simulated_points(field, spec, tie_points, sensors, known, (a, b, c)).check_images
+            ties = _simulated_points(field, spec, tie_points, sensors, pass_info, (a, b, c)).check_images
         except BenchError as error:
             remedy = "a shorter strip, or a longer pass (`span`)"
             raise BenchError(f"tie points: {error}", ("strip", "length"), remedy) from error
@@ -433,17 +437,17 @@ def _pass(
     assert attitude_errors is not None
     middle = float(earth.geodetic(trajectory.position(0.0))[1])
     shape = np.sin(middle - attitude_errors.reference)
-    found = rotation_matrix(attitude_errors.bias + shape * attitude_errors.thermal).T
+    to_true = rotation_matrix(attitude_errors.bias + shape * attitude_errors.thermal).T
     truth = PassTruth(
-        Rotation.from_matrix(found).as_euler("XYZ"),
+        Rotation.from_matrix(to_true).as_euler("XYZ"),
         -attitude_errors.position(np.array(0.0)),
         trajectory,
         attitude_errors,
         drift,
     )
     datum = errors.datum if errors.switched_on else (0.0, 0.0, 0.0)
-    told = _measurements_of(name, platform, times, points, ties, datum)
-    return told, readings, images, truth
+    measurements = _measurements_of(name, platform, times, points, ties, datum)
+    return measurements, readings, images, truth
 
 
 def _measurements_of(
@@ -454,34 +458,34 @@ def _measurements_of(
     ties: Mapping[str, ImagePoints],
     datum: tuple[float, float, float],
 ) -> PassMeasurements:
-    """What was measured of a simulated pass, as files would have it.
+    """Return the measurements of a simulated pass, in the form in which files hold them.
 
     Parameters
     ----------
     name : str
-        Of the pass.
+        Name of the pass.
     platform : PlatformTable
-        readings.
+        Readings of orbit and attitude.
     times : LineTimes
-        Of every line.
+        Exposure times, the same for every line.
     points : FieldPoints
         Control, tie and check points.
     ties : Mapping[str, ImagePoints]
-        Line -> image points of further tie points, counted from 0.
-    datum : tuple[float, float, float]
-        By which control points are given too far east, north and up, metres.
+        Line -> image points of further tie points, numbered from 0.
+    datum : tuple of float
+        Error of the control points' datum east, north and up, in metres.
     """
-    given, is_control = points.control_ground, points.control
+    coordinates, is_control = points.control_ground, points.control
     if any(datum):
-        lon, lat, _ = Earth().geodetic(given.mean(axis=0))
-        given = given + np.array(datum) @ east_north_up(lon, lat)
-    count, checks = len(given), len(points.check_ground)
+        lon, lat, _ = Earth().geodetic(coordinates.mean(axis=0))
+        coordinates = coordinates + np.array(datum) @ east_north_up(lon, lat)
+    count, checks = len(coordinates), len(points.check_ground)
     more = 1 + max((int(r.point.max()) for r in ties.values() if len(r.point)), default=-1)
-    known = np.where(is_control[:, None], given, np.nan)
+    known = np.where(is_control[:, None], coordinates, np.nan)
     itrs = np.concatenate([known, points.check_ground, np.full((more, 3), np.nan)])
     role = np.array(["control" if c else "tie" for c in is_control] + ["check"] * checks + ["tie"] * more, object)
     covariance = np.zeros((len(role), 3, 3))
-    covariance[:count][is_control] = level_covariance(given[is_control], *points.sigma)
+    covariance[:count][is_control] = level_covariance(coordinates[is_control], *points.sigma)
     images = {}
     for line, row in points.control_images.items():
         parts = [row, points.check_images[line].numbered(-count)]
@@ -499,7 +503,7 @@ def _simulated_points(
     data: PassData,
     random: tuple[np.random.Generator, np.random.Generator, np.random.Generator],
 ) -> FieldPoints:
-    """Places of points, their image points and control coordinates, by three random streams."""
+    """Draw ground points, their image points and the control coordinates, from three random streams."""
     place, image, ground = random
     points, seen = _points(data.name, field, spec, wanted, sensors, place)
     errors = spec.errors
@@ -512,17 +516,17 @@ def _simulated_points(
         spread = np.diag((max(sigma, _LEAST_IMAGE) * unit) ** 2)
         images[k] = ImagePoints.of(np.arange(len(line)), line + noise[:, 0], pixel + noise[:, 1], spread)
     count = wanted.control
-    given = points[:count] + control * ground.standard_normal((count, 3))
+    coordinates = points[:count] + control * ground.standard_normal((count, 3))
     control_images = {k: row.taken(np.arange(count)) for k, row in images.items()}
     check_images = {k: row.taken(np.arange(count, len(points))).numbered(count) for k, row in images.items()}
-    known = np.ones(count, bool)
-    return FieldPoints(control_images, given, known, (control, control), check_images, points[count:])
+    is_control = np.ones(count, bool)
+    return FieldPoints(control_images, coordinates, is_control, (control, control), check_images, points[count:])
 
 
 def _trajectory(
     name: str, field: FieldSpec, spec: OrbitCalibrationSpec, earth: Earth, seed: np.random.SeedSequence
 ) -> Trajectory:
-    """The true orbit, which passes the field's middle at its epoch, and the true attitude."""
+    """Return the true orbit, which passes over the field's middle at its epoch, and the true attitude."""
     orbit = passing_orbit(field.epoch, spec.span, spec.altitude, field.longitude, field.latitude)
     try:
         return Trajectory.flown(propagate(orbit, earth), spec.attitude, seed)
@@ -535,23 +539,23 @@ def _points(
     name: str,
     field: FieldSpec,
     spec: OrbitCalibrationSpec,
-    asked: PointsSpec,
+    counts: PointsSpec,
     sensors: Mapping[str, Sensor],
     random: np.random.Generator,
 ) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Ground points (n, 3), control first, and line -> their image lines and pixels, (n,) each."""
-    wanted, nadir = asked.control + asked.check, sensors["nadir"]
+    """Draw ground points (n, 3), control points first, and compute their image lines and pixels (n,) by line."""
+    wanted, nadir = counts.control + counts.check, sensors["nadir"]
     height = field.height + field.relief * random.uniform(-1.0, 1.0, int(np.ceil(_SPARE * wanted)))
-    pixel = random.uniform(asked.first, asked.last, len(height))
+    pixel = random.uniform(counts.first, counts.last, len(height))
     trajectory = nadir.trajectory
     assert isinstance(trajectory, Trajectory)
     above = float(nadir.earth.geodetic(trajectory.position(0.0))[2])
     radius = float(np.linalg.norm(trajectory.position(0.0)))
     speed = float(np.linalg.norm(trajectory.velocity(0.0))) * (1.0 - above / radius)
-    reach = 0.5 * asked.length / speed
-    if reach > 0.99 * spec.span:  # the image ends a line before the orbit
-        raise BenchError("the pass is shorter than the field", ("span",), f"more than {reach:.3g} s")
-    line = (random.uniform(-reach, reach, len(height)) - nadir.first_line_time) / spec.line_time
+    half_time = 0.5 * counts.length / speed
+    if half_time > 0.99 * spec.span:  # the image ends a line before the orbit
+        raise BenchError("the pass is shorter than the field", ("span",), f"more than {half_time:.3g} s")
+    line = (random.uniform(-half_time, half_time, len(height)) - nadir.first_line_time) / spec.line_time
     points = nadir.ground(line, pixel, height)
     seen = {k: s.image(points) for k, s in sensors.items()}
     edge = _MARGIN * spec.errors.image * spec.errors.switched_on - 0.5
@@ -566,7 +570,7 @@ def _points(
     if len(good) < wanted:
         key = ("span",) if not all(np.any(np.isfinite(line)) for line, _ in seen.values()) else ("points",)
         raise BenchError(
-            f"over {name} only {len(good)} of {len(height)} places are seen by all three lines",
+            f"over {name} only {len(good)} of {len(height)} candidate points are seen by all three lines",
             key,
             "a longer pass, and a field inside all three strips",
         )

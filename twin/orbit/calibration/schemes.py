@@ -1,19 +1,20 @@
-"""Schemes of averaged parameters (paper 003, section 4.4), tested on all fields by forward intersection without ground
-control: on one campaign, and on campaigns repeated with everything drawn anew. What averaging can gain depends on how
-well the parameters repeat from field to field, which stands here, too.
+"""Errors at check points without ground control, by scheme of averaged parameters, and their dependence on the method.
 
-Passes adjusted on tie points before their check points are intersected (paper 003: calibrate with control points,
-adjust, intersect check points), by every scheme of parameters.
+Schemes (paper 003, section 4.4): the parameters of several fields, each calibrated by itself, are averaged and tested
+on all fields by forward intersection, on one campaign and on campaigns repeated with all errors drawn anew. The gain of
+averaging depends on how well the parameters repeat from field to field, which `repeatability` computes.
 
-Slow errors of the attitude over a field's control points go into its interior orientation and bias. To adjust the
-attitude afterwards, with these as if they were exact, counts that part twice and makes errors larger. So the
-calibration whose parameters are used has the tie points of its pass in it, and tells both apart.
+Strips: passes are adjusted on tie points before their check points are intersected. Slow errors of the attitude over a
+field's control points go into its interior orientation and bias. Adjusting the attitude afterwards with these
+parameters as if they were exact would count that part twice and increase the errors. The calibration whose parameters
+are used therefore includes the tie points of its pass, which separates the two.
 
-What an on-board monitor of the cameras buys where they change from field to field (papers 001 and 003): campaigns
-with the same draws and a drift of several sizes, adjusted as if nothing drifted and with the monitor's readings.
+Monitoring: the gain of an on-board monitor where the cameras change from field to field (papers 001 and 003) is found
+from campaigns with the same draws and drifts of several sizes, adjusted as if nothing drifted and with the monitor's
+readings.
 
-Effects on the light that are corrected are left out of these campaigns, and the noise of attitude and orbit counts as
-independent: both take most of the time and change the errors at check points hardly at all.
+Effects on the light that are corrected are left out of these campaigns, and the noise of attitude and orbit is treated
+as independent: both take most of the time and hardly change the errors at check points.
 """
 
 from __future__ import annotations
@@ -45,19 +46,27 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
 
 RMS = ("plan_rms", "height_rms")
-"""Attributes of `CheckErrors` and of `FieldErrors`."""
+"""Attributes of `CheckErrors` and `FieldErrors` with the RMS error in plan and in height."""
 
 
 @dataclass(frozen=True)
 class FieldErrors:
-    """RMS errors at the check points of several fields, metres: in plan (both axes) and in height."""
+    """RMS errors at the check points of several fields, in metres.
+
+    Attributes
+    ----------
+    plan_rms : float
+        RMS error in plan, both axes together.
+    height_rms : float
+        RMS error in height.
+    """
 
     plan_rms: float
     height_rms: float
 
     @classmethod
     def pooled(cls, errors: Iterable[CheckErrors]) -> FieldErrors:
-        """RMS errors over all check points, so that a field weighs by the number of its points."""
+        """Return the RMS errors over all check points, so that a field weighs by the number of its points."""
         rows = list(errors)
         count = [e.count for e in rows]
         plan, height = (np.average(np.square([getattr(e, what) for e in rows]), weights=count) for what in RMS)
@@ -65,27 +74,27 @@ class FieldErrors:
 
     @classmethod
     def mean(cls, errors: Mapping[str, CheckErrors]) -> FieldErrors:
-        """Means of the fields' RMS errors."""
+        """Return the means of the fields' RMS errors."""
         return cls(*(float(values_of(errors, what).mean()) for what in RMS))
 
 
 def meets(errors: Mapping[str, CheckErrors], limits: MapLimitsSpec) -> bool:
-    """Whether the RMS errors of every field lie within the limits of a map."""
+    """Return True if the RMS errors of every field lie within the limits of a map."""
     return all(e.plan_rms <= limits.plan and e.height_rms <= limits.height for e in errors.values())
 
 
 @dataclass(frozen=True, eq=False)
 class SchemeMeans:
-    """Errors of the schemes of averaged parameters over the fields, fewest fields first.
+    """Errors of the schemes of averaged parameters over the fields, fewest averaged fields first.
 
     Attributes
     ----------
-    plan : np.ndarray
-        Mean over the fields of the RMS in plan, metres, each scheme.
-    plan_spread : np.ndarray
-        Standard deviation over the fields.
-    height, height_spread : np.ndarray
-        likewise.
+    plan : ndarray
+        Mean over the fields of the RMS error in plan of each scheme, in metres.
+    plan_spread : ndarray
+        Standard deviation over the fields of the RMS error in plan, in metres.
+    height, height_spread : ndarray
+        Mean and standard deviation of the RMS error in height, in metres.
     """
 
     plan: np.ndarray
@@ -95,9 +104,12 @@ class SchemeMeans:
 
     @classmethod
     def of(cls, schemes: Mapping[str, Mapping[str, CheckErrors]]) -> SchemeMeans | None:
-        """Means and spreads of the schemes; None for a single scheme of averaged parameters.
+        """Return means and spreads of the schemes; None for a single scheme of averaged parameters.
 
-        schemes: all of them; the last, each field its own, is not averaged and does not count.
+        Parameters
+        ----------
+        schemes : Mapping[str, Mapping[str, CheckErrors]]
+            All schemes; the last one, in which each field uses its own parameters, is not averaged and is excluded.
         """
         if len(schemes) < _LEAST_SCHEMES:
             return None
@@ -106,24 +118,24 @@ class SchemeMeans:
 
     @property
     def height_change(self) -> float:
-        """Largest change of the mean height error between schemes, relative to the first."""
+        """Largest change of the mean height error between schemes, relative to the first scheme."""
         return float(np.ptp(self.height) / self.height[0])
 
 
 _LEAST_SCHEMES = 3
-"""Two of averaged parameters, and each field its own."""
+"""Least number of schemes for a comparison: two of averaged parameters, and each field with its own."""
 
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Campaigns over the same fields with everything drawn anew.
+    """Campaigns over the same fields with all errors drawn anew.
 
     Attributes
     ----------
-    schemes : tuple[str, ...]
-        Names, the last lets each field use its own parameters.
-    plan, height : np.ndarray
-        (N, schemes, fields) RMS at check points, metres.
+    schemes : tuple of str
+        Names of the schemes; in the last one each field uses its own parameters.
+    plan, height : (N, schemes, fields) ndarray
+        RMS errors at check points, in metres.
     """
 
     schemes: tuple[str, ...]
@@ -131,67 +143,76 @@ class Repeats:
     height: np.ndarray
 
     def met(self, plan: float, height: float) -> np.ndarray:
-        """(schemes,) share of the campaigns in which every field is within limits, metres."""
+        """Return the (schemes,) share of campaigns in which every field is within the limits, given in metres."""
         good = np.all((self.plan <= plan) & (self.height <= height), axis=2)
         return np.asarray(good.mean(axis=0))
 
 
 def values_of(errors: Mapping[str, CheckErrors], what: str) -> np.ndarray:
-    """(fields,) RMS of one sort of `RMS`, metres."""
+    """Return the (fields,) RMS errors of one attribute of `RMS`, in metres."""
     return np.array([getattr(e, what) for e in errors.values()])
 
 
 T = TypeVar("T")
 
 
-def by_scheme(
+def evaluate_schemes(
     campaign: Campaign,
     alone: Mapping[str, Adjustment],
     test: Callable[[FieldPass, Mapping[str, LineModel], np.ndarray], T],
 ) -> FrozenMap[str, FrozenMap[str, T]]:
-    """Return what a test of the schemes gives, scheme -> field.
+    """Evaluate every scheme on every field; return scheme -> field -> result.
 
     Parameters
     ----------
     campaign : Campaign
-        Schemes and fields.
+        Campaign with its schemes and fields.
     alone : Mapping[str, Adjustment]
-        Field -> it calibrated by itself.
-    test : Callable[[FieldPass, Mapping[str, LineModel], np.ndarray], T]
-        Of a field by cameras and bias, which are means of the scheme's fields; by its own in the last scheme.
+        Calibration of each field by itself, by field.
+    test : Callable[[FieldPass, Mapping[str, LineModel], ndarray], T]
+        Function of a field's pass, the cameras and the bias (3,). Cameras and bias are means of the scheme's fields,
+        and the field's own in the last scheme.
     """
-    found = {}
+    results = {}
     for k, scheme in enumerate((*campaign.spec.schemes, None)):
         errors = {}
-        for one in campaign.passes:
-            names = scheme or (one.name,)
-            errors[one.name] = test(one, *averaged(campaign, [alone[name] for name in names], names))
-        found[str(k + 1)] = FrozenMap(errors)
-    return FrozenMap(found)
+        for field_pass in campaign.passes:
+            names = scheme or (field_pass.name,)
+            errors[field_pass.name] = test(
+                field_pass, *mean_parameters(campaign, [alone[name] for name in names], names)
+            )
+        results[str(k + 1)] = FrozenMap(errors)
+    return FrozenMap(results)
 
 
-def schemes_tested(campaign: Campaign, alone: Mapping[str, Adjustment]) -> FrozenMap[str, FrozenMap[str, CheckErrors]]:
-    """Scheme -> field -> errors at its check points; arguments as of `by_scheme`."""
-    return by_scheme(campaign, alone, lambda one, cameras, bias: tested(campaign, one, cameras, bias))
+def scheme_errors(campaign: Campaign, alone: Mapping[str, Adjustment]) -> FrozenMap[str, FrozenMap[str, CheckErrors]]:
+    """Return the errors at check points, scheme -> field; arguments as in `evaluate_schemes`."""
+    return evaluate_schemes(
+        campaign, alone, lambda field_pass, cameras, bias: check_point_errors(campaign, field_pass, cameras, bias)
+    )
 
 
-def tested_before(campaign: Campaign) -> FrozenMap[str, CheckErrors]:
-    """Field -> errors with the laboratory's camera."""
-    return FrozenMap({p.name: tested(campaign, p, campaign.laboratory, np.zeros(3)) for p in campaign.passes})
+def laboratory_errors(campaign: Campaign) -> FrozenMap[str, CheckErrors]:
+    """Return the errors at the check points of each field with the laboratory's camera."""
+    return FrozenMap(
+        {p.name: check_point_errors(campaign, p, campaign.laboratory, np.zeros(3)) for p in campaign.passes}
+    )
 
 
-def tested(campaign: Campaign, one: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
-    """Errors at a field's check points."""
-    return check_errors(intersect(one.check, cameras, campaign.noise, bias=bias).ground, one.check_ground)
+def check_point_errors(
+    campaign: Campaign, field_pass: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray
+) -> CheckErrors:
+    """Return the errors at a field's check points, intersected with these cameras and this attitude bias (3,)."""
+    return check_errors(intersect(field_pass.check, cameras, campaign.noise, bias=bias).ground, field_pass.check_ground)
 
 
-def repeated(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Repeats | None:
-    """Fly and calibrate as many campaigns as the file asks for; None for none. Only errors at check points count.
+def repeat_campaigns(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Repeats | None:
+    """Simulate and calibrate as many campaigns as the file asks for, and keep their errors; None for none.
 
     Raises
     ------
     CalibrationError
-        One of them cannot be solved.
+        An adjustment cannot be solved.
     """
     count = setup.test.repeats
     test = setup.test
@@ -201,9 +222,9 @@ def repeated(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Adv
         setup = setup.model_copy(update={"test": test.model_copy(update={"effects": none})})
     plan, height = [], []
     names: tuple[str, ...] = ()
-    for k, own in enumerate(seed.spawn(count)):
-        campaign = fly_fields(setup, own).independent
-        schemes = schemes_tested(campaign, {p.name: calibrated_alone(campaign, p) for p in campaign.passes})
+    for k, campaign_seed in enumerate(seed.spawn(count)):
+        campaign = fly_fields(setup, campaign_seed).independent
+        schemes = scheme_errors(campaign, {p.name: calibrated_alone(campaign, p) for p in campaign.passes})
         names = tuple(schemes)
         plan.append([values_of(e, "plan_rms") for e in schemes.values()])
         height.append([values_of(e, "height_rms") for e in schemes.values()])
@@ -211,10 +232,10 @@ def repeated(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Adv
     return Repeats(names, np.array(plan), np.array(height)) if count else None
 
 
-def averaged(
+def mean_parameters(
     campaign: Campaign, results: Sequence[Adjustment], names: Sequence[str]
 ) -> tuple[dict[str, LineModel], np.ndarray]:
-    """Cameras and bias (3,): means of the parameters of these fields, each calibrated by itself."""
+    """Return cameras and bias (3,) that are means of the parameters of these fields, each calibrated by itself."""
     cameras = {
         line: camera.with_interior(np.mean([r.cameras[line].interior for r in results], axis=0))
         for line, camera in campaign.laboratory.items()
@@ -224,18 +245,18 @@ def averaged(
 
 @dataclass(frozen=True)
 class Repeatability:
-    """One parameter over the fields, each calibrated by itself, metres or radians.
+    """Scatter of one parameter over the fields, each calibrated by itself, in metres or radians.
 
     Attributes
     ----------
     name : str
-        Of the parameter, without a field.
+        Name of the parameter, without a field.
     scatter : float
         Standard deviation over the fields.
     sigma : float
-        That the adjustments claim, root mean square; 0 where held.
-    p_value : float | None
-        Chance of such a scatter or a larger one if the parameter is the same in all fields; None where held.
+        Standard deviation by the adjustments of single fields, root mean square; 0 where held.
+    p_value : float or None
+        Probability of a scatter at least as large if the parameter is the same in all fields; None where held.
     """
 
     name: str
@@ -245,47 +266,47 @@ class Repeatability:
 
 
 def repeatability(campaign: Campaign, alone: Mapping[str, Adjustment]) -> tuple[Repeatability, ...]:
-    """Interior orientation, then biases; empty for fewer than two fields.
+    """Return the repeatability of the interior orientation, then of the biases; empty for fewer than two fields.
 
     Parameters
     ----------
     campaign : Campaign
-        The fields.
+        Campaign with its fields.
     alone : Mapping[str, Adjustment]
-        Field -> it calibrated by itself.
+        Calibration of each field by itself, by field.
     """
     if len(alone) < 2:
         return ()
-    found = []
+    rows = []
     for name in (*campaign.inner, *BIAS):
         names = {field: f"{field} {name}" if name in BIAS else name for field in alone}
-        value = np.array([one.value(names[field]) for field, one in alone.items()])
-        sigma = np.array([one.sigma[names[field]] for field, one in alone.items()])
+        value = np.array([adjustment.value(names[field]) for field, adjustment in alone.items()])
+        sigma = np.array([adjustment.sigma[names[field]] for field, adjustment in alone.items()])
         scatter, claimed = float(value.std(ddof=1)), float(np.sqrt(np.mean(sigma**2)))
-        chance = None
+        p_value = None
         if claimed > 0.0:
             weight = sigma**-2.0
             mean = float(np.sum(weight * value) / np.sum(weight))
-            chance = float(chi2.sf(np.sum(weight * (value - mean) ** 2), len(value) - 1))
-        found.append(Repeatability(name, scatter, claimed, chance))
-    return tuple(found)
+            p_value = float(chi2.sf(np.sum(weight * (value - mean) ** 2), len(value) - 1))
+        rows.append(Repeatability(name, scatter, claimed, p_value))
+    return tuple(rows)
 
 
 @dataclass(frozen=True, eq=False)
 class Strips:
-    """Passes adjusted on their tie points.
+    """Results of passes that are adjusted on their tie points.
 
     Attributes
     ----------
     ties : Mapping[str, int]
-        Field -> how many tie points two lines or more see.
+        Field -> number of tie points that two lines or more see.
     schemes : Mapping[str, Mapping[str, CheckErrors]]
         Scheme -> field -> errors at its check points, calibrated on control and tie points and adjusted on tie points;
-        the last lets each field use its own parameters.
+        in the last scheme each field uses its own parameters.
     p_values : Mapping[str, float]
-        Field -> chance of the fit of its strip with its own parameters.
-    datum : tuple[Datum, ...]
-        Of the first field with these: turns of the whole pass, sigma before and after.
+        Field -> p-value of the fit of its strip with its own parameters.
+    datum : tuple of Datum
+        Rotations of the whole first pass, with their sigmas before and after the adjustment.
     """
 
     ties: Mapping[str, int]
@@ -294,20 +315,20 @@ class Strips:
     datum: tuple[Datum, ...]
 
 
-def strips_adjusted(campaign: Campaign, advance: Advance) -> Strips | None:
-    """Every field by every scheme; None for a file without a strip.
+def adjust_strips(campaign: Campaign, advance: Advance) -> Strips | None:
+    """Adjust every field's strip with every scheme; None for a file without a strip.
 
     Parameters
     ----------
     campaign : Campaign
-        Measurements and schemes.
+        Campaign with measurements and schemes.
     advance : Advance
-        How far it is.
+        Callback that reports the progress.
 
     Raises
     ------
     CalibrationError
-        a strip cannot be adjusted.
+        A strip cannot be adjusted.
     """
     spec = campaign.spec
     if not spec.strip:
@@ -315,18 +336,18 @@ def strips_adjusted(campaign: Campaign, advance: Advance) -> Strips | None:
     parts, done = (len(spec.schemes) + 2) * len(campaign.passes), itertools.count(1)
     calibrated, strips = {}, {}
 
-    def in_strip(one: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
+    def in_strip(field_pass: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
         # those of the last scheme, with each field's own parameters, stay
-        strips[one.name] = strip = adjusted_strip(campaign, one, cameras, bias)
+        strips[field_pass.name] = strip = adjust_pass_strip(campaign, field_pass, cameras, bias)
         advance("strips", next(done), parts)
-        return tested_in_strip(campaign, one, strip, cameras, bias)
+        return strip_check_errors(campaign, field_pass, strip, cameras, bias)
 
     with one_blas_thread():
-        for one in campaign.passes:
-            field, gauge = field_with_ties(campaign, one), gauge_of(campaign)
-            calibrated[one.name] = adjust([field], campaign.laboratory, campaign.noise, gauge=gauge)
+        for field_pass in campaign.passes:
+            field, gauge = field_with_ties(campaign, field_pass), gauge_of(campaign)
+            calibrated[field_pass.name] = adjust([field], campaign.laboratory, campaign.noise, gauge=gauge)
             advance("strips", next(done), parts)
-        schemes = by_scheme(campaign, calibrated, in_strip)
+        schemes = evaluate_schemes(campaign, calibrated, in_strip)
     return Strips(
         FrozenMap({name: int(np.isfinite(s.ground[:, 0]).sum()) for name, s in strips.items()}),
         schemes,
@@ -335,18 +356,23 @@ def strips_adjusted(campaign: Campaign, advance: Advance) -> Strips | None:
     )
 
 
-def field_with_ties(campaign: Campaign, one: FieldPass) -> CalibrationField:
-    """Control and tie points of a pass; of points measured in images the field has both already."""
-    if not one.ties:
-        return one.control
-    return with_points(one.control, one.ties, intersect(one.ties, campaign.laboratory, campaign.noise).ground)
+def field_with_ties(campaign: Campaign, field_pass: FieldPass) -> CalibrationField:
+    """Return the control and tie points of a pass; points measured in images already contain both."""
+    if not field_pass.ties:
+        return field_pass.control
+    return with_points(
+        field_pass.control, field_pass.ties, intersect(field_pass.ties, campaign.laboratory, campaign.noise).ground
+    )
 
 
 def with_points(field: CalibrationField, rays: Mapping[str, Rays], ground: np.ndarray) -> CalibrationField:
-    """A field with more points (n, 3), ITRS, metres, without given coordinates; their rays are numbered from zero."""
+    """Return a field with further points (n, 3) that have no given coordinates; their rays are numbered from zero."""
     more, joined = len(ground), {}
     for line, row in field.rays.items():
-        pairs = ((getattr(one, name) for one in (row, rays[line])) for name in ("image", "station", "attitude", "time"))
+        pairs = (
+            (getattr(rays_of, name) for rays_of in (row, rays[line]))
+            for name in ("image", "station", "attitude", "time")
+        )
         point = np.concatenate([row.point, rays[line].point + len(field.ground)])
         joined[line] = Rays.of(point, *(np.concatenate(list(pair)) for pair in pairs))
     return replace(
@@ -358,43 +384,47 @@ def with_points(field: CalibrationField, rays: Mapping[str, Rays], ground: np.nd
     )
 
 
-def adjusted_strip(
-    campaign: Campaign, one: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray
+def adjust_pass_strip(
+    campaign: Campaign, field_pass: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray
 ) -> StripAdjustment:
-    """One pass on its tie points; where points are measured in images, on all those that the calibration uses.
+    """Adjust one pass on its tie points; with points measured in images, on all those that the calibration uses.
 
     Raises
     ------
     CalibrationError
-        It cannot be adjusted.
+        The strip cannot be adjusted.
     """
-    return adjust_strip(one.ties or one.control.rays, cameras, campaign.noise, bias=bias)
+    return adjust_strip(field_pass.ties or field_pass.control.rays, cameras, campaign.noise, bias=bias)
 
 
-def tested_in_strip(
-    campaign: Campaign, one: FieldPass, strip: StripAdjustment, cameras: Mapping[str, LineModel], bias: np.ndarray
+def strip_check_errors(
+    campaign: Campaign,
+    field_pass: FieldPass,
+    strip: StripAdjustment,
+    cameras: Mapping[str, LineModel],
+    bias: np.ndarray,
 ) -> CheckErrors:
-    """Errors at a field's check points, intersected with the strip's attitude and orbit."""
-    rays = {line: strip.corrected(row) for line, row in one.check.items()}
-    return check_errors(intersect(rays, cameras, campaign.noise, bias=bias).ground, one.check_ground)
+    """Return the errors at a field's check points, intersected with the strip's adjusted attitude and orbit."""
+    rays = {line: strip.corrected(row) for line, row in field_pass.check.items()}
+    return check_errors(intersect(rays, cameras, campaign.noise, bias=bias).ground, field_pass.check_ground)
 
 
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
-"""Sizes of the drift against the file's."""
+"""Sizes of the simulated drift relative to that of the file."""
 
 
 @dataclass(frozen=True, eq=False)
 class Treatment:
-    """One campaign in one treatment.
+    """Errors of one campaign, adjusted with the monitor's readings or without.
 
     Attributes
     ----------
     together : FieldErrors
-        All fields adjusted at once, each field with its own bias.
+        Errors with all fields adjusted at once, each field with its own bias.
     p_value : float
-        Of that adjustment.
+        p-value of that adjustment.
     schemes : Mapping[str, FieldErrors]
-        Scheme -> all fields without ground control; the last lets each field use its own parameters.
+        Scheme -> errors of all fields without ground control; in the last scheme each field uses its own parameters.
     """
 
     together: FieldErrors
@@ -404,16 +434,16 @@ class Treatment:
 
 @dataclass(frozen=True, eq=False)
 class DriftSize:
-    """A drift of one size.
+    """Errors for one size of the cameras' drift.
 
     Attributes
     ----------
     factor : float
-        Against the file's.
+        Size relative to that of the file.
     without : Treatment
-        Adjusted as if nothing drifted.
-    monitored : Treatment | None
-        With the monitor's readings; None without a monitor.
+        Errors of the adjustment that assumes no drift.
+    monitored : Treatment or None
+        Errors of the adjustment with the monitor's readings; None without a monitor.
     """
 
     factor: float
@@ -423,16 +453,16 @@ class DriftSize:
 
 @dataclass(frozen=True, eq=False)
 class Monitoring:
-    """Drift and monitor.
+    """Comparison of calibrations of drifting cameras with and without the on-board monitor.
 
     Attributes
     ----------
-    sizes : tuple[DriftSize, ...]
-        Of `FACTORS`.
+    sizes : tuple of DriftSize
+        Errors for each of the `FACTORS`.
     angle : float
-        Root mean square over the lines that drift of the file's sigma of d_alpha, radians.
+        Standard deviation of d_alpha in the file, root mean square over the lines that drift, in radians.
     metres : float
-        By which heights change for 1 arcsec of d_alpha of the forward line, mean of the first field.
+        Change of heights for 1 arcsec of d_alpha of the forward line, mean of the first field, in metres.
     """
 
     sizes: tuple[DriftSize, ...]
@@ -440,58 +470,58 @@ class Monitoring:
     metres: float
 
     def at(self, factor: float) -> DriftSize:
-        """One size."""
+        """Return the errors for one factor of the drift."""
         return next(s for s in self.sizes if s.factor == factor)
 
 
-def monitored(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Monitoring | None:
-    """Fly the same campaign with drifts of several sizes; None for a file without drift.
+def study_monitoring(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Monitoring | None:
+    """Simulate the same campaign with drifts of several sizes; None for a file without drift.
 
     Parameters
     ----------
     setup : CalibrationSetup
-        Test and camera.
+        Resolved test file and camera.
     seed : np.random.SeedSequence
-        Of the campaign. It is left as it is.
+        Seed of the campaign; it is not changed.
     advance : Advance
-        How far it is.
+        Callback that reports the progress.
 
     Raises
     ------
     CalibrationError
-        a campaign cannot be adjusted.
+        A campaign cannot be adjusted.
     BenchError
-        It cannot be flown.
+        A campaign cannot be simulated.
     """
     if not setup.test.drift:
         return None
     sizes = []
     metres = 0.0
     for k, factor in enumerate(FACTORS):
-        campaign = flown(setup, factor, seed)
+        campaign = fly_with_drift(setup, factor, seed)
         treatment = with_monitor(campaign) if setup.test.monitor is not None else None
         sizes.append(DriftSize(factor, without_monitor(campaign), treatment))
         if factor == 0.0:
             metres = height_per_arcsec(campaign)
         advance("drift", k + 1, len(FACTORS))
-    angles = [one.angles[0] for one in setup.test.drift.values() if any(one.angles) or one.principal_distance]
+    angles = [spec.angles[0] for spec in setup.test.drift.values() if any(spec.angles) or spec.principal_distance]
     return Monitoring(tuple(sizes), float(np.sqrt(np.mean(np.square(angles or [0.0])))), metres)
 
 
-def flown(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) -> Campaign:
-    """The campaign with the file's drift times a factor and no effects on the light that would be taken out again.
+def fly_with_drift(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) -> Campaign:
+    """Simulate the campaign with the file's drift times a factor, without effects on the light that would be corrected.
 
-    All else is drawn as without the drift. The seed is left as it is.
+    All other draws are those without drift. The seed is not changed.
     """
     test = setup.test
     drift = {
-        name: one.model_copy(
+        name: spec.model_copy(
             update={
-                "angles": tuple(factor * v for v in one.angles),
-                "principal_distance": factor * one.principal_distance,
+                "angles": tuple(factor * v for v in spec.angles),
+                "principal_distance": factor * spec.principal_distance,
             }
         )
-        for name, one in test.drift.items()
+        for name, spec in test.drift.items()
     }
     update: dict[str, object] = {"drift": FrozenMap(drift), "strip": None}
     if test.effects.corrected:
@@ -499,62 +529,71 @@ def flown(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) 
     return fly_fields(setup.model_copy(update={"test": test.model_copy(update=update)}), stream(seed)).independent
 
 
-def _treatment(campaign: Campaign, found: Adjustment, schemes: Mapping[str, Mapping[str, CheckErrors]]) -> Treatment:
-    errors = (tested(campaign, p, found.cameras_of(p.name), found.bias(p.name)) for p in campaign.passes)
+def _treatment(
+    campaign: Campaign, adjustment: Adjustment, schemes: Mapping[str, Mapping[str, CheckErrors]]
+) -> Treatment:
+    errors = (
+        check_point_errors(campaign, p, adjustment.cameras_of(p.name), adjustment.bias(p.name)) for p in campaign.passes
+    )
     pooled = {name: FieldErrors.pooled(fields.values()) for name, fields in schemes.items()}
-    return Treatment(FieldErrors.pooled(errors), found.p_value, FrozenMap(pooled))
+    return Treatment(FieldErrors.pooled(errors), adjustment.p_value, FrozenMap(pooled))
 
 
 def without_monitor(campaign: Campaign) -> Treatment:
     """Adjust a campaign as if no camera drifted."""
     alone = {p.name: calibrated_alone(campaign, p) for p in campaign.passes}
-    return _treatment(campaign, simultaneous(campaign), schemes_tested(campaign, alone))
+    return _treatment(campaign, simultaneous(campaign), scheme_errors(campaign, alone))
 
 
 def with_monitor(campaign: Campaign) -> Treatment:
-    """Adjust a campaign with the monitor's readings, which are observations where a field is calibrated and correct the
-    cameras where it is tested.
+    """Adjust a campaign with the monitor's readings.
+
+    The readings are observations where a field is calibrated, and correct the cameras where it is tested.
     """
 
-    def drifted(one: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
-        own = {line: camera.drifted(one.readings[line]) for line, camera in cameras.items()}
-        return tested(campaign, one, own, bias)
+    def drifted(field_pass: FieldPass, cameras: Mapping[str, LineModel], bias: np.ndarray) -> CheckErrors:
+        corrected = {line: camera.drifted(field_pass.readings[line]) for line, camera in cameras.items()}
+        return check_point_errors(campaign, field_pass, corrected, bias)
 
     alone = {p.name: adjust_field_with_readings(campaign, p) for p in campaign.passes}
-    return _treatment(campaign, adjust_with_readings(campaign), by_scheme(campaign, alone, drifted))
+    return _treatment(campaign, adjust_with_readings(campaign), evaluate_schemes(campaign, alone, drifted))
 
 
 def adjust_with_readings(campaign: Campaign) -> Adjustment:
-    """All fields at once, with the drift of every camera in every field as unknowns that the readings tell."""
+    """Adjust all fields at once, with the drift of every camera in every field as unknowns that the readings observe."""
     return simultaneous(
-        campaign, drift=True, monitor=tuple(p for one in campaign.passes for p in _reading_priors(campaign, one))
+        campaign,
+        drift=True,
+        monitor=tuple(p for field_pass in campaign.passes for p in _reading_priors(campaign, field_pass)),
     )
 
 
-def adjust_field_with_readings(campaign: Campaign, one: FieldPass) -> Adjustment:
-    """A field by itself with its readings; the interior orientation is that of the cameras without their drift."""
+def adjust_field_with_readings(campaign: Campaign, field_pass: FieldPass) -> Adjustment:
+    """Adjust one field with its readings; the interior orientation is that of the cameras without their drift."""
     return adjust(
-        [one.control],
+        [field_pass.control],
         campaign.laboratory,
         campaign.noise,
         unknowns=Unknowns(drift=True),
-        priors=_reading_priors(campaign, one),
+        priors=_reading_priors(campaign, field_pass),
         gauge=gauge_of(campaign),
     )
 
 
 def height_per_arcsec(campaign: Campaign) -> float:
-    """Mean change of the first field's heights for 1 arcsec of d_alpha of the forward line that the cameras do not
-    have, metres.
-    """
-    one, cameras = campaign.passes[0], dict(campaign.truth)
+    """Return the mean height error, in metres, of the first field for 1 arcsec of d_alpha of the forward line."""
+    field_pass, cameras = campaign.passes[0], dict(campaign.truth)
     ground = [
-        intersect(one.check, {**cameras, "forward": turned}, campaign.noise, bias=one.bias).ground
+        intersect(field_pass.check, {**cameras, "forward": turned}, campaign.noise, bias=field_pass.bias).ground
         for turned in (cameras["forward"], cameras["forward"].drifted(np.array([ARCSEC, 0.0, 0.0, 0.0])))
     ]
     return float(np.nanmean(check_errors(ground[1], ground[0]).error[:, 2]))
 
 
-def _reading_priors(campaign: Campaign, one: FieldPass) -> list[Prior]:
+def _reading_priors(campaign: Campaign, field_pass: FieldPass) -> list[Prior]:
     sigma = reading_sigma(campaign.simulated)
-    return [p for line, told in one.readings.items() for p in monitor_priors(one.name, line, told, sigma)]
+    return [
+        p
+        for line, reading in field_pass.readings.items()
+        for p in monitor_priors(field_pass.name, line, reading, sigma)
+    ]

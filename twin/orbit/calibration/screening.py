@@ -1,8 +1,7 @@
-"""What measured points say of themselves: robust weights of the adjustment, whether the rays of check points meet, how
-large a pixel is on the ground.
+"""Screening of measured points (robust weights, wrong names, intersections of check points), and ground sampling.
 
-What the adjustment leaves out is taken from the measurements for good, and the sigmas of matching grow where the
-residuals of the rest ask for it. Nothing here uses the truth but the counts.
+Points that the adjustment rejects are removed from the measurements, and the sigmas of image points are enlarged
+where the residuals of the remaining points require it. The truth is used for the counts alone.
 """
 
 from __future__ import annotations
@@ -27,48 +26,56 @@ from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.measured.pass_measurements import ImagePoints, listed
 
 _ROUNDS = 3
+"""Largest number of rounds in which the sigmas of image points are rescaled."""
 _SETTLED = 1.05
-"""A factor on the sigmas of all lines together that is as small is not applied, and none below 1: what the three lines'
-matches with one template have in common does not show in residuals, because it moves the adjusted point."""
+"""Factor on the sigmas of all lines together below which it is not applied, nor any below 1: errors that the three
+lines' matches with one template have in common do not show in residuals, because they move the adjusted point.
+"""
 _OWN_SIGMAS = 4.0
-"""By which the variance of a line of a pass must stand out to have a factor of its own, 3e-5 by chance. A variance by
-the median of n good points is uncertain by 1.44 / sqrt(n) of itself (1 / ln 2 of its root mean square)."""
+"""Sigmas by which the variance of a line of a pass must exceed the others to get a separate factor; 3e-5 by chance. A
+variance from the median of n good points has a relative uncertainty of 1.44 / sqrt(n) (1 / ln 2 that of the root mean
+square).
+"""
 _MEDIAN_SPREAD = 1.0 / np.log(2.0)
+"""Relative standard deviation of a variance from the median of one squared residual; see `_OWN_SIGMAS`."""
 _FALSE_ALARM = 1e-4
-"""False-alarm rate of check points, the same as for image points in the adjustment."""
+"""False-alarm probability of the test of check points, the same as for image points in the adjustment."""
 
 
 _FAR_SCATTERS, _FAR_SIGMAS = 10.0, 20.0
-"""Scatters of a line's image points about their common misclosure, and sigmas of an image point, beyond which a point
-is not that of its name. The nearest of 100 points in a strip of 60 km lies 1000 sigmas away in the median."""
+"""Limits beyond which an image point does not belong to the ground point of its name: scatters of a line's image points
+about their common misclosure, and sigmas of an image point. The nearest of 100 points in a strip of 60 km lies 1000
+sigmas away in the median."""
 _LEAST_OF_LINE = 8
-"""Control points in a line by which the others are judged."""
+"""Least number of control points in a line for which wrong names are looked for."""
 _SLOPE_POINTS = 500
+"""Largest number of points from which the slope of the misclosures is computed."""
 _Kept = dict[str, dict[str, np.ndarray]]
 
 
-def mislabelled(campaign: Campaign, one: FieldPass) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def mislabelled_points(campaign: Campaign, field_pass: FieldPass) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return which image points of a pass show another place than the ground point of their name.
 
-    The camera's and the platform's errors move the image points of a line alike, turned and scaled a little: a straight
-    line in the pixel through the medians of misclosures, which half of the points may miss.
+    Errors of camera and platform move the image points of a line alike, slightly rotated and scaled: a straight line in
+    the pixel through the medians of misclosures, a fit that tolerates up to half of the points being wrong.
 
     Returns
     -------
-    tuple[dict[str, np.ndarray], np.ndarray]
-        Line -> mask of its image points (n,), of control points alone; mask of the check points (m,) that some line
-        shows elsewhere.
+    wrong : dict of str to (n,) ndarray of bool
+        Line -> mask of its image points, for control points alone.
+    wrong_check : (m,) ndarray of bool
+        Check points that at least one line shows elsewhere.
     """
-    wrong, wrong_check, still = {}, np.zeros(len(one.check_ground), bool), np.zeros(3)
-    for name, rays in one.control.rays.items():
-        control = one.is_control[rays.point]
+    wrong, wrong_check, still = {}, np.zeros(len(field_pass.check_ground), bool), np.zeros(3)
+    for name, rays in field_pass.control.rays.items():
+        control = field_pass.is_control[rays.point]
         wrong[name] = np.zeros(len(control), bool)
         if control.sum() < _LEAST_OF_LINE:
             continue
         known, model = rays.taken(control), campaign.laboratory[name]
-        miss = misclosure(model, known, one.control.ground[known.point], still, still)
-        some = np.unique(np.linspace(0, len(miss) - 1, min(_SLOPE_POINTS, len(miss))).round().astype(int))
-        fits = [siegelslopes(miss[some, k], known.image[some, 1]) for k in (0, 1)]
+        miss = misclosure(model, known, field_pass.control.ground[known.point], still, still)
+        sample = np.unique(np.linspace(0, len(miss) - 1, min(_SLOPE_POINTS, len(miss))).round().astype(int))
+        fits = [siegelslopes(miss[sample, k], known.image[sample, 1]) for k in (0, 1)]
 
         def size(rays: Rays, miss: np.ndarray, fits: list[Any] = fits) -> np.ndarray:
             return np.hypot(*(miss[:, k] - fits[k][1] - fits[k][0] * rays.image[:, 1] for k in (0, 1)))
@@ -76,128 +83,130 @@ def mislabelled(campaign: Campaign, one: FieldPass) -> tuple[dict[str, np.ndarra
         scatter = np.sqrt(robust_variance(size(known, miss) ** 2))
         limit = max(_FAR_SCATTERS * scatter, _FAR_SIGMAS * campaign.noise.image)
         wrong[name][control] = size(known, miss) > limit
-        if name in one.check:
-            check = one.check[name]
-            away = misclosure(model, check, one.check_ground[check.point], still, still)
+        if name in field_pass.check:
+            check = field_pass.check[name]
+            away = misclosure(model, check, field_pass.check_ground[check.point], still, still)
             wrong_check[check.point[size(check, away) > limit]] = True
     return wrong, wrong_check
 
 
-def require_labelled(campaign: Campaign) -> None:
-    """Refuse a campaign whose image points show other places than the ground points of their names.
+def require_correct_names(campaign: Campaign) -> None:
+    """Raise an error if image points show other places than the ground points of their names.
 
     Raises
     ------
     FarPointsError
-        Some do; with their names.
+        Image points belong to other ground points; the message names them.
     """
-    for name, gone in _relabelled(campaign)[1].items():
-        if gone.points:
-            shown = listed([f"{point} in {line}" for point, line in gone.points])
-            raise FarPointsError(f"calibration: image points of {name} lie elsewhere than those around: {shown}")
+    for name, rejected in _without_mislabelled(campaign)[1].items():
+        if rejected.points:
+            shown = listed([f"{point} in {line}" for point, line in rejected.points])
+            raise FarPointsError(
+                f"calibration: image points of {name} do not lie where their ground points are: {shown}"
+            )
 
 
-def _relabelled(campaign: Campaign) -> tuple[Campaign, dict[str, Rejected]]:
-    """The campaign without mislabelled points, and field -> these."""
+def _without_mislabelled(campaign: Campaign) -> tuple[Campaign, dict[str, Rejected]]:
+    """Return the campaign without mislabelled points, and these points by field."""
     passes, gross = [], {}
-    for one in campaign.passes:
-        wrong, wrong_check = mislabelled(campaign, one)
+    for field_pass in campaign.passes:
+        wrong, wrong_check = mislabelled_points(campaign, field_pass)
         kept = {name: ~mask for name, mask in wrong.items()}
-        gross[one.name] = _rejected(one, kept, ~wrong_check, {})
-        passes.append(_reduced(one, kept, np.ones(len(one.control_ground), bool), ~wrong_check))
-    if not any(one.points or one.check_points for one in gross.values()):
+        gross[field_pass.name] = _rejected(field_pass, kept, ~wrong_check, {})
+        passes.append(_reduced(field_pass, kept, np.ones(len(field_pass.control_ground), bool), ~wrong_check))
+    if not any(field_pass.points or field_pass.check_points for field_pass in gross.values()):
         return campaign, gross
     return _with_light(campaign, tuple(passes)), gross
 
 
 def _with_light(campaign: Campaign, passes: tuple[FieldPass, ...]) -> Campaign:
-    """The campaign with other image points, of which effects on the light are taken out as before."""
+    """Return the campaign with other image points, from which effects on the light are taken out as before."""
     removed = campaign.effects if campaign.spec.effects.corrected else NO_EFFECTS
     return replace(campaign, passes=passes).without_effects(removed)
 
 
-def screened(campaign: Campaign) -> Campaign:
-    """The campaign without what is mislabelled or the adjustment rejects, with sigmas of the image points that fit the
-    residuals.
+def screen_campaign(campaign: Campaign) -> Campaign:
+    """Return the campaign without mislabelled and rejected points, with image sigmas rescaled to the residuals.
 
     Raises
     ------
     CalibrationError
-        It cannot be adjusted.
+        The campaign cannot be adjusted.
     """
     gross: dict[str, Rejected] = {}
     if campaign.images is None:  # names of points that were matched here are right
-        campaign, gross = _relabelled(campaign)
-    found, kept = _robust(campaign)
+        campaign, gross = _without_mislabelled(campaign)
+    adjustment, kept = _robust(campaign)
     total: dict[tuple[str, str], float] = {(p.name, line): 1.0 for p in campaign.passes for line in p.control_images}
     for _ in range(_ROUNDS):
-        factors = _factors(found, kept)
+        factors = _factors(adjustment, kept)
         if not factors:
             break
         for key, factor in factors.items():
             total[key] *= factor
         campaign = _rescaled(campaign, factors)
-        found, kept = _robust(campaign)
+        adjustment, kept = _robust(campaign)
     passes, rejected, judged = [], {}, []
-    for k, one in enumerate(campaign.passes):
-        less, keep_check = _without(campaign, one, kept[one.name], found)
-        passes.append(less)
-        own = FrozenMap({line: total[one.name, line] for line in one.control_images})
-        rejected[one.name] = _rejected(one, kept[one.name], keep_check, own)
+    for k, field_pass in enumerate(campaign.passes):
+        reduced, keep_check = _without(campaign, field_pass, kept[field_pass.name], adjustment)
+        passes.append(reduced)
+        factors_of_pass = FrozenMap({line: total[field_pass.name, line] for line in field_pass.control_images})
+        rejected[field_pass.name] = _rejected(field_pass, kept[field_pass.name], keep_check, factors_of_pass)
         if campaign.images is None:
-            rejected[one.name] = rejected[one.name].after(gross[one.name])
+            rejected[field_pass.name] = rejected[field_pass.name].after(gross[field_pass.name])
         else:
             shown = campaign.images[k]
-            judged.append(replace(shown, screening=_counted(one, shown, kept[one.name], keep_check)))
+            judged.append(replace(shown, screening=_counted(field_pass, shown, kept[field_pass.name], keep_check)))
     images = None if campaign.images is None else tuple(judged)
     return _with_light(replace(campaign, images=images, rejected=FrozenMap(rejected)), tuple(passes))
 
 
 def _robust(campaign: Campaign) -> tuple[Adjustment, _Kept]:
-    """The adjustment with robust weights, and field -> line -> which image points it keeps."""
-    found = simultaneous(campaign, robust="igg")
+    """Return the adjustment with robust weights, and masks of the accepted image points, field -> line."""
+    adjustment = simultaneous(campaign, robust="igg")
     kept: _Kept = {}
-    for name, lines in found.residual.items():
+    for name, lines in adjustment.residual.items():
         kept[name] = {}
         for line, residual in lines.items():
             far = np.linalg.norm(residual, axis=1) > REJECT
-            kept[name][line] = (found.weight[name][line] > 0.0) & ~far
-    return found, kept
+            kept[name][line] = (adjustment.weight[name][line] > 0.0) & ~far
+    return adjustment, kept
 
 
-def _factors(found: Adjustment, kept: _Kept) -> dict[tuple[str, str], float]:
-    """(field, line) -> factor on the sigmas of its image points, by the median of the standardised residuals that are
-    kept: its own where a line stands out from the sigmas and from all others, else that of all these together. Empty
-    where none is needed.
+def _factors(adjustment: Adjustment, kept: _Kept) -> dict[tuple[str, str], float]:
+    """Return factors on image sigmas by (field, line), from the median of the accepted standardised residuals.
+
+    A line has a factor of its own where its residuals stand out from the sigmas and from all other lines; all others
+    share one factor. The result is empty where no factor is needed.
     """
     squares = {
         (name, line): np.sum(residual**2, axis=1)[kept[name][line]]
-        for name, lines in found.residual.items()
+        for name, lines in adjustment.residual.items()
         for line, residual in lines.items()
     }
-    own: dict[tuple[str, str], float] = {}
-    while len(own) < len(squares):
+    separate: dict[tuple[str, str], float] = {}
+    while len(separate) < len(squares):
         # the worst first: its residuals are no measure of the others
-        rest = {key: robust_variance(row) for key, row in squares.items() if key not in own and len(row)}
-        if not rest:
+        variances = {key: robust_variance(row) for key, row in squares.items() if key not in separate and len(row)}
+        if not variances:
             break
-        common = max(robust_variance(np.concatenate([squares[key] for key in rest])), 1.0)
-        beyond = {k: (v / common - 1.0) * np.sqrt(len(squares[k])) / _MEDIAN_SPREAD for k, v in rest.items()}
+        common = max(robust_variance(np.concatenate([squares[key] for key in variances])), 1.0)
+        beyond = {k: (v / common - 1.0) * np.sqrt(len(squares[k])) / _MEDIAN_SPREAD for k, v in variances.items()}
         worst = max(beyond, key=lambda k: beyond[k])
         if beyond[worst] <= _OWN_SIGMAS:
-            factor = float(np.sqrt(robust_variance(np.concatenate([squares[key] for key in rest]))))
-            return own | (dict.fromkeys(rest, factor) if factor > _SETTLED else {})
-        own[worst] = float(np.sqrt(rest[worst]))
-    return own
+            factor = float(np.sqrt(robust_variance(np.concatenate([squares[key] for key in variances]))))
+            return separate | (dict.fromkeys(variances, factor) if factor > _SETTLED else {})
+        separate[worst] = float(np.sqrt(variances[worst]))
+    return separate
 
 
 def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> Campaign:
-    """The campaign with sigmas of image points times the factor of their pass and line."""
+    """Return the campaign with the sigmas of image points multiplied by the factor of their pass and line."""
 
-    def grown(one: FieldPass, images: Mapping[str, ImagePoints]) -> FrozenMap[str, ImagePoints]:
+    def rescaled(field_pass: FieldPass, images: Mapping[str, ImagePoints]) -> FrozenMap[str, ImagePoints]:
         return FrozenMap(
             {
-                line: replace(row, covariance=row.covariance * factors.get((one.name, line), 1.0) ** 2)
+                line: replace(row, covariance=row.covariance * factors.get((field_pass.name, line), 1.0) ** 2)
                 for line, row in images.items()
             }
         )
@@ -205,9 +214,9 @@ def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> C
     passes = tuple(
         replace(
             p,
-            control_images=grown(p, p.control_images),
-            check_images=grown(p, p.check_images),
-            tie_images=grown(p, p.tie_images),
+            control_images=rescaled(p, p.control_images),
+            check_images=rescaled(p, p.check_images),
+            tie_images=rescaled(p, p.tie_images),
         )
         for p in campaign.passes
     )
@@ -215,61 +224,74 @@ def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> C
 
 
 def _without(
-    campaign: Campaign, one: FieldPass, kept: dict[str, np.ndarray], found: Adjustment
+    campaign: Campaign, field_pass: FieldPass, kept: dict[str, np.ndarray], adjustment: Adjustment
 ) -> tuple[FieldPass, np.ndarray]:
-    """A pass without rejected image points, ties that are left to one line, check points whose rays do not meet."""
-    count = len(one.control_ground)
+    """Return a pass without rejected points, and the mask of accepted check points.
+
+    Rejected are image points, tie points that only one line still sees, and check points whose rays do not intersect.
+    """
+    count = len(field_pass.control_ground)
     seen = np.zeros(count, int)
-    for name, row in one.control_images.items():
+    for name, row in field_pass.control_images.items():
         np.add.at(seen, row.point[kept[name]], 1)
-    stays = np.where(one.is_control, seen > 0, seen > 1)
-    keep = np.ones(len(one.check_ground), bool)
-    if one.check:
-        meeting = intersect(one.check, found.cameras_of(one.name), campaign.noise, bias=found.bias(one.name))
+    stays = np.where(field_pass.is_control, seen > 0, seen > 1)
+    keep = np.ones(len(field_pass.check_ground), bool)
+    if field_pass.check:
+        intersection = intersect(
+            field_pass.check,
+            adjustment.cameras_of(field_pass.name),
+            campaign.noise,
+            bias=adjustment.bias(field_pass.name),
+        )
         # three rays are six conditions of three coordinates
-        keep = meeting.chi_square <= statistics.limit_of(_FALSE_ALARM, 2 * meeting.rays - 3)
-    return _reduced(one, kept, stays, keep), keep
+        keep = intersection.chi_square <= statistics.limit_of(_FALSE_ALARM, 2 * intersection.rays - 3)
+    return _reduced(field_pass, kept, stays, keep), keep
 
 
-def _reduced(one: FieldPass, kept: dict[str, np.ndarray], stays: np.ndarray, keep: np.ndarray) -> FieldPass:
-    """A pass with some image points (line -> mask), some ground points (n,) and some check points (m,) alone."""
+def _reduced(field_pass: FieldPass, kept: dict[str, np.ndarray], stays: np.ndarray, keep: np.ndarray) -> FieldPass:
+    """Return a pass with the selected image points (masks by line), ground points (n,) and check points (m,) alone."""
     images = {
-        name: _renumbered(row.taken(kept[name] & stays[row.point]), stays) for name, row in one.control_images.items()
+        name: _renumbered(row.taken(kept[name] & stays[row.point]), stays)
+        for name, row in field_pass.control_images.items()
     }
-    check = {name: _renumbered(row.taken(keep[row.point]), keep) for name, row in one.check_images.items()}
+    check = {name: _renumbered(row.taken(keep[row.point]), keep) for name, row in field_pass.check_images.items()}
     return replace(
-        one,
+        field_pass,
         control_images=FrozenMap(images),
-        control_ground=one.control_ground[stays],
-        control_covariance=one.control_covariance[stays],
-        is_control=one.is_control[stays],
-        control_ids=one.control_ids[stays],
+        control_ground=field_pass.control_ground[stays],
+        control_covariance=field_pass.control_covariance[stays],
+        is_control=field_pass.is_control[stays],
+        control_ids=field_pass.control_ids[stays],
         check_images=FrozenMap(check),
-        check_ground=one.check_ground[keep],
-        check_ids=one.check_ids[keep],
+        check_ground=field_pass.check_ground[keep],
+        check_ids=field_pass.check_ids[keep],
     )
 
 
 def _renumbered(row: ImagePoints, stays: np.ndarray) -> ImagePoints:
-    """Image points of ground points that stay (n,), which are counted anew."""
+    """Return image points renumbered for the ground points that remain, given as a mask (n,)."""
     return replace(row, point=(np.cumsum(stays) - 1)[row.point])
 
 
-def _rejected(one: FieldPass, kept: dict[str, np.ndarray], check: np.ndarray, factors: Mapping[str, float]) -> Rejected:
-    """Names of what was left out."""
+def _rejected(
+    field_pass: FieldPass, kept: dict[str, np.ndarray], check: np.ndarray, factors: Mapping[str, float]
+) -> Rejected:
+    """Return the names of the rejected points and the counts before and after."""
     points = [
-        (str(one.control_ids[point]), name)
-        for name, row in one.control_images.items()
+        (str(field_pass.control_ids[point]), name)
+        for name, row in field_pass.control_images.items()
         for point in row.point[~kept[name]].tolist()
     ]
-    entered = sum(len(row.point) for row in one.control_images.values())
-    gone = tuple(str(name) for name in one.check_ids[~check])
-    return Rejected(entered, entered - len(points), tuple(points), len(check), int(check.sum()), gone, factors)
+    entered = sum(len(row.point) for row in field_pass.control_images.values())
+    rejected_checks = tuple(str(name) for name in field_pass.check_ids[~check])
+    return Rejected(
+        entered, entered - len(points), tuple(points), len(check), int(check.sum()), rejected_checks, factors
+    )
 
 
-def _counted(one: FieldPass, shown: FieldImages, kept: dict[str, np.ndarray], check: np.ndarray) -> Screening:
+def _counted(field_pass: FieldPass, shown: FieldImages, kept: dict[str, np.ndarray], check: np.ndarray) -> Screening:
     entered = left = wrong_entered = wrong_left = right_lost = 0
-    for name, row in one.control_images.items():
+    for name, row in field_pass.control_images.items():
         wrong, stays = shown.wrong[name][row.point], kept[name]
         entered, left = entered + len(wrong), left + int(stays.sum())
         wrong_entered, wrong_left = wrong_entered + int(wrong.sum()), wrong_left + int((wrong & stays).sum())
@@ -281,13 +303,13 @@ def _counted(one: FieldPass, shown: FieldImages, kept: dict[str, np.ndarray], ch
 
 
 @dataclass(frozen=True)
-class Meeting:
-    """How well the rays of check points meet, by the sigmas of image points and readings.
+class IntersectionFit:
+    """Chi-square of the intersections of the check points' rays, with the sigmas of image points and readings.
 
     Attributes
     ----------
     chi_square : float
-        Of all of them.
+        Sum over all check points.
     degrees_of_freedom : int
         Two for each ray less three for each point.
     """
@@ -297,33 +319,37 @@ class Meeting:
 
     @property
     def p_value(self) -> float:
-        """Chance of such a chi-square or a larger one. Points exposed within a few readings err alike, and the
-        calibration's own errors are in it.
+        """Probability of a chi-square at least as large.
+
+        Points exposed within a few readings have correlated errors, and the errors of the calibration itself are
+        included.
         """
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
 
-def meeting_of(campaign: Campaign, one: FieldPass, adjustment: Adjustment) -> Meeting:
-    """Intersect a pass's check points by the cameras and the bias of an adjustment.
+def intersection_fit(campaign: Campaign, field_pass: FieldPass, adjustment: Adjustment) -> IntersectionFit:
+    """Intersect a pass's check points with the cameras and the bias of an adjustment, and return the fit.
 
     Raises
     ------
     CalibrationError
-        They cannot be intersected.
+        The check points cannot be intersected.
     """
-    found = intersect(one.check, adjustment.cameras_of(one.name), campaign.noise, bias=adjustment.bias(one.name))
-    seen = found.rays > 1
-    return Meeting(float(np.sum(found.chi_square[seen])), int(np.sum(2 * found.rays[seen] - 3)))
+    intersection = intersect(
+        field_pass.check, adjustment.cameras_of(field_pass.name), campaign.noise, bias=adjustment.bias(field_pass.name)
+    )
+    seen = intersection.rays > 1
+    return IntersectionFit(float(np.sum(intersection.chi_square[seen])), int(np.sum(2 * intersection.rays[seen] - 3)))
 
 
-def ground_sample(one: FieldPass, line: str) -> tuple[float, float]:
-    """Ground sample distance of the middle of a line's image along and across the track, metres."""
-    sensor = one.data.sensors[line]
-    row = one.control_images.get(line)
+def ground_sample(field_pass: FieldPass, line: str) -> tuple[float, float]:
+    """Return the ground sample distance of the middle of a line's image along and across the track, in metres."""
+    sensor = field_pass.data.sensors[line]
+    row = field_pass.control_images.get(line)
     middle = 0.5 * (sensor.lines - 1) if row is None or not len(row.line) else float(np.mean(row.line))
     pixel = 0.5 * (sensor.camera.pixels - 1)
     step = 0.5 if 0.0 <= middle - 0.5 and middle + 0.5 <= sensor.lines - 1 else 0.25
     places = np.array([[middle - step, pixel], [middle + step, pixel], [middle, pixel - step], [middle, pixel + step]])
-    ground = sensor.ground(places[:, 0], places[:, 1], one.data.height)
+    ground = sensor.ground(places[:, 0], places[:, 1], field_pass.data.height)
     along, across = (float(np.linalg.norm(ground[k + 1] - ground[k])) / (2.0 * step) for k in (0, 2))
     return along, across

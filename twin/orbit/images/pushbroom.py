@@ -85,7 +85,7 @@ class LookMap:
         Raises
         ------
         ValueError
-            The part lies outside the image, a look misses the Earth, or the attitude is too rough for the nodes.
+            The part lies outside the image, a line of sight misses the Earth, or the attitude is too rough for the nodes.
         """
         low, high = terrain.limits
         span = np.array([lines, pixels, (low - 1.0, high + 1.0)])
@@ -118,7 +118,7 @@ class LookMap:
         with one_blas_thread():
             along = self._basis(0, lines, self.east.shape[1])
             across = self._basis(1, pixels, self.east.shape[2])
-            # as polynomials in x, height over the span: -1 at the lowest
+            # Convert to polynomials in x, the height over the span, which is -1 at the lowest.
             power = np.zeros((_HEIGHTS, _HEIGHTS))
             for k in range(_HEIGHTS):
                 power[k, : k + 1] = chebyshev.cheb2poly([0.0] * k + [1.0])
@@ -137,7 +137,7 @@ class LookMap:
             x = (h - middle) / half
             return self.terrain.height(_horner(east, x), _horner(north, x)) - h
 
-        # the terrain lies between the span's ends, so that there is always a place between `below` and `above`
+        # The terrain lies between the span's ends, so that an intersection lies between `below` and `above`.
         below, above = np.full(east[0].shape, low), np.full(east[0].shape, high)
         before, excess_before = np.full(east[0].shape, middle), excess(np.full(east[0].shape, middle))
         height = before + excess_before
@@ -150,7 +150,7 @@ class LookMap:
             np.copyto(above, height, where=now < 0.0)
             with np.errstate(divide="ignore", invalid="ignore"):
                 step = height - now * (height - before) / (now - excess_before)
-            if k % 4 == 3:  # secants alone may creep toward a place from one side
+            if k % 4 == 3:  # secants alone may creep toward the intersection from one side
                 step[np.abs(now) > 1.0] = np.nan
             inside = (step > below) & (step < above)
             arrived = np.abs(now) <= _MET
@@ -201,7 +201,7 @@ def _local(
     """Return east and north of looks at heights, by the rigorous sensor, in metres."""
     points = sensor.ground(line, pixel, height)
     if not np.all(np.isfinite(points)):
-        raise UnphysicalError("a look misses the Earth")
+        raise UnphysicalError("a line of sight misses the Earth")
     return frame.local(points)[:2]
 
 
@@ -340,7 +340,7 @@ def extent_of(looks: LookMap, step: int = 16) -> Extent:
     (first, last), (left, right), _ = looks.span
     lines, pixels = (np.linspace(a, b, int((b - a) / step) + 2) for a, b in ((first, last), (left, right)))
     east, north, _ = looks.ground(lines, pixels)
-    # between two samples the terrain moves the place by less than they lie apart
+    # Between two samples the terrain displaces the point by less than their distance.
     spare = max(float(np.max(np.abs(np.diff(v, axis=k)))) for v in (east, north) for k in (0, 1))
     found = Extent(float(east.min()), float(east.max()), float(north.min()), float(north.max()))
     return found.grown(spare)
@@ -361,7 +361,7 @@ def require_open(looks: LookMap, extent: Extent) -> None:
     for part in (slice(i, i + 256) for i in range(0, len(north), 256)):
         slope_east, slope_north = looks.terrain.slopes(east, north[part])
         steepest = max(steepest, float(np.max(slope_east * to_east + slope_north * to_north)))
-    # following the look up by 1 m, the ground below it rises by this much
+    # Along the look the ground below it rises by this much per metre.
     if steepest >= 1.0:
         look = np.hypot(to_east, to_north)
         raise SteepTerrainError(
@@ -406,7 +406,7 @@ def render_patch(
     looks = looks or look_map(sensor, scene.frame, scene.terrain, window)
     line, pixel = window.middle
     height = float(looks.ground(np.array([line]), np.array([pixel]))[2][0, 0])
-    # what jitter blurs differs from line to line: it is in the moments that the light is collected at
+    # Blur by jitter differs from line to line and is contained in the moments of the collection.
     motion = ImageMotion.of(steady(sensor), line, pixel, height)
     moments = exposures(sensor, optics)
     if len(moments) > 1 or moments[0][1] is not sensor:
@@ -414,7 +414,7 @@ def render_patch(
         photons = np.sum([share * photons for share, (photons, _) in seen], axis=0)
         return RenderedPatch(np.maximum(photons, 0.0), window, motion, max(error for _, (_, error) in seen))
     photons, error = _expected(sensor, optics, scene, window, oversampling, motion, looks)
-    # a point spread function that a grid of samples cuts off rings by 1e-4 of an edge
+    # The point spread function on a finite grid rings by 1e-4 of an edge.
     return RenderedPatch(np.maximum(photons, 0.0), window, motion, error)
 
 
@@ -429,7 +429,7 @@ def _expected(
 ) -> tuple[np.ndarray, float]:
     """Return expected photons at one moment of the collection, and the position error; arguments as `render_patch`."""
     looks = looks or look_map(sensor, scene.frame, scene.terrain, window)
-    # samples at pixels first, then finer if the terrain asks for it
+    # Try samples at pixels first, then finer ones if the terrain needs them.
     for fine in (1, oversampling):
         error = _interpolation_error(sensor, looks, window, oversampling, fine)
         if error <= LARGEST_ERROR:
@@ -470,7 +470,7 @@ def _samples(looks: LookMap, window: Window, oversampling: int, fine: int) -> tu
     cut = slice(_NEAR * fine, -_NEAR * fine)
     if fine == oversampling:
         return east[cut, cut], north[cut, cut]
-    # at pixels only: from one before the margin, and to one after
+    # With samples at pixels only, interpolation needs one more at either end.
     out = [_spread(_spread(v[1:-1, 1:-1], oversampling, 0), oversampling, 1) for v in (east, north)]
     return out[0], out[1]
 
@@ -498,12 +498,12 @@ def _spread(values: np.ndarray, factor: int, axis: int) -> np.ndarray:
 
 def _filtered(values: np.ndarray, kernel: np.ndarray, oversampling: int, window: Window) -> np.ndarray:
     """Return samples, with a margin, convolved with the point spread function, at the pixels."""
-    # what the ring of a transform brings from the far side falls into the margin alone
+    # Wrap-around of the transform falls into the margin alone.
     shape = [fft.next_fast_len(n, True) for n in values.shape]
     spectrum = fft.rfft2(values.astype(np.float32, copy=False), s=shape)
     spectrum *= fft.rfft2(kernel.astype(np.float32), s=shape)
     image = fft.irfft2(spectrum, s=shape, overwrite_x=True)
-    # the kernel begins at its corner: the image of a sample lies half a kernel later
+    # The kernel begins at its corner: the image of a sample lies half a kernel later.
     first = 2 * MARGIN * oversampling
     lines, pixels = (first + oversampling * np.arange(n) for n in (window.lines, window.pixels))
     return np.asarray(image[lines[0] : lines[-1] + 1 : oversampling, pixels[0] : pixels[-1] + 1 : oversampling])

@@ -24,8 +24,8 @@ from twin.framework.random_streams import stream
 from twin.framework.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
-from twin.orbit.calibration.campaign_adjustment import LatitudeFit, calibrated_alone, fitted
-from twin.orbit.calibration.schemes import schemes_tested, tested, tested_before, values_of
+from twin.orbit.calibration.campaign_adjustment import LatitudeFit, calibrated_alone, fit_latitude
+from twin.orbit.calibration.schemes import check_point_errors, laboratory_errors, scheme_errors, values_of
 from twin.validation.check import SIGMAS, CheckResult, Chosen, Supposed, mean_of, median_of, rms
 from twin.validation.group import Context, drawing, group_of
 from twin.validation.paper_003.model import FIELDS, all_errors, changed, setup_of, without_light
@@ -125,8 +125,8 @@ def flights_of(campaigns: Sequence[Campaign]) -> Flights:
     fits = []
     for one in campaigns:
         alone = {p.name: calibrated_alone(one, p) for p in one.passes}
-        schemes, before = schemes_tested(one, alone), tested_before(one)
-        floor = {p.name: tested(one, p, one.truth, p.bias) for p in one.passes}
+        schemes, before = scheme_errors(one, alone), laboratory_errors(one)
+        floor = {p.name: check_point_errors(one, p, one.truth, p.bias) for p in one.passes}
         true = np.array([p.bias for p in one.passes])
         bias = np.array([alone[n].bias(n) for n in names])
         sigma = np.array([[alone[n].sigma[f"{n} {axis}"] for axis in BIAS] for n in names])
@@ -147,7 +147,7 @@ def flights_of(campaigns: Sequence[Campaign]) -> Flights:
         new["true_amplitude"], new["true_significance"] = _slopes(latitude, true)
         for key, value in new.items():
             rows.setdefault(key, []).append(value)
-        fits.append(tuple(fitted(a, latitude, bias[:, k], np.diag(sigma[:, k] ** 2)) for k, a in enumerate(BIAS)))
+        fits.append(tuple(fit_latitude(a, latitude, bias[:, k], np.diag(sigma[:, k] ** 2)) for k, a in enumerate(BIAS)))
     return Flights(
         fields=names, latitude=latitude, fits=tuple(fits), **{key: np.array(value) for key, value in rows.items()}
     )

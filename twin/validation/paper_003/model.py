@@ -31,7 +31,7 @@ from twin.framework.svg import BLUE, GREY, VERMILION
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass, line_model
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
-from twin.orbit.calibration.schemes import tested, tested_before
+from twin.orbit.calibration.schemes import check_point_errors, laboratory_errors
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import changed_payload, line_cameras
 from twin.orbit.flight.sensor import Platform, Sensor
@@ -515,7 +515,7 @@ def _field(campaign: Campaign, one: FieldPass) -> FromImages:
         for line, camera in campaign.laboratory.items()
     }
     bias = np.array([value[f"{one.name} {n}"] for n in BIAS])
-    after = tested(campaign, one, cameras, bias)
+    after = check_point_errors(campaign, one, cameras, bias)
     return FromImages(
         one.name,
         int(one.control.control.sum()),
@@ -524,7 +524,7 @@ def _field(campaign: Campaign, one: FieldPass) -> FromImages:
         together,
         error,
         together.covariance[np.ix_(where, where)],
-        tested_before(campaign)[one.name],
+        laboratory_errors(campaign)[one.name],
         after,
     )
 
