@@ -1,17 +1,14 @@
-"""Image files as grey values that are linear in light: TIFF, FITS, PNG and JPEG; regions of all pages, or
-frames as they are in the file.
+"""Reader of image files as grey values that are linear in light: TIFF, FITS, PNG and JPEG.
 
-The header is read first, so that what would not fit into memory is refused before it is decoded. Of an uncompressed
-TIFF and of a FITS file nothing but what is asked for is read.
+It reads regions of all pages, or frames as they are stored. The header (size, type of the numbers, tone curve) is read
+first, so that an image that does not fit into memory is refused before it is decoded. Of an uncompressed TIFF and of a
+FITS file only the required part is read.
 
-What the header of an image file says before anything is decoded: its size, its numbers and its tone curve.
+FITS: header and planes of the images in the file, primary or extension, cubes, scaled and compressed ones. A plane's
+first row is the one stored first (NAXIS2 = 1), wherever a viewer draws it. Values are the physical ones, BZERO + BSCALE
+times stored; 16-bit integers with BZERO 32768 stay integers. Undefined pixels (BLANK) are NaN.
 
-FITS: header and planes of the images in it, primary or extension, cubes, scaled and compressed ones.
-
-A plane's first row is the one stored first (NAXIS2 = 1), wherever a viewer draws it. Values are the physical ones,
-BZERO + BSCALE times stored; 16-bit integers with BZERO 32768 stay integers. Undefined pixels (BLANK) are NaN.
-
-TIFF and BigTIFF of either byte order: header and pages, uncompressed, LZW, deflate and what imagecodecs knows.
+TIFF and BigTIFF of either byte order: header and pages, uncompressed, LZW, deflate and the codecs of imagecodecs.
 """
 
 from __future__ import annotations
@@ -41,34 +38,34 @@ from analysis.arrays import Array
 
 
 class ImageError(Exception):
-    """A file, page or region that cannot be read; the message says what to change."""
+    """Error raised for a file, page or region that cannot be read; the message says what to change."""
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Header of the pages that belong together.
+    """Header of the pages of an image file that belong together.
 
     Attributes
     ----------
     kind : str
         TIFF, FITS, PNG or JPEG.
-    pages : tuple[int, ...]
-        Their numbers in the file, the first is 0.
+    pages : tuple of int
+        Numbers of the pages in the file; the first is 0.
     rows, columns : int
-        Of every page.
+        Size of every page, pixels.
     channels : int
-        1 of grey, 2 with alpha, 3 and more of colour.
+        1 for grey, 2 with alpha, 3 and more for colour.
     page_bytes : int
-        Of a decoded page.
+        Size of a decoded page, bytes.
     full_scale : float
-        Largest grey value that the file's type holds, infinity for signed and real numbers.
+        Largest grey value of the file's type; infinity for signed and real numbers.
     coded : str
-        Why grey values probably follow a tone curve and not the light; empty if nothing says so.
+        Reason why grey values probably follow a tone curve instead of the light; empty if there is none.
     inverted : bool
-        The largest value is black.
-    turned : str
-        How the file says that rows and columns are to be drawn, where it is not the order in which they are stored;
-        empty if it is.
+        True if the largest value is black.
+    orientation : str
+        Orientation in which the file says that rows and columns are to be drawn, where it differs from the order in
+        which they are stored; empty if not.
     """
 
     kind: str
@@ -80,18 +77,18 @@ class ImageHeader:
     full_scale: float
     coded: str = ""
     inverted: bool = False
-    turned: str = ""
+    orientation: str = ""
 
 
 def full_scale(dtype: np.dtype[Any], bits: int | None = None) -> float:
-    """Largest value of a type, of which perhaps not all bits are used; infinity for signed and real numbers.
+    """Return the largest value of a type, of which perhaps not all bits are used; infinity for signed and real numbers.
 
     Parameters
     ----------
-    dtype : np.dtype[Any]
-        Of the decoded pages.
-    bits : int | None
-        Of a sample in the file.
+    dtype : dtype
+        Type of the decoded pages.
+    bits : int or None
+        Bits of a sample in the file.
     """
     if dtype.kind != "u":
         return math.inf
@@ -99,56 +96,56 @@ def full_scale(dtype: np.dtype[Any], bits: int | None = None) -> float:
 
 
 def different_pages(path: Path, kinds: dict[str, list[int]], choose: str) -> ImageError:
-    """The error for pages that do not belong together.
+    """Return the error for pages that do not belong together.
 
     Parameters
     ----------
     path : Path
-        Of the file.
-    kinds : dict[str, list[int]]
-        What they are -> their numbers.
+        Path of the file.
+    kinds : dict of str to list of int
+        Page numbers by the description of their kind.
     choose : str
-        By which option the user can name one, empty for none.
+        Option with which the user can select a page; empty for none.
     """
     listed = ", ".join(f"{kind} (first: {numbers[0]})" for kind, numbers in list(kinds.items())[:4])
-    remedy = f"say which with {choose} NUMBER" if choose else "save those that belong together as a file of their own"
+    remedy = f"select one with {choose} NUMBER" if choose else "save those that belong together as a separate file"
     return ImageError(f"{path} has pages of different sizes or types, {listed}: {remedy}")
 
 
 def no_such_page(path: Path, page: int, count: int, choose: str) -> ImageError:
-    """The error for a page that is not there.
+    """Return the error for a page that does not exist.
 
     Parameters
     ----------
     path : Path
-        Of the file.
+        Path of the file.
     page : int
-        Its number.
+        Number of the page.
     count : int
-        Of pages.
+        Number of pages in the file.
     choose : str
-        By which option it was named.
+        Option with which the user selected the page.
     """
     return ImageError(f"{choose or 'page'} {page} does not exist: {path} has {count} pages, the first is 0")
 
 
 PNG_MAGIC, JPEG_MAGIC = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
-"""Colour type of a PNG -> channels that it is decoded to."""
+"""Number of decoded channels by the colour type of a PNG."""
 
 
 def png_header(path: Path) -> ImageHeader:
-    """Size, type and named tone curve of a PNG.
+    """Read size, type and tone curve of a PNG.
 
     Parameters
     ----------
     path : Path
-        Of the file.
+        Path of the file.
 
     Raises
     ------
     ImageError
-        It is cut off or damaged.
+        The file is truncated or damaged.
     """
     rows = columns = depth = colour = 0
     coded, name, damaged = "", b"", f"{path} cannot be read as an image: it is cut off or damaged"
@@ -157,19 +154,19 @@ def png_header(path: Path) -> ImageHeader:
         while name != b"IEND" and len(head := file.read(8)) == 8:
             length, name = struct.unpack(">I4s", head)
             data, check = file.read(length), file.read(4)
-            # libpng would tell the terminal of it
+            # libpng would report a wrong checksum to the terminal only
             if len(check) < 4 or struct.unpack(">I", check)[0] != zlib.crc32(data, zlib.crc32(name)):
                 raise ImageError(damaged)
             if name == b"IHDR" and length == 13:
                 columns, rows, depth, colour = struct.unpack(">IIBB", data[:10])
-            elif not rows:  # something stands before it
+            elif not rows:  # another chunk precedes the header
                 raise ImageError(damaged)
             elif name == b"gAMA" and length == 4:
                 gamma = struct.unpack(">I", data)[0] * 1e-5
                 if not coded and abs(gamma - 1.0) > 0.01:
-                    coded = f"it says gamma {gamma:.4g}"
+                    coded = f"it gives gamma {gamma:.4g}"
             elif name in (b"sRGB", b"iCCP"):
-                coded = "it has a colour profile" if name == b"iCCP" else "it says sRGB"
+                coded = "it has a colour profile" if name == b"iCCP" else "it is marked as sRGB"
     if not (rows and columns and name == b"IEND"):
         raise ImageError(damaged)
     if colour not in _PNG_CHANNELS:
@@ -181,36 +178,36 @@ def png_header(path: Path) -> ImageHeader:
 
 
 def jpeg_header(path: Path) -> ImageHeader:
-    """Size of a JPEG; wherever its tables stand.
+    """Read the size of a JPEG, at whatever position its tables are.
 
     Parameters
     ----------
     path : Path
-        Of the file.
+        Path of the file.
 
     Raises
     ------
     ImageError
-        It is cut off, damaged, or not of 8 bits.
+        The file is truncated, damaged, or not of 8 bits.
     """
     data = path.read_bytes()
-    place = 2
-    while place + 9 < len(data):
-        if data[place] != 0xFF:
+    position = 2
+    while position + 9 < len(data):
+        if data[position] != 0xFF:
             break
-        marker = data[place + 1]
+        marker = data[position + 1]
         if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:
-            place += 1 if marker == 0xFF else 2
+            position += 1 if marker == 0xFF else 2
             continue
         # start of frame, but not the tables of Huffman and arithmetic coding
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            depth, rows, columns, channels = struct.unpack(">BHHB", data[place + 4 : place + 10])
-            if not (rows and columns and depth == 8) or data.rfind(b"\xff\xd9") < place:
+            depth, rows, columns, channels = struct.unpack(">BHHB", data[position + 4 : position + 10])
+            if not (rows and columns and depth == 8) or data.rfind(b"\xff\xd9") < position:
                 break
-            # three channels, also of four
+            # four channels are decoded to three
             size = rows * columns * min(channels, 3)
             return ImageHeader("JPEG", (0,), rows, columns, min(channels, 3), size, 255.0, "it is a JPEG of 8 bits")
-        place += 2 + struct.unpack(">H", data[place + 2 : place + 4])[0]
+        position += 2 + struct.unpack(">H", data[position + 2 : position + 4])[0]
     raise ImageError(f"{path} cannot be read as an image: it is cut off or damaged, or not a JPEG of 8 bits")
 
 
@@ -218,38 +215,38 @@ FITS_MAGIC = b"SIMPLE  ="
 _SCIENCE = "SCI"
 _MJD_ZERO = datetime(1858, 11, 17, tzinfo=UTC)
 _NOT_IMAGES = {"ERR", "DQ", "VAR", "MASK", "WHT", "UNCERT", "BPM", "QUALITY"}
-"""Names of extensions that go with an image."""
+"""Names of extensions that accompany an image."""
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The file's list of units; what it only grumbles about is no error, but a cut-off file is."""
-    # takes longer to import than most images to be read
+    """Open a FITS file and yield its list of units; a truncated file is an error, other warnings are ignored."""
+    # imported here, as the import takes longer than reading most images
     from astropy.io import fits
 
-    # without a memory map: astropy maps no scaled integers, and sections read what they need anyway
-    # opened here, since astropy leaves a file open that it cannot read
-    with path.open("rb") as file, warnings.catch_warnings(record=True) as told:
+    # No memory map: astropy maps no scaled integers, and sections read only the required part. The file is opened
+    # here, since astropy leaves a file open that it cannot read.
+    with path.open("rb") as file, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False) as units:
-            cut = next((str(w.message) for w in told if "truncated" in str(w.message)), "")
+            cut = next((str(w.message) for w in caught if "truncated" in str(w.message)), "")
             if cut:
                 raise ImageError(f"{path} cannot be read as an image: it is cut off ({cut})")
             yield units
 
 
 def _images(units: Any) -> list[Any]:
-    """The units that are images, of those with names the ones that are the measurement."""
+    """Return the units that are images; if some are named as the measurement, only these."""
     from astropy.io import fits
 
     kinds = (fits.PrimaryHDU, fits.ImageHDU, fits.CompImageHDU)
-    found = [unit for unit in units if isinstance(unit, kinds) and len(unit.shape) >= 2 and 0 not in unit.shape]
-    science = [unit for unit in found if str(unit.name).upper() == _SCIENCE]
-    return science or [unit for unit in found if str(unit.name).upper() not in _NOT_IMAGES]
+    images = [unit for unit in units if isinstance(unit, kinds) and len(unit.shape) >= 2 and 0 not in unit.shape]
+    science = [unit for unit in images if str(unit.name).upper() == _SCIENCE]
+    return science or [unit for unit in images if str(unit.name).upper() not in _NOT_IMAGES]
 
 
 def _physical(unit: Any) -> np.dtype[Any]:
-    """Type of a unit's values once they are scaled."""
+    """Return the type of a unit's scaled values."""
     header = unit.header
     bits, zero, scale = int(header["BITPIX"]), float(header.get("BZERO", 0)), float(header.get("BSCALE", 1))
     if bits < 0:
@@ -264,31 +261,31 @@ def _physical(unit: Any) -> np.dtype[Any]:
 
 
 def _planes(units: Any) -> list[tuple[Any, tuple[int, ...]]]:
-    """(unit, index of the plane in its cube) in the order of the file."""
+    """Return (unit, index of the plane in its cube) of all planes in the order of the file."""
     return [(unit, index) for unit in _images(units) for index in np.ndindex(*unit.shape[:-2])]
 
 
 def fits_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
-    """What the header says of all planes, or of one.
+    """Read the header of all planes of a FITS file, or of one.
 
     Parameters
     ----------
     path : Path
-        Of the file.
-    wanted : int | None
-        Number of the one plane, None for all.
+        Path of the file.
+    wanted : int or None
+        Number of the one plane; None for all.
     choose : str
-        Option that names a plane, for messages.
+        Option that selects a plane, for messages.
 
     Raises
     ------
     ImageError
-        No image in it, or planes of several kinds.
+        The file has no image, or planes of several kinds.
     """
     with _opened(path) as units:
         planes = _planes(units)
         if not planes:
-            raise ImageError(f"{path} holds no image: none of its {len(units)} units has rows and columns")
+            raise ImageError(f"{path} contains no image: none of its {len(units)} units has rows and columns")
         if wanted is not None and not 0 <= wanted < len(planes):
             raise no_such_page(path, wanted, len(planes), choose)
         kinds: dict[str, list[int]] = {}
@@ -306,12 +303,14 @@ def fits_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
 
 
 def fits_time(path: Path) -> datetime | None:
-    """When the first image was recorded, by DATE-BEG, DATE-OBS (with TIME-OBS) or MJD-OBS; None where it does not say.
+    """Return the recording time of the first image of a FITS file; None if it is not given.
+
+    The time is that of DATE-BEG, DATE-OBS (with TIME-OBS) or MJD-OBS.
 
     Parameters
     ----------
     path : Path
-        Of the file.
+        Path of the file.
     """
     with _opened(path) as units:
         for unit in units:
@@ -329,19 +328,19 @@ def fits_time(path: Path) -> datetime | None:
 
 
 def fits_cards(path: Path, number: int) -> dict[str, Any]:
-    """Keys and values of the header of the unit that holds a plane.
+    """Return keys and values of the header of the unit that contains a plane.
 
     Parameters
     ----------
     path : Path
-        Of the file.
+        Path of the file.
     number : int
-        Of the plane.
+        Number of the plane.
 
     Raises
     ------
     ImageError
-        a header that cannot be read.
+        The header cannot be read.
     """
     try:
         with _opened(path) as units:
@@ -349,20 +348,20 @@ def fits_cards(path: Path, number: int) -> dict[str, Any]:
             return {str(key): header[key] for key in header if key}
     except ImageError:
         raise
-    # what astropy finds wrong with a spoilt card cannot be foreseen
+    # astropy may raise any exception for a damaged card
     except Exception as error:
         raise ImageError(f"{path} cannot be read as an image: its header is damaged") from error
 
 
 def fits_planes(path: Path, pages: Iterable[int]) -> Iterator[NDArray[Any]]:
-    """Planes (rows, columns) of physical values.
+    """Yield planes (rows, columns) of physical values.
 
     Parameters
     ----------
     path : Path
-        Of the file.
-    pages : Iterable[int]
-        Their numbers.
+        Path of the file.
+    pages : iterable of int
+        Numbers of the planes.
     """
     with _opened(path) as units:
         planes = _planes(units)
@@ -371,14 +370,14 @@ def fits_planes(path: Path, pages: Iterable[int]) -> Iterator[NDArray[Any]]:
             yield np.asarray(unit.section[(*index, slice(None), slice(None))])
 
 
-# what it logs of a spoilt file would stand beside the sentence in which the file is refused
+# its log messages about a damaged file would appear beside the error message of this program
 tifffile.logger().addHandler(logging.NullHandler())
 
 TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-"""First four bytes."""
+"""First four bytes of a TIFF."""
 _ICC_PROFILE, _ORIENTATION, _EXIF = 34675, 274, 34665
 _AXES = {"YX": (0, 1, None), "YXS": (0, 1, 2), "SYX": (1, 2, 0)}
-"""Where rows, columns and channels stand in a page."""
+"""Positions of rows, columns and channels among the axes of a page."""
 _GREY = {"MINISWHITE", "MINISBLACK", "RGB"}
 _OTHERS = {
     "PALETTE": "numbers of a palette's colours",
@@ -396,21 +395,21 @@ def _page(file: tifffile.TiffFile, number: int) -> tifffile.TiffPage:
 
 
 def tiff_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
-    """What the header says of all full pages, or of one.
+    """Read the header of all full pages of a TIFF, or of one.
 
     Parameters
     ----------
     path : Path
-        Of the file.
-    wanted : int | None
-        Number of the one page, None for all but thumbnails and masks.
+        Path of the file.
+    wanted : int or None
+        Number of the one page; None for all but thumbnails and masks.
     choose : str
-        Option that names a page, for messages.
+        Option that selects a page, for messages.
 
     Raises
     ------
     ImageError
-        No pages, pages of several kinds, no grey values or colours linear in light.
+        The file has no pages, pages of several kinds, or neither grey values nor RGB colours.
     """
     with tifffile.TiffFile(path) as file:
         file.pages.useframes = False
@@ -418,7 +417,7 @@ def tiff_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
         sizes: dict[tuple[Any, ...], list[int]] = {}
         for number in range(count) if wanted is None else [wanted] if 0 <= wanted < count else []:
             page = _page(file, number)
-            # thumbnails and masks say that they are
+            # thumbnails and masks are marked as such
             if wanted is not None or not (page.is_reduced or page.is_mask):
                 sizes.setdefault((page.shape, page.dtype, page.axes), []).append(number)
         if not sizes:
@@ -429,15 +428,15 @@ def tiff_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
         ((shape, dtype, axes), numbers) = next(iter(sizes.items()))
         page = _page(file, numbers[0])
         if dtype is None or dtype.kind not in "uif":
-            raise ImageError(f"{path} holds {dtype} values; grey values must be integers or real numbers")
+            raise ImageError(f"{path} contains {dtype} values; grey values must be integers or real numbers")
         if axes not in _AXES:
             raise ImageError(f"{path} has axes {axes}; pages of rows and columns are needed")
         compressed = str(page.compression.name)
         photometric = str(getattr(page.photometric, "name", page.photometric))
-        # the decoder of JPEG turns YCbCr into RGB
+        # the JPEG decoder converts YCbCr to RGB
         if photometric not in _GREY and not (photometric == "YCBCR" and "JPEG" in compressed):
-            what = _OTHERS.get(photometric, f"colours of the kind {photometric}")
-            raise ImageError(f"{path} holds {what}; save it as grey values, or as RGB linear in light")
+            content = _OTHERS.get(photometric, f"colours of the kind {photometric}")
+            raise ImageError(f"{path} contains {content}; save it as grey values, or as RGB linear in light")
         bits, coded = 8 * dtype.itemsize, ""
         if bits == 8 and "JPEG" in compressed:
             coded = "its 8-bit pages are compressed as JPEG"
@@ -456,42 +455,44 @@ def tiff_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
             full_scale=full_scale(dtype, used),
             coded=coded,
             inverted=photometric == "MINISWHITE",
-            turned="" if orientation == 1 else f"orientation {orientation}",
+            orientation="" if orientation == 1 else f"orientation {orientation}",
         )
 
 
 def tiff_origin(path: Path) -> tuple[datetime | None, str]:
-    """When the first page was recorded, by Exif's DateTimeOriginal, None where it does not say; and the ``note`` in a
-    description that is JSON, as this program writes it.
+    """Return the recording time of a TIFF's first page and the ``note`` in its description.
+
+    The time is Exif's DateTimeOriginal, None if it is not given. The note is read from a description in JSON, as this
+    program writes it.
 
     Parameters
     ----------
     path : Path
-        Of the file.
+        Path of the file.
     """
     with tifffile.TiffFile(path) as file:
         page = _page(file, 0)
-        exif, told = page.tags.valueof(_EXIF) or {}, str(page.description)
-    note = str(json.loads(told).get("note", "")) if told.startswith("{") else ""
-    found = re.fullmatch(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)\0?", str(exif.get("DateTimeOriginal", "")))
-    if found is None:
+        exif, description = page.tags.valueof(_EXIF) or {}, str(page.description)
+    note = str(json.loads(description).get("note", "")) if description.startswith("{") else ""
+    match = re.fullmatch(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)\0?", str(exif.get("DateTimeOriginal", "")))
+    if match is None:
         return None, note
     fraction = re.sub(r"\D", "", str(exif.get("SubsecTimeOriginal", "")))[:6]
-    text = "{}-{}-{}T{}".format(*found.groups()) + (f".{fraction:0<6}" if fraction else "")
+    text = "{}-{}-{}T{}".format(*match.groups()) + (f".{fraction:0<6}" if fraction else "")
     return datetime.fromisoformat(text).replace(tzinfo=UTC), note
 
 
 def tiff_pages(path: Path, pages: Iterable[int], check: Callable[[], None]) -> Iterator[NDArray[Any]]:
-    """Every page, (rows, columns) or with channels last; of an uncompressed one only what is looked at is read.
+    """Yield the pages, (rows, columns) or with channels last; of an uncompressed page only the accessed part is read.
 
     Parameters
     ----------
     path : Path
-        Of the file.
-    pages : Iterable[int]
-        Their numbers.
-    check : Callable[[], None]
-        Called before a page is decoded as a whole.
+        Path of the file.
+    pages : iterable of int
+        Numbers of the pages.
+    check : callable
+        Function called before a page is decoded as a whole.
     """
     with tifffile.TiffFile(path) as file:
         for number in pages:
@@ -506,22 +507,22 @@ def tiff_pages(path: Path, pages: Iterable[int], check: Callable[[], None]) -> I
 
 
 MOST_BYTES = 1 << 29
-"""Largest size of one decoded page, and of the frames of one file together."""
+"""Largest size of one decoded page, and of the frames of one file together, bytes."""
 MOST_PIXELS = 4_000_000
-"""Largest region: the fits need some 250 bytes for each pixel."""
+"""Largest number of pixels of a region: the fits need some 250 bytes for each."""
 MOST_STACKED = 16_000_000
-"""Largest region in all pages together."""
+"""Largest number of pixels of a region in all pages together."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _LARGEST_GAMMA = 5.0
 _GZIP = b"\x1f\x8b"
 _OF_CODEC = re.compile(rb"JPEG|libpng|grfmt_|loadsave")
 _INSIDE = (struct.error, ArithmeticError, AssertionError, AttributeError, LookupError, TypeError)
-"""What readers of spoilt files stumble over; the words of these are about their own code."""
+"""Exceptions of libraries that read a damaged file; their messages describe the library's own code."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """Pixels from row and column (the first is 0) on."""
+    """Rectangle of pixels, given by its first row and column (counted from 0) and its size."""
 
     row: int
     column: int
@@ -530,20 +531,20 @@ class Region:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """For an array (rows, columns)."""
+        """Slices of an array (rows, columns)."""
         return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
 
 
 @dataclass(frozen=True)
 class ImageFile:
-    """An image file whose header has been read.
+    """Image file whose header has been read.
 
     Attributes
     ----------
     path : Path
-        Of the file.
+        Path of the file.
     header : ImageHeader
-        Of the pages that are used.
+        Header of the pages that are used.
     """
 
     path: Path
@@ -551,35 +552,35 @@ class ImageFile:
 
     @classmethod
     def open(cls, path: Path, frames: int | None = None, page: int | None = None, choose: str = "--page") -> ImageFile:
-        """Read the header.
+        """Open an image file and read its header.
 
         Parameters
         ----------
         path : Path
-            Of the file.
-        frames : int | None
+            Path of the file.
+        frames : int or None
             Number of pages to use, from the first on; None for all.
-        page : int | None
-            The only page to use, from 0; None for all.
+        page : int or None
+            Number of the only page to use, from 0; None for all.
         choose : str
-            By which option the user names a page, empty if there is none; for messages.
+            Option with which the user selects a page, for messages; empty if there is none.
 
         Raises
         ------
         ImageError
-            Not a readable image, pages of different sizes, or no such page.
+            The file is not a readable image, has pages of different sizes, or has no such page.
         """
         try:
             if path.is_dir():
                 raise ImageError(f"{path} is a folder, not an image")
             if not path.exists():
                 raise ImageError(f"there is no image {path}")
-            if not path.is_file():  # it could be endless, or block
+            if not path.is_file():  # reading could block or never end
                 raise ImageError(f"{path} is a device, a pipe or a socket, not an image")
             header = _header(path, page, choose)
         except ImageError:
             raise
-        # readers of spoilt files fail in ways that cannot be foreseen
+        # reading a damaged file may raise any exception
         except Exception as error:
             raise ImageError(f"{path} cannot be read as an image ({_reason(error)})") from error
         if page is not None and page not in header.pages:
@@ -589,32 +590,31 @@ class ImageFile:
         if frames is not None and frames > len(header.pages):
             raise ImageError(f"--frames {frames} is more than the {len(header.pages)} pages of {path}")
         if header.inverted and not math.isfinite(header.full_scale):
-            raise ImageError(f"{path} says that its largest value is black, but real numbers have no largest one")
+            raise ImageError(f"{path} defines its largest value as black, but real numbers have no largest one")
         return cls(path, replace(header, pages=header.pages[:frames]))
 
     def read(self, regions: dict[str, Region], gamma: str | None = None) -> dict[str, Array]:
-        """Grey values of all pages, name -> (P, H, W), linear in light.
+        """Read regions of all pages as grey values linear in light, (P, H, W) by name.
 
         Parameters
         ----------
-        regions : dict[str, Region]
-            Name -> what to read; names are options of the command, for messages.
-        gamma : str | None
+        regions : dict of str to Region
+            Regions to read by name; names are options of the command, for messages.
+        gamma : str or None
             Tone curve of the file, ``srgb`` or the exponent as text; None and "1" for none.
 
         Raises
         ------
         ImageError
-            a region beyond the image or too large, too large an image, or one that cannot be decoded.
+            A region is not inside the image or too large, the image is too large, or it cannot be decoded.
         """
         for name, region in regions.items():
             self._check(name, region)
             size = len(self.header.pages) * region.height * region.width
             if size > MOST_STACKED:
                 raise ImageError(
-                    f"{name} has {region.height} x {region.width} pixels in {len(self.header.pages)} pages, more than"
-                    f" {MOST_STACKED} in all do not fit into memory: choose a smaller region, or fewer pages with"
-                    " --frames"
+                    f"{name} has {region.height} x {region.width} pixels in {len(self.header.pages)} pages; at most"
+                    f" {MOST_STACKED} in all fit into memory: choose a smaller region, or fewer pages with --frames"
                 )
         whole = self.header.full_scale
         linear = tone_curve(gamma, whole)
@@ -628,32 +628,32 @@ class ImageFile:
         return out
 
     def frames(self, region: Region | None = None) -> NDArray[Any]:
-        """All pages as they are, (frames, H, W) in the file's type, the byte order being the machine's.
+        """Return all pages as they are stored, (frames, H, W) in the file's type and the machine's byte order.
 
         Parameters
         ----------
-        region : Region | None
-            Part of every page, None for all of it.
+        region : Region or None
+            Part of every page; None for all of it.
 
         Raises
         ------
         ImageError
-            Colours, too large an image, or one that cannot be decoded.
+            The image has colours, is too large, or cannot be decoded.
         """
         return np.stack(list(self.pages(region)))
 
     def pages(self, region: Region | None = None) -> Iterator[NDArray[Any]]:
-        """The pages of `frames`, (H, W) each, one at a time.
+        """Yield the pages of `frames`, (H, W) each, one at a time.
 
         Parameters
         ----------
-        region : Region | None
-            As there.
+        region : Region or None
+            Part of every page; None for all of it.
 
         Raises
         ------
         ImageError
-            As there.
+            The image has colours, is too large, or cannot be decoded.
         """
         head = self.header
         if head.channels > 2:
@@ -664,7 +664,7 @@ class ImageFile:
         if size > MOST_BYTES:
             raise ImageError(
                 f"{self.path} has {len(head.pages)} frames of {part.height} x {part.width} pixels,"
-                f" {1e-9 * size:.1f} GB, more than {1e-9 * MOST_BYTES:.1f} GB: cut the region out first, or take fewer"
+                f" {1e-9 * size:.1f} GB, more than {1e-9 * MOST_BYTES:.1f} GB: crop the images first, or use fewer"
                 " frames"
             )
         for data in self._decoded():
@@ -678,26 +678,26 @@ class ImageFile:
         if region.height == 0 or region.width == 0 or down > self.header.rows or right > self.header.columns:
             where = ",".join(map(str, (region.row, region.column, region.height, region.width)))
             raise ImageError(
-                f"{name} {where} does not lie in the image of {self.header.rows} rows and {self.header.columns} columns"
+                f"{name} {where} is not inside the image of {self.header.rows} rows and {self.header.columns} columns"
             )
         if region.height * region.width > most:
             raise ImageError(
-                f"{name} has {region.height} x {region.width} pixels, more than {most} do not fit into memory:"
+                f"{name} has {region.height} x {region.width} pixels; at most {most} fit into memory:"
                 " choose a smaller region"
             )
 
     def _decoded(self) -> Iterator[NDArray[Any]]:
-        """Every page, (rows, columns) or with channels last.
+        """Yield the pages, (rows, columns) or with channels last.
 
         Raises
         ------
         ImageError
-            It cannot be decoded, or is not what the header says.
+            A page cannot be decoded, or differs from the header.
         """
         try:
             for data in self._stored():
                 if data.shape[:2] != (self.header.rows, self.header.columns):
-                    raise ImageError(f"{self.path} holds another number of rows or columns than its header says")
+                    raise ImageError(f"{self.path} contains another number of rows or columns than its header states")
                 yield data
         except ImageError:
             raise
@@ -712,42 +712,43 @@ class ImageFile:
         if self.header.kind == "FITS":
             yield from fits_planes(self.path, self.header.pages)
             return
-        data, told = _imread(self.path)
-        if data is None or told:
+        data, corrupt = _imread(self.path)
+        if data is None or corrupt:
             raise ImageError(f"{self.path} cannot be read as an image: it is damaged")
         yield data[..., 2::-1] if data.ndim == 3 else data
 
     def _check_memory(self) -> None:
         head = self.header
         if head.page_bytes > MOST_BYTES:
-            remedy = "cut the region out first, or save it as an uncompressed TIFF, of which only the region is read"
+            remedy = "crop the image first, or save it as an uncompressed TIFF, of which only the region is read"
             raise ImageError(
-                f"{self.path} of {head.rows} x {head.columns} pixels fills {1e-9 * head.page_bytes:.1f} GB when it is"
+                f"{self.path} of {head.rows} x {head.columns} pixels needs {1e-9 * head.page_bytes:.1f} GB when"
                 f" decoded, more than {1e-9 * MOST_BYTES:.1f} GB: {remedy}"
             )
 
 
 def _imread(path: Path) -> tuple[NDArray[Any] | None, bool]:
-    """Pixels of a PNG or JPEG, and whether its library found the data corrupt: libjpeg goes on with what it has, and
-    tells nobody but the terminal.
+    """Return the pixels of a PNG or JPEG, and True if its library found the data corrupt.
+
+    libjpeg continues with incomplete data and reports that to the terminal only, so its output is captured here.
     """
     try:
         terminal = os.dup(2)
     except OSError:  # closed
         return cv2.imread(str(path), cv2.IMREAD_UNCHANGED), False
-    with tempfile.TemporaryFile() as said:
-        os.dup2(said.fileno(), 2)
+    with tempfile.TemporaryFile() as output:
+        os.dup2(output.fileno(), 2)
         try:
             data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         finally:
             os.dup2(terminal, 2)
             os.close(terminal)
-        said.seek(0)
-        lines = said.read().splitlines(keepends=True)
-    told = [line for line in lines if _OF_CODEC.search(line)]
-    if len(told) < len(lines):  # of a thread that has something to say
-        os.write(2, b"".join(line for line in lines if line not in told))
-    return data, any(b"extraneous" not in line for line in told)
+        output.seek(0)
+        lines = output.read().splitlines(keepends=True)
+    messages = [line for line in lines if _OF_CODEC.search(line)]
+    if len(messages) < len(lines):  # lines that another thread has written
+        os.write(2, b"".join(line for line in lines if line not in messages))
+    return data, any(b"extraneous" not in line for line in messages)
 
 
 def _header(path: Path, page: int | None, choose: str) -> ImageHeader:
@@ -766,23 +767,23 @@ def _header(path: Path, page: int | None, choose: str) -> ImageHeader:
 
 
 def _reason(error: Exception) -> str:
-    """Reason of an error in one line, without what only the reader's author understands."""
+    """Return the reason of an error in one line, without the internals of the reading library."""
     text = " ".join(str(error).split())
     if isinstance(error, MemoryError):
         return "it does not fit into memory"
-    # a codec that is not installed is named by a ValueError
+    # a codec that is not installed is reported by a ValueError
     if isinstance(error, _INSIDE) or (isinstance(error, ValueError) and "requires" not in text):
         return "it is damaged"
     return text or "it is damaged"
 
 
 def tone_curve(gamma: str | None, full_scale: float) -> Callable[[Array], Array]:
-    """From the file's grey values to grey values linear in light, both up to the full scale.
+    """Return the function from the file's grey values to grey values linear in light, both up to the full scale.
 
     Raises
     ------
     ImageError
-        No such curve, or no full scale.
+        There is no such curve, or no full scale.
     """
     if gamma is None or gamma == "1":
         return lambda grey: grey
@@ -809,27 +810,28 @@ def tone_curve(gamma: str | None, full_scale: float) -> Callable[[Array], Array]
 
 
 def _luminance(colour: Array, linear: Callable[[Array], Array], full_scale: float) -> Array:
-    """(H, W) from grey (H, W) or (H, W, RGB and perhaps alpha)."""
+    """Return the luminance (H, W) of grey (H, W) or of (H, W, RGB and perhaps alpha)."""
     if colour.ndim == 2:
         return linear(colour)
     if colour.shape[-1] < 3:
         return linear(colour[..., 0])
     grey = linear(colour[..., :3]) @ _LUMINANCE
-    # one saturated channel spoils the sum
+    # one saturated channel makes the sum invalid
     return np.where((colour[..., :3] >= full_scale).any(axis=-1), full_scale, grey)
 
 
-def recorded(path: Path) -> tuple[datetime | None, str]:
-    """Time of the first frame, UTC if the file names no time zone, None where it does not say; and the note in it.
+def recording_origin(path: Path) -> tuple[datetime | None, str]:
+    """Return the recording time of an image file's first frame, and its note.
 
-    The time at which a file was written or changed does not count: a copy has another one.
+    The time is UTC if the file names no time zone, None if it gives no time. The time at which a file was written or
+    changed does not count: a copy has another one.
 
     Parameters
     ----------
     path : Path
-        Of an image file.
+        Path of the image file.
     """
-    # a header that cannot be read says nothing; whether the image can be is told where it is
+    # an unreadable header gives no time; whether the image is readable is checked when it is read
     try:
         with path.open("rb") as file:
             magic = file.read(9)

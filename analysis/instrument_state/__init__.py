@@ -1,1 +1,1 @@
-"""The state of one instrument, estimated from measurements of several kinds, and the next move that follows from it."""
+"""State of one instrument, estimated from measurements of several kinds, and the next move of its actuators."""

@@ -1,24 +1,22 @@
-"""The state of an instrument from everything that was measured on it: Bayesian least squares on an exact model.
+"""State of an instrument by Bayesian least squares on an exact model, its observability, and the next alignment move.
 
 A state is an amount for each of M motions with a joint normal prior, x = m + G u with u ~ N(0, I). Measurements are
-groups of numbers y = h(x) + B b + e: h is the traced instrument, e ~ N(0, R), and b are biases of the instrument of
-measurement, free or with a prior of their own. Each group is whitened and its free biases are projected out. The
-estimate is the mode of the posterior distribution, found by Gauss-Newton steps on the exact h; its covariance is that
-of the linearisation there (Tarantola, Inverse Problem Theory, 2005, sec. 3.4). With a linear h and one group of monitor
-spots it is the best linear unbiased prediction of ``analysis.monitor.disturbances``.
+groups of numbers y = h(x) + B b + e: h is the traced instrument, e ~ N(0, R), and b are biases of the measuring
+instrument, free or with a prior. Each group is whitened and its free biases are projected out. The estimate is the mode
+of the posterior distribution, found by Gauss-Newton steps on the exact h; its covariance is that of the linearisation
+there (Tarantola, Inverse Problem Theory, 2005, sec. 3.4). With a linear h and one group of monitor spots it is the best
+linear unbiased prediction of ``analysis.monitor.disturbances``.
 
-Which combinations of motions measurements know, and which they do not: the benign subspace of an instrument.
+Observability: few combinations of many small motions affect a wavefront (Schechter & Levinson, PASP 123, 812, 2011);
+the others form the benign subspace of an instrument. In independent units of the prior, measurements with whitened
+derivatives J determine the right singular vectors of J: the standard deviation along a vector falls from 1 to 1/sqrt(1
++ s^2), s its singular value.
 
-Few combinations of many small motions show in a wavefront (Schechter & Levinson, PASP 123, 812, 2011). In independent
-units of the prior, measurements with whitened derivatives J know the right singular vectors of J: the standard
-deviation along a vector falls from 1 to 1/sqrt(1 + s^2), s its singular value.
-
-The next move of an instrument's actuators, and what one more measurement would be worth before it is made.
-
-A merit is the sum of squares of numbers that change linearly with small motions: r = r0 + D x + A a, of a state x of
-which a posterior is known and moves a. Its expectation is |E r|^2 + tr(D P D'), so that of all moves the one that makes
-|r0 + D E x + A a|^2 least is best. A move of relative error e adds e^2 |A_k a_k|^2. Moves by whole steps are found by
-branch and bound (Land & Doig, Econometrica 28, 497, 1960).
+Next move: a merit is the sum of squares of numbers that change linearly with small motions, r = r0 + D x + A a, of a
+state x with a known posterior and moves a of the actuators. Its expectation is |E r|^2 + tr(D P D'), so that the best
+move minimises |r0 + D E x + A a|^2. A move of relative error e adds e^2 |A_k a_k|^2. Moves by whole steps are found by
+branch and bound (Land & Doig, Econometrica 28, 497, 1960). The reduction of the merit by one more measurement is
+predicted before it is made.
 """
 
 from __future__ import annotations
@@ -35,34 +33,36 @@ from analysis.statistics import chance_beyond, limit_of
 from optics.numerics.array_math import covariance_root
 
 Predict = Callable[[Array], Array]
-"""States (S, M), SI -> what the measurements would read without errors, (S, D), group after group; NaN where the light
-is lost."""
+"""Function from states (S, M), SI, to the error-free measurements (S, D), group after group; NaN where the light is
+lost.
+"""
 Slope = Callable[[Array], Array]
-"""One state (M,) -> derivatives (D, M) of what the measurements read."""
+"""Function from one state (M,) to the derivatives (D, M) of the measurements."""
 
 FALSE_ALARM = 1e-3
-"""Chance that measurements which are as stated are called a contradiction."""
-SETTLED = 0.01
-"""Change of the predicted measurements by the last step, in standard deviations of each."""
+"""Probability that measurements with the specified errors are called a contradiction."""
+STEP_TOLERANCE = 0.01
+"""Largest change of the predicted measurements by the last step of a converged estimate, in their standard deviations.
+"""
 MOST_STEPS = 20
 _SHORTEST = 2.0**-8
-_MOST_LEFT_OUT = 1.0 / 3.0
-"""Share of a group's blocks that are left out at most: of more the measurement itself is in doubt."""
+_MOST_EXCLUDED = 1.0 / 3.0
+"""Largest fraction of a group's blocks that are excluded: with more the measurement itself is in doubt."""
 _NO_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class StatePrior:
-    """What is known of a state before anything is measured.
+    """Prior distribution of a state, before any measurement.
 
     Attributes
     ----------
-    labels : tuple[str, ...]
-        (M,) names of the motions.
-    mean : Array
-        (M,) SI.
-    root : Array
-        G, (M, U), SI; the covariance is G G'.
+    labels : tuple of str
+        Names of the M motions.
+    mean : (M,) ndarray
+        Mean, SI.
+    root : (M, U) ndarray
+        Root G of the covariance G G', SI.
     """
 
     labels: tuple[str, ...]
@@ -71,53 +71,53 @@ class StatePrior:
 
     @classmethod
     def of(cls, labels: Sequence[str], covariance: Array, mean: Array | None = None) -> StatePrior:
-        """Prior of a covariance.
+        """Return the prior with a given covariance.
 
         Parameters
         ----------
-        labels : Sequence[str]
-            Names of the motions, (M,).
-        covariance : Array
-            (M, M), SI, positive semidefinite.
-        mean : Array | None
-            (M,), SI; zero by default.
+        labels : sequence of str
+            Names of the M motions.
+        covariance : (M, M) ndarray
+            Covariance, SI, positive semidefinite.
+        mean : (M,) ndarray or None
+            Mean, SI; zero by default.
         """
         mean = np.zeros(len(covariance)) if mean is None else np.asarray(mean, np.float64)
         return cls(tuple(labels), mean, covariance_root(covariance))
 
     @cached_property
     def sigma(self) -> Array:
-        """(M,) standard deviations, SI."""
+        """Standard deviations, (M,) SI."""
         return np.asarray(np.sqrt(np.sum(self.root**2, axis=1)))
 
     @property
     def covariance(self) -> Array:
-        """(M, M) SI."""
+        """Covariance, (M, M) SI."""
         return np.asarray(self.root @ self.root.T)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredGroup:
-    """Numbers of one measurement.
+    """Numbers of one measurement with their errors.
 
     Attributes
     ----------
     name : str
-        Of the measurement.
+        Name of the measurement.
     kind : str
-        What was measured: ``wavefronts``, ``focus`` ...
-    labels : tuple[str, ...]
-        (D,) of the numbers.
-    values : Array
-        (D,) SI.
-    covariance : Array
-        (D, D) of their errors, SI.
-    biases : Array
-        (D, B) what one unit of each bias does to the numbers.
-    bias_sigmas : Array
-        (B,) standard deviations of the biases; infinite for a free one.
-    blocks : tuple[str, ...]
-        (D,) name of what one gross error would spoil together, such as a field.
+        Kind of measurement: ``wavefronts``, ``focus`` ...
+    labels : tuple of str
+        Names of the D numbers.
+    values : (D,) ndarray
+        Measured values, SI.
+    covariance : (D, D) ndarray
+        Covariance of their errors, SI.
+    biases : (D, B) ndarray
+        Derivatives of the numbers with respect to each bias.
+    bias_sigmas : (B,) ndarray
+        Standard deviations of the biases; infinite for a free one.
+    blocks : tuple of str
+        For each number, the name of its block: the numbers that one gross error would affect together, such as a field.
     """
 
     name: str
@@ -130,117 +130,117 @@ class MeasuredGroup:
     blocks: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        """Check shapes. Raises ValueError."""
+        """Raise ValueError if shapes do not match."""
         count = len(self.values)
         if self.covariance.shape != (count, count) or self.biases.shape != (count, len(self.bias_sigmas)):
-            raise ValueError(f"measurement {self.name}: covariance or biases are not those of {count} numbers")
+            raise ValueError(f"measurement {self.name}: covariance or biases do not have the shape for {count} numbers")
         if len(self.labels) != count or len(self.blocks) != count:
             raise ValueError(f"measurement {self.name}: {count} numbers need as many labels and blocks")
 
     def with_values(self, values: Array) -> MeasuredGroup:
-        """The same measurement with other numbers (D,)."""
+        """Return the same measurement with other values (D,)."""
         return MeasuredGroup(
             self.name, self.kind, self.labels, values, self.covariance, self.biases, self.bias_sigmas, self.blocks
         )
 
     def whitener(self, without: Sequence[str] = ()) -> Array:
-        """W (R, D) by which errors become independent with unit variance and free biases vanish.
+        """Return W (R, D), which makes errors independent with unit variance and eliminates free biases.
 
         Parameters
         ----------
-        without : Sequence[str]
-            Blocks that are left out.
+        without : sequence of str
+            Blocks to exclude.
 
         Raises
         ------
         UndeterminedError
             The covariance is not positive definite.
         """
-        kept = np.array([block not in without for block in self.blocks])
+        included = np.array([block not in without for block in self.blocks])
         out = np.zeros((0, len(self.values)))
-        if not kept.any():
+        if not included.any():
             return out
-        own, free = self.biases[kept], np.isinf(self.bias_sigmas)
-        known = own[:, ~free] * self.bias_sigmas[~free]
-        spread = self.covariance[np.ix_(kept, kept)] + known @ known.T
+        biases, free = self.biases[included], np.isinf(self.bias_sigmas)
+        bias_root = biases[:, ~free] * self.bias_sigmas[~free]
+        spread = self.covariance[np.ix_(included, included)] + bias_root @ bias_root.T
         scale = np.sqrt(np.diagonal(spread))
         if not np.all(scale > 0.0):
-            raise UndeterminedError(f"measurement {self.name}: an error of zero")
+            raise UndeterminedError(f"measurement {self.name}: the standard deviation of a number is zero")
         try:
             root = scale[:, None] * np.linalg.cholesky(spread / scale / scale[:, None])
         except np.linalg.LinAlgError as error:
             raise UndeterminedError(f"measurement {self.name}: its covariance is not positive definite") from error
         white = np.linalg.inv(root)
         if free.any():
-            u, s, _ = np.linalg.svd(white @ own[:, free])
+            u, s, _ = np.linalg.svd(white @ biases[:, free])
             rank = int(np.sum(s > _NO_RANK * s[0])) if s.size and s[0] > 0.0 else 0
             white = u[:, rank:].T @ white
         out = np.zeros((len(white), len(self.values)))
-        out[:, kept] = white
+        out[:, included] = white
         return out
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """Do some numbers agree with what all others, the prior and the instrument predict of them?
+class ConsistencyTest:
+    """Chi-square test of some numbers against their prediction by all others, the prior and the instrument.
 
     Attributes
     ----------
     name : str
-        Of a measurement, or of one of its blocks.
+        Name of a measurement, or of one of its blocks.
     chi_square : float
-        Of the numbers about their prediction from all others.
+        Chi-square of the numbers about their prediction from all others.
     degrees : int
-        Of freedom.
-    chance : float
-        Probability of so large a chi-square if everything is as stated.
+        Degrees of freedom.
+    p_value : float
+        Probability of so large a chi-square if prior and errors are as specified.
     """
 
     name: str
     chi_square: float
     degrees: int
-    chance: float
+    p_value: float
 
     @classmethod
-    def of(cls, name: str, chi_square: float, degrees: int) -> Agreement:
-        """Chance of a chi-square; of no degrees of freedom nothing is told."""
-        chance = float(chance_beyond(chi_square, degrees)) if degrees else 1.0
-        return cls(name, float(chi_square), degrees, chance)
+    def of(cls, name: str, chi_square: float, degrees: int) -> ConsistencyTest:
+        """Return the test of a chi-square; without degrees of freedom p is 1."""
+        p_value = float(chance_beyond(chi_square, degrees)) if degrees else 1.0
+        return cls(name, float(chi_square), degrees, p_value)
 
-    def holds(self, looks: int = 1, false_alarm: float = FALSE_ALARM) -> bool:
-        """Whether it agrees, as one of so many that are tested together."""
+    def passes(self, looks: int = 1, false_alarm: float = FALSE_ALARM) -> bool:
+        """Return True if the numbers are consistent, as one of several groups (``looks``) that are tested together."""
         return not self.degrees or self.chi_square <= float(limit_of(false_alarm / max(1, looks), self.degrees))
 
 
 @shows("prior.labels", "measurements", "whole")
 @dataclass(frozen=True, eq=False)
 class StateEstimate:
-    """The state after the measurements.
+    """Posterior state after the measurements, with its tests.
 
     Attributes
     ----------
     prior : StatePrior
-        Before them.
-    groups : tuple[MeasuredGroup, ...]
-        The measurements.
-    unit : Array
-        u, (U,), the estimate in the prior's independent units.
-    root : Array
-        Posterior covariance of u is root root', (U, U).
-    slope : Array
-        Whitened derivatives of all measurements by u at the estimate, (R, U).
-    residual : Array
-        Whitened, (R,).
-    whole : Agreement
-        Chi-square of everything together.
-    measurements : tuple[Agreement, ...]
-        Of each measurement, as all others predict it.
-    blocks : dict[str, tuple[Agreement, ...]]
-        Of each block of each measurement, likewise: name of the measurement -> agreements.
-    left_out : tuple[tuple[str, str, Agreement], ...]
-        Blocks that were left out since they contradict all else: (measurement, block, agreement then).
+        Prior of the state.
+    groups : tuple of MeasuredGroup
+        Measurements.
+    unit : (U,) ndarray
+        Estimate u in the prior's independent units.
+    root : (U, U) ndarray
+        Root of the posterior covariance of u, root root'.
+    slope : (R, U) ndarray
+        Whitened derivatives of all measurements with respect to u at the estimate.
+    residual : (R,) ndarray
+        Whitened residuals.
+    whole : ConsistencyTest
+        Test of everything together.
+    measurements : tuple of ConsistencyTest
+        Test of each measurement against its prediction by all others.
+    blocks : dict of str to tuple of ConsistencyTest
+        Tests of each block, by the name of its measurement.
+    excluded : tuple of (str, str, ConsistencyTest)
+        Blocks that were excluded since they contradict all else: measurement, block, test at that time.
     steps : int
-        Gauss-Newton steps that were taken.
+        Number of Gauss-Newton steps.
     settled : float
         Change of the predicted measurements by the last step, in standard deviations.
     """
@@ -251,52 +251,52 @@ class StateEstimate:
     root: Array
     slope: Array
     residual: Array
-    whole: Agreement
-    measurements: tuple[Agreement, ...]
-    blocks: dict[str, tuple[Agreement, ...]] = field(default_factory=dict)
-    left_out: tuple[tuple[str, str, Agreement], ...] = ()
+    whole: ConsistencyTest
+    measurements: tuple[ConsistencyTest, ...]
+    blocks: dict[str, tuple[ConsistencyTest, ...]] = field(default_factory=dict)
+    excluded: tuple[tuple[str, str, ConsistencyTest], ...] = ()
     steps: int = 0
     settled: float = 0.0
 
     @property
     def converged(self) -> bool:
-        """Whether the last step changed the predicted measurements by less than ``SETTLED``."""
-        return self.settled < SETTLED
+        """True if the last step changed the predicted measurements by less than ``STEP_TOLERANCE``."""
+        return self.settled < STEP_TOLERANCE
 
     @cached_property
     def mean(self) -> Array:
-        """(M,) SI."""
+        """Estimated state, (M,) SI."""
         return np.asarray(self.prior.mean + self.prior.root @ self.unit)
 
     @cached_property
     def spread(self) -> Array:
-        """(M, U): the posterior covariance is spread spread', SI."""
+        """Root of the posterior covariance, (M, U) SI: the covariance is spread spread'."""
         return np.asarray(self.prior.root @ self.root)
 
     @property
     def covariance(self) -> Array:
-        """(M, M) SI."""
+        """Posterior covariance, (M, M) SI."""
         return np.asarray(self.spread @ self.spread.T)
 
     @property
     def sigma(self) -> Array:
-        """(M,) SI."""
+        """Posterior standard deviations, (M,) SI."""
         return np.asarray(np.sqrt(np.sum(self.spread**2, axis=1)))
 
     @property
     def variance_factor(self) -> float:
-        """Chi-square over its degrees of freedom where everything together contradicts what is stated, else 1."""
-        return 1.0 if self.whole.holds() else self.whole.chi_square / self.whole.degrees
+        """Chi-square per degree of freedom of everything together if its test fails, else 1."""
+        return 1.0 if self.whole.passes() else self.whole.chi_square / self.whole.degrees
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Random states of the posterior, (count, M), SI; wider where the measurements contradict what is stated.
+        """Draw random states of the posterior, (count, M) SI, scaled by the variance factor.
 
         Parameters
         ----------
-        rng : np.random.Generator
-            Their source.
+        rng : Generator
+            Random number generator.
         count : int
-            How many.
+            Number of states.
         """
         unit = rng.standard_normal((count, self.root.shape[1])) * np.sqrt(self.variance_factor)
         return np.asarray(self.mean + unit @ self.spread.T)
@@ -305,28 +305,29 @@ class StateEstimate:
 def estimate_state(
     prior: StatePrior, groups: Sequence[MeasuredGroup], predict: Predict, slope: Slope, start: Array | None = None
 ) -> StateEstimate:
-    """Estimate a state.
+    """Estimate a state from measurements.
 
-    A block of numbers that contradicts everything else at the chance of a false alarm, shared among all blocks, is left
-    out and the estimate is made again (data snooping: Baarda, A testing procedure for use in geodetic networks, 1968).
+    A block of numbers that contradicts everything else, at the false-alarm probability shared among all blocks, is
+    excluded and the estimate is repeated (data snooping: Baarda, A testing procedure for use in geodetic networks,
+    1968).
 
     Parameters
     ----------
     prior : StatePrior
-        What is known before.
-    groups : Sequence[MeasuredGroup]
+        Prior of the state.
+    groups : sequence of MeasuredGroup
         Measurements, in the order of the predictions.
-    predict : Predict
-        States -> what the measurements would read.
-    slope : Slope
-        One state -> derivatives of that.
-    start : Array | None
-        State from which the steps go, (M,), SI; the prior's mean by default.
+    predict : callable
+        Function from states to error-free measurements.
+    slope : callable
+        Function from one state to the derivatives of the measurements.
+    start : (M,) ndarray or None
+        State at which the iteration starts, SI; the prior's mean by default.
 
     Raises
     ------
     UndeterminedError
-        No number, a covariance that is none, or no light at the prior's mean.
+        There are no measurements, a covariance is not positive definite, or there is no light at the prior's mean.
     """
     if not groups:
         raise UndeterminedError("nothing was measured")
@@ -334,30 +335,30 @@ def estimate_state(
     if start is not None:
         unit = np.asarray(np.linalg.lstsq(prior.root, start - prior.mean, rcond=None)[0], np.float64)
     out: dict[str, list[str]] = {}
-    left_out: list[tuple[str, str, Agreement]] = []
+    excluded: list[tuple[str, str, ConsistencyTest]] = []
     count = len({(g.name, b) for g in groups for b in g.blocks})
     while True:
-        found = _settle(prior, groups, predict, slope, unit, out)
-        unit = found.unit
+        estimate = _gauss_newton(prior, groups, predict, slope, unit, out)
+        unit = estimate.unit
         worst = min(
-            ((one.chance, group.name, one) for group in groups for one in found.blocks[group.name]),
+            ((test.p_value, group.name, test) for group in groups for test in estimate.blocks[group.name]),
             key=lambda entry: (entry[0], -entry[2].chi_square),
             default=None,
         )
-        if worst is None or worst[2].holds(count):
+        if worst is None or worst[2].passes(count):
             break
         _, name, agreement = worst
-        own = next(group for group in groups if group.name == name)
-        blocks = len(set(own.blocks))
-        if len(out.get(name, ())) + 1 > _MOST_LEFT_OUT * blocks:
+        contradicted = next(group for group in groups if group.name == name)
+        blocks = len(set(contradicted.blocks))
+        if len(out.get(name, ())) + 1 > _MOST_EXCLUDED * blocks:
             break
         out.setdefault(name, []).append(agreement.name)
-        left_out.append((name, agreement.name, agreement))
-    fields = {key: getattr(found, key) for key in found.__dataclass_fields__}
-    return StateEstimate(**fields | {"left_out": tuple(left_out)})
+        excluded.append((name, agreement.name, agreement))
+    fields = {key: getattr(estimate, key) for key in estimate.__dataclass_fields__}
+    return StateEstimate(**fields | {"excluded": tuple(excluded)})
 
 
-def _settle(
+def _gauss_newton(
     prior: StatePrior,
     groups: Sequence[MeasuredGroup],
     predict: Predict,
@@ -365,12 +366,12 @@ def _settle(
     unit: Array,
     out: dict[str, list[str]],
 ) -> StateEstimate:
-    """Gauss-Newton steps from one estimate to the next, without what is left out."""
+    """Iterate Gauss-Newton steps from a start, without the excluded blocks."""
     whiteners = [group.whitener(out.get(group.name, ())) for group in groups]
     values = np.concatenate([group.values for group in groups])
 
     def whitened(rows: Array) -> Array:
-        """Of numbers (D, ...) the whitened ones (R, ...)."""
+        """Return whitened rows (R, ...) of numbers (D, ...)."""
         ends = np.cumsum([0, *(len(group.values) for group in groups)])
         return np.concatenate([w @ rows[a:b] for w, a, b in zip(whiteners, ends[:-1], ends[1:], strict=True)])
 
@@ -382,35 +383,37 @@ def _settle(
         unit = np.zeros_like(unit)
         residual = residual_at(unit)
     if not np.all(np.isfinite(residual)):
-        raise UndeterminedError("the instrument has no light where the prior expects it")
+        raise UndeterminedError("the instrument has no light at the prior's mean")
     moved, steps = np.inf, 0
     while True:
         table = whitened(slope(prior.mean + prior.root @ unit) @ prior.root)
         normal = np.eye(len(unit)) + table.T @ table
-        if moved < SETTLED or steps >= MOST_STEPS:
+        if moved < STEP_TOLERANCE or steps >= MOST_STEPS:
             break
         step = np.linalg.solve(normal, table.T @ residual - unit)
         cost = residual @ residual + unit @ unit
         share = 1.0
         while True:
             trial = unit + share * step
-            ahead = residual_at(trial)
-            good = bool(np.all(np.isfinite(ahead))) and ahead @ ahead + trial @ trial <= cost * (1.0 + 1e-12)
+            trial_residual = residual_at(trial)
+            good = bool(
+                np.all(np.isfinite(trial_residual))
+            ) and trial_residual @ trial_residual + trial @ trial <= cost * (1.0 + 1e-12)
             if good or share < _SHORTEST:
                 break
             share *= 0.5
         steps += 1
         moved = float(np.max(np.abs(table @ step), initial=0.0))
         if not good:
-            # no way down along the step: the estimate stands, and what is left of the step says how well
-            moved = moved if moved < SETTLED else max(moved, SETTLED)
+            # no descent along the step: the estimate is kept, and the size of the step tells its accuracy
+            moved = moved if moved < STEP_TOLERANCE else max(moved, STEP_TOLERANCE)
             break
-        unit, residual = np.asarray(trial), ahead
+        unit, residual = np.asarray(trial), trial_residual
         moved = max(moved * share, 0.0) if share == 1.0 else np.inf
-    return _judged(prior, groups, whiteners, unit, table, residual, steps, moved)
+    return _tested(prior, groups, whiteners, unit, table, residual, steps, moved)
 
 
-def _judged(
+def _tested(
     prior: StatePrior,
     groups: Sequence[MeasuredGroup],
     whiteners: Sequence[Array],
@@ -420,7 +423,7 @@ def _judged(
     steps: int,
     moved: float,
 ) -> StateEstimate:
-    """Posterior covariance and all tests at an estimate."""
+    """Return the estimate with posterior covariance and all tests."""
     values, vectors = np.linalg.eigh(table.T @ table)
     # the symmetric root, since states are drawn with it: eigenvectors of equal eigenvalues depend on rounding
     root = (vectors / np.sqrt(1.0 + np.clip(values, 0.0, None))) @ vectors.T
@@ -432,58 +435,58 @@ def _judged(
     for group, white in zip(groups, whiteners, strict=True):
         rows = slice(start, start + len(white))
         start += len(white)
-        own, spread = residual[rows], np.eye(len(white)) - left[rows] @ left[rows].T
-        measurements.append(_agreement(group.name, own, spread, np.eye(len(white))))
-        each = []
+        part, spread = residual[rows], np.eye(len(white)) - left[rows] @ left[rows].T
+        measurements.append(_consistency(group.name, part, spread, np.eye(len(white))))
+        tests = []
         for block in dict.fromkeys(group.blocks):
-            which = white[:, [name == block for name in group.blocks]]
-            if np.any(which):
-                each.append(_agreement(block, own, spread, which))
-        blocks[group.name] = tuple(each)
-    whole = Agreement.of("all", total, len(residual))
+            columns = white[:, [name == block for name in group.blocks]]
+            if np.any(columns):
+                tests.append(_consistency(block, part, spread, columns))
+        blocks[group.name] = tuple(tests)
+    whole = ConsistencyTest.of("all", total, len(residual))
     return StateEstimate(
         prior, tuple(groups), unit, root, table, residual, whole, tuple(measurements), blocks, (), steps, moved
     )
 
 
-def _agreement(name: str, residual: Array, spread: Array, rows: Array) -> Agreement:
-    """Chi-square of what a mean shift of some numbers, rows (R, K), would take off the whole.
+def _consistency(name: str, residual: Array, spread: Array, rows: Array) -> ConsistencyTest:
+    """Return the test of a mean shift of some numbers, rows (R, K): the reduction of the total chi-square.
 
-    The same as the chi-square of these numbers about their prediction from all others.
+    It equals the chi-square of these numbers about their prediction from all others.
     """
     scale = np.linalg.norm(rows, axis=0)
     rows = rows[:, scale > 0.0] / scale[scale > 0.0]
     if not rows.size:
-        return Agreement.of(name, 0.0, 0)
+        return ConsistencyTest.of(name, 0.0, 0)
     pull, stiff = rows.T @ residual, rows.T @ spread @ rows
     values, vectors = np.linalg.eigh(stiff)
     held = values > _NO_RANK * max(1.0, float(values[-1]))
     parts = (vectors.T @ pull)[held]
-    return Agreement.of(name, float(np.sum(parts**2 / values[held])), int(np.sum(held)))
+    return ConsistencyTest.of(name, float(np.sum(parts**2 / values[held])), int(np.sum(held)))
 
 
-KNOWN = 0.5
-"""Standard deviation of a combination after the measurements, of one before, below which it is called known."""
+DETERMINED = 0.5
+"""Ratio of posterior to prior standard deviation below which a combination counts as determined."""
 _NAMED = 0.25
-"""Weight of a motion in a combination, relative to the largest, from which on its name stands in it."""
+"""Least weight of a motion in a combination, relative to the largest, for it to be named."""
 _MOST_NAMED = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """One combination of motions.
+    """Linear combination of motions that the measurements determine to some degree.
 
     Attributes
     ----------
     name : str
-        Its largest motions with their weights: ``0.71 M2 shift x + 0.52 M3 rotate y``, each motion in units of its
-        prior standard deviation.
-    weights : Array
-        (M,) of the motions in their prior standard deviations.
+        Largest motions with their weights: ``0.71 M2 shift x + 0.52 M3 rotate y``, each motion in units of its prior
+        standard deviation.
+    weights : (M,) ndarray
+        Weights of the motions in their prior standard deviations.
     value : float
         Estimate, in standard deviations of the prior.
     sigma : float
-        Standard deviation after the measurements; it was 1 before.
+        Posterior standard deviation; the prior one is 1.
     """
 
     name: str
@@ -493,45 +496,45 @@ class Combination:
 
     @property
     def known(self) -> bool:
-        """Whether the measurements tell it."""
-        return self.sigma < KNOWN
+        """True if the measurements determine the combination."""
+        return self.sigma < DETERMINED
 
     def of(self, amounts: Array, prior_sigma: Array, mean: Array) -> Array:
-        """Value of the combination in states (..., M), SI.
+        """Return the value of the combination in states (..., M), SI.
 
         Parameters
         ----------
-        amounts : Array
-            The states.
-        prior_sigma : Array
-            (M,) SI.
-        mean : Array
-            (M,) of the prior, SI.
+        amounts : (..., M) ndarray
+            States, SI.
+        prior_sigma : (M,) ndarray
+            Standard deviations of the prior, SI.
+        mean : (M,) ndarray
+            Mean of the prior, SI.
         """
         safe = np.where(prior_sigma > 0.0, prior_sigma, np.inf)
         return np.asarray((amounts - mean) / safe @ self.weights)
 
 
-def combinations(found: StateEstimate, most: int | None = None) -> tuple[Combination, ...]:
-    """The combinations by what the measurements know of them, the best known first.
+def combinations(estimate: StateEstimate, most: int | None = None) -> tuple[Combination, ...]:
+    """Return the combinations of motions in the order of their observability, the best determined first.
 
     Parameters
     ----------
-    found : StateEstimate
-        An estimate.
-    most : int | None
-        How many; all by default.
+    estimate : StateEstimate
+        Estimate of the state.
+    most : int or None
+        Number of combinations; all by default.
     """
-    _, values, rows = np.linalg.svd(found.slope, full_matrices=True)
+    _, values, rows = np.linalg.svd(estimate.slope, full_matrices=True)
     values = np.pad(values, (0, len(rows) - len(values)))
-    back = np.linalg.pinv(found.prior.root, rcond=1e-12) * found.prior.sigma
+    back = np.linalg.pinv(estimate.prior.root, rcond=1e-12) * estimate.prior.sigma
     out = []
     for value, row in list(zip(values, rows, strict=True))[:most]:
         weights = row @ back
         if weights[np.argmax(np.abs(weights))] < 0.0:
             weights, row = -weights, -row
         sigma = float(1.0 / np.sqrt(1.0 + value**2))
-        out.append(Combination(_name(found.prior.labels, weights), weights, float(row @ found.unit), sigma))
+        out.append(Combination(_name(estimate.prior.labels, weights), weights, float(row @ estimate.unit), sigma))
     return tuple(out)
 
 
@@ -548,28 +551,28 @@ def _name(labels: tuple[str, ...], weights: Array) -> str:
 
 
 _MOST_NODES = 600
-"""Nodes of the search; the best move found by then is told, and that it may not be the best of all."""
+"""Greatest number of nodes of the search; if it is reached, the result may not be the optimum."""
 _CLOSE = 1e-3
-"""Share of the merit by which another move would have to be better."""
+"""Relative improvement of the merit below which another move is not sought."""
 _TINY = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Actuators:
-    """What can be moved.
+    """Actuators of an instrument.
 
     Attributes
     ----------
-    names : tuple[str, ...]
-        (C,).
-    low, high : Array
-        (C,) limits of the next move, SI.
-    steps : Array
-        (C,) of which moves are whole numbers, SI; 0 for any amount.
-    relative : Array
-        (C,) standard deviation of a move as a share of it.
-    absolute : Array
-        (C,) standard deviation of any move, SI.
+    names : tuple of str
+        Names of the C actuators.
+    low, high : (C,) ndarray
+        Limits of the next move, SI.
+    steps : (C,) ndarray
+        Step of which moves are whole multiples, SI; 0 for continuous moves.
+    relative : (C,) ndarray
+        Relative standard deviation of a move.
+    absolute : (C,) ndarray
+        Standard deviation of any move, SI.
     """
 
     names: tuple[str, ...]
@@ -580,14 +583,14 @@ class Actuators:
     absolute: Array
 
     def made(self, wanted: Array, errors: Array) -> Array:
-        """What moves (..., C) come to with random errors; an actuator that is not moved makes none.
+        """Return the executed moves (..., C) with random errors; an actuator that is not moved has no error.
 
         Parameters
         ----------
-        wanted : Array
-            The moves.
-        errors : Array
-            Standard normal, (..., 2, C): of the share and of the amount.
+        wanted : (..., C) ndarray
+            Commanded moves, SI.
+        errors : (..., 2, C) ndarray
+            Standard normal numbers, for the relative and for the absolute error.
         """
         moved = wanted != 0.0
         share, amount = errors[..., 0, :], errors[..., 1, :]
@@ -596,17 +599,17 @@ class Actuators:
 
 @dataclass(frozen=True, eq=False)
 class NextMove:
-    """A move.
+    """Move of the actuators.
 
     Attributes
     ----------
-    amounts : Array
-        (C,) SI.
+    amounts : (C,) ndarray
+        Amount of each actuator's move, SI.
     expected : float
-        Merit after it, by the linear model and with the errors of the move; the part due to what is not known of the
-        state is not in it.
+        Expected merit after the move, by the linear model and with the errors of the move, without the part due to the
+        uncertainty of the state.
     searched : bool
-        Whether all whole steps were enumerated.
+        True if the search over whole steps was completed.
     """
 
     amounts: Array
@@ -615,16 +618,16 @@ class NextMove:
 
 
 def best_move(residual: Array, slope: Array, actuators: Actuators) -> NextMove:
-    """The move that makes the expected merit least.
+    """Return the move that minimises the expected merit.
 
     Parameters
     ----------
-    residual : Array
-        r0 + D E x, (R,).
-    slope : Array
-        A, (R, C), per SI unit of each actuator.
+    residual : (R,) ndarray
+        Expected numbers before the move, r0 + D E x.
+    slope : (R, C) ndarray
+        Derivatives A with respect to each actuator, per SI unit.
     actuators : Actuators
-        Limits, steps and errors.
+        Limits, steps and errors of the actuators.
     """
     count = slope.shape[1]
     length = np.linalg.norm(slope, axis=0)
@@ -643,44 +646,44 @@ def best_move(residual: Array, slope: Array, actuators: Actuators) -> NextMove:
     return NextMove(best, cost(best), searched)
 
 
-def measurement_worth(
+def merit_reduction(
     spread: Array, slope: Array, actuators: Actuators, response: Array, candidates: Mapping[str, Array]
 ) -> dict[str, float]:
-    """By how much one more measurement is expected to lower the merit after the move that follows from it.
+    """Return the expected reduction of the merit, after the following move, by one more measurement of each kind.
 
-    What is not known of the state costs only where actuators could have mended it: tr(H D P D' H) with H the projection
-    on what they reach.
+    The uncertainty of the state matters only where actuators could correct it: tr(H D P D' H) with H the projection on
+    their range.
 
     Parameters
     ----------
-    spread : Array
-        P = spread spread', (U, U) in independent units of the prior.
-    slope : Array
-        D, derivatives of the merit's numbers by these units, (R, U).
+    spread : (U, U) ndarray
+        Root of the covariance P = spread spread' in independent units of the prior.
+    slope : (R, U) ndarray
+        Derivatives D of the merit's numbers with respect to these units.
     actuators : Actuators
-        As of ``best_move``; steps and limits do not count here.
-    response : Array
-        A, (R, C).
-    candidates : Mapping[str, Array]
-        Name -> whitened derivatives of its numbers by the units, (N, U).
+        Actuators as in ``best_move``; their steps are ignored, their limits only exclude those that cannot move.
+    response : (R, C) ndarray
+        Derivatives A with respect to the actuators.
+    candidates : dict of str to (N, U) ndarray
+        Whitened derivatives of each candidate measurement with respect to the units, by name.
     """
     length = np.linalg.norm(response, axis=0)
     used = (length > 0.0) & (actuators.high > actuators.low)
-    reach = np.concatenate([response[:, used], np.diag((actuators.relative * length)[used])])
-    q, _ = np.linalg.qr(reach)
+    range_columns = np.concatenate([response[:, used], np.diag((actuators.relative * length)[used])])
+    q, _ = np.linalg.qr(range_columns)
     padded = np.concatenate([slope, np.zeros((int(np.sum(used)), slope.shape[1]))])
-    mendable = q.T @ padded @ spread
-    before = float(np.sum(mendable**2))
+    correctable = q.T @ padded @ spread
+    before = float(np.sum(correctable**2))
     out = {}
     for name, rows in candidates.items():
         table = rows @ spread
         root = np.linalg.inv(np.linalg.cholesky(np.eye(spread.shape[1]) + table.T @ table)).T
-        out[name] = before - float(np.sum((mendable @ root) ** 2))
+        out[name] = before - float(np.sum((correctable @ root) ** 2))
     return out
 
 
 def _bounded(slope: Array, residual: Array, low: Array, high: Array) -> Array:
-    """Amounts within limits that make |residual + slope amounts| least; those whose limits are equal stand there."""
+    """Return the amounts within limits that minimise |residual + slope amounts|; fixed where both limits are equal."""
     out = np.clip(np.zeros(slope.shape[1]), low, high)
     length = np.linalg.norm(slope, axis=0)
     used = (length > 0.0) & (high > low)
@@ -688,17 +691,16 @@ def _bounded(slope: Array, residual: Array, low: Array, high: Array) -> Array:
         return out
     size = 1.0 / length[used]
     rest = residual + slope[:, ~used] @ out[~used]
-    found = lsq_linear(slope[:, used] * size, -rest, (low[used] / size, high[used] / size), "bvls", tol=1e-12)
-    out[used] = np.clip(found.x * size, low[used], high[used])
+    solution = lsq_linear(slope[:, used] * size, -rest, (low[used] / size, high[used] / size), "bvls", tol=1e-12)
+    out[used] = np.clip(solution.x * size, low[used], high[used])
     return out
 
 
 def _whole_steps(slope: Array, residual: Array, low: Array, high: Array, steps: Array) -> tuple[Array, bool]:
-    """Amounts within limits, by whole steps where there are such, that make |residual + slope amounts| least; and
-    whether no better ones exist.
+    """Minimise |residual + slope amounts| within limits, by whole steps where required.
 
-    Branch and bound: amounts between steps bound from below what whole steps can reach, and the actuator whose rounding
-    costs most is branched upon first.
+    Returns the amounts, and True if the search was completed. Branch and bound: continuous amounts are a lower bound of
+    what whole steps can reach, and the actuator whose rounding costs most is branched upon first.
     """
     length = np.linalg.norm(slope, axis=0)
     best, least = np.zeros(slope.shape[1]), np.inf
@@ -728,13 +730,13 @@ def _whole_steps(slope: Array, residual: Array, low: Array, high: Array, steps: 
         below, above = highs.copy(), lows.copy()
         below[k], above[k] = np.floor(parts[k]) * steps[k], np.ceil(parts[k]) * steps[k]
         halves = [(lows, below), (above, highs)]
-        # the nearer half is looked into first
+        # the nearer half is searched first
         boxes += halves[::-1] if parts[k] - np.floor(parts[k]) < 0.5 else halves
     return best, False
 
 
 def _rounded(slope: Array, residual: Array, amounts: Array, low: Array, high: Array, steps: Array) -> Array:
-    """Whole steps one actuator after the other, the strongest first; the others follow what it has become."""
+    """Round one actuator after the other to whole steps, the strongest first, and re-optimise the others."""
     lows, highs, out = low.copy(), high.copy(), amounts
     for k in np.argsort(-np.linalg.norm(slope, axis=0) * steps):
         if steps[k] > 0.0:

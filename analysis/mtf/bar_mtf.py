@@ -132,7 +132,7 @@ def bar_mtf(
     offset: float = 0.0,
     rounding: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> BarMtf:
-    """Measure the MTF from the bars that fill a region.
+    """Measure the MTF at the frequency of a group of bars that fills a region, also at Nyquist if the bars are tilted.
 
     For several frames see `measure_bar_pages`.
 
@@ -145,26 +145,35 @@ def bar_mtf(
         far from edges.
     bright : array_like
         Pixels with the level of the bars, likewise.
-    frequency : array_like or None
-        Approximate frequency, good to one cycle over the region: (2,) cycles/pixel (down the column, along the row), or
-        one number, its length, or None for the strongest below Nyquist.
-    noise : NoiseModel or None
-        Noise model of the detector; without one the variance is that of the residuals and of the patches.
+    frequency : array_like, optional
+        Approximate frequency, good to one cycle over the region: (2,) cycles per pixel (down the column, along the
+        row), or one number, its length. By default the strongest below Nyquist.
+    noise : NoiseModel, optional
+        Noise of the detector. By default the variance is that of the residuals and of the patches.
     frames : int
         Number of averaged frames.
-    saturation : float or None
-        Grey value of saturation, as in `slanted_edge.slanted_edge_mtf`.
+    saturation : float, optional
+        Grey value of saturation; by default that of `noise`.
     offset : float
         Grey value without light, for the contrast only.
     rounding : tuple of float
-        Rms of the rounding error that remains in a pixel of the region and in the two levels, grey values
-        (`edge_pages.rounding_residual`).
+        Rms of the rounding error that remains in a pixel of the region and in the two levels, in grey values.
+
+    Returns
+    -------
+    BarMtf
+        `mtf` and `sigma`, the fitted `frequency` vector, the levels and the Coltman estimate.
 
     Raises
     ------
-    BarError
+    ValueError
         There are no bars; the region is saturated, too small or not filled; the bars are at Nyquist without tilt; or
         the patches have no contrast.
+
+    Notes
+    -----
+    A square wave between the levels has a fundamental of (2 / pi) times their difference: MTF = pi A / (2 (bright -
+    dark)) for the fitted amplitude A (Coltman, J. Opt. Soc. Am. 44, 468 (1954)).
 
     Examples
     --------

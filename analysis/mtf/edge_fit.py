@@ -1,16 +1,17 @@
 """Fit of one edge to all pixels of a region: its path, the light on both sides, and its edge-spread function.
 
-The path is a straight line, found by Gauss-Newton steps on all pixels. What the pixels say against it is tested: a
-bowed edge is followed by Legendre polynomials of the row up to order 5, as ISO 12233:2023 allows, with the highest
-order that stands out of the noise. Light that is uneven along or across the edge makes the levels on both sides planes,
+The path is a straight line, found by Gauss-Newton steps on all pixels. Its straightness is tested: a curved edge is
+followed by Legendre polynomials of the row up to order 5, as ISO 12233:2023 allows, with the highest significant order.
+Light that is uneven along or across the edge makes the levels on both sides planes,
 
     grey = E(x) + (b1 v + b2 c) L(x) + (d1 v + d2 c) (1 - L(x)),        L = (E - dark) / contrast,
 
-v along the edge and c across it. Their four changes are fitted together with the edge-spread function where they stand
-out of the noise, so that its covariance holds what they cost. A collimator whose light falls by 1 % over the region
-otherwise takes 0.7 % off the MTF at low frequencies.
+v along the edge and c across it. Their four changes are fitted together with the edge-spread function where they are
+significant, so that its covariance includes their uncertainty. Without them, a collimator whose light falls by 1 % over
+the region lowers the MTF at low frequencies by 0.7 %.
 
-Edge-spread function (ESF) as a least-squares curve through pixels at irregular places, and its Fourier transform.
+The edge-spread function (ESF) is a least-squares curve through pixels at irregular positions, with a closed-form
+Fourier transform:
 
     E(x) = dark + contrast * S(x) + tail * T(x) + sum_k a_k B((x - x_k) / step),        |x_k| < core
 
@@ -18,7 +19,7 @@ S is a smooth unit step (normal distribution, width 0.5 px), T = -x / (x^2 + 1 p
 transforms are known in closed form, so that there is no bin, no difference quotient, no window and no cut-off of the
 line-spread function to correct for:
 
-- pixels enter at their own places; the bins of ISO 12233 average places that are not at the bin's centre;
+- pixels enter at their own positions; the bins of ISO 12233 average positions that are not at the bin's centre;
 - the derivative of the curve is exact, where a difference of bins multiplies the MTF by a sinc;
 - any pupil with a sharp rim makes line-spread tails c / x^2 (the kink of the OTF at zero frequency, slope -4 / (pi f_c)
   for a circle), hence ESF tails c / x. A region of +-32 px cuts off 0.4% of the energy of an F/9 camera with 7 um
@@ -43,7 +44,7 @@ from analysis.statistics import limit_of
 
 _STEP_WIDTH = 0.5
 _TAIL_WIDTH = 1.0
-# Weight of the third differences of the spline against the data. It decides only where pixels leave gaps between the
+# Weight of the third differences of the spline against the data. It matters only where pixels leave gaps between the
 # sampling phases; it lowers the MTF by 2e-5 at 0.5 cycles/pixel and by 8e-4 at 1 cycle/pixel.
 _STIFFNESS = 1e-4
 _FOUR = np.arange(4)[:, None]
@@ -52,10 +53,24 @@ _FIRST, _SECOND = (index[:, None] for index in np.triu_indices(4))
 
 @dataclass(frozen=True, eq=False)
 class EdgeDesign:
-    """Pixels at x (N,), px along the normal, as rows of the least-squares design; P unknowns.
+    """Rows of the least-squares design of pixels at distances x from the edge, with P unknowns.
 
-    inside: (M,) numbers of the pixels in the core. cell, u: their knot interval and place in it, 0 to 1.
-    basis: (4, M) the splines that live there. levels: (K + 3, N) columns of uneven light, dark level, step and tail.
+    Attributes
+    ----------
+    x : (N,) ndarray
+        Distance along the normal, px.
+    core : float
+        Half width of the spline's range, px.
+    oversampling : int
+        Knots per pixel.
+    inside : (M,) ndarray of int
+        Indices of the pixels in the core.
+    cell, u : (M,) ndarray
+        Knot interval of each of these and position in it, 0 to 1.
+    basis : (4, M) ndarray
+        Values of the four splines of that interval.
+    levels : (K + 3, N) ndarray
+        Columns of uneven light, dark level, step and tail.
     """
 
     x: Array
@@ -73,14 +88,14 @@ class EdgeDesign:
 
         Parameters
         ----------
-        x : Array
-            Distances from the edge, (N,), px.
+        x : (N,) ndarray
+            Distances from the edge, px.
         core : float
             Half width of the spline, px, rounded up to whole knots.
         oversampling : int
             Knots per pixel.
-        light : Array | None
-            Columns of uneven light, (K, N); none by default. They are no part of the edge-spread function.
+        light : (K, N) ndarray or None
+            Columns of uneven light; none by default. They are no part of the edge-spread function.
         """
         half = math.ceil(core * oversampling)
         place = x * oversampling + half
@@ -103,20 +118,21 @@ class EdgeDesign:
 
     @property
     def spline_count(self) -> int:
-        """Splines that lie in the core as a whole; the curve and two derivatives go over into the tails without a step.
+        """Number of splines that lie entirely in the core.
 
-        Spline k of interval c is number c + k - 3; numbers outside of these have the coefficient zero.
+        The curve and two derivatives therefore continue smoothly into the tails. Spline k of interval c has number c +
+        k - 3; numbers outside of these have the coefficient zero.
         """
         return round(2.0 * self.core * self.oversampling) - 3
 
     def project(self, grey: Array) -> Array:
-        """Transposed design times grey (N,), (P,)."""
+        """Return the transposed design times the grey values (N,), (P,)."""
         index = (self.cell + _FOUR).ravel()
         spline = np.bincount(index, (self.basis * grey[self.inside]).ravel(), minlength=self.spline_count + 6)
         return np.concatenate([spline[3:-3], self.levels @ grey])
 
     def normal_matrix(self, weight: Array | None = None) -> Array:
-        """Sum over pixels of weight (N,) * (design row)^T (design row), (P, P)."""
+        """Return the sum over pixels of weight (N,) * (design row)^T (design row), (P, P)."""
         count = self.spline_count
         size = count + 6
         basis = self.basis if weight is None else self.basis * weight[self.inside]
@@ -135,12 +151,18 @@ class EdgeDesign:
 
 @dataclass(frozen=True, eq=False)
 class EdgeSpread:
-    """A fitted edge-spread function; x in pixels along the normal, grey values rise with x.
+    """Fitted edge-spread function; x in pixels along the normal, grey values rise with x.
 
-    core: half width of the spline's range, px. oversampling: knots per pixel.
-    coefficients: (P,) spline, uneven light, then dark level, contrast, tail (grey values; the tail's in grey values *
-        px).
-    factor: Cholesky factor of the normal matrix.
+    Attributes
+    ----------
+    core : float
+        Half width of the spline's range, px.
+    oversampling : int
+        Knots per pixel.
+    coefficients : (P,) ndarray
+        Spline, uneven light, then dark level, contrast, tail (grey values; the tail's in grey values * px).
+    factor : tuple
+        Cholesky factor of the normal matrix.
     """
 
     core: float
@@ -150,7 +172,7 @@ class EdgeSpread:
 
     @property
     def spline_count(self) -> int:
-        """Number of splines, the first coefficients."""
+        """Number of splines, whose coefficients come first."""
         return round(2.0 * self.core * self.oversampling) - 3
 
     @property
@@ -164,17 +186,17 @@ class EdgeSpread:
         return float(self.coefficients[-2])
 
     def design(self, x: Array) -> EdgeDesign:
-        """The design of other places x (N,)."""
+        """Return the design for other distances x, (N,)."""
         return EdgeDesign.of(x, self.core, self.oversampling)
 
     def value(self, design: EdgeDesign) -> Array:
-        """Grey values (N,) at the places of a design with the same knots."""
+        """Return the grey values (N,) at the distances of a design with the same knots."""
         value = self.coefficients[-len(design.levels) :] @ design.levels
         value[design.inside] += (design.basis * self._local(design)).sum(axis=0)
         return np.asarray(value)
 
     def core_slope(self, design: EdgeDesign) -> Array:
-        """Line-spread function in grey values per pixel (M,) at the places of a design that are inside the core."""
+        """Return the line-spread function inside the core at the distances of a design, (M,) grey values per pixel."""
         u = design.u
         v = 1.0 - u
         basis = np.stack([-v * v / 2, u * (1.5 * u - 2), v * (2 - 1.5 * v), u * u / 2])
@@ -182,15 +204,16 @@ class EdgeSpread:
         return np.asarray(slope + self._level_slope(design.x[design.inside]))
 
     def slope(self, design: EdgeDesign) -> Array:
-        """Line-spread function in grey values per pixel (N,) at all places of a design."""
+        """Return the line-spread function at all distances of a design, (N,) grey values per pixel."""
         slope = self._level_slope(design.x)
         slope[design.inside] = self.core_slope(design)
         return slope
 
     def transform(self, frequency: Array) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Optical transfer function at (F,) cycles/px, (F,), and its derivative by the coefficients, (P, F).
+        """Return the optical transfer function (F,) and its derivatives by the coefficients (P, F).
 
-        Integral of the line-spread function times exp(-2 pi i f x), over the contrast.
+        The transfer function at a frequency, cycles/px, is the integral of the line-spread function times exp(-2 pi i f
+        x), over the contrast.
         """
         omega = 2.0 * np.pi * frequency
         step = 1.0 / self.oversampling
@@ -206,21 +229,21 @@ class EdgeSpread:
         return transfer, rows
 
     def covariance(self, design: EdgeDesign, variance: Array) -> Array:
-        """Covariance (P, P) of the coefficients when the fitted pixels carry independent noise of variance (N,)."""
+        """Return the covariance (P, P) of the coefficients for independent pixel noise of variance (N,)."""
         half = self._solved(design.normal_matrix(variance))
         return self._solved(half.T)
 
     def _solved(self, right: Array) -> Array:
-        """Inverse normal matrix times (P, P), eight columns at a time.
+        """Return the inverse normal matrix times (P, P), computed eight columns at a time.
 
-        All at once would be split over threads by the linear algebra library, which on a busy machine wait for each
+        All at once, the linear algebra library would split the work over threads, which on a busy machine wait for each
         other a hundred times longer than the solution takes.
         """
         columns = range(0, right.shape[1], 8)
         return np.hstack([cho_solve(self.factor, right[:, k : k + 8], check_finite=False) for k in columns])
 
     def _local(self, design: EdgeDesign) -> Array:
-        """(4, M) coefficients of the splines at each pixel of the core."""
+        """Return the coefficients of the splines at each pixel of the core, (4, M)."""
         padded = np.zeros(self.spline_count + 6)
         padded[3:-3] = self.coefficients[: self.spline_count]
         return np.asarray(padded[design.cell + _FOUR])
@@ -233,19 +256,19 @@ class EdgeSpread:
 
 
 def fit_edge_spread(design: EdgeDesign, grey: Array) -> EdgeSpread:
-    """Least-squares curve through pixels of grey values (N,) at the places of the design.
+    """Fit the edge-spread function to pixels of grey values (N,) at the distances of the design.
 
-    All pixels have the same weight: weights that follow the shot noise would gain little, and taken from the data they
-    would bias the levels.
+    All pixels have the same weight: weights that follow the shot noise would gain little, and if taken from the data
+    they would bias the levels.
     """
     count = design.spline_count
     matrix = design.normal_matrix()
     density = grey.size / float(np.ptp(design.x)) / design.oversampling
     # third differences of a spline that is zero outside
     third = np.zeros((count + 3, count))
-    at = np.arange(count)
+    index = np.arange(count)
     for offset, weight in enumerate((1.0, -3.0, 3.0, -1.0)):
-        third[at + offset, at] = weight
+        third[index + offset, index] = weight
     matrix[:count, :count] += _STIFFNESS * density * (third.T @ third)
     factor = cho_factor(matrix, check_finite=False)
     return EdgeSpread(
@@ -253,20 +276,21 @@ def fit_edge_spread(design: EdgeDesign, grey: Array) -> EdgeSpread:
     )
 
 
-# Half width of the spline: so many 10-90% widths of the edge, at least so many px, at most this part of the plateau.
+# Half width of the spline: in 10-90% widths of the edge, its least value in px, its largest fraction of the plateau.
 CORE_WIDTHS, _LEAST_CORE, _LARGEST_CORE_SHARE = 4.0, 6.0, 0.7
 # Widest hole between neighbouring sampling phases, px.
 _LARGEST_GAP = 0.3
-# Gauss-Newton steps of a straight line in uneven light, which moves with it, and in even light.
+# Gauss-Newton steps of a straight line: in uneven light, which is correlated with the line, and in even light.
 _LINE_STEPS = (4, 2)
 OVERSAMPLING, COARSE = 4, 2
-"""Knots of the edge-spread function per pixel; and while the line is sought, whose slope must not follow the noise."""
+"""Knots of the edge-spread function per pixel: final, and coarse while the line is fitted to avoid fitting noise."""
 HIGHEST_ORDER = 5
-"""Highest order of the polynomial that follows a bowed edge: that of ISO 12233:2023."""
+"""Highest order of the polynomial that follows a curved edge, that of ISO 12233:2023."""
 FALSE_ALARM = 1e-4
-"""Rate at which a straight edge is followed by a polynomial."""
+"""Probability that a straight edge is followed by a polynomial."""
 LEAST_BEND = 0.005
-"""Smallest coefficient of a bow that is followed, px: a straight line instead costs 3e-5 of the MTF at Nyquist."""
+"""Smallest coefficient of a curved path that is fitted, px: a straight line instead costs 3e-5 of the MTF at Nyquist.
+"""
 _FOLLOWING_STEPS, _LAST_STEPS = 4, 2
 
 
@@ -274,10 +298,16 @@ _FOLLOWING_STEPS, _LAST_STEPS = 4, 2
 class EdgeRows:
     """Rows across an edge that rises with the column, of one page or of several, and the edge's path through them.
 
-    offset, slope: (R,) column of the page's straight line in the middle row of the page, and its slope.
-    along: (R,) distance from the middle row, px.
-    columns: number of columns W.
-    bend: (B,) coefficients of the Legendre polynomials of order 2 and up that all pages have in common, px.
+    Attributes
+    ----------
+    offset, slope : (R,) ndarray
+        Column of the page's straight line in the middle row of the page, px, and its slope.
+    along : (R,) ndarray
+        Distance of the row from the middle row, px.
+    columns : int
+        Number of columns W.
+    bend : (B,) ndarray
+        Coefficients of the Legendre polynomials of order 2 and up that all pages have in common, px.
     """
 
     offset: Array
@@ -292,12 +322,12 @@ class EdgeRows:
 
         Parameters
         ----------
-        lines : Array
-            Offset and slope of each page's line, (P, 2).
-        shape : tuple[int, ...]
+        lines : (P, 2) ndarray
+            Offset and slope of each page's line.
+        shape : tuple of int
             Rows and columns of a page.
-        bend : Array
-            As the attribute.
+        bend : (B,) ndarray
+            Coefficients of the path, as the attribute.
         """
         along = np.arange(shape[0]) - (shape[0] - 1) / 2.0
         offset, slope = np.repeat(lines, shape[0], axis=0).T
@@ -305,7 +335,7 @@ class EdgeRows:
 
     @property
     def half(self) -> float:
-        """Distance of the first row from the middle one, px: the unit of the polynomials."""
+        """Distance of the first row from the middle one, px: the unit of length of the polynomials."""
         return -float(self.along.min())
 
     @property
@@ -315,20 +345,20 @@ class EdgeRows:
 
     @property
     def plateau(self) -> float:
-        """Distance of the edge from the nearer side, along the row, at least, px."""
+        """Least distance of the edge from the nearer side of the region, along the row, px."""
         path = self.path
         return float(min(path.min(), self.columns - 1 - path.max()))
 
     @property
     def middle(self) -> float:
-        """Column of the edge in the middle row, mean of the pages."""
+        """Column of the edge in the middle row, mean over the pages, px."""
         return float(self.offset.mean()) + float(legendre.legval(0.0, [0.0, 0.0, *self.bend]))
 
     def distance(self) -> Array:
-        """Return the distance of every pixel from the edge along its normal, (R * W,), px.
+        """Return the distance of every pixel from the edge along its normal, (R * W,) px.
 
         A pixel h to the right of a path with the curvature p'' and the angle t is h cos t - p'' h^2 sin^2 t cos^3 t / 2
-        away from it, to the first order of p''.
+        away from it, to first order in p''.
         """
         angle = np.arctan(self.slope + self._legendre(1))[:, None]
         beside = np.arange(self.columns) - self.path[:, None]
@@ -357,13 +387,21 @@ class EdgeRows:
 class FittedEdge:
     """Path, edge-spread function and uneven light of an edge, fitted to N pixels.
 
-    rows: with the path.
-    design: of all pixels by their distance from the edge; with the columns of uneven light if that was fitted.
-    spread: the edge-spread function in the middle of the region. Its coefficients of uneven light are zero.
-    light: (N,) what uneven light adds to the grey values.
-    change: (4,) change of the bright level over the region's length along the edge and over its width, and that of the
-        dark level, grey values; empty where the light is even.
-    jitter: mean variance of what noise does to the line of a page, px^2.
+    Attributes
+    ----------
+    rows : EdgeRows
+        Rows of the region with the path.
+    design : EdgeDesign
+        Design of all pixels by their distance from the edge, with columns of uneven light if that was fitted.
+    spread : EdgeSpread
+        Edge-spread function in the middle of the region. Its coefficients of uneven light are zero.
+    light : (N,) ndarray
+        Contribution of uneven light to the grey values.
+    change : (4,) ndarray
+        Change of the bright level over the region's length along the edge and over its width, and that of the dark
+        level, grey values; empty where the light is even.
+    jitter : float
+        Mean variance of the position of a page's line by noise, px^2.
     """
 
     rows: EdgeRows
@@ -375,28 +413,28 @@ class FittedEdge:
 
     @property
     def order(self) -> int:
-        """Order of the path: 1 of a straight line."""
+        """Order of the path's polynomial: 1 for a straight line."""
         return 1 + self.rows.bend.size
 
 
 def fit_edge(rising: Array, offset: float, slope: float, even: bool = False) -> FittedEdge:
-    """Return the path, the edge-spread function and the light of a region.
+    """Fit the path, the edge-spread function and the light of a region.
 
     Parameters
     ----------
-    rising : Array
-        Grey values (H, W), from `slanted_edge.rising`.
+    rising : (H, W) ndarray
+        Grey values, from `slanted_edge.rising`.
     offset : float
-        Column of the line in the middle row, about.
+        Approximate column of the line in the middle row, px.
     slope : float
-        Of the line, about.
+        Approximate slope of the line.
     even : bool
-        The light is known to be even.
+        True if the light is known to be even.
 
     Raises
     ------
     EdgeError
-        Too few sampling phases, or no sharp edge.
+        There are too few sampling phases, or no sharp edge.
     """
     grey = rising.ravel()
     rows = EdgeRows.of(np.array([[offset, slope]]), rising.shape, np.empty(0))
@@ -406,26 +444,26 @@ def fit_edge(rising: Array, offset: float, slope: float, even: bool = False) -> 
 
 
 def fit_rows(rows: EdgeRows, grey: Array, core: float, even: bool, line_steps: int = 0) -> FittedEdge:
-    """Return the fit to rows of one page or of several, bowed as far as the edge is.
+    """Fit the edge to rows of one page or of several, with a curved path where that is significant.
 
     Parameters
     ----------
     rows : EdgeRows
-        With their straight lines.
-    grey : Array
-        Values (N,) of their pixels.
+        Rows with their straight lines.
+    grey : (N,) ndarray
+        Values of their pixels.
     core : float
         Half width of the spline, px.
     even : bool
-        The light is known to be even.
+        True if the light is known to be even.
     line_steps : int
-        Gauss-Newton steps by which the lines are refined.
+        Number of Gauss-Newton steps by which the lines are refined.
     """
     fitted = _fitted(rows, None, grey, core, COARSE, True)
     for step in range(line_steps):
         fitted = _fitted(fitted.rows, fitted, grey, core, COARSE, even) if step else fitted
         fitted = _moved(fitted, grey, 1)
-    # of a region that holds something else the residuals say more
+    # a region with other structure is rejected later, by its residuals
     with contextlib.suppress(EdgeError):
         core = core if even else core_width(fitted.rows.distance(), grey - fitted.light, fitted.rows.plateau)
     straight = _fitted(fitted.rows, fitted, grey, core, OVERSAMPLING, even)
@@ -453,7 +491,7 @@ def _moved(fitted: FittedEdge, grey: Array, order: int) -> FittedEdge:
 def _fitted(
     rows: EdgeRows, before: FittedEdge | None, grey: Array, core: float, oversampling: int, even: bool
 ) -> FittedEdge:
-    """Return edge-spread function and light at a path; the columns of light take the spread of the fit before."""
+    """Return edge-spread function and light for a path; the columns of light use the spread of the fit before."""
     x = rows.distance()
     if even or before is None:
         design = EdgeDesign.of(x, core, oversampling)
@@ -466,15 +504,16 @@ def _fitted(
     design = EdgeDesign.of(x, core, oversampling, light)
     spread = fit_edge_spread(design, grey)
     coefficients = spread.coefficients.copy()
-    at = slice(spread.spline_count, -3)
-    change, coefficients[at] = coefficients[at].copy(), 0.0
+    light_slice = slice(spread.spline_count, -3)
+    change, coefficients[light_slice] = coefficients[light_slice].copy(), 0.0
     return FittedEdge(rows, design, replace(spread, coefficients=coefficients), change @ light, change)
 
 
 def path_parts(fitted: FittedEdge, order: int) -> tuple[Array, NDArray[np.intp]]:
-    """Return the derivatives of grey values by the coefficients of the path, (order + 1, M), and the pixels, (M,).
+    """Return the derivatives of grey values by the path's coefficients, and the indices of their pixels.
 
-    Only pixels in the inner quarter of the core: farther out the fitted slope is mostly noise and would pull the path.
+    The arrays have the shapes (order + 1, M) and (M,). Only pixels in the inner quarter of the core are used: farther
+    out the fitted slope is mostly noise and would bias the path.
     """
     design, rows = fitted.design, fitted.rows
     close = np.abs(design.x[design.inside]) <= fitted.spread.core / CORE_WIDTHS
@@ -484,7 +523,7 @@ def path_parts(fitted: FittedEdge, order: int) -> tuple[Array, NDArray[np.intp]]
 
 
 def _path_step(fitted: FittedEdge, grey: Array, order: int) -> tuple[Array, Array]:
-    """Return the change of the path's coefficients by least squares, (order + 1,), and their sigmas by residuals."""
+    """Return the least-squares change of the path's coefficients, (order + 1,), and their sigmas by the residuals."""
     parts, near = path_parts(fitted, order)
     inverse = np.linalg.inv(parts @ parts.T)
     rest = (grey - fitted.light - fitted.spread.value(fitted.design))[near]
@@ -494,7 +533,7 @@ def _path_step(fitted: FittedEdge, grey: Array, order: int) -> tuple[Array, Arra
 
 
 def _chosen_order(fitted: FittedEdge, grey: Array) -> int:
-    """Return the highest order of the path whose coefficient stands out of the noise, at least 1."""
+    """Return the highest order of the path whose coefficient is significant, at least 1."""
     change, sigma = _path_step(fitted, grey, HIGHEST_ORDER)
     bend = np.abs(fitted.rows.moved(change).bend)
     least = math.sqrt(float(limit_of(FALSE_ALARM / len(bend), 1)))
@@ -503,16 +542,16 @@ def _chosen_order(fitted: FittedEdge, grey: Array) -> int:
 
 
 def check_phases(distance: Array, rows: int, slope: float) -> None:
-    """EdgeError where the sampling phases leave a wide gap.
+    """Raise EdgeError if the sampling phases leave a wide gap.
 
     Parameters
     ----------
-    distance : Array
-        Of pixels from the edge, (N,), px.
+    distance : (N,) ndarray
+        Distances of the pixels from the edge, px.
     rows : int
-        Lines that they lie in, for the message.
+        Number of lines of pixels, for the message.
     slope : float
-        Of the edge, likewise.
+        Slope of the edge, for the message.
     """
     near = np.sort(distance[np.abs(distance) <= 1.5])
     gap = float(np.diff(near).max()) if near.size > 1 else math.inf
@@ -520,27 +559,27 @@ def check_phases(distance: Array, rows: int, slope: float) -> None:
         degrees = math.degrees(abs(math.atan(slope)))
         raise EdgeError(
             f"the edge at {degrees:.2f} deg to the pixel grid leaves gaps of {gap:.2f} px between its sampling phases "
-            f"in {rows} lines, at most {_LARGEST_GAP} px will do: tilt the target by 2 to 10 deg"
+            f"in {rows} lines; at most {_LARGEST_GAP} px are allowed: tilt the target by 2 to 10 deg"
             + (" or take a region that is longer along the edge" if 0.2 < degrees < 5 else "")
         )
 
 
 def core_width(distance: Array, grey: Array, plateau: float) -> float:
-    """Half width of the spline, from the 10-90% width of the edge, px.
+    """Return the half width of the spline from the 10-90% width of the edge, px.
 
     Parameters
     ----------
-    distance : Array
-        Of pixels from the edge, (N,), px.
-    grey : Array
-        Their values, (N,).
+    distance : (N,) ndarray
+        Distances of the pixels from the edge, px.
+    grey : (N,) ndarray
+        Values of the pixels.
     plateau : float
-        That lies beside the edge on both sides, px.
+        Width of the level area beside the edge on both sides, px.
 
     Raises
     ------
     EdgeError
-        The edge is too wide for it.
+        The edge is too wide for the region.
     """
     cell = np.round(2.0 * distance).astype(np.intp)
     low = int(cell.min())

@@ -1,8 +1,8 @@
-"""Where a straight edge runs through a region of an image: which way, at which sub-pixel place, at which angle.
+"""Location of a straight edge in a region of an image: direction, sub-pixel position and angle.
 
-The first half of the slanted-edge method (ISO 12233): rows across the edge, the centroid of each row's derivative in a
-window, a robust straight line through the centroids. Coordinates: (row, column), the centre of the region's first
-pixel is (0, 0).
+This is the first half of the slanted-edge method (ISO 12233): rows across the edge, the centroid of each row's
+derivative in a window, a robust straight line through the centroids. Coordinates: (row, column), the centre of the
+region's first pixel is (0, 0).
 """
 
 from __future__ import annotations
@@ -20,17 +20,19 @@ from analysis.statistics import robust_sigma
 Axis = Literal["x", "y"]
 # Smallest region: along the edge, and across it.
 LEAST_ALONG, LEAST_ACROSS = 20, 32
-# Distance that the line must keep from the region's sides, px: tails and plateaus must be seen.
+# Least distance of the line from the region's sides, px: tails and plateaus must be visible.
 LEAST_MARGIN = 10.0
 # Contrast over the noise of one pixel below which centroids of single rows mean nothing.
 LEAST_CONTRAST = 5.0
-# |t| of the plane's slope below which there is no edge; by chance once in some 1e8 regions.
+# |t| of the plane's slope below which there is no edge; the false-alarm rate is about 1 in 1e8 regions.
 _LEAST_SLOPE_T = 6.0
 LARGEST_GREY = 1e50
-"""Above it, and with differences below its inverse, fourth powers come near the ends of double precision."""
-# More equal extreme values than this share of the pixels is a clipped plateau.
+"""Largest grey value. Above it, and for differences below its inverse, fourth powers approach the limits of double
+precision.
+"""
+# Fraction of pixels with the same extreme value above which they are a clipped plateau.
 _CLIPPED_SHARE = 0.05
-# Above this the edge is as much of the one kind as of the other.
+# Angle above which the edge is neither near-vertical nor near-horizontal.
 LARGEST_GREY_ANGLE = math.radians(40.0)
 _HALF_WINDOWS = (8.0, 6.0, 6.0)
 _NOT_FOLLOWED = (
@@ -40,19 +42,25 @@ _NOT_FOLLOWED = (
 
 
 class EdgeError(MeasurementError, ValueError):
-    """A region that does not show one measurable edge; the message says what is wrong and what to change."""
+    """Error raised for a region without one measurable edge; the message says what is wrong and what to change."""
 
 
 @dataclass(frozen=True)
 class EdgeLine:
-    """A straight edge, near-vertical (axis "x") or near-horizontal (axis "y").
+    """Straight edge, near-vertical (axis "x") or near-horizontal (axis "y").
 
-    axis: along which the MTF is measured: "x" is across a near-vertical edge, along a row; "y" is across a
+    Attributes
+    ----------
+    axis : {"x", "y"}
+        Axis along which the MTF is measured: "x" is across a near-vertical edge, along a row; "y" is across a
         near-horizontal edge, along a column.
-    angle: of the edge against the pixel grid, rad: column = position + tan(angle) (row - middle row) for axis "x", and
+    angle : float
+        Angle of the edge to the pixel grid, rad: column = position + tan(angle) (row - middle row) for axis "x", and
         row = position + tan(angle) (column - middle column) for axis "y".
-    position: column (row) of the edge in the middle of the region, px.
-    sign: +1 if grey values rise with column (row), -1 if they fall.
+    position : float
+        Column (row) of the edge in the middle of the region, px.
+    sign : int
+        +1 if grey values rise with column (row), -1 if they fall.
     """
 
     axis: Axis
@@ -62,15 +70,20 @@ class EdgeLine:
 
 
 def checked_region(region: ArrayLike, saturation: float | None) -> Array:
-    """The region as float64 (H, W) after the checks that need no edge.
+    """Return the region as float64 (H, W) after the checks that need no edge.
 
-    saturation: grey value from which the detector is saturated; without it a plateau of equal extreme values counts as
-    clipped. Infinity switches the check off (noise-free computed images).
+    Parameters
+    ----------
+    region : array_like
+        Grey values, (H, W).
+    saturation : float or None
+        Grey value from which the detector is saturated; without it a plateau of equal extreme values counts as clipped.
+        Infinity switches the check off (noise-free computed images).
 
     Raises
     ------
     EdgeError
-        Not a plane of real finite numbers, too small, saturated.
+        The region is not a plane of real finite numbers, is too small, or is saturated.
     """
     array = np.asarray(region)
     if array.ndim != 2 or array.dtype.kind not in "uif":
@@ -88,8 +101,10 @@ def checked_region(region: ArrayLike, saturation: float | None) -> Array:
 
 
 def grey_fault(grey: Array, saturation: float | None) -> str:
-    """What is wrong with grey values (H, W) that no fit can use: not finite, too large or too small to compute with,
-    all the same, saturated, or heaped up at their extremes; "" if nothing.
+    """Return the fault of grey values (H, W) that no fit can use; an empty text if there is none.
+
+    Faults are values that are not finite, too large or too small to compute with, all equal, saturated, or accumulated
+    at their extremes.
     """
     advice = "lower the exposure or the light"
     bad = int(np.count_nonzero(~np.isfinite(grey)))
@@ -111,35 +126,35 @@ def grey_fault(grey: Array, saturation: float | None) -> str:
         if count < _CLIPPED_SHARE * grey.size:
             continue
         others = values[values < extreme]
-        # noise makes a maximum rarer than its neighbour; clipping heaps it up
+        # noise makes a maximum rarer than its neighbour; clipping makes it more frequent
         if count > 2 * np.count_nonzero(values == others.max()):
             return (
                 f"{count} pixels share the {side} value {abs(extreme):g}: the "
                 + ("bright side is saturated" if side == "highest" else "dark side is cut off at the black level")
                 + f"; {advice if side == 'highest' else 'raise the offset'}. If the image is computed without noise, "
-                "state a saturation level above it"
+                "give a saturation level above it"
             )
     return ""
 
 
 def pixel_noise(residual: Array) -> float:
-    """Robust rms noise of one pixel from the checkerboard of (H, W): (a - b - c + d) / 2 of 2 x 2 pixels.
+    """Return a robust rms noise of one pixel from the checkerboard differences (a - b - c + d) / 2 of 2 x 2 pixels.
 
-    Straight edges of small tilt and slow shading drop out of that difference.
+    Straight edges of small tilt and slow shading cancel in that difference. The residual has the shape (H, W).
     """
     checker = residual[1:, 1:] - residual[1:, :-1] - residual[:-1, 1:] + residual[:-1, :-1]
     return 0.5 * robust_sigma(checker)
 
 
 def locate_edge(grey: Array) -> EdgeLine:
-    """First line through the one edge in grey values (H, W) as from `checked_region`.
+    """Return a first line through the one edge in grey values (H, W) as from `checked_region`.
 
-    Good to some hundredths of a pixel; `analysis.mtf.slanted_edge` refines it on all pixels together.
+    The line is good to some hundredths of a pixel; `analysis.mtf.slanted_edge` refines it on all pixels together.
 
     Raises
     ------
     EdgeError
-        No edge, more than one, too weak, near 45 degrees, or not inside the region.
+        There is no edge, more than one, or one that is too weak, near 45 degrees, or not inside the region.
     """
     axis, sign = _direction(grey)
     across = grey if axis == "x" else grey.T
@@ -154,7 +169,7 @@ def locate_edge(grey: Array) -> EdgeLine:
             f"the edge runs at {math.degrees(abs(angle)):.0f} deg, near 45 deg, where it is neither vertical nor "
             "horizontal: tilt the target by 2 to 10 deg against rows or columns"
         )
-    # slope offset is at the middle row; where is the line at the first and the last row?
+    # the offset belongs to the middle row; the margin is that of the first or the last row
     reach = abs(slope) * (rows - 1) / 2.0
     margin = min(offset - reach, columns - 1 - offset - reach)
     if margin < LEAST_MARGIN:
@@ -179,7 +194,7 @@ def _check_shape(shape: tuple[int, ...], axis: Axis) -> None:
 
 
 def _direction(grey: Array) -> tuple[Axis, int]:
-    """Axis and sign of the steeper slope of the least-squares plane."""
+    """Return axis and sign of the steeper slope of the least-squares plane."""
     rows, columns = grey.shape
     row, column = np.arange(rows) - (rows - 1) / 2.0, np.arange(columns) - (columns - 1) / 2.0
     centred = grey - grey.mean()
@@ -196,7 +211,7 @@ def _direction(grey: Array) -> tuple[Axis, int]:
                 "no single edge in the region: there is structure, but one side is not brighter than the other (two "
                 "edges of a bar?); choose a region with one edge between two even areas"
             )
-        raise EdgeError("no edge in the region: it is even but for noise; move the region onto the edge")
+        raise EdgeError("no edge in the region: it is even apart from noise; move the region onto the edge")
     # the slopes, not their significance: the region need not be square
     if abs(slope_x) * columns >= abs(slope_y) * rows:
         return "x", 1 if slope_x > 0 else -1
@@ -204,14 +219,14 @@ def _direction(grey: Array) -> tuple[Axis, int]:
 
 
 def _blocks(grey: Array) -> Array:
-    """Means of whole blocks of 4 x 4 px."""
+    """Return the means of complete blocks of 4 x 4 px."""
     rows, columns = grey.shape[0] // 4, grey.shape[1] // 4
     whole = grey[: rows * 4, : columns * 4].reshape(rows, 4, columns, 4)
     return np.asarray(whole.mean(axis=(1, 3)))
 
 
 def _coarse_line(rising: Array) -> tuple[float, float]:
-    """Column of the edge in the middle row and its slope, from the steepest place of bands of rows."""
+    """Return the column of the edge in the middle row and its slope, from the steepest position of bands of rows."""
     rows, columns = rising.shape
     height = max(2, rows // 12)
     bands = rows // height
@@ -228,7 +243,7 @@ def _coarse_line(rising: Array) -> tuple[float, float]:
 
 
 def _refined(rising: Array, offset: float, slope: float) -> tuple[float, float]:
-    """The line through the centroids of each row's derivative in a window about the line before."""
+    """Return the line through the centroids of each row's derivative in a window about the previous line."""
     rows, columns = rising.shape
     row = np.arange(rows) - (rows - 1) / 2.0
     rise = rising[:, 1:] - rising[:, :-1]
@@ -266,7 +281,7 @@ def _check_contrast(rising: Array, line: Array) -> None:
 
 
 def _huber_line(x: Array, y: Array) -> tuple[float, float]:
-    """Offset and slope; residuals beyond 1.5 robust sigmas count less (Huber)."""
+    """Fit offset and slope; residuals beyond 1.5 robust sigmas have less weight (Huber)."""
     weight = np.ones_like(x)
     for _ in range(3):
         mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)

@@ -1,14 +1,12 @@
-"""One slanted edge in several frames: where it stands in each of them, and its MTF with the frames laid over each other
-where it moves.
+"""Slanted edge in several frames: its position in each of them, and the MTF of the frames aligned where it moves.
 
-The mean of frames between which the edge moves by d rms has an MTF that is lower by (2 pi f d)^2 / 2 of itself, and
-nothing in the mean tells it. So every page is compared with the mean: its place, angle and two levels are
-fitted to what it differs by, with the derivatives of the mean's edge-spread function. Differences of pages hold only
-noise that is new in each, so that chi-square of places and angles has a known distribution. Pages that do not move are
-measured in their mean, as ever. Pages that do are fitted together, each pixel at its own distance from the edge in its
-page.
+The mean of frames between which the edge moves by d rms has an MTF that is lower by (2 pi f d)^2 / 2 of itself, which
+the mean does not show. Every page is therefore compared with the mean: its position, angle and two levels are fitted to
+its difference from the mean, with the derivatives of the mean's edge-spread function. Differences of pages contain only
+noise that is new in each, so that chi-square of positions and angles has a known distribution. Pages that do not move
+are measured in their mean. Pages that do are fitted together, each pixel at its own distance from the edge in its page.
 
-Rounding to whole grey values is noise only while other noise spreads over the steps (`left_over`).
+Rounding to whole grey values is noise only while other noise spreads over the steps (`rounding_residual`).
 """
 
 from __future__ import annotations
@@ -28,20 +26,20 @@ from analysis.spots.noise import NoiseModel
 from analysis.statistics import chance_beyond
 
 FALSE_ALARM = 1e-4
-"""Rate at which pages are aligned although the edge does not move in them."""
+"""Probability that pages are aligned although the edge does not move in them."""
 MOST_PIXELS = 4_000_000
-"""Largest number of pixels of all pages together when they are aligned: the fit needs some 300 bytes for each."""
+"""Largest total number of pixels of pages that are aligned: the fit needs some 300 bytes for each."""
 _STEPS = 30
 _SETTLED = 2
-"""Steps after which the places of pages are near enough to tell whether they turn, too."""
+"""Iterations after which the positions of pages are accurate enough to test for rotation as well."""
 _DONE = 0.1
-"""Steps below so many sigmas end the iteration."""
+"""Step, in sigmas, below which the iteration ends."""
 _LARGEST_STEP = 2.0
 _LINE, _LEVELS = slice(0, 2), slice(2, 4)
 
 
-def left_over(noise: float, step: float) -> float:
-    """Rms of what rounding leaves in the mean of arbitrarily many grey values.
+def rounding_residual(noise: float, step: float) -> float:
+    """Return the rms of the rounding error that remains in the mean of arbitrarily many grey values.
 
     Values with normal noise that are rounded to multiples of a step have a mean whose error is a Fourier series of the
     level over the step, with amplitudes step / (pi k) exp(-2 pi^2 k^2 noise^2 / step^2) (Widrow and Kollar,
@@ -51,9 +49,9 @@ def left_over(noise: float, step: float) -> float:
     Parameters
     ----------
     noise : float
-        Of one value, rms, grey values.
+        Rms noise of one value, grey values.
     step : float
-        Between possible grey values; 0 for real numbers.
+        Step between possible grey values; 0 for real numbers.
     """
     if step <= 0.0:
         return 0.0
@@ -63,7 +61,7 @@ def left_over(noise: float, step: float) -> float:
 
 
 def grey_step(grey: ArrayLike) -> float:
-    """Largest power of two of which all grey values are multiples but for a constant; 0 if they are no whole numbers.
+    """Return the largest power of two of which all grey values are multiples but for a constant; 0 for real numbers.
 
     Cameras of 12 bits often fill the upper bits of 16.
     """
@@ -84,59 +82,59 @@ def measure_pages(
     step: float = 0.0,
     even: bool = False,
 ) -> EdgeMtf:
-    """MTF of the one edge that all pages show.
+    """Measure the MTF of the one edge that all pages show.
 
     Parameters
     ----------
-    pages : ArrayLike
-        (P, H, W) grey values, linear in light; pages that repeat another one to the bit do not count.
-    noise : NoiseModel | None
-        The detector's model, as in `slanted_edge_mtf`.
-    saturation : float | None
-        As there; one page that reaches it is enough.
+    pages : (P, H, W) array_like
+        Grey values, linear in light; identical copies of a page do not count.
+    noise : NoiseModel or None
+        Noise model of the detector, as in `slanted_edge.slanted_edge_mtf`.
+    saturation : float or None
+        Grey value of saturation; one page that reaches it is enough for a refusal.
     step : float
-        Between the grey values of a page, which are rounded to it; 0 for real numbers.
+        Step between the grey values of a page, to which they are rounded; 0 for real numbers.
     even : bool
-        The light is known to be even, as in `slanted_edge_mtf`.
+        True if the light is known to be even, as in `slanted_edge.slanted_edge_mtf`.
 
     Raises
     ------
     EdgeError
-        The region does not show one measurable edge, or pages cannot be laid over each other.
+        The region does not show one measurable edge, or the pages cannot be aligned.
     """
-    given = np.asarray(pages)
-    if given.ndim != 3 or given.dtype.kind not in "uif":
-        raise EdgeError(f"pages must be planes of real grey values (P, H, W), found {given.dtype} {given.shape}")
-    kept = different_pages(given)
-    same = len(given) - len(kept)
-    given = given[kept]
+    array = np.asarray(pages)
+    if array.ndim != 3 or array.dtype.kind not in "uif":
+        raise EdgeError(f"pages must be planes of real grey values (P, H, W), found {array.dtype} {array.shape}")
+    unique = different_pages(array)
+    same = len(array) - len(unique)
+    array = array[unique]
     if saturation is None and noise is not None:
         saturation = noise.saturation_dn
-    grey = checked_region(mean_page(given, saturation), saturation)
-    every = np.asarray(given, np.float64)
+    grey = checked_region(mean_page(array, saturation), saturation)
+    frames = np.asarray(array, np.float64)
     run = _Run(noise, step, same, even)
     try:
         line = locate_edge(grey)
-        up = slanted_edge.rising(grey, line)
-        fitted = edge_fit.fit_edge(up, *slanted_edge.rising_line(line, up.shape[1]), even)
-        up = up - fitted.light.reshape(up.shape)
-        stack = _Stack.of(slanted_edge.rising(every, line), fitted)
-        shift = stack.differences(step, up)
-        if len(every) == 1 or shift.p_value >= FALSE_ALARM:
+        rising_mean = slanted_edge.rising(grey, line)
+        fitted = edge_fit.fit_edge(rising_mean, *slanted_edge.rising_line(line, rising_mean.shape[1]), even)
+        rising_mean = rising_mean - fitted.light.reshape(rising_mean.shape)
+        stack = _Stack.of(slanted_edge.rising(frames, line), fitted)
+        shift = stack.differences(step, rising_mean)
+        if len(frames) == 1 or shift.p_value >= FALSE_ALARM:
             stack = stack.moved(shift.line)
-            return run.result(up[None], len(every), line, fitted, stack, shift, aligned=False)
+            return run.result(rising_mean[None], len(frames), line, fitted, stack, shift, aligned=False)
     except EdgeError:
-        # an edge that moves far has a mean that shows none
-        if len(every) == 1:
+        # the mean of pages whose edge moves far shows no edge
+        if len(frames) == 1:
             raise
-        line = _any_line(every)
+        line = _first_line(frames)
         stack = None
-    return _aligned(every, line, stack, run)
+    return _aligned(frames, line, stack, run)
 
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """What is asked for."""
+    """Options of a measurement: noise model, step of grey values, number of copied pages, even light."""
 
     noise: NoiseModel | None
     step: float
@@ -153,19 +151,22 @@ class _Run:
         shift: _Shift,
         aligned: bool,
     ) -> EdgeMtf:
-        """Result of pages (1, H, W), their mean, or (P, H, W), aligned; each page is the mean of some frames."""
+        """Return the result of pages (1, H, W), their mean, or (P, H, W), aligned.
+
+        ``frames`` is the number of frames averaged into all pages together.
+        """
         count = len(stack.line)
-        rounded = [left_over(rms, self.step) for rms in shift.page_noise]
-        found = slanted_edge.edge_result(
+        rounded = [rounding_residual(rms, self.step) for rms in shift.page_noise]
+        result = slanted_edge.edge_result(
             pages, line, fitted, self.noise, frames // len(pages), slanted_edge.FREQUENCY, (rounded[0], rounded[1])
         )
         place, slope = stack.line.T
         spread = np.sqrt(np.stack([np.diag(one) for one in shift.covariance]))
         cosine = np.cos(np.arctan(slope)) ** 2
-        # the line is that of the fit, the edge at half height a little beside it
-        own = place - place.mean()
-        places = slanted_edge.PagePlaces(
-            position=found.position + (own if line.sign > 0 else -own),
+        # the fitted line and the edge at half height differ slightly
+        relative = place - place.mean()
+        places = slanted_edge.PagePositions(
+            position=result.position + (relative if line.sign > 0 else -relative),
             position_sigma=spread[:, 0],
             angle=line.sign * np.arctan(slope),
             angle_sigma=spread[:, 1] * cosine,
@@ -176,25 +177,25 @@ class _Run:
             noise=shift.page_noise,
             rounded=(rounded[0], rounded[1]),
         )
-        return replace(found, pages=places)
+        return replace(result, pages=places)
 
 
 @dataclass(frozen=True, eq=False)
 class _Shift:
-    """What pages differ by.
+    """Differences between pages.
 
     Attributes
     ----------
-    line : Array
-        Change of each page's offset and slope, (P, 2).
-    levels : Array
-        Of its dark level and contrast, (P, 2).
-    covariance : Array
-        Of the line by noise that is new in each page, (P, 2, 2).
+    line : (P, 2) ndarray
+        Change of each page's offset and slope.
+    levels : (P, 2) ndarray
+        Change of each page's dark level and contrast.
+    covariance : (P, 2, 2) ndarray
+        Covariance of the line by noise that is new in each page.
     chi_square : float
-        Of all lines being the same.
-    page_noise : tuple[float, float]
-        Of one pixel in one page on the dark and on the bright side, fixed pattern included, rms.
+        Chi-square of all lines being the same.
+    page_noise : tuple of float
+        Rms noise of one pixel in one page on the dark and on the bright side, fixed pattern included.
     """
 
     line: Array
@@ -210,7 +211,7 @@ class _Shift:
 
     @property
     def turned(self) -> bool:
-        """The pages turn against each other, too."""
+        """True if the pages rotate against each other as well."""
         slope = self.line[:, 1] - self.line[:, 1].mean()
         chi_square = float(np.sum(slope**2 / self.covariance[:, 1, 1]))
         return bool(chance_beyond(chi_square, len(slope) - 1) < FALSE_ALARM)
@@ -218,9 +219,10 @@ class _Shift:
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """Pages (P, H, W) without uneven light, the edge rising in their rows, with a line for each, (P, 2) offset and
-    slope, one edge-spread function and one bend, (B,) as `edge_fit.EdgeRows` has it. Of the levels (2,) each page has
-    its own, (P, 2). light: (H, W), what was taken off.
+    """Pages (P, H, W) without uneven light, the edge rising in their rows, with their common edge-spread function.
+
+    Each page has a line, offset and slope (P, 2), and levels (P, 2); all share one bend (B,), as in
+    `edge_fit.EdgeRows`. ``light`` (H, W) is the uneven light that was subtracted.
     """
 
     pages: Array
@@ -232,50 +234,50 @@ class _Stack:
 
     @classmethod
     def of(cls, pages: Array, fitted: edge_fit.FittedEdge) -> _Stack:
-        """Return all pages at the place and the levels of their mean, the light of that taken off."""
+        """Return the stack of all pages with the line and the levels of their mean, and its uneven light subtracted."""
         line = np.tile([fitted.rows.offset.mean(), fitted.rows.slope.mean()], (len(pages), 1))
         levels = np.tile([fitted.spread.dark, fitted.spread.contrast], (len(pages), 1))
         light = fitted.light.reshape(pages.shape[1:])
         return cls(pages - light, line, fitted.spread, levels, fitted.rows.bend, light)
 
     def moved(self, line: Array) -> _Stack:
-        """Stack of the same pages with its lines changed by the given amounts."""
+        """Return the stack of the same pages with their lines changed by the given amounts."""
         return replace(self, line=self.line + line)
 
     @property
     def along(self) -> Array:
-        """Rows from the middle one, (H,)."""
+        """Distances of the rows from the middle one, (H,) px."""
         rows = self.pages.shape[1]
         return np.arange(rows) - (rows - 1) / 2.0
 
     def distance(self) -> Array:
-        """Distance of all pixels from the edge in their page, along its normal, (P, H, W), px."""
+        """Return the distance of all pixels from the edge in their page, along its normal, (P, H, W) px."""
         return edge_fit.EdgeRows.of(self.line, self.pages.shape[1:], self.bend).distance().reshape(self.pages.shape)
 
     @property
     def levelled(self) -> Array:
-        """Pages with the levels of the edge-spread function, (P, H, W)."""
+        """Pages scaled to the levels of the edge-spread function, (P, H, W)."""
         dark, contrast = self.levels[:, :1, None], self.levels[:, 1:, None]
         return np.asarray(self.spread.dark + (self.pages - dark) * (self.spread.contrast / contrast))
 
     def differences(self, step: float, mean: Array | None = None) -> _Shift:
-        """Line and levels of each page against those it has, by least squares.
+        """Fit the change of each page's line and levels by least squares.
 
         Parameters
         ----------
         step : float
-            Between the grey values of a page.
-        mean : Array | None
-            Of all pages (H, W), which takes the place of the model; what pixels have in all pages alike then drops out.
+            Step between the grey values of a page.
+        mean : (H, W) ndarray or None
+            Mean of all pages, which replaces the model; errors that pixels have in all pages alike then cancel.
         """
         pages = self.pages if mean is not None else self.levelled
         count, x = len(pages), self.distance()
         line, levels = np.zeros((count, 2)), np.zeros((count, 2))
         inverse, square = [], np.zeros((2, 2))
-        every = []
-        # of a difference from the mean of P pages (P - 1) / P is left
-        left = (count - 1) / count if mean is not None and count > 1 else 1.0
-        own = np.zeros(2)
+        designs = []
+        # the variance of a difference from the mean of P pages is reduced by (P - 1) / P
+        variance_share = (count - 1) / count if mean is not None and count > 1 else 1.0
+        sums = np.zeros(2)
         for p, page in enumerate(pages):
             design = self.spread.design(x[p].ravel())
             value = self.spread.value(design)
@@ -288,23 +290,23 @@ class _Stack:
             parts = np.stack([fall, fall * along, np.ones(page.size), lift])
             rest = page.ravel() - (mean.ravel() if mean is not None else value)
             normal = np.linalg.inv(np.einsum("in,jn->ij", parts, parts))
-            found = normal @ (parts @ rest)
-            line[p], levels[p] = found[_LINE], found[_LEVELS]
+            solution = normal @ (parts @ rest)
+            line[p], levels[p] = solution[_LINE], solution[_LEVELS]
             sides = design.x < -self.spread.core, design.x > self.spread.core
             for k, side in enumerate(sides):
-                square[k] += float(np.sum((rest - found @ parts)[side] ** 2)), max(np.count_nonzero(side) - 1.5, 1.0)
-                own[k] += float(np.sum((page.ravel() - value)[side] ** 2))
+                square[k] += float(np.sum((rest - solution @ parts)[side] ** 2)), max(np.count_nonzero(side) - 1.5, 1.0)
+                sums[k] += float(np.sum((page.ravel() - value)[side] ** 2))
             inverse.append(normal)
-            every.append(parts)
-        noise = [math.sqrt(total / number) for total, (_, number) in zip(own, square, strict=True)]
-        # on an even side rounding may hide what it does on the edge
+            designs.append(parts)
+        noise = [math.sqrt(total / number) for total, (_, number) in zip(sums, square, strict=True)]
+        # on an even side the rounding error may be invisible, but not on the edge
         least = 1e-12 * self.spread.contrast**2
         dark, bright = (
-            max(total / (number * left), least, left_over(rms, step) ** 2)
+            max(total / (number * variance_share), least, rounding_residual(rms, step) ** 2)
             for (total, number), rms in zip(square, noise, strict=True)
         )
         covariance = np.empty((count, 2, 2))
-        for p, parts in enumerate(every):
+        for p, parts in enumerate(designs):
             variance = np.maximum(dark + (bright - dark) * parts[3], 0.1 * min(dark, bright))
             spread = inverse[p] @ np.einsum("in,jn->ij", parts * variance, parts) @ inverse[p]
             covariance[p] = spread[_LINE, _LINE]
@@ -314,16 +316,16 @@ class _Stack:
 
 
 def different_pages(pages: NDArray[np.generic]) -> list[int]:
-    """Numbers of the pages that no page before them is equal to."""
-    seen: dict[bytes, int] = {}
+    """Return the indices of the pages that are not equal to an earlier page."""
+    first_of: dict[bytes, int] = {}
     for number, page in enumerate(pages):
-        seen.setdefault(np.ascontiguousarray(page).tobytes(), number)
-    return sorted(seen.values())
+        first_of.setdefault(np.ascontiguousarray(page).tobytes(), number)
+    return sorted(first_of.values())
 
 
 def mean_page(pages: NDArray[np.generic], saturation: float | None) -> Array:
-    """Mean (H, W) of pages (P, H, W); a pixel that is saturated in one page is put at that level at least."""
-    # sums of huge real numbers may overflow; what is not finite is refused where it is measured
+    """Return the mean (H, W) of pages (P, H, W); a pixel that is saturated in one page gets that level at least."""
+    # sums of huge real numbers may overflow; values that are not finite are refused by the measurement
     with np.errstate(over="ignore", invalid="ignore"):
         mean = np.asarray(pages.mean(axis=0), np.float64)
         if saturation is None:
@@ -331,8 +333,8 @@ def mean_page(pages: NDArray[np.generic], saturation: float | None) -> Array:
         return np.where(np.any(np.asarray(pages, np.float64) >= saturation, axis=0), np.maximum(mean, saturation), mean)
 
 
-def _any_line(pages: Array) -> EdgeLine:
-    """The line in the first page that shows one. EdgeError, of the first, if none does."""
+def _first_line(pages: Array) -> EdgeLine:
+    """Return the line in the first page that shows one; raise the EdgeError of the first page if none does."""
     failure: EdgeError | None = None
     for page in pages:
         try:
@@ -343,29 +345,29 @@ def _any_line(pages: Array) -> EdgeLine:
     raise failure
 
 
-def _own_lines(pages: Array, line: EdgeLine) -> Array | None:
-    """Lines (P, 2) as each page shows them alone, or None where one of them does not."""
+def _page_lines(pages: Array, line: EdgeLine) -> Array | None:
+    """Return the line of each page alone, (P, 2); None if a page does not show it."""
     out = []
     for page in pages:
         try:
-            found = locate_edge(page)
+            page_line = locate_edge(page)
         except EdgeError:
             return None
-        if (found.axis, found.sign) != (line.axis, line.sign):
+        if (page_line.axis, page_line.sign) != (line.axis, line.sign):
             return None
-        out.append(slanted_edge.rising_line(found, slanted_edge.rising(page, line).shape[1]))
+        out.append(slanted_edge.rising_line(page_line, slanted_edge.rising(page, line).shape[1]))
     return np.array(out)
 
 
 def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> EdgeMtf:
-    """The edge of pages (P, H, W) in which it moves, all of them fitted together."""
+    """Measure the edge of pages (P, H, W) in which it moves, by fitting all of them together."""
     if pages.size > MOST_PIXELS:
         raise EdgeError(
-            f"the edge moves between the pages, and {len(pages)} of {pages[0].size} pixels are too many to be laid over"
-            f" each other, {MOST_PIXELS} in all are possible: take a smaller region, or fewer pages"
+            f"the edge moves between the pages, and {len(pages)} of {pages[0].size} pixels are too many to be aligned;"
+            f" at most {MOST_PIXELS} in all are possible: take a smaller region, or fewer pages"
         )
-    up = slanted_edge.rising(pages, line)
-    lines = _own_lines(pages, line)
+    upright = slanted_edge.rising(pages, line)
+    lines = _page_lines(pages, line)
     if lines is None and stack is None:
         raise EdgeError(
             "the edge moves so far between the pages that their mean does not show it, and single pages are too noisy"
@@ -375,11 +377,11 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
         assert stack is not None
         lines = stack.line
     if stack is None:
-        stack = _Stack.of(up, edge_fit.fit_edge(up[0], float(lines[0, 0]), float(lines[0, 1]), run.even))
-    # what the mean shows of light and bend is near enough to lay the pages over each other
-    flat = up - stack.light
-    # one slope for all unless they turn
-    start = np.column_stack([lines[:, 0], np.full(len(up), lines[:, 1].mean())])
+        stack = _Stack.of(upright, edge_fit.fit_edge(upright[0], float(lines[0, 0]), float(lines[0, 1]), run.even))
+    # light and bend of the mean are accurate enough to align the pages
+    flat = upright - stack.light
+    # one slope for all unless they rotate
+    start = np.column_stack([lines[:, 0], np.full(len(upright), lines[:, 1].mean())])
     left, right = (np.median(part, axis=(1, 2)) for part in (flat[..., :8], flat[..., -8:]))
     levels = np.column_stack([left, right - left])
     turning = False
@@ -392,41 +394,41 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
         change[:, 0] = np.clip(change[:, 0], -_LARGEST_STEP, _LARGEST_STEP)
         gain = current.levels[:, 1] / current.spread.contrast
         new = current.levels + shift.levels * gain[:, None]
-        own = np.abs(change) / np.sqrt(np.diagonal(shift.covariance, axis1=1, axis2=2))
+        significance = np.abs(change) / np.sqrt(np.diagonal(shift.covariance, axis1=1, axis2=2))
         current = _fitted(flat, current.line + change, new, stack.bend)
         if not turning and number >= _SETTLED and shift.turned:
             turning = True
-        elif number >= _SETTLED and np.max(own) < _DONE:
+        elif number >= _SETTLED and np.max(significance) < _DONE:
             break
     else:
         raise EdgeError(
-            "the pages cannot be laid over each other: the edge does not look alike in them; measure single pages"
+            "the pages cannot be aligned: the edge does not have the same shape in them; measure single pages"
         )
-    rows, grey, core = _levelled(up, current.line, current.levels, stack.bend)
+    rows, grey, core = _levelled(upright, current.line, current.levels, stack.bend)
     fitted = edge_fit.fit_rows(rows, grey, core, run.even)
-    lines = np.column_stack([fitted.rows.offset, fitted.rows.slope])[:: up.shape[1]]
-    levels = np.tile([fitted.spread.dark, fitted.spread.contrast], (len(up), 1))
-    even = (grey - fitted.light).reshape(up.shape)
+    lines = np.column_stack([fitted.rows.offset, fitted.rows.slope])[:: upright.shape[1]]
+    levels = np.tile([fitted.spread.dark, fitted.spread.contrast], (len(upright), 1))
+    even = (grey - fitted.light).reshape(upright.shape)
     final = _Stack(even, lines, fitted.spread, levels, fitted.rows.bend, stack.light)
     sigma = np.stack([np.diag(one) for one in shift.covariance])
     normal = np.cos(np.arctan(final.line[:, 1])) ** 2
     jitter = normal * (sigma[:, 0] + turning * sigma[:, 1] * np.mean(final.along**2))
     fitted = replace(fitted, jitter=float(np.mean(jitter)))
     chi = final.differences(run.step)
-    # of pages that differ: how far the lines stand apart
+    # chi-square of the differences between the lines
     apart = final.line - final.line.mean(axis=0)
     square = float(np.sum(apart * np.linalg.solve(chi.covariance, apart[..., None])[..., 0]))
-    return run.result(final.levelled, len(up), line, fitted, final, replace(chi, chi_square=square), aligned=True)
+    return run.result(final.levelled, len(upright), line, fitted, final, replace(chi, chi_square=square), aligned=True)
 
 
-def _levelled(up: Array, lines: Array, levels: Array, bend: Array) -> tuple[edge_fit.EdgeRows, Array, float]:
+def _levelled(upright: Array, lines: Array, levels: Array, bend: Array) -> tuple[edge_fit.EdgeRows, Array, float]:
     """Return the rows of all pages, their grey values with the mean levels (N,), and the half width of the spline."""
     dark, contrast = levels.mean(axis=0)
     if np.any(levels[:, 1] < 0.1 * contrast) or contrast <= 0.0:
         page = int(np.argmin(levels[:, 1]))
-        raise EdgeError(f"page {page} of those that are not repeated shows no edge; leave it out")
-    grey = (dark + (up - levels[:, :1, None]) * (contrast / levels[:, 1:, None])).ravel()
-    rows = edge_fit.EdgeRows.of(lines, up.shape[1:], bend)
+        raise EdgeError(f"page {page}, not counting copies, shows no edge; exclude it")
+    grey = (dark + (upright - levels[:, :1, None]) * (contrast / levels[:, 1:, None])).ravel()
+    rows = edge_fit.EdgeRows.of(lines, upright.shape[1:], bend)
     if rows.plateau < 10.0:
         raise EdgeError(
             "the edge moves so far between the pages that it comes within 10 px of the region's side: take a wider"
@@ -437,12 +439,12 @@ def _levelled(up: Array, lines: Array, levels: Array, bend: Array) -> tuple[edge
     return rows, grey, edge_fit.core_width(distance, grey, rows.plateau)
 
 
-def _fitted(up: Array, lines: Array, levels: Array, bend: Array) -> _Stack:
+def _fitted(upright: Array, lines: Array, levels: Array, bend: Array) -> _Stack:
     """Return the edge-spread function of all pages, each at its own line and with its own levels."""
-    rows, grey, core = _levelled(up, lines, levels, bend)
+    rows, grey, core = _levelled(upright, lines, levels, bend)
     spread = fit_edge_spread(EdgeDesign.of(rows.distance(), core, edge_fit.COARSE), grey)
     # levels of the pages against those of the fit
     dark, contrast = levels.mean(axis=0)
     gain = levels[:, 1] / contrast
-    own = np.column_stack([levels[:, 0] + (spread.dark - dark) * gain, spread.contrast * gain])
-    return _Stack(up, lines, spread, own, bend, np.zeros(up.shape[1:]))
+    page_levels = np.column_stack([levels[:, 0] + (spread.dark - dark) * gain, spread.contrast * gain])
+    return _Stack(upright, lines, spread, page_levels, bend, np.zeros(upright.shape[1:]))

@@ -1,4 +1,4 @@
-"""What ``python -m analysis.mtf`` does between its options and its result."""
+"""Implementation of the command ``python -m analysis.mtf``."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from analysis.mtf.slanted_edge import EdgeMtf
 BAD_INPUT, NOT_PRINTED = 2, 1
 PLOT_KINDS = (".png", ".pdf", ".svg")
 _LENGTHS = {"nm": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "mm": 1.0}
-# Beyond twice the sampling frequency no camera passes light.
+# Highest frequency, cycles/pixel: beyond twice the sampling frequency no camera passes light.
 _HIGHEST = 2.0
-# Larger numbers are in no image.
+# Numbers of more digits occur in no image.
 _NUMBERS = re.compile(r"\s*" + r"\s*,\s*".join([r"([0-9]{1,10})"] * 4) + r"\s*")
 _LIGHT = tuple(f"{level}_change_{way}" for level in ("bright", "dark") for way in ("along", "across"))
 # Table rows, cycles/pixel.
@@ -39,7 +39,7 @@ _ROWS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 
 
 class _Wrong(Exception):
-    """What the user must change, in one sentence."""
+    """Error of the user's input, described in one sentence."""
 
 
 def run_mtf(
@@ -64,7 +64,7 @@ def run_mtf(
     Raises
     ------
     typer.Exit
-        With the exit code of a failure, which has been told.
+        The measurement failed; the exit code is set and the error has been printed.
     """
     errors = Console(stderr=True)
     try:
@@ -75,7 +75,7 @@ def run_mtf(
             _check_target(path, kinds, image)
         _check_bar_options(frequency is not None, dark, bright, plot, csv_file)
         source = ImageFile.open(image, frames, page)
-        # wrong curves are told before the pixels are read
+        # an unsuitable curve is refused before the pixels are read
         tone_curve(gamma, source.header.full_scale)
         regions = {"--roi": _region(roi, "--roi")}
         fields: dict[str, ImageFile] = {}
@@ -94,27 +94,27 @@ def run_mtf(
         region = read["--roi"]
         if saturation is None and np.any(region >= source.header.full_scale):
             saturation = source.header.full_scale
-        found: BarMtf | EdgeMtf
+        result: BarMtf | EdgeMtf
         step = _step(source, region, gamma)
         if frequency is not None:
-            found = measure_bar_pages(
+            result = measure_bar_pages(
                 region, read["--dark"], read["--bright"], frequency, saturation=saturation, offset=offset, step=step
             )
         else:
-            found = measure_pages(region, saturation=saturation, step=step)
-        warnings += page_warnings(found, step)
-        if isinstance(found, EdgeMtf):
-            edge = found
+            result = measure_pages(region, saturation=saturation, step=step)
+        warnings += page_warnings(result, step)
+        if isinstance(result, EdgeMtf):
+            edge = result
             _write(plot, lambda path: _draw(edge, size, path))
             _write(csv_file, lambda path: _write_csv(edge, size, path))
     except (EdgeError, BarError, ImageError, _Wrong) as error:
-        # what is wrong with an image says which: there may be many in a script
+        # the message names the image, as a script may measure many
         named = isinstance(error, _Wrong) or str(image) in str(error)
         text = str(error) if named else f"{image}: {error}"
         errors.print(f"error: {text}", style="bold red", markup=False, highlight=False, soft_wrap=True)
         raise typer.Exit(BAD_INPUT) from None
     except OSError as error:
-        # names that the system does not take, such as too long ones
+        # file names that the system refuses, such as too long ones
         name = str(error.filename)[:80]
         errors.print(
             f"error: {name}: {error.strerror}", style="bold red", markup=False, highlight=False, soft_wrap=True
@@ -123,16 +123,16 @@ def run_mtf(
     for text in warnings:
         errors.print(f"warning: {text}", style="yellow", markup=False, highlight=False, soft_wrap=True)
     try:
-        if isinstance(found, BarMtf):
-            _print_bars(found, size, offset, warnings, as_json)
+        if isinstance(result, BarMtf):
+            _print_bars(result, size, offset, warnings, as_json)
         elif as_json:
-            _print_json({**_edge_json(found, size, offset), "warnings": warnings})
+            _print_json({**_edge_json(result, size, offset), "warnings": warnings})
         else:
-            _print_edge(found, size, offset, [path for path in (plot, csv_file) if path is not None])
+            _print_edge(result, size, offset, [path for path in (plot, csv_file) if path is not None])
         sys.stdout.flush()
     except OSError as error:
         errors.print(f"error: the result cannot be printed ({error.strerror})", markup=False, soft_wrap=True)
-        # what is left in the buffer would fail once more at the end
+        # otherwise the buffer would fail once more at the interpreter's end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(NOT_PRINTED) from None
 
@@ -148,7 +148,7 @@ def _check_bar_options(
     bars: bool, dark: str | None, bright: str | None, plot: Path | None, csv_file: Path | None
 ) -> None:
     if not bars and (dark is not None or bright is not None):
-        raise _Wrong("--dark and --bright belong to --bars; an edge carries its own levels")
+        raise _Wrong("--dark and --bright belong to --bars; the levels of an edge are measured in its region")
     if bars and (dark is None or bright is None):
         raise _Wrong("--bars needs --dark and --bright: the levels of spaces and bars, images or even patches")
     if bars and (plot is not None or csv_file is not None):
@@ -160,14 +160,14 @@ def _warnings(images: list[ImageFile], gamma: str | None) -> list[str]:
         return []
     return [
         f"{image.path}: {image.header.coded}, so that its grey values probably follow a tone curve. Taken as linear"
-        " they make the MTF wrong: state --gamma srgb (or the curve's exponent), or --gamma 1 if they are linear"
+        " they make the MTF wrong: give --gamma srgb (or the curve's exponent), or --gamma 1 if they are linear"
         for image in images
         if image.header.coded
     ]
 
 
 def _step(source: ImageFile, region: Array, gamma: str | None) -> float:
-    """Between the grey values of a page, linear in light; of a tone curve the largest."""
+    """Return the step between the grey values of a page, linear in light; for a tone curve the largest step."""
     if gamma in (None, "1"):
         return grey_step(region)
     whole = source.header.full_scale
@@ -176,16 +176,16 @@ def _step(source: ImageFile, region: Array, gamma: str | None) -> float:
 
 
 def _given_pitch(pitch: str | None, pixel_size: str | None, errors: Console) -> str:
-    """The option, also by its old name."""
+    """Return the text of the pitch option, also under its old name."""
     if pixel_size is not None:
-        errors.print("note: --pixel-size is called --pitch now; the old name is read for one version", soft_wrap=True)
+        errors.print("note: --pixel-size is now --pitch; the old name is accepted for one version", soft_wrap=True)
     if (pitch is None) == (pixel_size is None):
         raise _Wrong('--pitch is missing: the pixel pitch, as "7 um"' if pitch is None else "--pitch is given twice")
     return str(pitch if pixel_size is None else pixel_size)
 
 
 def _pitch(text: str) -> float:
-    """Pixel pitch in millimetres."""
+    """Return the pixel pitch in millimetres."""
     match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(\S*)\s*", text)
     try:
         value = float(match[1]) if match else math.nan
@@ -200,7 +200,7 @@ def _pitch(text: str) -> float:
 
 
 def _frequency(text: str, pitch: float) -> float:
-    """Cycles per pixel; pitch in millimetres."""
+    """Return the frequency in cycles per pixel; the pitch is in millimetres."""
     match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(cycles/mm|cycles/pixel|lp/mm)\s*", text)
     try:
         value = float(match[1]) if match else math.nan
@@ -234,7 +234,7 @@ def _region(text: str, option: str) -> Region:
 
 
 def _write(target: Path | None, make: Callable[[Path], None]) -> None:
-    """Make a file under a temporary name beside the target and rename it, so that no half-written one is left."""
+    """Write a file under a temporary name beside the target and rename it, so that no half-written file is left."""
     if target is None:
         return
     try:
@@ -243,7 +243,7 @@ def _write(target: Path | None, make: Callable[[Path], None]) -> None:
         temporary = Path(name)
         try:
             make(temporary)
-            # mkstemp makes files that only their owner can read
+            # mkstemp creates files that only their owner can read
             mask = os.umask(0)
             os.umask(mask)
             temporary.chmod(0o666 & ~mask)
@@ -263,7 +263,7 @@ def _write_csv(edge: EdgeMtf, pitch: float, path: Path) -> None:
 
 
 def _draw(edge: EdgeMtf, pitch: float, path: Path) -> None:
-    # a figure without pyplot has no window and no global state
+    # a figure made without pyplot needs no window and no global state
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -374,7 +374,7 @@ def _print_edge(edge: EdgeMtf, pitch: float, offset: float, written: list[Path])
         if math.isnan(half)
         else f"MTF50: {half / pitch:.2f} ± {half_sigma / pitch:.2f} cycles/mm ({half:.4f} cycles/pixel)",
         f"edge: {math.degrees(edge.angle):+.3f} ± {math.degrees(edge.angle_sigma):.3f} deg, {kind}; "
-        + ("straight" if edge.order == 1 else f"bowed, followed by a polynomial of order {edge.order}"),
+        + ("straight" if edge.order == 1 else f"curved, fitted by a polynomial of order {edge.order}"),
         f"levels: {edge.dark - offset:.1f} and {edge.bright - offset:.1f}, noise {edge.noise_dark:.2f} and "
         f"{edge.noise_bright:.2f} per pixel",
         "light: bright level changes by {} along the edge and {} across it, dark level by {} and {}".format(
@@ -393,8 +393,8 @@ def _pages_text(edge: EdgeMtf) -> str:
     sigma = float(np.sqrt(np.mean(pages.position_sigma**2)))
     each = ", ".join(f"{place:+.3f}" for place in pages.position[:9] - edge.position)
     more = f", ... ({len(pages.position)} pages)" if len(pages.position) > 9 else ""
-    how = "laid over each other" if pages.aligned else "averaged"
-    return f"edge in the pages, against {edge.position:.3f} px: {each}{more}, each ± {sigma:.3f} px; {how}"
+    treatment = "aligned" if pages.aligned else "averaged"
+    return f"edge in the pages, relative to {edge.position:.3f} px: {each}{more}, each ± {sigma:.3f} px; {treatment}"
 
 
 def _print_bars(bars: BarMtf, pitch: float, offset: float, warnings: list[str], as_json: bool) -> None:

@@ -53,37 +53,45 @@ def slanted_edge_mtf(
     saturation: float | None = None,
     frequency: ArrayLike | None = None,
     rounding: tuple[float, float] = (0.0, 0.0),
-    even: bool = False,
+    uniform_light: bool = False,
 ) -> EdgeMtf:
-    """Measure the MTF from the one edge in a region.
+    """Measure the modulation transfer function from a slanted edge, with the standard deviation at every frequency.
 
-    For several frames see `edge_pages.measure_pages`.
+    Frequencies are counted along the normal of the edge, not along the rows as in ISO 12233. For several frames of the
+    edge see `edge_pages.measure_pages`.
 
     Parameters
     ----------
     region : (H, W) array_like
-        Grey values, linear in light.
-    noise : NoiseModel or None
-        Noise model of the detector; its fixed pattern counts as independent from pixel to pixel. Without a model the
-        variance is estimated from the residuals on both sides of the edge and taken as linear in the grey value.
+        Grey values, linear in light, of a region with one edge. The edge should be 2 to 10 deg off the pixel grid.
+    noise : NoiseModel, optional
+        Noise of the detector; its fixed pattern counts as independent from pixel to pixel. By default the variance is
+        estimated from the residuals on both sides of the edge and taken as linear in the grey value.
     frames : int
-        Number of frames averaged into the region, used with `noise` only.
-    saturation : float or None
-        Grey value of saturation; default the model's, otherwise plateaus of equal values count as saturated.
-    frequency : (F,) array_like or None
-        Increasing frequencies, cycles/pixel; default 0 to 1 in steps of 1/64.
+        Number of frames averaged into the region; used with `noise` only.
+    saturation : float, optional
+        Grey value of saturation. By default that of `noise`; without it, plateaus of equal values count as saturated.
+    frequency : (F,) array_like, optional
+        Increasing frequencies, in cycles per pixel. The default is 0 to 1 in steps of 1/64.
     rounding : tuple of float
-        Rms of the rounding error that remains in the dark and in the bright level, grey values
-        (`edge_pages.rounding_residual`).
-    even : bool
-        True if the light is known to be even, as in a simulated image; else both levels are planes.
+        Rms of the rounding error that remains in the dark and in the bright level, in grey values.
+    uniform_light : bool
+        True if the light is known to be uniform, as in a simulated image; otherwise both levels are fitted as planes.
+
+    Returns
+    -------
+    EdgeMtf
+        `frequency`, `mtf` and `sigma` (F,), the edge-spread function and the fitted line; `at` interpolates.
 
     Raises
     ------
-    EdgeError
-        The region does not show one measurable edge.
     ValueError
-        The frequencies are not increasing, negative or too high.
+        The region does not show one straight edge that can be measured, or the frequencies are not increasing, are
+        negative or exceed 2 cycles per pixel.
+
+    Notes
+    -----
+    After ISO 12233, with a least-squares edge-spread function and exact propagation of the noise (module docstring).
 
     Examples
     --------
@@ -117,7 +125,7 @@ def slanted_edge_mtf(
     grey = checked_region(region, saturation)
     line = locate_edge(grey)
     upright = rising(grey, line)
-    fitted = fit_edge(upright, *rising_line(line, upright.shape[1]), even)
+    fitted = fit_edge(upright, *rising_line(line, upright.shape[1]), uniform_light)
     return edge_result(
         upright[None] - fitted.light.reshape(upright.shape), line, fitted, noise, frames, frequencies, rounding
     )

@@ -152,7 +152,7 @@ def _usable(dark: Array, flat: Array) -> Mask:
 
 
 def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
-    """Measure gain, noise and non-uniformities of a detector.
+    """Measure gain, noise and non-uniformity of a detector from dark and flat frames (photon transfer, EMVA 1288).
 
     Parameters
     ----------
@@ -161,9 +161,15 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
     flat : (M, H, W) ndarray
         Grey values in even light well above the dark level, M >= 2.
 
+    Returns
+    -------
+    PhotonTransfer
+        `gain_dn_per_e`, `dark_noise_e`, `dark_level_dn`, `prnu` and `dsnu_e`, with the standard deviations `gain_sigma`
+        and so on; `noise_model` makes a `NoiseModel` of them.
+
     Raises
     ------
-    FramesError
+    ValueError
         There are too few frames, the frames differ in size, or the flat frames show no light.
 
     Examples

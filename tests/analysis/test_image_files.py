@@ -93,13 +93,13 @@ def test_what_is_not_grey_is_told(tmp_path):
     mean = ImageFile.open(path).read({"a": Region(0, 0, 20, 31)})["a"]
     np.testing.assert_array_equal(mean, 65535.0 - FRAMES[:1])
     tifffile.imwrite(path, FRAMES[0].astype(np.float32), photometric="miniswhite")
-    refuses(ImageError, "largest value is black", read, path)
+    refuses(ImageError, "largest value as black", read, path)
     Image.fromarray((FRAMES[0] >> 8).astype(np.uint8)).convert("P").save(path)
     refuses(ImageError, "palette", read, path)
     Image.fromarray(np.dstack([(FRAMES[0] >> 8).astype(np.uint8)] * 4), "CMYK").save(path)
     refuses(ImageError, r"inks \(CMYK\)", read, path)
     tifffile.imwrite(path, FRAMES[0], extratags=[(274, "H", 1, 3, True)])
-    assert ImageFile.open(path).header.turned == "orientation 3"
+    assert ImageFile.open(path).header.orientation == "orientation 3"
     cv2.imwrite(str(tmp_path / "a.png"), np.dstack([FRAMES[0]] * 3))
     refuses(ImageError, "3 colours", read, tmp_path / "a.png")
     for planes in ("contig", "separate"):
@@ -168,10 +168,10 @@ def test_only_what_is_asked_for_is_decoded(tmp_path):
     fits.PrimaryHDU(FRAMES).writeto(tmp_path / "a.fits")
     for name in ("a.tif", "a.fits"):
         np.testing.assert_array_equal(ImageFile.open(tmp_path / name).frames(part), FRAMES[:, 2:7, 3:10])
-        with pytest.raises(ImageError, match="does not lie in the image of 20 rows and 31 columns"):
+        with pytest.raises(ImageError, match="is not inside the image of 20 rows and 31 columns"):
             ImageFile.open(tmp_path / name).frames(Region(0, 0, 21, 31))
     tifffile.imwrite(tmp_path / "b.tif", shape=(40, 4000, 4000), dtype=np.uint16, photometric="minisblack")
-    with pytest.raises(ImageError, match=r"40 frames of 4000 x 4000 pixels, 1.3 GB, more than 0.5 GB: cut"):
+    with pytest.raises(ImageError, match=r"40 frames of 4000 x 4000 pixels, 1.3 GB, more than 0.5 GB: crop"):
         ImageFile.open(tmp_path / "b.tif").frames()
     assert ImageFile.open(tmp_path / "b.tif").frames(Region(0, 0, 8, 8)).shape == (40, 8, 8)
 

@@ -20,7 +20,7 @@ from analysis.instrument_state.state_estimate import (
     best_move,
     combinations,
     estimate_state,
-    measurement_worth,
+    merit_reduction,
 )
 from tests.analysis.refusals import refuses
 
@@ -129,7 +129,7 @@ def test_agreements_are_predictions_from_all_others() -> None:
         spread = whole[np.ix_(own, own)] - across @ whole[np.ix_(~own, own)]
         assert agreement.chi_square == pytest.approx(off @ np.linalg.solve(spread, off), rel=1e-6)
         assert agreement.degrees == own.sum()
-        assert agreement.chance == pytest.approx(chi2.sf(agreement.chi_square, own.sum()))
+        assert agreement.p_value == pytest.approx(chi2.sf(agreement.chi_square, own.sum()))
 
 
 def test_a_gross_error_is_left_out() -> None:
@@ -137,10 +137,10 @@ def test_a_gross_error_is_left_out() -> None:
     rng = np.random.default_rng(11)
     model = Linear(rng, random_prior(rng), [random_group(rng, "one", 24, 0, False, 8), random_group(rng, "two", 8)])
     _, (one, two) = model.drawn()
-    assert not model.estimate([one, two]).left_out
+    assert not model.estimate([one, two]).excluded
     values = one.values + 300.0 * (np.arange(24) // 3 == 2)
     found = model.estimate([one.with_values(values), two])
-    assert [(name, block) for name, block, _ in found.left_out] == [("one", "block 2")]
+    assert [(name, block) for name, block, _ in found.excluded] == [("one", "block 2")]
     kept = np.array([block != "block 2" for block in one.blocks])
     labels, blocks = (tuple(np.array(each)[kept]) for each in (one.labels, one.blocks))
     spread = one.covariance[np.ix_(kept, kept)]
@@ -184,11 +184,11 @@ def test_nothing_and_impossible_errors_are_refused() -> None:
     refuses(UndeterminedError, "nothing was measured", estimate_state, prior, [], *still)
     for spread, said in (
         (np.ones((2, 2)) + np.eye(2)[::-1], "not positive definite"),
-        (0.0 * np.eye(2), "error of zero"),
+        (0.0 * np.eye(2), "standard deviation of a number is zero"),
     ):
         refuses(UndeterminedError, said, estimate_state, prior, [group(spread)], *still)
     refuses(UndeterminedError, "no light", estimate_state, prior, [group(np.eye(2))], lambda x: x * np.nan, still[1])
-    refuses(ValueError, "are not those of 2 numbers", group, np.eye(3))
+    refuses(ValueError, "do not have the shape for 2 numbers", group, np.eye(3))
     refuses(ValueError, "need as many labels and blocks", replace, group(np.eye(2)), blocks=("a",))
 
 
@@ -259,7 +259,7 @@ def test_the_worth_of_a_measurement_is_what_it_saves() -> None:
     covariance = np.linalg.inv(np.eye(units) + old.T @ old)
     root = np.linalg.cholesky(covariance)
     free = Actuators(("a", "b"), np.full(2, -1e3), np.full(2, 1e3), np.zeros(2), np.zeros(2), np.zeros(2))
-    worth = measurement_worth(root, slope, free, response, {"new": new})["new"]
+    worth = merit_reduction(root, slope, free, response, {"new": new})["new"]
     states = rng.standard_normal((4000, units)) @ root.T
     after = np.linalg.inv(np.linalg.inv(covariance) + new.T @ new)
     read = states @ new.T + rng.standard_normal((4000, 2))

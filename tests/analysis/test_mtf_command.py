@@ -125,7 +125,7 @@ def test_pages_between_which_the_edge_moves_are_laid_over_each_other(tmp_path, f
     pages = [edge_frame(30.0, k, shift=s, turn=t) for k, (s, t) in enumerate(zip(shift, turned, strict=True))]
     tifffile.imwrite(tmp_path / "pages.tiff", np.stack(pages), photometric="minisblack")
     result = run(tmp_path / "pages.tiff", *EDGE, "--json")
-    assert "were laid over each other" in " ".join(result.stderr.split())
+    assert "the pages were aligned" in " ".join(result.stderr.split())
     data = json.loads(result.stdout)
     right(data)
     right(data, 0.5)
@@ -140,7 +140,7 @@ def test_pages_between_which_the_edge_moves_are_laid_over_each_other(tmp_path, f
 @pytest.mark.second
 @pytest.mark.parametrize("imagej", [False, True])
 def test_still_pages_are_averaged_to_the_bit(tmp_path, imagej):
-    """One page in 10 000 images would be laid over each other by chance."""
+    """One page in 10 000 images would be aligned by chance."""
     pages = np.stack([edge_frame(30.0, k) for k in range(9)])
     tifffile.imwrite(tmp_path / "pages.tiff", pages, photometric="minisblack", imagej=imagej)
     for more, used in (((), 9), (("--frames", 4), 4)):
@@ -157,7 +157,7 @@ def test_rounding_and_repeated_pages_enter_the_sigma(tmp_path):
     """Of 20 grey values without noise the MTF at Nyquist was 0.0635 with a sigma of 4e-7 for 0.0891."""
     small = edge_frame(0.0, 5, 3.0, 23.0).astype(np.uint8)
     found = []
-    for count, said in ((1, "rounding does not average out"), (7, "6 pages repeat another one")):
+    for count, said in ((1, "rounding does not average out"), (7, "6 pages are identical to another one")):
         tifffile.imwrite(tmp_path / "one.tiff", np.stack([small] * count), photometric="minisblack")
         words = (tmp_path / "one.tiff", *EDGE, "--saturation", 255)
         found.append(run_json(*words))
@@ -181,9 +181,9 @@ def flat(seed):
 
 SOFT = 6000.0 + 5000.0 * np.tanh((np.arange(64) - 31) / 12.0)
 PAGES = {
-    "it is even but for noise": lambda: [flat(1), flat(2)],
+    "it is even apart from noise": lambda: [flat(1), flat(2)],
     "single pages are too noisy": lambda: [page(-12, 1), page(12, 2), flat(3)],
-    "page 6 of those that are not repeated shows no edge": lambda: [*(page(k / 2, k) for k in range(6)), flat(9)],
+    "page 6, not counting copies, shows no edge": lambda: [*(page(k / 2, k) for k in range(6)), flat(9)],
     "4000000 in all are possible": lambda: [page(12 * (-1) ** (k % 2), k % 10) + k for k in range(1000)],
     "the edge does not look alike in them": lambda: [*(page(k / 2, k) for k in range(4)), SOFT + 0.01 * flat(9)],
     "within 10 px of the region's side": lambda: [*(page(k / 5, k) for k in range(20)), page(25, 99)],
@@ -205,7 +205,7 @@ def test_pages_of_different_size_must_be_chosen(tmp_path):
     refused("--page NUMBER", path, *EDGE)
     for page in (0, 1):
         right(run_json(path, *EDGE, "--page", page), 0.5)
-    refused("does not lie", path, "--roi", "10,20,80,64", "--pitch", "7 um", "--page", 0)
+    refused("is not inside", path, "--roi", "10,20,80,64", "--pitch", "7 um", "--page", 0)
     # a thumbnail says that it is one
     with tifffile.TiffWriter(path) as file:
         file.write(edge_frame())
@@ -268,7 +268,7 @@ def test_images_beyond_memory_are_refused_by_their_header(tmp_path):
     data = path.read_bytes()
     path.write_bytes(data[:8] + chunk(b"IHDR", (30_000).to_bytes(4, "big") * 2 + data[24:29]) + data[33:])
     begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    refused("of 30000 x 30000 pixels fills 0.9 GB when it is decoded, more than 0.5 GB: cut the region", path, *EDGE)
+    refused("of 30000 x 30000 pixels needs 0.9 GB when decoded, more than 0.5 GB: crop the image", path, *EDGE)
     refused("choose a smaller region", path, "--roi", "0,0,20000,20000", "--pitch", "7 um")
     size, one = (30_000, 30_000), iter([b"x"])
     tifffile.imwrite(packed, shape=size, dtype=np.uint16, compression="zlib", tile=size, data=one)

@@ -87,7 +87,7 @@ def test_blocks():
         "the sigma of image points must be positive, found 0": {"image": 0.0},
         "a coordinate is not finite": {"points": replace(points, start=nowhere)},
         "must be positive definite": {"points": replace(points, covariance=0.0 * points.covariance)},
-        r"covariance \(4, 4\) of 2 passes": {"known": some},
+        r"covariance \(4, 4\) does not match 2 passes": {"known": some},
         "needs a standard deviation above zero": {"known": still, "monitored": None},
         "needs a constant error of each of them": {"attitude": white},
         "the monitor has no reading of camera 'fore'": {"monitored": unwatched},
@@ -157,7 +157,7 @@ def test_images(tmp_path, monkeypatch):
     refuses(ImageError, "pages of rows and columns are needed", ImageFile.open, path)
     tifffile.imwrite(path, shape=(40, 4000, 4000), dtype=np.uint16, photometric="minisblack")
     whole = {"--roi": Region(0, 0, 2000, 2000)}
-    refuses(ImageError, "in all do not fit into memory", ImageFile.open(path).read, whole)
+    refuses(ImageError, "in all fit into memory", ImageFile.open(path).read, whole)
     fits.PrimaryHDU(np.zeros((8, 9)), fits.Header({"OBSERVER": "one"})).writeto(tmp_path / "a.fits")
     assert fits_cards(tmp_path / "a.fits", 0)["OBSERVER"] == "one"
     data = (tmp_path / "a.fits").read_bytes().replace(b"'one     '", b"'one      ")
@@ -229,7 +229,7 @@ def test_jitter(monkeypatch):
     refuses(JitterError, "needs distinct times", fit_spline, given, 0.0, 1.0)
     once = of_disparities(0.0 * time, 0.0 * time, 0.0 * time, 0.1, 0 * time, degree=0)
     refuses(JitterError, "all observations have the same time", periodogram, once, 0.5, 6.0)
-    refuses(JitterError, "moves nothing", jitter._fitted, given, np.array([2.0]), np.zeros(1))
+    refuses(JitterError, "has no effect on the observations", jitter._fitted, given, np.array([2.0]), np.zeros(1))
     periodogram(given, 0.5, 2.0)
     monkeypatch.setattr(jitter, "BLIND", 2.0)
     refuses(JitterError, "all frequencies between 0.5 and 2 Hz are blind", periodogram, given, 0.5, 2.0)

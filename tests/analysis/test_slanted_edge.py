@@ -102,7 +102,7 @@ def chi_square_limits(count):
 def test_perfect_pupil(degrees, size, pitch):
     image = edge_image(degrees, size, pitch=pitch)
     # 28 um: the image is aliased, with 13% of contrast left at 1.5 cycles/pixel
-    across_columns = slanted_edge_mtf(image, even=True)
+    across_columns = slanted_edge_mtf(image, uniform_light=True)
     across_rows = slanted_edge_mtf(np.ascontiguousarray(image.T))
     for edge, axis, levels in ((across_columns, "x", 0.1), (across_rows, "y", 0.2)):
         assert edge.axis == axis

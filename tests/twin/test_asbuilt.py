@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag, null_space
 
 from analysis.arrays import ARCSEC
-from analysis.instrument_state.state_estimate import Agreement
+from analysis.instrument_state.state_estimate import ConsistencyTest
 from analysis.wavefront_maps.pupil_fit import Orientation
 from optics.geometry import zernike
 from optics.numerics.array_math import UnphysicalError
@@ -169,11 +169,11 @@ def test_a_gross_error_of_one_field_is_named(whole) -> None:
     true = whole.draw(rng, "normal")
     data = list(whole.measured(true, rng))
     clean = whole.estimate(data)
-    assert not clean.left_out
+    assert not clean.excluded
     table = data[0].reshape(5, 8).copy()
     table[3, 4] += 150e-9
     found = whole.estimate([table.ravel(), *data[1:]])
-    assert [(name, block) for name, block, _ in found.left_out] == [("interferometer", "field (0.5, 0)")]
+    assert [(name, block) for name, block, _ in found.excluded] == [("interferometer", "field (0.5, 0)")]
     assert np.max(np.abs(found.mean - clean.mean) / found.sigma) < 3.0
 
 
@@ -364,8 +364,8 @@ def test_quantiles_and_chances_of_a_merit_are_those_of_its_draws() -> None:
 
 def state(**changes) -> SimpleNamespace:
     """Return an estimate of two measurements that agree, but for what is changed."""
-    good = [Agreement.of(name, 9.0, 10) for name in ("focus", "sight")]
-    own = {"left_out": (), "whole": Agreement.of("", 20.0, 20), "measurements": good, "variance_factor": 1.0}
+    good = [ConsistencyTest.of(name, 9.0, 10) for name in ("focus", "sight")]
+    own = {"excluded": (), "whole": ConsistencyTest.of("", 20.0, 20), "measurements": good, "variance_factor": 1.0}
     own |= {"converged": True, "steps": 3, "settled": 0.001}
     return SimpleNamespace(**{**own, **changes})
 
@@ -373,18 +373,23 @@ def state(**changes) -> SimpleNamespace:
 def test_each_warning_is_there_where_it_holds_and_no_other() -> None:
     lit = np.ones((5, 2))
     # 29.59 is exceeded by chi-square of ten degrees once in a thousand, 32.0 once in two thousand: two are looked at
-    assert _warnings(state(measurements=[Agreement.of("focus", 31.0, 10), Agreement.of("sight", 9.0, 10)]), lit) == []
+    assert (
+        _warnings(
+            state(measurements=[ConsistencyTest.of("focus", 31.0, 10), ConsistencyTest.of("sight", 9.0, 10)]), lit
+        )
+        == []
+    )
     dark = lit.copy()
     dark[2, 1] = np.nan
-    bad = Agreement.of("focus", 45.0, 10)
+    bad = ConsistencyTest.of("focus", 45.0, 10)
     for found, parts, text in (
         (
-            state(left_out=[("focus", "field 0", bad)]),
+            state(excluded=[("focus", "field 0", bad)]),
             lit,
             "focus: field 0 contradicts all other measurements (chi-square 45",
         ),
         (
-            state(whole=Agreement.of("", 80.0, 20), variance_factor=4.0),
+            state(whole=ConsistencyTest.of("", 80.0, 20), variance_factor=4.0),
             lit,
             "all measurements together do not agree with the prior and their errors (chi-square 80 of 20); "
             "all sigmas are 2 times larger",
@@ -400,10 +405,10 @@ def test_each_warning_is_there_where_it_holds_and_no_other() -> None:
 def test_estimates_that_do_not_settle_or_contradict_themselves_are_refused(whole) -> None:
     """Nine times the degrees of freedom is still an estimate; more names what agrees least."""
     names = [kind.name for kind in whole.kinds]
-    each = [Agreement.of(name, 30.0 if name == "mtf" else 9.0, 10) for name in names]
-    require_agreement(whole, state(whole=Agreement.of("", 180.0, 20), measurements=each))
+    each = [ConsistencyTest.of(name, 30.0 if name == "mtf" else 9.0, 10) for name in names]
+    require_agreement(whole, state(whole=ConsistencyTest.of("", 180.0, 20), measurements=each))
     with pytest.raises(InputError, match="miss what the instrument can do by 3 standard deviations") as caught:
-        require_agreement(whole, state(whole=Agreement.of("", 180.1, 20), measurements=each))
+        require_agreement(whole, state(whole=ConsistencyTest.of("", 180.1, 20), measurements=each))
     assert "measurements.mtf.mtf" in str(caught.value)
     with pytest.raises(InputError, match=r"not settled after 3 steps: one more changes the predicted readings by 0\.5"):
         require_agreement(whole, state(converged=False, settled=0.5))

@@ -63,7 +63,7 @@ def judged(bench: AsBuiltBench, rng: np.random.Generator, count: int, unknown_fi
         state = compose(state, figures, bodies) if unknown_figure else state
         view = View(true[None], [state], None)
         found = bench.estimate([kind.drawn(kind.predict(view)[0], rng) for kind in bench.kinds])
-        agree.append(found.whole.holds() and not found.left_out)
+        agree.append(found.whole.passes() and not found.excluded)
         draws = found.draw(rng, DRAWS)
         parts, exact = bench.merit_parts(draws, None), bench.merits.parts_of([state])[0]
         pairs = []

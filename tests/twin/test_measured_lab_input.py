@@ -264,7 +264,7 @@ IMAGES = [
     (more(("page", "3")), "does not exist"),
     (more(("page", "-1")), "page: out of range"),
     (more(("per shift", "1")), "moved: target"),
-    (more(*REGION), "does not lie in the image"),
+    (more(*REGION), "is not inside the image"),
     (noisy("Q", 4095), "noise.Q: no image is of this band; allowed: P"),
     (noisy("P", 50), "saturation_dn 50.0 must lie above the dark level"),
     (lambda place: edited(place / "images.csv", without("file")), "no column 'file'"),

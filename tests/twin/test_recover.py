@@ -20,7 +20,7 @@ import tifffile
 from astropy.io import fits
 from PIL import Image
 
-from analysis.images.image_file import recorded
+from analysis.images.image_file import recording_origin
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State
@@ -232,7 +232,7 @@ def burnt(frames):
         [
             (no_spot, "no spot", "the right file, with the light on"),
             (at_the_edge, "too near the edge", "10 pixels or more inside"),
-            (half_dark, "6 of 9 frames hold less than half of the light", "with the light on"),
+            (half_dark, "6 of 9 frames contain less than half of the light", "with the light on"),
             (burnt, "too much of the spot is missing (saturation", "less light"),
             (lambda f: f[:, :20], "frames of 20 x 96 pixels", "24 rows and columns or more"),
             (
@@ -299,7 +299,7 @@ def states(tmp_path, dates, **more):
         unit.header.update({"DATE-OBS": date, **(more if "T" not in date else {})})
         path = tmp_path / f"{k}.fits"
         unit.writeto(path, overwrite=True)
-        found.append(StateFrames((str(path),), unit.data, (0, 0), ("frames",), (recorded(path),)))
+        found.append(StateFrames((str(path),), unit.data, (0, 0), ("frames",), (recording_origin(path),)))
     noise = NoiseModel(0.16, 12.0, 0.0, 100.0, 0.0, 0.0, 16000.0)
     return ChannelFrames("forward/left", (24, 24), found[0], tuple(found[1:]), None, None, None, noise, noise)
 
@@ -342,11 +342,11 @@ def test_a_tiff_says_when_it_was_recorded_in_exif(tmp_path):
     path = tmp_path / "frame.tif"
     image = Image.fromarray(np.full((24, 24), 7, np.uint16))
     image.save(path, tiffinfo={306: "2026:03:01 10:00:00"})
-    assert recorded(path) == (None, "")
+    assert recording_origin(path) == (None, "")
     image.save(path, tiffinfo={34665: {36867: "2026:03:01 10:00:07", 37521: "25"}})
-    assert recorded(path)[0] == datetime(2026, 3, 1, 10, 0, 7, 250000, tzinfo=UTC)
+    assert recording_origin(path)[0] == datetime(2026, 3, 1, 10, 0, 7, 250000, tzinfo=UTC)
     path.write_bytes(tiff(np.full((2, 24, 24), 7, np.uint16), FrameFacts(note="nominal")))
-    assert recorded(path) == (None, "nominal")
+    assert recording_origin(path) == (None, "nominal")
 
 
 call = partial(invoke, app, terminal_width=200)
@@ -411,7 +411,7 @@ def test_files_that_are_no_raw_frames_are_refused(tmp_path):
         (("a.tif", "b.tif"), "have frames of different sizes, 30 x 30 and 32 x 30"),
         (("turned.tif",), "is stored turned or mirrored"),
         (("none.tif",), "there is no image"),
-        (("coded.png",), "it says sRGB, which is not linear in light"),
+        (("coded.png",), "it is marked as sRGB, which is not linear in light"),
     ):
         with pytest.raises(InputError, match=told):
             measured_frames._stacked(test, tuple(str(tmp_path / name) for name in names), ("frames",))

@@ -110,7 +110,7 @@ def _verdict(run: AsBuiltRun) -> str:
 def _known_words(run: AsBuiltRun) -> str:
     known = sum(one.known for one in run.known)
     agreement = run.found.whole
-    fits = "fit" if agreement.holds() else "do not fit"
+    fits = "fit" if agreement.passes() else "do not fit"
     return (
         f"The measurements tell {known} of {len(run.known)} combinations of motions and {fits} the prior and their "
         f"errors (chi-square {agreement.chi_square:.0f} of {agreement.degrees})"
@@ -222,7 +222,7 @@ def _measured_table(run: AsBuiltRun) -> Table:
     count = len(run.found.measurements)
     rows: list[list[Cell]] = []
     for kind, one in zip(run.bench.kinds, run.found.measurements, strict=True):
-        left = [block for name, block, _ in run.found.left_out if name == one.name]
+        left = [block for name, block, _ in run.found.excluded if name == one.name]
         rows.append(
             [
                 one.name,
@@ -230,14 +230,15 @@ def _measured_table(run: AsBuiltRun) -> Table:
                 len(kind.labels),
                 one.chi_square,
                 one.degrees,
-                one.chance,
-                "agrees" if one.holds(count) else "contradicts",
+                one.p_value,
+                "agrees" if one.passes(count) else "contradicts",
                 ", ".join(left),
             ]
         )
-    heads = ("measurement", "kind", "numbers", "chi-square", "degrees", "chance", "", "left out")
-    caption = "Chance: of so large a chi-square if everything is as stated."
-    return Table("measurements", "Agreement", caption, heads, rows, (None, None, None, 1, None, 4, None, None))
+    heads = ("measurement", "kind", "numbers", "chi-square", "degrees", "p", "", "excluded")
+    caption = "p: probability of so large a chi-square if prior and errors are as specified."
+    decimals = (None, None, None, 1, None, 4, None, None)
+    return Table("measurements", "Consistency of the measurements", caption, heads, rows, decimals)
 
 
 def _move_sections(run: AsBuiltRun) -> tuple[Section, ...]:

@@ -8,7 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from analysis.instrument_state.state_estimate import FALSE_ALARM, Agreement, Combination, StateEstimate, combinations
+from analysis.instrument_state.state_estimate import (
+    FALSE_ALARM,
+    Combination,
+    ConsistencyTest,
+    StateEstimate,
+    combinations,
+)
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
 from scenes.specs.asbuilt import AsBuiltSetup
@@ -192,7 +198,7 @@ def require_agreement(bench: AsBuiltBench, found: StateEstimate) -> None:
         raise test.error(f"{problem}{found.settled:.2g} of their errors", ("measurements",), allowed=allowed)
     if found.whole.chi_square <= WORST_FACTOR * max(1, found.whole.degrees):
         return
-    worst = min(found.measurements, key=lambda one: (one.chance, -one.chi_square / max(1, one.degrees)))
+    worst = min(found.measurements, key=lambda one: (one.p_value, -one.chi_square / max(1, one.degrees)))
     key = next(kind.key for kind in bench.kinds if kind.name == worst.name)
     ratio = np.sqrt(found.whole.chi_square / found.whole.degrees)
     raise test.error(
@@ -245,19 +251,19 @@ def _along(
 
 def _warnings(found: StateEstimate, now: np.ndarray) -> list[str]:
     out = []
-    for name, block, agreement in found.left_out:
+    for name, block, agreement in found.excluded:
         out.append(
             f"{name}: {block} contradicts all other measurements (chi-square {agreement.chi_square:.0f} of "
             f"{agreement.degrees}) and is left out"
         )
-    if not found.whole.holds():
+    if not found.whole.passes():
         factor = np.sqrt(found.variance_factor)
         out.append(
             f"all measurements together do not agree with the prior and their errors (chi-square "
             f"{found.whole.chi_square:.0f} of {found.whole.degrees}); all sigmas are {factor:.2g} times larger for it"
         )
     for one in found.measurements:
-        if not one.holds(len(found.measurements)):
+        if not one.passes(len(found.measurements)):
             out.append(
                 f"{one.name} does not agree with what all others predict of it: chi-square {one.chi_square:.0f} of "
                 f"{one.degrees}"
@@ -293,8 +299,8 @@ def _standing_plain(one: Standing) -> dict[str, Any]:
     return out if np.isnan(one.true) else {**out, "true": shown_merit(one.true, merit)}
 
 
-def _agreement_plain(one: Agreement) -> dict[str, Any]:
-    return {"chi_square": one.chi_square, "degrees": one.degrees, "chance": one.chance}
+def _agreement_plain(one: ConsistencyTest) -> dict[str, Any]:
+    return {"chi_square": one.chi_square, "degrees": one.degrees, "p_value": one.p_value}
 
 
 def _measured_plain(run: AsBuiltRun) -> dict[str, Any]:
@@ -305,8 +311,8 @@ def _measured_plain(run: AsBuiltRun) -> dict[str, Any]:
             "kind": kind.kind,
             "numbers": len(kind.labels),
             **_agreement_plain(one),
-            "agrees": one.holds(count),
-            "left_out": [block for name, block, _ in run.found.left_out if name == one.name],
+            "agrees": one.passes(count),
+            "excluded": [block for name, block, _ in run.found.excluded if name == one.name],
         }
     return out
 
@@ -376,7 +382,7 @@ ASBUILT: Record[AsBuiltRun] = Record(
     Quantity("camera", lambda run: run.bench.camera, "the camera that is judged"),
     Quantity(
         "whole",
-        lambda run: {**_agreement_plain(run.found.whole), "agrees": run.found.whole.holds()},
+        lambda run: {**_agreement_plain(run.found.whole), "agrees": run.found.whole.passes()},
         "chi-square of all together",
     ),
     Quantity("false_alarm", lambda run: FALSE_ALARM, "chance that what is as stated is called a contradiction"),

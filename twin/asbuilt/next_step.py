@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.instrument_state.state_estimate import NextMove, StateEstimate, best_move, measurement_worth
+from analysis.instrument_state.state_estimate import NextMove, StateEstimate, best_move, merit_reduction
 from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
 
 MOST_ROUNDS = 3
@@ -112,7 +112,7 @@ def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np
         white = kind.group(np.zeros(len(kind.labels))).whitener()
         candidates[kind.name] = white @ rows @ found.prior.root
     everything: dict[str, np.ndarray] = {"": np.asarray(np.linalg.pinv(found.root) * 1e6)}
-    worth = measurement_worth(found.root, unit_slope, bench.actuators, by_actuators, {**candidates, **everything})
+    worth = merit_reduction(found.root, unit_slope, bench.actuators, by_actuators, {**candidates, **everything})
     ignorance = worth.pop("")
     return Advice(move, both[0], both[1], ignorance, worth)
 

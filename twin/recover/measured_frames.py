@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.images.image_file import ImageError, ImageFile, recorded
+from analysis.images.image_file import ImageError, ImageFile, recording_origin
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PhotonTransfer, PixelCorrection, photon_transfer, pixel_correction
@@ -326,7 +326,7 @@ def _state(test: Spec, files: tuple[str, ...], offset: Shape, key: KeyPath) -> S
     if min(frames.shape[1:]) < 24:
         text = f"{files[0]} has frames of {frames.shape[1]} x {frames.shape[2]} pixels"
         raise _told(test, key, text, "24 rows and columns or more, to measure a spot in")
-    return StateFrames(files, frames, offset, key, tuple(recorded(Path(file)) for file in files))
+    return StateFrames(files, frames, offset, key, tuple(recording_origin(Path(file)) for file in files))
 
 
 def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
@@ -362,8 +362,8 @@ def _opened(test: Spec, file: str, key: KeyPath) -> ImageFile:
     """The image of a file, whose header is read; raw frames alone."""
     with _readable(test, file, key):
         image = ImageFile.open(Path(file), choose="")
-        if image.header.turned:
-            raise ImageError(f"{file} is stored turned or mirrored ({image.header.turned}): save it as it was read out")
+        if image.header.orientation:
+            raise ImageError(f"{file} is stored turned or mirrored ({image.header.orientation}): save it as it was read out")
         if image.header.coded:
             raise ImageError(f"{file}: {image.header.coded}, which is not linear in light: give raw frames")
         return image
