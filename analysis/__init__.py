@@ -62,7 +62,7 @@ Monitoring of a camera in orbit
 
 Statistics
     robust_sigma              standard deviation of residuals with outliers
-    share_interval            confidence interval of a proportion
+    proportion_interval       confidence interval of a proportion
 
 `help(analysis.fit_spot)` and so on show parameters, references and a runnable example. Names are imported when they are
 first used. They stay the same within a major version; the modules below this package may change.
@@ -112,7 +112,7 @@ if TYPE_CHECKING:
     from analysis.spots.photon_transfer import photon_transfer
     from analysis.spots.spot_fit import fit_spot
     from analysis.spots.spot_template import SpotTemplate
-    from analysis.statistics import robust_sigma, share_interval
+    from analysis.statistics import proportion_interval, robust_sigma
     from analysis.turntable.dividing_error import chauvenet, fit_dividing_error
     from analysis.wavefront_maps.pupil_fit import Pupil, find_pupil, fit_wavefront_map
     from analysis.wavefront_maps.zernike_table import ansi_to_nm, fringe_to_nm, nm_to_noll
@@ -141,7 +141,7 @@ _MODULES = {
     "spots.photon_transfer": ("photon_transfer",),
     "spots.spot_fit": ("fit_spot",),
     "spots.spot_template": ("SpotTemplate",),
-    "statistics": ("robust_sigma", "share_interval"),
+    "statistics": ("robust_sigma", "proportion_interval"),
     "turntable.dividing_error": ("chauvenet", "fit_dividing_error"),
     "wavefront_maps.pupil_fit": ("Pupil", "find_pupil", "fit_wavefront_map"),
     "wavefront_maps.zernike_table": ("ansi_to_nm", "fringe_to_nm", "nm_to_noll"),
@@ -186,9 +186,9 @@ __all__ = [
     "match_windows",
     "nm_to_noll",
     "photon_transfer",
+    "proportion_interval",
     "recover_monitor",
     "robust_sigma",
-    "share_interval",
     "slanted_edge_mtf",
     "smooth_series",
 ]

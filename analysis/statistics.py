@@ -93,45 +93,57 @@ def gain(columns: np.ndarray, root: np.ndarray | None = None, cutoff: float = 1e
     return np.asarray(inverse if root is None else inverse @ np.linalg.inv(root), dtype=np.float64)
 
 
-def share_interval(met: int, count: int, confidence: float) -> tuple[float, float]:
+def proportion_interval(successes: int, trials: int, confidence: float) -> tuple[float, float]:
     """Return the Clopper-Pearson confidence interval of a proportion; (0, 1) without trials.
-
-    Reference: Clopper and Pearson, Biometrika 26, 404 (1934).
 
     Parameters
     ----------
-    met : int
+    successes : int
         Number of successes.
-    count : int
+    trials : int
         Number of trials.
     confidence : float
         Least probability with which the interval contains the proportion.
+
+    Returns
+    -------
+    low, high : float
+        Limits of the interval.
+
+    Notes
+    -----
+    Clopper and Pearson, Biometrika 26, 404 (1934).
 
     Examples
     --------
     No failure in 60 trials: the rate of failure is below 4.9 % with 95 % confidence (rule of three: 3 / 60):
 
     >>> import analysis
-    >>> low, high = analysis.share_interval(0, 60, 0.90)
+    >>> low, high = analysis.proportion_interval(0, 60, 0.90)
     >>> low, round(high, 4)
     (0.0, 0.0487)
     """
-    if count == 0:
+    if trials == 0:
         return 0.0, 1.0
     # imported here, as the import takes longer than a short command
     from scipy.stats import binomtest
 
-    interval = binomtest(met, count).proportion_ci(confidence, "exact")
+    interval = binomtest(successes, trials).proportion_ci(confidence, "exact")
     return float(interval.low), float(interval.high)
 
 
 def robust_sigma(residuals: ArrayLike) -> float:
-    """Return the standard deviation of normal residuals from their median size; up to half may be outliers.
+    """Return the standard deviation of normal residuals from their median absolute value; up to half may be outliers.
 
     Parameters
     ----------
     residuals : array_like
         Residuals about their median, of any shape.
+
+    Returns
+    -------
+    float
+        Standard deviation, in the unit of the residuals.
 
     Examples
     --------

@@ -291,26 +291,32 @@ def adjust_block(
     datum: bool = False,
     pool: Pool | None = None,
 ) -> BlockAdjustment:
-    """Adjust a block.
+    """Adjust points, attitude, station and cameras of a block of line-camera images by least squares.
 
     Parameters
     ----------
     block : Block
-        Observations and priors.
-    robust : {'huber', 'reject'}, optional
-        "huber" reduces the weights of packets with large residuals; "reject" excludes outliers (of good packets, one in
-        10 000) after rounds with Huber weights, and with them points with too few remaining observations.
+        Images, points, cameras and prior knowledge; see `make_block`.
+    robust : {"huber", "reject"}, optional
+        "huber" reduces the weight of large residuals. "reject" leaves out observations that stand out from the others,
+        one good observation in 10 000, and points of which too little is left.
     variance_components : bool or collection of str
-        True to estimate a variance factor of every group, or the names of the groups to estimate.
+        True to estimate a factor on the variances of every group of observations, or the names of the groups.
     datum : bool
         True to estimate a shift that all control points share.
     pool : Pool, optional
-        Processes that eliminate the points; the current process by default.
+        Worker processes that eliminate the points; None for this process alone.
+
+    Returns
+    -------
+    BlockAdjustment
+        `ground` (m, 3) in metres, `point_covariance`, `change` of the camera of each image, residuals and tests of the
+        variance groups, chi-square and `p_value`.
 
     Raises
     ------
-    BlockError
-        The input is invalid, points do not match their images, or the iteration does not converge.
+    ValueError
+        Input that cannot be used, points that lie elsewhere than their images, or no convergence.
 
     Examples
     --------

@@ -214,28 +214,36 @@ class FocalPlaneFit:
 
 
 def fit_focal_plane(
-    place: ArrayLike, defocus: ArrayLike, sigma: ArrayLike, *, estimate_extra: bool = False
+    position: ArrayLike, defocus: ArrayLike, sigma: ArrayLike, *, estimate_extra: bool = False
 ) -> FocalPlaneFit:
-    """Weighted least-squares plane through the defocus of N places.
+    """Fit a plane to the defocus at several positions of a focal plane by weighted least squares.
 
     Parameters
     ----------
-    place : ArrayLike
-        (N, 2) X', Y', metres.
-    defocus : ArrayLike
-        (N,) metres, best focus minus CCD along +Z'.
-    sigma : ArrayLike
-        (N,) or a number, metres.
+    position : (N, 2) array_like
+        Positions X', Y' in the focal plane, in metres.
+    defocus : (N,) array_like
+        Best focus minus detector along +Z', in metres.
+    sigma : float or (N,) array_like
+        Standard deviations of the defocus, in metres.
     estimate_extra : bool
-        When the residuals are larger than the sigmas say, estimate a common extra scatter (Paule and Mandel, J. Res.
-        NBS 87, 377 (1982)) and weight with it; see FocalPlaneFit.extra_sigma.
+        True to estimate a common extra scatter if the residuals exceed their sigmas, and to weight with it.
+
+    Returns
+    -------
+    FocalPlaneFit
+        `piston` (metres), `slope_x` and `slope_y` with their `covariance`, residuals, chi-square, and the rigid motion
+        that corrects them, `correction`.
 
     Raises
     ------
-    ObservabilityError
-        The places lie so that a slope cannot be told.
     ValueError
-        Wrong shapes, numbers that are not finite, a sigma that is not positive.
+        Positions that do not determine both slopes, arrays of other shapes, values that are not finite, or a sigma that
+        is not positive.
+
+    Notes
+    -----
+    The extra scatter follows Paule and Mandel, J. Res. NBS 87, 377 (1982).
 
     Examples
     --------
@@ -256,7 +264,7 @@ def fit_focal_plane(
     >>> round(float(height) * 1e6, 3), round(float(sigma) * 1e6, 2)
     (14.0, 0.76)
     """
-    spots, height = np.asarray(place, np.float64), np.asarray(defocus, np.float64)
+    spots, height = np.asarray(position, np.float64), np.asarray(defocus, np.float64)
     if spots.ndim != 2 or spots.shape[1] != 2 or height.shape != spots.shape[:1]:
         raise ValueError(f"focal plane: place must be (N, 2) and defocus (N,), found {spots.shape} and {height.shape}")
     spread = np.asarray(np.broadcast_to(np.asarray(sigma, np.float64), height.shape))

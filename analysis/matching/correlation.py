@@ -1,12 +1,15 @@
-"""Points that can be matched well, and their search by normalised cross-correlation.
+"""Selection of points that can be matched well, and their search by normalised cross-correlation.
 
-Strength is the smaller eigenvalue of the structure tensor (Foerstner and Gülch, 1987; Shi and Tomasi, CVPR 1994) of
-slightly smoothed grey values: the weight of the worse direction in least squares matching, per pixel.
+**Point selection.** The strength of a point is the smaller eigenvalue of the structure tensor (Foerstner and Gülch,
+1987; Shi and Tomasi, CVPR 1994) of slightly smoothed grey values: the weight of the worse direction in least squares
+matching, per pixel.
 
-The coefficient is that of grey values about their means, so that gain and offset do not matter. It is good to some
-tenths of a pixel (parabola through the peak, with its known pull towards whole pixels); least squares matching refines.
+**Search.** The correlation coefficient is that of grey values about their means, so that gain and offset do not matter.
+The position is accurate to some tenths of a pixel (parabola through the peak, with its known bias towards whole
+pixels); least squares matching refines it.
 
-Thresholds and model of a match, checks of what it is given, why a point was not matched, results put together.
+The module also holds what the package shares: the thresholds and the model of a match (`MatchOptions`), validation of
+input, the reasons of a verdict (`Reason`), and concatenation of results.
 """
 
 from __future__ import annotations
@@ -23,17 +26,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array
 
-# A parabola and a 5 x 5 window within the margins need that much.
 _LEAST_TEMPLATE = 11
+"""Smallest side of a template, in pixels, for a parabola and a 5 x 5 window within the margins."""
 
 
 def checked_image(image: ArrayLike, what: str) -> NDArray[np.generic]:
-    """The image as an array (rows, columns) of real numbers; not copied.
+    """Return the image as a (rows, columns) array of real numbers, without copying.
 
     Raises
     ------
     ValueError
-        Not a plane of real grey values, or empty.
+        The image is not a plane of real grey values, or is empty.
     """
     array = np.asarray(image)
     if array.ndim != 2 or array.dtype.kind not in "uif" or array.size == 0:
@@ -44,37 +47,39 @@ def checked_image(image: ArrayLike, what: str) -> NDArray[np.generic]:
     return array
 
 
-def checked_places(places: ArrayLike, count: int | None, what: str) -> Array:
-    """Places (n, 2) row and column as float64; they may be NaN.
+def checked_positions(positions: ArrayLike, count: int | None, what: str) -> Array:
+    """Return positions (n, 2), row and column, as float64; they may be NaN.
 
     Parameters
     ----------
-    places : ArrayLike
-        (n, 2), px.
-    count : int | None
-        n that is asked for, None for any.
+    places : (n, 2) array_like
+        Positions, in pixels.
+    count : int or None
+        Required number n; None for any.
     what : str
-        What they are, for the message.
+        Name of the positions, for the message.
 
     Raises
     ------
     ValueError
-        Another shape, or another number than count.
+        The shape is wrong, or the number differs from count.
     """
-    array = np.asarray(places, np.float64)
+    array = np.asarray(positions, np.float64)
     if array.ndim != 2 or array.shape[1] != 2 or (count is not None and len(array) != count):
-        wanted = "(n, 2)" if count is None else f"({count}, 2)"
-        raise ValueError(f"{what}: need {wanted} places (row, column), found {array.shape}; give one row a point")
+        required = "(n, 2)" if count is None else f"({count}, 2)"
+        raise ValueError(
+            f"{what}: need {required} positions (row, column), found {array.shape}; give one row per point"
+        )
     return array
 
 
 def checked_templates(templates: ArrayLike, what: str) -> Array:
-    """Templates (n, k, k) as float64.
+    """Return templates (n, k, k) as float64.
 
     Raises
     ------
     ValueError
-        Not square, k even or below 11.
+        The templates are not square, or k is even or below 11.
     """
     array = np.asarray(templates, np.float64)
     if (
@@ -91,7 +96,7 @@ def checked_templates(templates: ArrayLike, what: str) -> Array:
 
 
 class Reason(IntEnum):
-    """Code of a verdict; `text` says it in words."""
+    """Code of a verdict; `text` describes it."""
 
     ACCEPTED = 0
     TEMPLATE = 1
@@ -112,78 +117,79 @@ class Reason(IntEnum):
 
     @property
     def text(self) -> str:
-        """Reason in words."""
+        """Description of the reason."""
         return _TEXTS[self]
 
 
 _TEXTS = {
     Reason.ACCEPTED: "accepted",
-    Reason.TEMPLATE: "the template or its predicted place is not finite",
-    Reason.OUTSIDE: "the template does not fit into the image at its predicted place",
+    Reason.TEMPLATE: "the template or its predicted position is not finite",
+    Reason.OUTSIDE: "the template does not fit into the image at its predicted position",
     Reason.IMAGE: "pixels of the image under the template are not finite",
     Reason.SATURATED: "pixels of the image under the template are saturated",
     Reason.FLAT: "too little texture",
     Reason.BORDER: "the best correlation lies on the border of the search window",
     Reason.WEAK: "the correlation is too low",
-    Reason.AMBIGUOUS: "another place correlates nearly as well",
+    Reason.AMBIGUOUS: "another position correlates nearly as well",
     Reason.DIVERGED: "least squares matching did not converge",
     Reason.MOVED: "least squares matching left the correlation's peak",
     Reason.DISTORTED: "the affine change is too large",
     Reason.UNCERTAIN: "the standard deviation is too large",
     Reason.RELIEF: "parts of the window are displaced against each other",
-    Reason.UNTESTED: "windows have steps of displacement here, and this one is too weak to show one",
-    Reason.BLOCKS: "compression left little but its blocks, which do not move with the scene",
+    Reason.UNTESTED: "some windows have steps of displacement, and this one has too little texture to test for one",
+    Reason.BLOCKS: "the position is that of the compression blocks, which do not move with the scene",
 }
 
 
 Part = TypeVar("Part")
 
 
-def joined(parts: Sequence[Part]) -> Part:
-    """One after the other: dataclasses of arrays (n, ...) and of such dataclasses; at least one."""
+def concatenated(parts: Sequence[Part]) -> Part:
+    """Concatenate dataclasses of arrays (n, ...) or of such dataclasses; there must be at least one."""
     columns: dict[str, Any] = {}
     for field in fields(parts[0]):  # type: ignore[arg-type]
         column = [getattr(part, field.name) for part in parts]
-        columns[field.name] = joined(column) if is_dataclass(column[0]) else np.concatenate(column)
+        columns[field.name] = concatenated(column) if is_dataclass(column[0]) else np.concatenate(column)
     return type(parts[0])(**columns)
 
 
 @dataclass(frozen=True)
 class MatchOptions:
-    """What least squares matching solves for, and what is accepted.
+    """Model of least squares matching and acceptance thresholds.
 
     Attributes
     ----------
     sharpness : bool
-        Solve for a difference in sharpness along rows and columns (second derivatives of the template). They also fit
-        what the smoothing of a noisy template leaves; without it the place of image against image is drawn towards
-        whole pixels.
+        True to estimate a difference in sharpness along rows and columns (second derivatives of the template). These
+        terms also fit what the smoothing of a noisy template leaves; without them, positions of image against image are
+        biased towards whole pixels.
     margin : int
-        Rows and columns at each side of a template that only feed its interpolation, px; also bounds how far the fit
-        may go before the template's rim enters it.
+        Rows and columns at each side of a template that serve only its interpolation, in pixels; also limits how far
+        the fit may move before the template's rim enters it.
     iterations : int
-        Most Gauss-Newton steps.
+        Largest number of Gauss-Newton steps.
     least_correlation : float
-        Of the fitted, smoothed template and the image; below it WEAK. A guard against the unrelated only: white noise
-        of r times the texture's standard deviation in the image alone brings it down to 1 / sqrt(1 + r^2), and
-        largest_sigma judges what that leaves.
+        Smallest correlation of the image with the fitted, smoothed template; below it the verdict is WEAK. It guards
+        only against unrelated windows: white noise of r times the texture's standard deviation in the image alone
+        lowers the correlation to 1 / sqrt(1 + r^2), and largest_sigma judges the rest.
     largest_ratio : float
-        Of the second best to the best peak of the search; above it AMBIGUOUS.
+        Largest ratio of the second best to the best peak of the search; above it the verdict is AMBIGUOUS.
     largest_move : float
-        Of the fit from the search's peak along an axis, px.
+        Largest shift of the fit from the search's peak along an axis, in pixels.
     largest_distortion : float
-        Of any element of the affine matrix from the unit matrix.
+        Largest difference of any element of the affine matrix from the unit matrix.
     largest_sigma : float
-        Of the place along its worst direction, px; above it UNCERTAIN, or RELIEF where only displacements within the
-        window bring it there.
+        Largest standard deviation of the position along its worst direction, in pixels; above it the verdict is
+        UNCERTAIN, or RELIEF if only displacements within the window raise it above.
     largest_risk : float
-        Chance of a step of displacement within a window that passes the test for one; above it UNTESTED. The share of
-        windows that fail the test and its power give it (`analysis.matching.window_checks`).
+        Largest probability of a step of displacement within a window that passes the test for steps; above it the
+        verdict is UNTESTED. It follows from the share of windows that fail the test and from the test's power
+        (`analysis.matching.window_checks`).
     least_contrast : float
-        Standard deviation of the image under the template over that of one pixel's noise; a point that fails otherwise
-        is called FLAT below it.
-    saturation : float | None
-        DN from which a pixel counts as saturated; None: the largest value of an integer type.
+        Smallest ratio of the standard deviation of the image under the template to the noise of one pixel; a point that
+        is rejected and lies below it has the verdict FLAT.
+    saturation : float or None
+        Grey value in DN from which a pixel counts as saturated; None for the largest value of an integer type.
 
     Examples
     --------
@@ -207,13 +213,13 @@ class MatchOptions:
     saturation: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the ranges.
+        """Raise ValueError if an option is out of range.
 
         Raises
         ------
         ValueError
-            a value that is not positive and finite, correlation, ratio or risk above 1, a margin below 2 px or too
-            small for the largest move.
+            A value is not positive and finite, a correlation, ratio or risk exceeds 1, or the margin is below 2 px or
+            too small for the largest move.
         """
         for field in fields(self):
             value = getattr(self, field.name)
@@ -224,49 +230,54 @@ class MatchOptions:
                 raise ValueError(f"match options: {name} must not exceed 1, found {getattr(self, name)}")
         if self.margin < 2 or self.largest_move > self.margin - 0.5:
             raise ValueError(
-                f"match options: a margin of {self.margin} px does not hold the fit's way of {self.largest_move:g} px: "
-                "take at least 2 px and half a pixel more than the way"
+                f"match options: a margin of {self.margin} px is too small for a largest move of {self.largest_move:g} px: "
+                "take at least 2 px, and half a pixel more than the move"
             )
 
     @property
     def parameters(self) -> int:
-        """Unknowns of a fit: place, affine matrix, offset, gain, sharpness."""
+        """Number of unknowns of a fit: position, affine matrix, offset, gain and sharpness."""
         return 8 + 2 * self.sharpness
 
 
 _SMOOTHING = 1.0
-# Standard deviation of the Gaussian window of the tensor, px: half of a window of matching.
+"""Standard deviation of the Gaussian that smooths grey values before the structure tensor, in pixels."""
 _WINDOW = 3.0
-# Rows that are worked on together, and what a pixel's strength needs about it.
+"""Standard deviation of the Gaussian window of the structure tensor, in pixels: half of a matching window."""
+# Number of rows that are processed together, and the rim that the strength of a pixel depends on.
 _STRIP, _HALO = 512, 18
-# Strength over that of the noise alone.
 _LEAST = 2.0
+"""Smallest strength of a point relative to that of noise alone."""
 
 
 def distinct_points(image: ArrayLike, count: int, *, spacing: float, border: int) -> Array:
-    """Well-defined points, spread evenly: the strongest of each cell of a grid first, then the second strongest ...
+    """Return well-defined points of an image, spread evenly over it, the strongest of each cell of a grid first.
 
     Parameters
     ----------
-    image : ArrayLike
-        (H, W), any real type; around pixels that are not finite there are no points.
+    image : (H, W) array_like
+        Image of any real type. Close to pixels that are not finite there are no points.
     count : int
-        Most points.
+        Largest number of points.
     spacing : float
-        Least distance of two points along rows or columns, px.
+        Least distance of two points along rows or columns, in pixels.
     border : int
-        Rows and columns at each side without points; at least half of a template and the reach.
+        Number of rows and columns at each side without points; at least half of a window and the search radius.
 
     Returns
     -------
-    Array
-        (n, 2) rows and columns, whole pixels, n <= count; fewer where the image has no more. The same image gives the
+    (n, 2) ndarray
+        Rows and columns, whole pixels; n is at most `count`, fewer if the image has no more. The same image gives the
         same points.
 
     Raises
     ------
     ValueError
-        Image not a plane, count or spacing below 1, border negative or so large that nothing is left.
+        An image that is not a plane, a count or spacing below 1, or a border that is negative or leaves nothing.
+
+    Notes
+    -----
+    The strength is the smaller eigenvalue of the structure tensor: Shi and Tomasi, Proc. CVPR, 593 (1994).
 
     Examples
     --------
@@ -289,7 +300,9 @@ def distinct_points(image: ArrayLike, count: int, *, spacing: float, border: int
         )
     height, width = plane.shape
     if min(height, width) <= 2 * border:
-        raise ValueError(f"distinct points: a border of {border} px leaves nothing of {plane.shape}; make it smaller")
+        raise ValueError(
+            f"distinct points: a border of {border} px leaves nothing of the image {plane.shape}; reduce it"
+        )
     strength = np.zeros(plane.shape, np.float32)
     for top in range(0, height, _STRIP):
         first, last = max(top - _HALO, 0), min(top + _STRIP + _HALO, height)
@@ -300,23 +313,23 @@ def distinct_points(image: ArrayLike, count: int, *, spacing: float, border: int
     inner[border : height - border, border : width - border] = True
     strength[~inner] = 0.0
     peak = (strength > 0) & (strength >= cv2.dilate(strength, np.ones((size, size), np.uint8)))
-    place = np.argwhere(peak)
+    points = np.argwhere(peak)
     order = np.argsort(-strength[peak], kind="stable")
-    place = _apart(place[order], size // 2)
+    points = _apart(points[order], size // 2)
     cell = max(np.sqrt((height - 2 * border) * (width - 2 * border) / count), 1.0)
-    index = ((place - border) // cell).astype(np.intp)
+    index = ((points - border) // cell).astype(np.intp)
     code = index[:, 0] * (width + 1) + index[:, 1]
-    # how many stronger points its cell has
+    # number of stronger points in the same cell
     by_cell = np.argsort(code, kind="stable")
     start = np.r_[True, np.diff(code[by_cell]) != 0] if len(code) else np.zeros(0, bool)
     rank = np.empty(len(code), np.intp)
     position = np.arange(len(code))
     rank[by_cell] = position - np.maximum.accumulate(np.where(start, position, 0))
-    return np.asarray(place[np.argsort(rank, kind="stable")[:count]], np.float64)
+    return np.asarray(points[np.argsort(rank, kind="stable")[:count]], np.float64)
 
 
 def _strength(rows: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Strength of pixels, 0 where it is not above noise or where pixels are missing."""
+    """Return the strength of each pixel, 0 where it does not exceed noise or where pixels are missing."""
     grey = rows.astype(np.float64)
     missing = ~np.isfinite(grey)
     if missing.all():
@@ -339,45 +352,46 @@ def _strength(rows: NDArray[np.generic]) -> NDArray[np.float32]:
     return least.astype(np.float32)
 
 
-def _apart(place: NDArray[np.intp], reach: int) -> NDArray[np.intp]:
-    """The places without the later of two that lie within reach, since equal neighbours are both maxima."""
-    keep = np.zeros(len(place), bool)
-    # maxima are reach apart unless they are equal, so few share a cell of this size
+def _apart(points: NDArray[np.intp], reach: int) -> NDArray[np.intp]:
+    """Return the positions without the later of two within reach of each other: equal neighbours are both maxima."""
+    keep = np.zeros(len(points), bool)
+    # maxima are at least reach apart unless they are equal, so few share a cell of this size
     side = reach + 1
-    kept: dict[tuple[int, int], list[int]] = {}
-    for k, (row, column) in enumerate(place.tolist()):
+    cells: dict[tuple[int, int], list[int]] = {}
+    for k, (row, column) in enumerate(points.tolist()):
         cell = (row // side, column // side)
-        near = (j for r in (-1, 0, 1) for c in (-1, 0, 1) for j in kept.get((cell[0] + r, cell[1] + c), ()))
-        if any(max(abs(row - place[j, 0]), abs(column - place[j, 1])) <= reach for j in near):
+        neighbours = (j for r in (-1, 0, 1) for c in (-1, 0, 1) for j in cells.get((cell[0] + r, cell[1] + c), ()))
+        if any(max(abs(row - points[j, 0]), abs(column - points[j, 1])) <= reach for j in neighbours):
             continue
         keep[k] = True
-        kept.setdefault(cell, []).append(k)
-    return place[keep]
+        cells.setdefault(cell, []).append(k)
+    return points[keep]
 
 
 LARGEST_REACH = 200
-# Half-width of the main lobe, px: other peaks count from there.
+"""Largest half width of a search window, in pixels."""
 _LOBE = 3
-# Standard deviation below which a patch is even, relative to its largest grey value: float32 sees no more.
+"""Half width of the main lobe, in pixels; peaks beyond it count as others."""
 _EVEN = 1e-6
+"""Relative standard deviation below which a patch counts as uniform, the resolution of float32."""
 
 
 @dataclass(frozen=True, eq=False)
 class Peaks:
-    """Best places.
+    """Best positions of a search.
 
     Attributes
     ----------
-    place : Array
-        (n, 2) row and column of the templates' middles; NaN where nothing was searched.
-    value : Array
-        (n,) coefficient of the best peak, -1 to 1; NaN likewise.
-    ratio : Array
-        (n,) second best local maximum, more than three pixels from the best, over the best; 0 without one, 1 if the
-        best is not positive.
-    reason : NDArray[np.int8]
-        (n,) codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, FLAT or BORDER. BORDER also where the image's edge
-        cuts the window.
+    place : (n, 2) ndarray
+        Row and column of the templates' middles; NaN where nothing was searched.
+    value : (n,) ndarray
+        Correlation coefficient of the best peak, -1 to 1; NaN where nothing was searched.
+    ratio : (n,) ndarray
+        Ratio of the second best local maximum, more than three pixels from the best, to the best; 0 if there is none, 1
+        if the best is not positive.
+    reason : (n,) ndarray of int8
+        Codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, FLAT or BORDER. BORDER also where the image's edge cuts
+        the window.
     """
 
     place: Array
@@ -387,78 +401,79 @@ class Peaks:
 
 
 def search(image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, reach: int) -> Peaks:
-    """Best place of each template within reach of its predicted place.
+    """Return the best position of each template within reach of its predicted position.
 
     Parameters
     ----------
-    image : ArrayLike
-        (H, W), any real type.
-    templates : ArrayLike
-        (n, k, k), k odd, in the image's geometry.
-    predicted : ArrayLike
-        (n, 2) row and column at which their middles are expected; searched from the nearest pixel.
+    image : (H, W) array_like
+        Image of any real type.
+    templates : (n, k, k) array_like
+        Templates in the image's geometry; k odd.
+    predicted : (n, 2) array_like
+        Expected row and column of their middles; the search starts from the nearest pixel.
     reach : int
-        Rows and columns to each side, px.
+        Rows and columns to each side, in pixels.
 
     Raises
     ------
     ValueError
-        Wrong shapes, reach not 1 to 200 px.
+        A shape is wrong, or reach is not 1 to 200 px.
     """
     plane = checked_image(image, "search")
-    patch = checked_templates(templates, "search")
-    place = checked_places(predicted, len(patch), "search")
+    windows = checked_templates(templates, "search")
+    expected = checked_positions(predicted, len(windows), "search")
     if not 1 <= reach <= LARGEST_REACH:
         raise ValueError(f"search: the reach must be 1 to {LARGEST_REACH} px, found {reach}; improve the prediction")
-    count = len(patch)
-    found, value, ratio = np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan)
+    count = len(windows)
+    positions, value, ratio = np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan)
     reason = np.zeros(count, np.int8)
     for k in range(count):
-        if not (np.isfinite(patch[k]).all() and np.isfinite(place[k]).all()):
+        if not (np.isfinite(windows[k]).all() and np.isfinite(expected[k]).all()):
             reason[k] = Reason.TEMPLATE
             continue
-        found[k], value[k], ratio[k], reason[k] = _best(plane, patch[k], np.rint(place[k]), int(reach))
-    return Peaks(found, value, ratio, reason)
+        positions[k], value[k], ratio[k], reason[k] = _best(plane, windows[k], np.rint(expected[k]), int(reach))
+    return Peaks(positions, value, ratio, reason)
 
 
 def _best(image: NDArray[np.generic], template: Array, middle: Array, reach: int) -> tuple[Array, float, float, Reason]:
-    nowhere = np.full(2, np.nan)
+    """Return position, coefficient and peak ratio of the best match of one template, and the verdict."""
+    no_position = np.full(2, np.nan)
     half = template.shape[0] // 2
     last = np.array(image.shape) - 1 - half
     low, high = np.maximum(middle - reach, half), np.minimum(middle + reach, last)
     if np.any(low > high) or np.any(middle < half) or np.any(middle > last):
-        return nowhere, np.nan, np.nan, Reason.OUTSIDE
+        return no_position, np.nan, np.nan, Reason.OUTSIDE
     (top, left), (bottom, right) = (low - half).astype(int), (high + half + 1).astype(int)
     window = image[top:bottom, left:right].astype(np.float64)
     if not np.isfinite(window).all():
-        return nowhere, np.nan, np.nan, Reason.IMAGE
+        return no_position, np.nan, np.nan, Reason.IMAGE
     # about the mean, because sums of squares are taken in float32
     window, level = window - window.mean(), template - template.mean()
     if template.std() <= _EVEN * np.abs(template).max() or window.std() <= _EVEN * np.abs(window).max():
-        return nowhere, np.nan, np.nan, Reason.FLAT
+        return no_position, np.nan, np.nan, Reason.FLAT
     scores = (window / window.std()).astype(np.float32), (level / level.std()).astype(np.float32)
-    field = cv2.matchTemplate(*scores, cv2.TM_CCOEFF_NORMED)
-    # where the window is even, 0 / 0 comes out as anything
-    field = np.where(np.abs(field) <= 1.0 + 1e-3, field, 0.0)
-    row, column = np.unravel_index(int(np.argmax(field)), field.shape)
-    best = float(field[row, column])
-    ratio = _second(field, int(row), int(column)) / best if best > 0 else 1.0
-    at = low + np.array([row, column])
-    if not (0 < row < field.shape[0] - 1 and 0 < column < field.shape[1] - 1):
-        return at, best, ratio, Reason.BORDER
-    lines = field[row - 1 : row + 2, column], field[row, column - 1 : column + 2]
-    at = at + np.array([_vertex(line.astype(np.float64)) for line in lines])
-    return at, best, ratio, Reason.ACCEPTED
+    correlation = cv2.matchTemplate(*scores, cv2.TM_CCOEFF_NORMED)
+    # in a uniform window 0 / 0 gives arbitrary values
+    correlation = np.where(np.abs(correlation) <= 1.0 + 1e-3, correlation, 0.0)
+    row, column = np.unravel_index(int(np.argmax(correlation)), correlation.shape)
+    best = float(correlation[row, column])
+    ratio = _second(correlation, int(row), int(column)) / best if best > 0 else 1.0
+    position = low + np.array([row, column])
+    if not (0 < row < correlation.shape[0] - 1 and 0 < column < correlation.shape[1] - 1):
+        return position, best, ratio, Reason.BORDER
+    lines = correlation[row - 1 : row + 2, column], correlation[row, column - 1 : column + 2]
+    position = position + np.array([_vertex(line.astype(np.float64)) for line in lines])
+    return position, best, ratio, Reason.ACCEPTED
 
 
-def _second(field: NDArray[np.float32], row: int, column: int) -> float:
-    """Highest local maximum (of 5 x 5) outside of the main lobe; the slope of a wide lobe is none."""
-    peak = field >= cv2.dilate(field, np.ones((5, 5), np.uint8))
+def _second(correlation: NDArray[np.float32], row: int, column: int) -> float:
+    """Return the highest local maximum (of 5 x 5) outside the main lobe; the slope of a wide lobe is not a maximum."""
+    peak = correlation >= cv2.dilate(correlation, np.ones((5, 5), np.uint8))
     peak[max(row - _LOBE, 0) : row + _LOBE + 1, max(column - _LOBE, 0) : column + _LOBE + 1] = False
-    return max(float(field[peak].max(initial=0.0)), 0.0)
+    return max(float(correlation[peak].max(initial=0.0)), 0.0)
 
 
-def _vertex(three: Array) -> float:
-    """Vertex of the parabola through three values about the largest, px from the middle one."""
-    bend = three[0] - 2.0 * three[1] + three[2]
-    return float(0.5 * (three[0] - three[2]) / bend) if bend < 0 else 0.0
+def _vertex(values: Array) -> float:
+    """Return the vertex of the parabola through three values about the largest, in pixels from the middle one."""
+    curvature = values[0] - 2.0 * values[1] + values[2]
+    return float(0.5 * (values[0] - values[2]) / curvature) if curvature < 0 else 0.0

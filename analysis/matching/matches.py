@@ -1,11 +1,10 @@
-"""Matching of templates in an image: search, least squares, thresholds.
+"""Matching of templates in an image: search, least squares, thresholds, and rejection of mismatches.
 
-Rejection of wrong matches: the way from predicted to found places varies smoothly over an image.
-
-Displacements are a polynomial of row and column, and optionally of height. Random minimal samples give candidates; the
-one with the least median distance of all points starts (least median of squares, Rousseeuw 1984), then the scatter,
-the points within its limit and their weighted fit are repeated until they stand. Right matches are lost at the false
-alarm rate; a wrong one stays if it lies in the limit by chance.
+**Consensus.** Displacements from predicted to measured positions vary smoothly over an image: they are a polynomial of
+row and column, and optionally of height. Random minimal samples give candidates; the one with the least median distance
+of all points starts (least median of squares, Rousseeuw 1984), then the scatter, the points within its limit and their
+weighted fit are iterated until they do not change. Correct matches are lost at the false-alarm rate; a mismatch remains
+if it lies within the limit by chance.
 """
 
 from __future__ import annotations
@@ -18,15 +17,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.arrays import Array, Mask, UndeterminedError
-from analysis.matching.correlation import MatchOptions, Reason, checked_image, checked_places, checked_templates, search
+from analysis.matching.correlation import (
+    MatchOptions,
+    Reason,
+    checked_image,
+    checked_positions,
+    checked_templates,
+    search,
+)
 from analysis.matching.least_squares import least_squares
 from analysis.matching.window_checks import FALSE_ALARM, risk
 
-# Side of a block of a JPEG file, px, and lines of an image in which its blocks are looked for.
+# Side of a JPEG block in pixels, and number of image lines in which blocks are sought.
 _BLOCK, _BLOCK_LINES = 8, 512
-# Ratio of steps between blocks to those within from which places are those of the blocks. JPEG of quality 30 to 95: 1.0
-# to 2.0 where the texture passes and sigmas hold, 2.3 to 4.3 where places lock to whole pixels.
 _BLOCKY = 2.2
+"""Ratio of steps between blocks to those within from which positions are those of the blocks. JPEG of quality 30 to 95
+gives 1.0 to 2.0 if the texture passes and sigmas are right, 2.3 to 4.3 if positions lock to whole pixels.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,18 +42,18 @@ class Matches:
 
     Attributes
     ----------
-    place : Array
-        (n, 2) row and column of the templates' middles in the image; NaN where least squares matching gave none.
-    covariance : Array
-        (n, 2, 2) px^2, of noise and of displacements within the window; see `analysis.matching.least_squares`.
-    correlation : Array
-        (n,) of the image with the fitted template; of the search where there is no fit; NaN if neither.
-    ratio : Array
-        (n,) second best to best peak of the search.
-    accepted : NDArray[np.bool_]
-        (n,) bool.
-    reason : NDArray[np.int8]
-        (n,) codes of `Reason`.
+    place : (n, 2) ndarray
+        Row and column of the templates' middles in the image; NaN without a least squares fit.
+    covariance : (n, 2, 2) ndarray
+        Covariance from noise and displacements within the window, in px^2; see `analysis.matching.least_squares`.
+    correlation : (n,) ndarray
+        Correlation of the image with the fitted template, or of the search without a fit; NaN without either.
+    ratio : (n,) ndarray
+        Ratio of the second best to the best peak of the search.
+    accepted : (n,) ndarray of bool
+        True for accepted matches.
+    reason : (n,) ndarray of int8
+        Codes of `Reason`.
     """
 
     place: Array
@@ -58,44 +65,59 @@ class Matches:
 
     @property
     def sigma(self) -> Array:
-        """(n,) standard deviation along the worst direction, px; NaN without a fit."""
+        """Standard deviation (n,) along the worst direction, in pixels; NaN without a fit."""
         return _worst(self.covariance)
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """(n,) reasons in words."""
+        """Descriptions (n,) of the reasons."""
         return tuple(Reason(int(code)).text for code in self.reason)
 
     @property
     def text(self) -> str:
-        """How many were accepted, and why the others were not, the most frequent reason first."""
+        """Number of accepted matches and the reasons of the others, the most frequent first."""
         count = Counter(text for text in self.texts if text != Reason.ACCEPTED.text)
         parts = [f"{int(self.accepted.sum())} of {len(self.accepted)} accepted"]
         return "; ".join(parts + [f"{number} x {text}" for text, number in count.most_common()])
 
 
 def match_windows(
-    image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, *, reach: int, options: MatchOptions | None = None
+    image: ArrayLike,
+    templates: ArrayLike,
+    predicted: ArrayLike,
+    *,
+    search_radius: int,
+    options: MatchOptions | None = None,
 ) -> Matches:
-    """Find templates in an image, each near its predicted place.
+    """Match windows of one image in another by cross-correlation and least squares, each near its predicted position.
 
     Parameters
     ----------
-    image : ArrayLike
-        (H, W), any real type.
-    templates : ArrayLike
-        (n, k, k), k odd, resampled into the image's geometry (`resampled`); NaN makes a point unusable.
-    predicted : ArrayLike
-        (n, 2) row and column at which their middles are expected.
-    reach : int
-        How far the prediction may be off along rows and columns, px.
-    options : MatchOptions | None
+    image : (H, W) array_like
+        Image that is searched, of any real type.
+    templates : (n, k, k) array_like
+        Windows of the other image, k odd, resampled to the geometry of `image`. NaN makes a point unusable.
+    predicted : (n, 2) array_like
+        Predicted row and column of the centre of each window in `image`, in pixels.
+    search_radius : int
+        Largest error of the prediction along rows and columns, in pixels.
+    options : MatchOptions, optional
         Model and thresholds.
+
+    Returns
+    -------
+    Matches
+        Positions `place` (n, 2), their `covariance` (n, 2, 2), `accepted` (n,) and the reasons in `texts`.
 
     Raises
     ------
     ValueError
-        Wrong shapes, reach out of range, a template too small for its margin.
+        Arrays of other shapes, a search radius out of range, or windows that are too small for their margin.
+
+    Notes
+    -----
+    Gruen, S. Afr. J. Photogramm. 14, 175 (1985): an affine transformation of the window, offset and gain are unknown.
+    The covariance includes the noise of both images and displacements that vary within the window.
 
     Examples
     --------
@@ -110,7 +132,7 @@ def match_windows(
     >>> first, second = (image + 2 * rng.standard_normal(image.shape) for image in (first, second))
     >>> points = np.rint(analysis.distinct_points(first, 9, spacing=30, border=30)).astype(int)
     >>> windows = np.stack([first[r - 15 : r + 16, c - 15 : c + 16] for r, c in points])
-    >>> matches = analysis.match_windows(second, windows, points, reach=3)
+    >>> matches = analysis.match_windows(second, windows, points, search_radius=3)
     >>> print(matches.text)
     7 of 7 accepted
     >>> np.round(np.mean(matches.place - points, axis=0), 2)
@@ -119,26 +141,26 @@ def match_windows(
     True
     """
     plane = checked_image(image, "match windows")
-    patch = checked_templates(templates, "match windows")
-    expected = checked_places(predicted, len(patch), "match windows")
-    chosen = options or MatchOptions()
-    peaks = search(plane, patch, expected, reach)
-    fits = least_squares(plane, patch, peaks.place, chosen)
-    # points without a peak have no start, which the fit calls a bad template
+    windows = checked_templates(templates, "match windows")
+    expected = checked_positions(predicted, len(windows), "match windows")
+    limits = options or MatchOptions()
+    peaks = search(plane, windows, expected, search_radius)
+    fits = least_squares(plane, windows, peaks.place, limits)
+    # points without a peak have no start position, which the fit reports as a bad template
     reason = np.where(peaks.reason != 0, peaks.reason, fits.reason).astype(np.int8)
-    weak = np.where(np.isfinite(fits.correlation), fits.correlation, peaks.value) < chosen.least_correlation
+    weak = np.where(np.isfinite(fits.correlation), fits.correlation, peaks.value) < limits.least_correlation
     reason[_open(reason) & weak] = Reason.WEAK
-    reason[(reason == 0) & (peaks.ratio > chosen.largest_ratio)] = Reason.AMBIGUOUS
+    reason[(reason == 0) & (peaks.ratio > limits.largest_ratio)] = Reason.AMBIGUOUS
     good = reason == Reason.ACCEPTED
     noise, relief = fits.covariances(good)
     covariance = noise + relief
     # NaN compares false
-    reason[(reason == 0) & ~(_worst(noise) <= chosen.largest_sigma)] = Reason.UNCERTAIN
-    reason[(reason == 0) & ~(_worst(covariance) <= chosen.largest_sigma)] = Reason.RELIEF
-    # windows that noise of the template makes unknown still tell whether windows here have steps
+    reason[(reason == 0) & ~(_worst(noise) <= limits.largest_sigma)] = Reason.UNCERTAIN
+    reason[(reason == 0) & ~(_worst(covariance) <= limits.largest_sigma)] = Reason.RELIEF
+    # windows that template noise makes undetermined still count in the share of windows with steps
     silent = good & ~np.isfinite(_worst(noise))
-    reason = _without_steps(reason, silent, *fits.steps(good), chosen)
-    reason[_open(reason) & (reason != 0) & (fits.contrast < chosen.least_contrast)] = Reason.FLAT
+    reason = _without_steps(reason, silent, *fits.steps(good), limits)
+    reason[_open(reason) & (reason != 0) & (fits.contrast < limits.least_contrast)] = Reason.FLAT
     if _block_ratio(plane) > _BLOCKY:
         reason[_open(reason)] = Reason.BLOCKS
     return Matches(
@@ -152,17 +174,17 @@ def match_windows(
 
 
 def _block_ratio(plane: NDArray[np.generic]) -> float:
-    """Return how much larger steps between neighbours are at one in eight of them, along rows and columns: about 1
-    where no compression has cut the image into blocks.
+    """Return how much larger grey-value steps are at one in eight pixels, along rows and columns.
 
-    The median over all steps of a phase, of their mean sizes over up to 512 lines, so that stripes of the scene count
-    little; the smaller ratio of the two directions.
+    The ratio is about 1 if no compression has cut the image into blocks. It uses the median over all steps of a phase
+    of their mean sizes over up to 512 lines, so that stripes of the scene count little, and is the smaller of both
+    directions.
     """
     ratios = []
     for lines in (plane, plane.T):
         size = np.abs(np.diff(lines[:: max(len(lines) // _BLOCK_LINES, 1)].astype(np.float64), axis=1))
-        seen = np.isfinite(size)
-        mean = np.where(seen, size, 0.0).sum(axis=0)[seen.any(axis=0)] / seen.sum(axis=0)[seen.any(axis=0)]
+        finite = np.isfinite(size)
+        mean = np.where(finite, size, 0.0).sum(axis=0)[finite.any(axis=0)] / finite.sum(axis=0)[finite.any(axis=0)]
         if len(mean) < 5 * _BLOCK:
             return 1.0
         phases = np.array([np.median(mean[k::_BLOCK]) for k in range(_BLOCK)])
@@ -173,7 +195,7 @@ def _block_ratio(plane: NDArray[np.generic]) -> float:
 def _without_steps(
     reason: NDArray[np.int8], silent: NDArray[np.bool_], chance: Array, power: Array, options: MatchOptions
 ) -> NDArray[np.int8]:
-    """Verdicts after the test for steps of the displacement within windows; the silent are only counted."""
+    """Return the verdicts after the test for displacement steps within windows; silent windows are only counted."""
     tested = reason == Reason.ACCEPTED
     # NaN compares false
     step = tested & ~(chance >= FALSE_ALARM)
@@ -184,23 +206,26 @@ def _without_steps(
 
 
 def _open(reason: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Verdicts that another one may explain better: fitted, or tried to."""
+    """Return a mask of verdicts that a later test may replace: windows that were fitted or that a fit was tried for."""
     return (reason == Reason.ACCEPTED) | (reason >= Reason.BORDER)
 
 
 def _worst(covariance: Array) -> Array:
+    """Return the standard deviation (n,) along the worst direction of covariances (n, 2, 2)."""
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
 
 
-# Of missing every all-right sample while this share is wrong.
+# Probability of drawing no sample free of mismatches, for the share of mismatches _WRONG.
 _MISSED, _WRONG = 1e-6, 0.45
 _MOST_SAMPLES = 8000
-# Values of candidates' distances that are held at once.
+"""Largest number of random samples."""
 _VALUES = 2_000_000
-# Median of chi-square with two degrees of freedom.
+"""Number of candidates' distances that are held in memory at once."""
 _MEDIAN = 2.0 * math.log(2.0)
+"""Median of chi-square with two degrees of freedom."""
 _ROUNDS = 50
+"""Largest number of iterations of the consensus."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,16 +234,16 @@ class DisplacementField:
 
     Attributes
     ----------
-    coefficients : Array
-        (terms, 2) of rows and columns, px: monomials of the scaled place by rising degree, then height.
-    middle : Array
-        (2,) place that is 0, px.
+    coefficients : (terms, 2) ndarray
+        Coefficients for rows and columns, in pixels: monomials of the scaled position by rising degree, then height.
+    middle : (2,) ndarray
+        Position of the scaled origin, in pixels.
     scale : float
-        Place difference that is 1, px.
+        Position difference of scaled length 1, in pixels.
     degree : int
-        Of the polynomial of row and column.
-    heights : tuple[float, float] | None
-        Mean and scale of height, or None without it.
+        Degree of the polynomial of row and column.
+    heights : tuple of float or None
+        Mean and scale of the heights; None without a height term.
     """
 
     coefficients: Array
@@ -228,37 +253,37 @@ class DisplacementField:
     heights: tuple[float, float] | None
 
     def __call__(self, place: ArrayLike, height: ArrayLike | None = None) -> Array:
-        """Displacement (n, 2), px, at places (n, 2) and heights (n,).
+        """Return the displacement (n, 2) at positions (n, 2) and heights (n,), in pixels.
 
         Raises
         ------
         ValueError
-            Heights given or missing against the fit.
+            Heights are present although the fit had none, or missing although it had some.
         """
-        at = checked_places(place, None, "displacement field")
+        positions = checked_positions(place, None, "displacement field")
         if (height is None) != (self.heights is None):
-            raise ValueError("displacement field: give heights exactly if the fit had them")
-        return _terms(at, height, self) @ self.coefficients
+            raise ValueError("displacement field: give heights if, and only if, the fit had them")
+        return _terms(positions, height, self) @ self.coefficients
 
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """Which matches agree.
+    """Matches that agree with one displacement field.
 
     Attributes
     ----------
-    accepted : Mask
-        (n,) bool; none if there is no consensus.
+    accepted : (n,) ndarray of bool
+        True for matches that agree; all False without a consensus.
     field : DisplacementField
-        The fitted displacement of the accepted, or the best candidate.
-    distance : Array
-        (n,) residual over its standard deviation; NaN where the match is not finite.
+        Displacement fitted to the accepted matches, or the best candidate.
+    distance : (n,) ndarray
+        Residual over its standard deviation; NaN where the match is not finite.
     scatter : float
-        Px along each axis, of the field beyond the covariances given; in all without them.
+        Scatter along each axis beyond the given covariances, in pixels; the total scatter without covariances.
     limit : float
-        Of distance.
+        Largest accepted distance.
     text : str
-        The outcome in words.
+        Description of the outcome.
     """
 
     accepted: Mask
@@ -271,7 +296,7 @@ class Consensus:
 
 def consensus(
     predicted: ArrayLike,
-    found: ArrayLike,
+    matched: ArrayLike,
     *,
     covariance: ArrayLike | None = None,
     height: ArrayLike | None = None,
@@ -279,29 +304,41 @@ def consensus(
     false_alarm: float = 1e-3,
     largest_scatter: float = 2.0,
 ) -> Consensus:
-    """Matches that follow one smooth displacement.
+    """Reject wrong matches: keep those that follow one displacement which varies smoothly over the image.
+
+    The displacement is a polynomial of row and column, found by least median of squares.
 
     Parameters
     ----------
-    predicted : ArrayLike
-        (n, 2) row and column; and found: (n, 2), NaN rows take no part.
-    found : ArrayLike
-        (n, 2).
-    covariance : ArrayLike | None
-        (n, 2, 2) px^2 of found; the scatter is then what the field needs beyond them.
-    height : ArrayLike | None
-        (n,) of points, any unit; adds a term for what parallax an unknown tilt leaves.
+    predicted : (n, 2) array_like
+        Predicted rows and columns, in pixels.
+    matched : (n, 2) array_like
+        Matched rows and columns, in pixels; rows with NaN are ignored.
+    covariance : (n, 2, 2) array_like, optional
+        Covariances of the matched positions, px^2. The scatter is then what the displacement needs beyond them.
+    height : (n,) array_like, optional
+        Heights of the points, in any unit. They add a term for the parallax that an unknown tilt leaves.
     degree : int
-        0 to 3 of the polynomial in row and column together.
+        Degree of the polynomial in row and column together, 0 to 3.
     false_alarm : float
-        Share of right matches that may be lost (normal errors).
+        Share of right matches that may be lost, for normal errors.
     largest_scatter : float
-        Px; above it there is no consensus: unrelated matches over a search window scatter by a third of its reach.
+        Largest scatter of a consensus, in pixels. Unrelated matches over a search window scatter by a third of its
+        radius.
+
+    Returns
+    -------
+    Consensus
+        `accepted` (n,), the displacement `field`, the `distance` of each match from it, and the `scatter`.
 
     Raises
     ------
     ValueError
-        Shapes, too few points (two a term, five at least), degree or rates out of range.
+        Arrays of other shapes, too few points (two for each term, at least five), or a degree or rate out of range.
+
+    Notes
+    -----
+    Rousseeuw, J. Am. Stat. Assoc. 79, 871 (1984).
 
     Examples
     --------
@@ -319,8 +356,8 @@ def consensus(
     >>> round(agreed.scatter, 2)
     0.09
     """
-    place = checked_places(predicted, None, "consensus")
-    to = checked_places(found, len(place), "consensus")
+    place = checked_positions(predicted, None, "consensus")
+    to = checked_positions(matched, len(place), "consensus")
     if not (0 <= degree <= 3 and 0 < false_alarm < 0.5 and largest_scatter > 0):
         raise ValueError(
             f"consensus: need a degree of 0 to 3, a false alarm rate below 0.5 and a positive largest scatter; found "
@@ -338,18 +375,20 @@ def consensus(
     terms = (degree + 1) * (degree + 2) // 2 + (heights is not None)
     if usable.sum() < max(2 * terms, 5):
         raise UndeterminedError(
-            f"consensus: {int(usable.sum())} usable matches do not carry {terms} terms; need {max(2 * terms, 5)}: "
+            f"consensus: {int(usable.sum())} usable matches are too few for {terms} terms; need {max(2 * terms, 5)}: "
             "match more points or lower the degree"
         )
     given = heights[usable] if heights is not None else None
-    empty = _empty(place[usable], given, degree, terms)
+    empty = _unfitted_field(place[usable], given, degree, terms)
     design, way, noise = _terms(place[usable], given, empty), (to - place)[usable], spread[usable]
     limit = math.sqrt(-2.0 * math.log(false_alarm))
     coefficients = _best_candidate(design, way, np.random.default_rng(0))
-    inside, coefficients, scatter, distance = _settled(design, way, noise, coefficients, limit)
+    inside, coefficients, scatter, distance = _converged(design, way, noise, coefficients, limit)
     accepted, apart = np.zeros(len(place), bool), np.full(len(place), np.nan)
     accepted[usable], apart[usable] = inside, distance
-    share = f"{int(inside.sum())} of {int(usable.sum())} matches agree within {limit:.1f} sigma of {scatter:.3g} px"
+    share = (
+        f"{int(inside.sum())} of {int(usable.sum())} matches agree within {limit:.1f} sigma (scatter {scatter:.3g} px)"
+    )
     if scatter > largest_scatter or inside.sum() < max(2 * terms, 5):
         accepted[:] = False
         share = f"no consensus: {share}, at most {largest_scatter:g} px allowed; improve prediction or matches"
@@ -357,23 +396,25 @@ def consensus(
     return Consensus(accepted, field, apart, scatter, limit, share)
 
 
-def _empty(place: Array, height: Array | None, degree: int, terms: int) -> DisplacementField:
-    middle = 0.5 * (place.min(axis=0) + place.max(axis=0))
-    scale = max(float(np.abs(place - middle).max()), 1.0)
+def _unfitted_field(positions: Array, height: Array | None, degree: int, terms: int) -> DisplacementField:
+    """Return a displacement field with zero coefficients, scaled to the points."""
+    middle = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
+    scale = max(float(np.abs(positions - middle).max()), 1.0)
     heights = None if height is None else (float(height.mean()), max(float(height.std()), 1e-9))
     return DisplacementField(np.zeros((terms, 2)), middle, scale, degree, heights)
 
 
-def _terms(place: Array, height: ArrayLike | None, field: DisplacementField) -> Array:
-    row, column = ((place - field.middle) / field.scale).T
+def _terms(positions: Array, height: ArrayLike | None, field: DisplacementField) -> Array:
+    """Return the (n, terms) polynomial terms of a displacement field."""
+    row, column = ((positions - field.middle) / field.scale).T
     powers = [row ** (total - k) * column**k for total in range(field.degree + 1) for k in range(total + 1)]
     if field.heights is not None:
         powers.append((np.asarray(height, np.float64) - field.heights[0]) / field.heights[1])
     return np.stack(powers, axis=1)
 
 
-def _best_candidate(design: Array, way: Array, rng: np.random.Generator) -> Array:
-    """Through the minimal sample with the least median distance of all points."""
+def _best_candidate(design: Array, displacement: Array, rng: np.random.Generator) -> Array:
+    """Return the coefficients through the minimal sample with the least median distance of all points."""
     count, terms = design.shape
     samples = min(_MOST_SAMPLES, math.ceil(math.log(_MISSED) / math.log1p(-((1.0 - _WRONG) ** terms))))
     best, least = np.zeros((terms, 2)), np.inf
@@ -381,49 +422,50 @@ def _best_candidate(design: Array, way: Array, rng: np.random.Generator) -> Arra
     for first in range(0, samples, batch):
         which = rng.random((min(batch, samples - first), count)).argpartition(terms - 1, axis=1)[:, :terms]
         matrix = design[which]
-        # lstsq-like: points on a line leave some terms open, which a ridge sets to next to nothing
+        # points on a line leave some terms undetermined; the ridge sets them nearly to zero
         square = np.swapaxes(matrix, 1, 2) @ matrix + 1e-10 * np.eye(terms)
-        candidate = np.linalg.solve(square, np.swapaxes(matrix, 1, 2) @ way[which])
-        rest = way - design @ candidate
-        middle = np.median(np.einsum("snk,snk->sn", rest, rest), axis=1)
-        k = int(np.argmin(middle))
-        if middle[k] < least:
-            best, least = candidate[k], float(middle[k])
+        candidate = np.linalg.solve(square, np.swapaxes(matrix, 1, 2) @ displacement[which])
+        residual = displacement - design @ candidate
+        medians = np.median(np.einsum("snk,snk->sn", residual, residual), axis=1)
+        k = int(np.argmin(medians))
+        if medians[k] < least:
+            best, least = candidate[k], float(medians[k])
     return best
 
 
-def _settled(
-    design: Array, way: Array, noise: Array, coefficients: Array, limit: float
+def _converged(
+    design: Array, displacement: Array, noise: Array, coefficients: Array, limit: float
 ) -> tuple[Mask, Array, float, Array]:
-    """Accepted points, their fit, the scatter beyond noise and distances, once they do not change any more."""
-    inside = np.ones(len(way), bool)
-    for turn in range(_ROUNDS):
-        rest = way - design @ coefficients
-        scatter = _scatter(rest[inside], noise[inside])
-        distance = np.sqrt(_square(rest, noise, scatter))
+    """Return accepted points, coefficients, scatter beyond noise and distances after convergence."""
+    inside = np.ones(len(displacement), bool)
+    for round_number in range(_ROUNDS):
+        residual = displacement - design @ coefficients
+        scatter = _scatter(residual[inside], noise[inside])
+        distance = np.sqrt(_square(residual, noise, scatter))
         before, inside = inside, distance < limit
-        # the first round only replaces all points by those near the candidate
-        if inside.sum() < design.shape[1] or (turn and np.array_equal(before, inside)):
+        # the first round only selects the points near the candidate
+        if inside.sum() < design.shape[1] or (round_number and np.array_equal(before, inside)):
             break
         weight = 1.0 / np.sqrt(0.5 * np.trace(noise, axis1=1, axis2=2) + scatter**2)[inside, None]
-        coefficients = np.linalg.lstsq(weight * design[inside], weight * way[inside], rcond=None)[0]
+        coefficients = np.linalg.lstsq(weight * design[inside], weight * displacement[inside], rcond=None)[0]
     return inside, coefficients, scatter, distance
 
 
-def _square(rest: Array, noise: Array, scatter: float) -> Array:
-    whole = noise + scatter**2 * np.eye(2)
-    a, b, c = whole[:, 0, 0], whole[:, 0, 1], whole[:, 1, 1]
-    row, column = rest.T
+def _square(residual: Array, noise: Array, scatter: float) -> Array:
+    """Return the (n,) squared distances normalised by noise and scatter."""
+    total = noise + scatter**2 * np.eye(2)
+    a, b, c = total[:, 0, 0], total[:, 0, 1], total[:, 1, 1]
+    row, column = residual.T
     return np.asarray((c * row**2 - 2.0 * b * row * column + a * column**2) / np.maximum(a * c - b * b, 1e-300))
 
 
-def _scatter(rest: Array, noise: Array) -> float:
-    """Isotropic standard deviation beyond noise that brings the median square distance to that of chi-square."""
-    high = math.sqrt(max(float(np.median(np.sum(rest**2, axis=1))) / _MEDIAN, 1e-18))
-    if np.median(_square(rest, noise, 1e-9)) <= _MEDIAN:
+def _scatter(residual: Array, noise: Array) -> float:
+    """Return the isotropic scatter beyond noise that brings the median squared distance to that of chi-square."""
+    high = math.sqrt(max(float(np.median(np.sum(residual**2, axis=1))) / _MEDIAN, 1e-18))
+    if np.median(_square(residual, noise, 1e-9)) <= _MEDIAN:
         return 1e-9
     low = 0.0
     for _ in range(40):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if np.median(_square(rest, noise, middle)) > _MEDIAN else (low, middle)
+        low, high = (middle, high) if np.median(_square(residual, noise, middle)) > _MEDIAN else (low, middle)
     return high

@@ -548,28 +548,47 @@ def recover_monitor(
     motions: Mapping[str, MotionModel] | None = None,
     frames: int | None = None,
 ) -> Recovery:
-    """Recover all parameters.
+    """Recover the changes of all cameras from frames of the monitor's spots before and after, with their covariance.
 
     Parameters
     ----------
-    before : NDArray[Any] | MeasuredSpots
-        (C, frames, H, W) or (S, C, frames, H, W) grey values of the nominal state, or what `judged_spots` gave of them.
-    after : NDArray[Any]
-        (S, C, frames, H, W) grey values of the states to be measured.
+    before : ndarray or MeasuredSpots
+        Grey values of the nominal state, (C, frames, H, W) or (S, C, frames, H, W) for C spots, or a result of
+        `judged_spots` on them.
+    after : (S, C, frames, H, W) ndarray
+        Grey values of S states to be measured.
     calibration : MonitorCalibration
-        Of the nominal instrument; C must be its number of spots.
+        Calibration of the nominal instrument, with C spots.
     centroid : str
-        `ml`, `gaussian` or `energy`.
+        Method of the spot positions: "ml", "gaussian" or "energy".
     threads : int
-        For the fits; results do not depend on it.
-    disturbances : Disturbances | None
-        What is stated to move; without it there is no `posterior`, and all sigmas are those of the noise alone.
+        Number of threads for the fits; results do not depend on it.
+    disturbances : Disturbances, optional
+        Prior on the motions. Without it there is no estimator `posterior`, and all standard deviations are those of the
+        noise alone.
     keep_parts : bool
-        Of the noise, which are large.
-    motions : Mapping[str, MotionModel] | None
-        Estimator -> the motions by which it reads, traced again to see whether they are linear; None to take them so.
-    frames : int | None
-        Of which each image is the mean, (C, H, W) and (S, C, H, W); None where these are frames.
+        True to keep the noise of every spot, which is large, for series of measurements.
+    motions : mapping of str to MotionModel, optional
+        For each estimator, the motions that are traced again to test whether its reading is linear.
+    frames : int, optional
+        Number of frames averaged into each image, for images (C, H, W) and (S, C, H, W); None if these are frames.
+
+    Returns
+    -------
+    Recovery
+        Spot positions `before` and `after` (S, C, 2); `parameters` maps camera and estimator to the changes d_alpha,
+        d_beta, d_gamma (radians) and d_f (metres), arrays (S,), with covariances; `angle` the change of the
+        intersection angle of two cameras.
+
+    Raises
+    ------
+    ValueError
+        Numbers of spots that do not match, an unknown centroid, or spots that cannot be measured.
+
+    Notes
+    -----
+    Wang et al., Acta Photonica Sinica 47(10) 1012001 (2018); `analysis.monitor.monitor_formulas` has the equations and
+    their corrections.
 
     Examples
     --------

@@ -171,27 +171,39 @@ def smooth_series(
     times: ArrayLike,
     reference: float | None = None,
 ) -> SmoothedSeries:
-    """Filtered and smoothed changes.
+    """Estimate the changes over a series of measurements, filtered and smoothed, at any times, with their covariance.
 
     Parameters
     ----------
-    stated : Disturbances
-        What moves, and how it goes on in time.
-    measured : ArrayLike
-        (M,) when the monitor measured, seconds, in any order.
-    shifts : Array
-        (M, D) what it measured, after - before, px.
-    noise : ShiftNoise
-        Of these shifts.
-    times : ArrayLike
-        (T,) for which changes are wanted, seconds, in any order.
-    reference : float | None
-        From which time of the process changes are counted, seconds; None for the calibration.
+    disturbances : Disturbances
+        Prior on the motions and their covariance in time. Motions that may jump are searched for first.
+    measured : (M,) array_like
+        Times of the measurements, in seconds, in any order.
+    shifts : (M, D) array_like
+        Measured values, such as shifts of spots, in the units of ``disturbances.spots``.
+    noise : (D, D) ndarray or ShiftNoise
+        Covariance of one measurement, independent from time to time, or an object with the covariance of all.
+    times : (T,) array_like
+        Times at which changes are wanted, in seconds, in any order.
+    reference : float, optional
+        Time from which changes are counted, in seconds; by default they are counted from the calibration.
+
+    Returns
+    -------
+    SmoothedSeries
+        `filtered` and `smoothed`, each with `values` (T, P), `noise` and `total` covariances (T, P, P); `consistency`,
+        the chi-square of the series; and `jumps`.
 
     Raises
     ------
     ValueError
-        Motions of different laws are correlated, or the shifts have no noise and say the same twice.
+        Arrays of other shapes, values that are not finite, correlated motions with different laws, or measurements
+        without noise that repeat each other.
+
+    Notes
+    -----
+    The values are those of a Kalman filter and of the Rauch-Tung-Striebel smoother (Kailath, Sayed and Hassibi, Linear
+    Estimation, 2000, ch. 4), written as a Gaussian process.
 
     Examples
     --------

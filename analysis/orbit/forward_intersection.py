@@ -574,10 +574,20 @@ def level_axes(points: Array) -> Array:
     return np.stack([east, np.cross(up, east), up], axis=1)
 
 
-def linear_error(variance: ArrayLike, share: float = _SHARE) -> Array:
-    """Return the half width of the zero-centred interval that holds a share of normal errors.
+def linear_error(variance: ArrayLike, probability: float = _SHARE) -> Array:
+    """Return the half width of the zero-centred interval that holds a share of normal errors; LE90 for 0.9.
 
-    The errors have zero mean and the given variance (...). The result is LE90, 1.645 sigma, for a share of 0.9.
+    Parameters
+    ----------
+    variance : array_like
+        Variances, of any shape.
+    probability : float
+        Share of the errors within the interval, between 0 and 1.
+
+    Returns
+    -------
+    ndarray
+        Half widths in the unit of the standard deviation; for 0.9 they are 1.645 sigma.
 
     Examples
     --------
@@ -587,10 +597,10 @@ def linear_error(variance: ArrayLike, share: float = _SHARE) -> Array:
     >>> round(float(analysis.linear_error(2.0**2)), 3)
     3.29
     """
-    return np.asarray(float(ndtri(0.5 + 0.5 * share)) * np.sqrt(variance))
+    return np.asarray(float(ndtri(0.5 + 0.5 * probability)) * np.sqrt(variance))
 
 
-def circular_error(covariance: ArrayLike, share: float = _SHARE) -> Array:
+def circular_error(covariance: ArrayLike, probability: float = _SHARE) -> Array:
     """Return the radius of the zero-centred circle that holds a share of normal errors in the plane; CE90 for 0.9.
 
     A circular covariance gives 2.146 sigma, a degenerate one (along a line) 1.645 sigma.
@@ -623,12 +633,12 @@ def circular_error(covariance: ArrayLike, share: float = _SHARE) -> Array:
     >>> round(float(analysis.circular_error(np.eye(2), 0.5)), 4)
     1.1774
     """
-    values = _axes(covariance, share)
+    values = _axes(covariance, probability)
     longer = np.sqrt(values[..., 1])
     ratio = np.divide(values[..., 0], values[..., 1], out=np.ones_like(longer), where=longer > 0.0)
 
     def missing(radius: Array, short: Array) -> Array:
-        return share - _within(radius, np.stack([short, np.ones_like(short)], axis=-1))
+        return probability - _within(radius, np.stack([short, np.ones_like(short)], axis=-1))
 
     root = elementwise.find_root(missing, (np.zeros_like(ratio), np.full_like(ratio, _FARTHEST)), args=(ratio,))
     return np.asarray(longer * root.x)

@@ -804,20 +804,24 @@ def height_error(
 ) -> Array:
     """Return the first-order error of intersected heights caused by an error of a look angle, in metres.
 
-    The wrong ray passes the ground point at slant_range * angle_error and so meets the other ray, at the angle
-    `convergence` on the ground, farther along by that over sin(convergence). For a camera at height H over flat ground,
-    against nadir: H * angle_error / (sin a cos a).
+    The erroneous ray passes the ground point at the distance slant_range x angle_error, and so meets the other ray
+    higher or lower. For a camera at height H over flat ground, against a nadir line: H angle_error / (sin a cos a).
 
     Parameters
     ----------
     angle_error : array_like
-        Error of the look angle, in radians, any shape.
+        Error of the look angle, in radians, of any shape.
     slant_range : array_like
-        Distance to the ground point, in metres.
+        Distance of the ground point, in metres.
     convergence : array_like
         Angle between the rays on the ground, in radians.
     zenith : array_like
         Zenith angle of the other ray, in radians.
+
+    Returns
+    -------
+    ndarray
+        Error of the height, in metres.
 
     Examples
     --------

@@ -472,27 +472,40 @@ def fit_interior_orientation(
     *,
     angle_covariance: ArrayLike | None = None,
 ) -> InteriorOrientation:
-    """Least squares for the terms of the model, linear in all of them, all points alike.
+    """Fit principal distance, principal point and distortion of a line camera to angles and image positions.
+
+    The model is L = c + f tan W - p tan^2 W + k3 tan^3 W. The estimate is that of equal weights; its covariance follows
+    from the given noise, which may be correlated between points.
 
     Parameters
     ----------
-    position : ArrayLike
-        (N,), m.
-    angle : ArrayLike
-        (N,), rad.
-    covariance : ArrayLike
-        Noise of the positions: (N, N) m^2, or sigmas (N,) or one sigma, m.
-    terms : Sequence[str]
-        Names out of `TERMS`, with principal_distance among them.
-    angle_covariance : ArrayLike | None
-        The same of the angles, rad^2 or rad; it acts through dL/dW. Its effect on tan W itself (attenuation) is of the
-        order (sigma_W / W)^2, below 1e-8, and left out.
+    position : (N,) array_like
+        Image positions L along the line, in metres.
+    angle : (N,) array_like
+        Angles W of the directions, in radians, counted in the same sense.
+    covariance : float, (N,) or (N, N) array_like
+        Noise of the positions: standard deviations in metres, or their covariance in m^2.
+    terms : sequence of str
+        Terms to fit, of "constant", "principal_distance", "principal_point" and "radial3".
+    angle_covariance : float, (N,) or (N, N) array_like, optional
+        Noise of the angles, in radians or rad^2.
+
+    Returns
+    -------
+    InteriorOrientation
+        `value` and `sigma` of each term, `covariance`, residuals, chi-square, and `point`, which says whether the
+        principal point can be observed.
 
     Raises
     ------
-    OrientationError
-        Bad readings or noise, fewer angles than terms, nearly constant angles, angles that count against the positions,
-        terms that these angles do not separate.
+    ValueError
+        Arrays of other shapes, values that are not finite, fewer angles than terms, angles that do not separate the
+        terms, or angles that count against the positions.
+
+    Notes
+    -----
+    Li et al., Infrared and Laser Engineering, doi 10.3788/IRLA20200143, equations 1 to 4, with a constant and a radial
+    term. The errors of the angles act through dL/dW; their effect on tan W itself is of the order (sigma_W / W)^2.
 
     Examples
     --------

@@ -200,25 +200,33 @@ def widest_step(angle: ArrayLike) -> float:
 def fit_dividing_error(
     angle: ArrayLike, value: ArrayLike, sigma: ArrayLike, method: str = "cubic_spline", seed: int = 0
 ) -> AngleFit:
-    """Fit a curve.
+    """Fit the dividing error of a turntable as a curve over the angle.
+
+    The order or the smoothing of the curve is chosen by leave-one-out cross-validation.
 
     Parameters
     ----------
-    name : str
-        One of `FITS`.
-    angle : ArrayLike
-        (N,) radians, increasing.
-    value : ArrayLike
-        (N,).
-    sigma : ArrayLike
-        Standard deviations, (N,) or one number, greater than zero.
+    angle : (N,) array_like
+        Angles, in radians, increasing.
+    value : (N,) array_like
+        Dividing error (reading minus true angle) at these angles, in any unit.
+    sigma : float or (N,) array_like
+        Standard deviations of the values, in the same unit, greater than zero.
+    method : {"cubic_spline", "piecewise_linear", "polynomial", "fourier", "network"}
+        Kind of curve.
     seed : int
-        Of the network's random starts; the others do not use it.
+        Seed of the random starts of "network"; the other methods do not use it.
+
+    Returns
+    -------
+    AngleFit
+        The curve. Call it with angles; `weights` and `covariance` give its derivative with respect to the values and
+        its covariance; `settings` are the chosen order, period or smoothing.
 
     Raises
     ------
     ValueError
-        Unknown name, wrong shapes, constant or repeated angles, fewer angles than the fit needs.
+        Another method, arrays of other shapes, angles that do not increase, or fewer angles than the method needs.
     NotConvergedError
         The network found no minimum.
 
@@ -440,20 +448,27 @@ def limit(n: ArrayLike) -> Array:
 
 
 def chauvenet(readings: ArrayLike, present: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-    """Which readings to keep, (..., n) bool.
+    """Return which of repeated readings to keep by Chauvenet's criterion, applied once.
+
+    A reading is rejected if fewer than half a reading would be expected at its deviation or beyond.
 
     Parameters
     ----------
-    readings : ArrayLike
-        (..., n); the last axis holds the repeats of one quantity, in any unit.
-    present : NDArray[np.bool_] | None
-        (..., n), which of them were taken, where quantities have different numbers of repeats; the others hold any
-        finite number and are not kept. None for all.
+    readings : (..., n) array_like
+        Readings, in any unit; the last axis holds the repeats of one quantity.
+    present : (..., n) ndarray of bool, optional
+        Readings that were taken, if quantities have different numbers of repeats; the others may hold any finite
+        number.
+
+    Returns
+    -------
+    (..., n) ndarray of bool
+        True for readings to keep.
 
     Raises
     ------
     ValueError
-        Not finite.
+        A reading is not finite.
 
     Examples
     --------

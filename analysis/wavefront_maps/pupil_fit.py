@@ -284,16 +284,16 @@ _ROUND_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Pupil:
-    """Where the pupil lies in a map.
+    """Circle of a pupil in a map.
 
     Attributes
     ----------
     x : float
-        Column of its centre, the first is 0.
+        Column of the centre, in pixels; the first column is 0.
     y : float
-        Row of its centre.
+        Row of the centre, in pixels.
     radius : float
-        pixels.
+        Radius, in pixels.
 
     Examples
     --------
@@ -344,17 +344,24 @@ class MapFit:
 
 
 def find_pupil(values: ArrayLike) -> Pupil:
-    """The circle about the lit areas, but for specks; holes, spiders and edges that are cut off do not move it.
+    """Find centre and radius of the pupil in a map from the edge of its measured area.
+
+    Specks, holes, spiders and cut-off edges do not change the circle.
 
     Parameters
     ----------
-    measured : WavefrontMap
-        map.
+    values : (rows, columns) array_like
+        Map with NaN where nothing was measured.
+
+    Returns
+    -------
+    Pupil
+        Centre and radius, in pixels.
 
     Raises
     ------
-    UndeterminedError
-        No light, or an edge that is round in less than half of the full angle.
+    ValueError
+        No measured pixel, or an edge that is round in less than half of the full angle.
 
     Examples
     --------
@@ -422,23 +429,33 @@ def _off(points: Array, circle: tuple[float, float, float]) -> Array:
 
 
 def fit_wavefront_map(values: ArrayLike, terms: Sequence[int], pupil: Pupil | None = None) -> MapFit:
-    """Least squares of Zernike terms over the lit pixels of a pupil, all of the same weight.
+    """Fit Zernike terms to the measured pixels of a wavefront map, over a pupil of any shape.
 
     Parameters
     ----------
-    measured : WavefrontMap
-        Map, turned as its user wants it.
-    terms : Sequence[int]
-        Indices of Noll in ascending order; piston and tilt belong to them unless the map has none.
-    pupil : Pupil | None
-        Where it lies; None to find it by the lit area.
+    values : (rows, columns) array_like
+        Optical path difference or height, in metres or any other unit, NaN where nothing was measured.
+    terms : sequence of int
+        Noll's indices in ascending order. Piston and tilt, 1 to 3, belong to them unless the map has none.
+    pupil : Pupil, optional
+        Centre and radius of the unit disk; by default `find_pupil` finds them.
+
+    Returns
+    -------
+    MapFit
+        `coefficients` of the circular terms, rms over the full disk, and `parts`, the coefficients of terms that are
+        orthonormal over the measured pixels.
 
     Raises
     ------
-    UndeterminedError
-        No light in the pupil, or terms that the light does not tell apart.
-    MapError
-        Terms that are not ascending.
+    ValueError
+        A map that is not a plane, terms that are not ascending, no measured pixels in the pupil, or terms that the
+        measured pixels do not separate.
+
+    Notes
+    -----
+    Over a ring the orthonormal terms are Mahajan's annular polynomials, J. Opt. Soc. Am. 71, 75 (1981), up to the
+    pixels.
 
     Examples
     --------

@@ -54,14 +54,19 @@ def noll_to_nm(index: int) -> tuple[int, int]:
 
 
 def nm_to_noll(n: int, m: int) -> int:
-    """Noll's index of a term.
+    """Return Noll's index of a Zernike term.
 
     Parameters
     ----------
     n : int
         Radial order.
     m : int
-        Azimuthal order, negative of sine terms.
+        Azimuthal order, negative for sine terms.
+
+    Returns
+    -------
+    int
+        Noll's index, 1 for piston.
 
     Examples
     --------
@@ -76,12 +81,22 @@ def nm_to_noll(n: int, m: int) -> int:
 
 
 def fringe_to_nm(index: int) -> tuple[int, int]:
-    """Orders of a term of the Fringe set of the University of Arizona.
+    """Return the orders of a term of the Fringe set (University of Arizona).
 
     Parameters
     ----------
     index : int
-        1 for piston, up to 37.
+        Fringe index, 1 for piston, up to 37.
+
+    Returns
+    -------
+    n, m : int
+        Radial and azimuthal order; m is negative for sine terms.
+
+    Raises
+    ------
+    ValueError
+        An index out of range.
 
     Examples
     --------
@@ -104,12 +119,22 @@ def fringe_to_nm(index: int) -> tuple[int, int]:
 
 
 def ansi_to_nm(index: int) -> tuple[int, int]:
-    """Orders of a term of the American standard Z80.28, which is that of the Optical Society.
+    """Return the orders of a term in the order of ANSI Z80.28, which is also that of OSA.
 
     Parameters
     ----------
     index : int
-        0 for piston.
+        ANSI index, 0 for piston.
+
+    Returns
+    -------
+    n, m : int
+        Radial and azimuthal order; m is negative for sine terms.
+
+    Raises
+    ------
+    ValueError
+        An index out of range.
 
     Examples
     --------

@@ -34,7 +34,7 @@ class Pair:
         return self.true + np.random.default_rng(9).uniform(-2.0, 2.0, self.true.shape)
 
     def matched(self, options: MatchOptions | None = None) -> Matches:
-        return match_windows(self.second, self.templates(), self.predicted(), reach=4, options=options)
+        return match_windows(self.second, self.templates(), self.predicted(), search_radius=4, options=options)
 
 
 def textured(side, *, slope=1.0, noise=0.1, relief=0.0, length=12.0, radiometry="same", seed=0) -> Pair:

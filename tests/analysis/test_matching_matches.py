@@ -100,7 +100,7 @@ def test_missing_matches_take_no_part_and_bad_input_is_told():
     result = consensus(place, found, degree=1, largest_scatter=5.0)
     assert not result.accepted[:10].any()
     assert np.isnan(result.distance[:10]).all()
-    refuses(ValueError, "5 usable matches do not carry 6 terms; need 12", consensus, place[10:15], found[10:15])
+    refuses(ValueError, "5 usable matches are too few for 6 terms; need 12", consensus, place[10:15], found[10:15])
     refuses(ValueError, r"covariances \(100, 2, 2\)", consensus, place, found, covariance=np.zeros((100, 2)))
     refuses(ValueError, "degree of 0 to 3", consensus, place, found, degree=4)
     # an exact field leaves no scatter
@@ -142,7 +142,7 @@ def test_reasons(texture):
     patches = texture.patches(np.nan_to_num(places, nan=50.0))
     patches[6, 3, 4] = np.nan
     patches[8] = 5.0
-    found = match_windows(image, patches, places, reach=10)
+    found = match_windows(image, patches, places, search_radius=10)
     expected = [
         Reason.ACCEPTED,
         Reason.FLAT,
@@ -158,13 +158,13 @@ def test_reasons(texture):
     assert found.texts[3] == "pixels of the image under the template are saturated"
     assert np.isnan(found.place[[4, 5, 6, 7, 8]]).all()
     # more than the reach away, and an image with missing pixels
-    far = match_windows(image, texture.patches([[50.0, 50.0]]), [[50.0, 64.0]], reach=10)
+    far = match_windows(image, texture.patches([[50.0, 50.0]]), [[50.0, 64.0]], search_radius=10)
     assert not far.accepted[0]
     holes = image.astype(float)
     holes[352, 352] = np.nan
-    assert match_windows(holes, texture.patches([[350.0, 350.0]]), [[350.0, 350.0]], reach=10).reason[0] == Reason.IMAGE
+    assert match_windows(holes, texture.patches([[350.0, 350.0]]), [[350.0, 350.0]], search_radius=10).reason[0] == Reason.IMAGE
     # at the image's side the window is cut, and the point is found all the same
-    side = match_windows(image, texture.patches([[17.3, 150.4]]), [[20.0, 150.0]], reach=10)
+    side = match_windows(image, texture.patches([[17.3, 150.4]]), [[20.0, 150.0]], search_radius=10)
     assert side.accepted[0]
     assert side.place[0] == pytest.approx([17.3, 150.4], abs=0.15)
 
@@ -172,10 +172,10 @@ def test_reasons(texture):
 def test_repeated_pattern_is_ambiguous_and_an_edge_is_uncertain():
     rows, columns = np.mgrid[:200.0, :200.0]
     periodic = 800 + 100 * np.sin(2 * np.pi * rows / 9) + 100 * np.sin(2 * np.pi * columns / 9)
-    found = match_windows(detected(periodic, 1), periodic[None, 85:116, 85:116], [[100.0, 100.0]], reach=20)
+    found = match_windows(detected(periodic, 1), periodic[None, 85:116, 85:116], [[100.0, 100.0]], search_radius=20)
     assert found.reason[0] == Reason.AMBIGUOUS
     edge = 800 + 200 * np.tanh((columns - 100.2) / 2)
-    found = match_windows(detected(edge, 2), edge[None, 85:116, 85:116], [[100.0, 100.0]], reach=10)
+    found = match_windows(detected(edge, 2), edge[None, 85:116, 85:116], [[100.0, 100.0]], search_radius=10)
     assert not found.accepted[0]
 
 
@@ -205,7 +205,7 @@ def test_sigma_is_that_of_the_worst_direction():
 
 
 def test_no_points_are_an_empty_result(frame):
-    found = match_windows(frame, np.zeros((0, 31, 31)), np.zeros((0, 2)), reach=10)
+    found = match_windows(frame, np.zeros((0, 31, 31)), np.zeros((0, 2)), search_radius=10)
     assert found.place.shape == (0, 2)
     assert found.covariance.shape == (0, 2, 2)
     assert found.text == "0 of 0 accepted"
@@ -253,7 +253,7 @@ def test_second_peaks_count_from_four_pixels_on():
 @pytest.mark.second
 def test_thresholds_are_options(texture, frame, points):
     patches = texture.patches(points[:30])
-    strict = match_windows(frame, patches, points[:30], reach=5, options=MatchOptions(largest_sigma=0.005))
+    strict = match_windows(frame, patches, points[:30], search_radius=5, options=MatchOptions(largest_sigma=0.005))
     assert np.all(strict.reason == Reason.UNCERTAIN)
-    low = match_windows(frame, patches, points[:30], reach=5, options=MatchOptions(saturation=700.0))
+    low = match_windows(frame, patches, points[:30], search_radius=5, options=MatchOptions(saturation=700.0))
     assert np.all(low.reason == Reason.SATURATED)

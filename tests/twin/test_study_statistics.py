@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.statistics import share_interval
+from analysis.statistics import proportion_interval
 from scenes.specs.study import ParetoSpec
 from tests.twin.study_bench import TEXTS
 from tests.twin.study_data import columns, dataset, study_of
@@ -57,7 +57,7 @@ def test_ranks_by_the_binomial_distribution() -> None:
     assert estimates.quantile_interval(np.arange(1227.0), 0.997)[1] is None
     assert estimates.quantile_interval(np.arange(1228.0), 0.997)[1] == 1227
     for met, count in ((0, 10), (3, 17), (10, 10), (500, 1000)):
-        low, high = share_interval(met, count, 0.95)
+        low, high = proportion_interval(met, count, 0.95)
         # the ends are those of which so many or more, or fewer, come with a chance of 2.5 %
         assert low == 0.0 if met == 0 else stats.binom.sf(met - 1, count, low) == pytest.approx(0.025, rel=1e-9)
         assert high == 1.0 if met == count else stats.binom.cdf(met, count, high) == pytest.approx(0.025, rel=1e-9)
@@ -371,8 +371,8 @@ def test_requirements_count_runs_with_numbers() -> None:
     one = found["requirements"][0]
     assert one["bounds"] == [one["met"] / 50, (one["met"] + 5) / 50]
     assert one["bounds_interval"] == [
-        share_interval(one["met"], 50, 0.95)[0],
-        share_interval(one["met"] + 5, 50, 0.95)[1],
+        proportion_interval(one["met"], 50, 0.95)[0],
+        proportion_interval(one["met"] + 5, 50, 0.95)[1],
     ]
     # a run that stands on its limit meets it
     edge = summary(dataset(study, {"y": np.tile([-0.5, 0.5, 0.0, 0.6, -0.6], 10)}), study)["requirements"]

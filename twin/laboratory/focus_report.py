@@ -142,7 +142,7 @@ def mtf_svg(run: SimulatedFocus) -> str:
             defocus = state.true_place(number)
             for edge in DIRECTIONS:
                 frames = state.focus[number].frames[edge]
-                measured = slanted_edge_mtf(frames.mean(axis=0), noise=ccd.noise, frames=len(frames), even=True)
+                measured = slanted_edge_mtf(frames.mean(axis=0), noise=ccd.noise, frames=len(frames), uniform_light=True)
                 frequency = measured.frequency / ccd.band.pitch
                 true = np.abs(site.imagers[edge].transfer(defocus, frequency))
                 colour = EDGE_COLOURS[edge]

@@ -19,7 +19,7 @@ from sqlalchemy import Select, func, select
 
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
-from analysis.statistics import share_interval
+from analysis.statistics import proportion_interval
 from optics.numerics.number_tree import FrozenMap
 from twin.framework.artefact import SAME
 from twin.operate.estimate.reported_estimate import name_of, percent, with_sigma
@@ -151,7 +151,7 @@ def coverage(sigmas: int, within: int, count: int) -> Coverage:
     count : int
         All components.
     """
-    low, high = share_interval(within, count, CONFIDENCE)
+    low, high = proportion_interval(within, count, CONFIDENCE)
     return Coverage(sigmas, WITHIN[sigmas], count, within / count if count else math.nan, low, high)
 
 

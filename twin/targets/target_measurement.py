@@ -481,7 +481,7 @@ def read_edge(view: View, direction: str, normal: np.ndarray, mean: np.ndarray, 
     found: EdgeMtf | None = None
     reason = ""
     try:
-        found = slanted_edge_mtf(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE, even=True)
+        found = slanted_edge_mtf(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE, uniform_light=True)
     except EdgeError as error:
         reason = str(error)
     at_nyquist = NYQUIST * float(normal[0]), NYQUIST * float(normal[1])

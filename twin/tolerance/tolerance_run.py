@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.statistics import share_interval
+from analysis.statistics import proportion_interval
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
@@ -70,7 +70,7 @@ class Yield:
     def count(cls, passing: np.ndarray) -> Yield:
         """Of cameras that pass or not, (S,)."""
         passed, total = int(np.sum(passing)), len(passing)
-        return cls(passed, total, *share_interval(passed, total, CONFIDENCE))
+        return cls(passed, total, *proportion_interval(passed, total, CONFIDENCE))
 
     @property
     def share(self) -> float:

@@ -130,7 +130,7 @@ class ReferenceHeights:
     def __call__(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
         """Return heights at positions, in metres; NaN beyond the posts, and where one of the next four is missing."""
         place = np.stack(self.raster.row_column(east, north))
-        found = map_coordinates(self.coefficients, place, order=3, mode="mirror", prefilter=False)
+        height = map_coordinates(self.coefficients, place, order=3, mode="mirror", prefilter=False)
         last = np.array(self.coefficients.shape).reshape(2, *(1,) * (place.ndim - 1)) - 1
         known = np.all((place >= 0.0) & (place <= last), axis=0)
         valid = self.raster.valid
@@ -138,7 +138,7 @@ class ReferenceHeights:
             cell = np.clip(np.floor(np.nan_to_num(place)).astype(np.intp), 0, np.maximum(last - 1, 0))
             for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
                 known &= valid[np.minimum(cell[0] + down, last[0]), np.minimum(cell[1] + across, last[1])]
-        return np.asarray(np.where(known, found, np.nan))
+        return np.asarray(np.where(known, height, np.nan))
 
     @property
     def mean(self) -> float:
@@ -353,7 +353,7 @@ class MatchedLine:
         return {status_text(code): number for code, number in count.most_common()}
 
     def displacement(self, place: np.ndarray, height: np.ndarray) -> np.ndarray:
-        """Return the smooth displacement (n, 2) from predicted to measured at positions (n, 2), heights (n,) in metres."""
+        """Return the smooth displacement (n, 2) from predicted to measured at positions (n, 2) and heights (n,)."""
         if self.way is None:
             return np.zeros_like(place)
         return self.way(place, None if self.way.heights is None else height)
@@ -432,7 +432,7 @@ def measure_points(patch: ImagedGround, spec: ImagePointsSpec) -> PatchPoints:
 
 def status_text(code: int) -> str:
     """Return the status of a match in words."""
-    extra = {CONSENSUS: "its neighbours contradict it", SOURCE: "chosen here"}
+    extra = {CONSENSUS: "contradicted by its neighbours", SOURCE: "chosen in this image"}
     return extra.get(code) or Reason(code).text
 
 
@@ -460,7 +460,7 @@ def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
         lines[name] = _matched(name, image, patterns, at, _rise(patch, image, ground, at), height, spec)
     which = np.arange(len(east))
     share = spec.check / max(wanted, 1)
-    # spread evenly over the strength of the points
+    # Check points are spread evenly over the strength of the points.
     check = np.floor((which + 1) * share + 1e-9) > np.floor(which * share + 1e-9)
     return MatchedPoints("map", east, north, height, ground, check, FrozenMap(lines))
 
@@ -534,7 +534,7 @@ def _require_room(patch: ImagedGround, spec: ImagePointsSpec) -> None:
             size = " x ".join(str(n) for n in image.frame.shape)
             raise PointsError(
                 f"the image of {name}, {size} pixels, has no room for a template of {spec.template} pixels that is "
-                f"sought {spec.reach} pixels to each side; that takes more than {least}"
+                f"searched {spec.reach} pixels to each side; more than {least} pixels are needed"
             )
 
 
@@ -582,9 +582,9 @@ def _followed(
         if known is not None:
             at = place - known.displacement(at, height)
         points = image.measured.ground(*image.image_point(at[:, 0], at[:, 1]), height)
-        found = heights(*patch.frame.local(points)[:2])
-        height = np.where(np.isfinite(found), found, height)
-    points[~np.isfinite(found)] = np.nan
+        ground_height = heights(*patch.frame.local(points)[:2])
+        height = np.where(np.isfinite(ground_height), ground_height, height)
+    points[~np.isfinite(ground_height)] = np.nan
     return np.asarray(points)
 
 
@@ -605,18 +605,18 @@ def _matched(
 ) -> MatchedLine:
     """Match templates in one line's frame, and reject matches that contradict their neighbours."""
     options = MatchOptions(least_correlation=spec.least_correlation, largest_sigma=spec.largest_sigma)
-    found = match_windows(image.frame, patterns, at, reach=spec.reach, options=options)
-    status = found.reason.astype(np.int64)
-    good = found.accepted
+    match = match_windows(image.frame, patterns, at, search_radius=spec.reach, options=options)
+    status = match.reason.astype(np.int64)
+    good = match.accepted
     degree = _degree(int(good.sum()))
     if degree is None:
-        raise PointsError(f"{name}: too few matches to tell right from wrong: {found.text}")
-    place = np.where(good[:, None], found.place, np.nan)
+        raise PointsError(f"{name}: too few matches for a consensus: {match.text}")
+    place = np.where(good[:, None], match.place, np.nan)
     agreed = consensus(
         at,
         place,
-        # neither wrong reference heights nor an attitude that swings make a wrong match
-        covariance=found.covariance
+        # Errors of reference heights and a swinging attitude do not make a match wrong.
+        covariance=match.covariance
         + spec.height_sigma**2 * rise[:, :, None] * rise[:, None, :]
         + spec.roughness**2 * np.eye(2),
         height=height if np.ptp(height[good]) > 1.0 else None,
@@ -624,13 +624,13 @@ def _matched(
         false_alarm=spec.false_alarm,
     )
     if not agreed.accepted.any():
-        raise PointsError(f"{name}: {agreed.text}; {found.text}")
+        raise PointsError(f"{name}: {agreed.text}; {match.text}")
     status[good & ~agreed.accepted] = CONSENSUS
     return MatchedLine(
         at,
-        found.place,
-        found.covariance,
-        found.correlation,
+        match.place,
+        match.covariance,
+        match.correlation,
         status,
         (image.window.first_line, image.window.first_pixel),
         agreed.scatter,

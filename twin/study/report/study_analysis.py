@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.statistics import share_interval
+from analysis.statistics import proportion_interval
 from scenes.specs.study import ParetoSpec, ThresholdSpec
 from twin.framework.record import Quantity, Record
 from twin.study.report import study_statistics as statistics
@@ -165,7 +165,7 @@ class Requirement:
         """
         if self.bounds is None or (self.interval is None and self.count):
             return None
-        (low, _), (_, high) = (share_interval(met, self.runs, statistics.CONFIDENCE) for met in (self.met, self.most))
+        (low, _), (_, high) = (proportion_interval(met, self.runs, statistics.CONFIDENCE) for met in (self.met, self.most))
         return low, high
 
 
@@ -212,7 +212,7 @@ def _counted(
     unit: str,
 ) -> Requirement:
     met, count = int(np.sum(good & known)), int(np.sum(known))
-    interval = share_interval(met, count, statistics.CONFIDENCE) if runs.sampled and count else None
+    interval = proportion_interval(met, count, statistics.CONFIDENCE) if runs.sampled and count else None
     return Requirement(name, text, met, count, runs.count, interval, judged, unit)
 
 

@@ -202,7 +202,7 @@ def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
     """Edges along the track at the fields of a band, measured after the alignment."""
     noise, focus = alignment.bench.ccds[band].noise, alignment.states[-1].focus
     stacks = [f.frames[TRACK] for f, site in zip(focus, alignment.bench.sites, strict=True) if site.band == band]
-    return [slanted_edge_mtf(frames.mean(axis=0), noise=noise, frames=len(frames), even=True) for frames in stacks]
+    return [slanted_edge_mtf(frames.mean(axis=0), noise=noise, frames=len(frames), uniform_light=True) for frames in stacks]
 
 
 def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
