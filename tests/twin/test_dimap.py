@@ -155,7 +155,7 @@ def test_bands(tmp_path: Path) -> None:
     other = text.replace("<XLOS_0>-0.022<", "<XLOS_0>-0.021<", 1)
     assert other != text
     path.write_text(other)
-    with pytest.raises(InputError, match="bands do not look alike"):
+    with pytest.raises(InputError, match="bands have different look angles"):
         read_dimap(path)
     one, two = (read_dimap(path, band) for band in ("B0", "B1"))
     assert one.right[0] == pytest.approx(two.right[0] - 0.001)

@@ -125,7 +125,7 @@ def test_a_geoid_of_a_region_reaches_to_its_outermost_nodes(tmp_path: Path) -> N
     np.testing.assert_allclose(geoid(lon - 360.0, lat), values, rtol=0, atol=1e-5)
     assert geoid([11.75], [50.75]) == pytest.approx(np.mean(values[:2, 3:]), abs=1e-5)
     for away in ((9.999, 50.5), (12.001, 50.5), (11.0, 51.001), (11.0, 49.999)):
-        with pytest.raises(Problem, match="beyond the grid of the geoid"):
+        with pytest.raises(Problem, match="outside the grid of the geoid"):
             geoid(*away)
 
 

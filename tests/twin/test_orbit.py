@@ -153,5 +153,5 @@ def test_bad_orbits() -> None:
         orbit(before="0 s", state={**thrown, "position": ["6000 km", "0 m", "0 m"]})
     found = orbit()
     for outside in (600.1, -601.0, math.nan):
-        with pytest.raises(ValueError, match="time outside the orbit, which is known from -600 s to 600 s"):
+        with pytest.raises(ValueError, match="time outside the orbit, which covers -600 s to 600 s"):
             found.itrs([0.0, outside])

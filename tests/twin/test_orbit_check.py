@@ -63,7 +63,7 @@ def test_what_is_stated_rightly_stands_and_what_cannot_be_told_is_said(files) ->
     platform by two arcseconds, and say so.
     """
     found = checked(files)
-    assert found.verdict == "stands"
+    assert found.verdict == "confirmed"
     assert found.best.changes == ()
     assert 0.5 < found.best.fit.chi_square / found.best.fit.freedom < 1.6
     open_ones = {name for name, answers in found.answers.items() if sum(a.possible for a in answers) > 1}
@@ -225,7 +225,7 @@ def gcp(files: tuple[Path, dict[str, Any]]) -> tuple[Path, dict[str, Any]]:
 @pytest.mark.second
 def test_places_in_images_of_a_gcp_file(gcp: tuple[Path, dict[str, Any]]) -> None:
     table, found = checked(gcp), checked(gcp, GCP, (("image_points", "file"), "points.gcp"))
-    assert found.verdict == table.verdict == "stands"
+    assert found.verdict == table.verdict == "confirmed"
     assert found.best.fit.chi_square == pytest.approx(table.best.fit.chi_square, rel=1e-9)
 
 

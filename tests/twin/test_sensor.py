@@ -245,10 +245,10 @@ def test_what_the_image_does_not_hold_is_nan(trajectory) -> None:
 def test_clear_errors_outside_the_image_and_the_orbit(trajectory) -> None:
     model = sensor(TH1["nadir"], ALL, trajectory)
     for line in (-0.6, LINES - 0.4, np.nan):
-        with pytest.raises(ValueError, match="line outside the image"):
+        with pytest.raises(ValueError, match="line lies outside the image"):
             model.ground(line, 6000.0)
     for pixel in (-0.6, 11999.6):
-        with pytest.raises(ValueError, match="pixel outside the line"):
+        with pytest.raises(ValueError, match="pixel lies outside the line"):
             model.ground(0.0, pixel)
     with pytest.raises(ValueError, match="time outside the orbit"):
         Sensor(TH1["nadir"], trajectory, EARTH, 0.7e-3, 595.0, LINES)

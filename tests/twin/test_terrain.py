@@ -97,7 +97,7 @@ def test_nothing_beyond_the_ground() -> None:
     ground = reflectance(EXTENT, TEXTURE, SEED)
     corners = np.array([EXTENT.west, EXTENT.east]), np.array([EXTENT.south, EXTENT.north])
     assert np.all(np.isfinite(ground(*corners)))
-    with pytest.raises(ValueError, match="beyond what is known"):
+    with pytest.raises(ValueError, match="outside the grid of the ground"):
         ground(corners[0] * 1.1, corners[1])
 
 

@@ -36,13 +36,19 @@ def _of_fit(get: Callable[[Fit], Any]) -> Callable[[Ranked], Any]:
 
 
 READING: Record[Ranked] = Record(
-    "A reading, and what it leaves of the points.",
-    Quantity("changes", lambda of: dict(of[1].changes), "question -> value that is not the stated one"),
-    Quantity("possible", lambda of: of[1].fit is not None, "whether the points can have been imaged so"),
-    Quantity("why_impossible", lambda of: of[1].why or None, "why they cannot"),
+    "A reading (set of conventions) and its fit to the ground points.",
+    Quantity(
+        "changes", lambda of: dict(of[1].changes), "conventions that differ from the stated ones, with their values"
+    ),
+    Quantity(
+        "possible", lambda of: of[1].fit is not None, "true if the points can have been imaged under this reading"
+    ),
+    Quantity("why_impossible", lambda of: of[1].why or None, "reason why they cannot"),
     Quantity("rms_m", _of_fit(lambda fit: fit.rms), "root mean square residual in plan", "rms", 1),
-    Quantity("rms_px", _of_fit(lambda fit: fit.rms_pixels), "the same along the lines' own axes", "rms", 1),
-    Quantity("chi_square", _of_fit(lambda fit: fit.chi_square), "of the residuals by their covariance"),
+    Quantity(
+        "rms_px", _of_fit(lambda fit: fit.rms_pixels), "root mean square residual along the lines' own axes", "rms", 1
+    ),
+    Quantity("chi_square", _of_fit(lambda fit: fit.chi_square), "of the residuals under their covariance"),
     Quantity("degrees_of_freedom", _of_fit(lambda fit: fit.freedom), "number of residuals"),
     Quantity(
         "cost_above_best",
@@ -51,25 +57,27 @@ READING: Record[Ranked] = Record(
     ),
 )
 ANSWER: Record[Answer] = Record(
-    "What the points say of one value of a convention, the others as in the best reading.",
-    Quantity("value", lambda one: one.value, "what the convention may be"),
-    Quantity("stated", lambda one: one.stated, "whether it is the stated one"),
-    Quantity("best", lambda one: one.best, "whether it is that of the best reading"),
-    Quantity("open", lambda one: one.possible, "whether the points leave it open"),
+    "Test of one value of a convention, with the other conventions as in the best reading.",
+    Quantity("value", lambda one: one.value, "tested value of the convention"),
+    Quantity("stated", lambda one: one.stated, "true for the stated value"),
+    Quantity("best", lambda one: one.best, "true for the value of the best reading"),
+    Quantity("open", lambda one: one.possible, "true if the points do not exclude the value"),
     Quantity(
         "cost_above_best",
         lambda one: one.excess if np.isfinite(one.excess) else None,
         "minus twice the log of the likelihood over that of the best reading",
     ),
-    Quantity("moves_points_by_m", lambda one: one.moved, "root mean square by which the points lie elsewhere"),
-    Quantity("why_impossible", lambda one: one.why or None, "why the points cannot have been imaged so"),
+    Quantity("moves_points_by_m", lambda one: one.moved, "root mean square displacement of the points on the ground"),
+    Quantity(
+        "why_impossible", lambda one: one.why or None, "reason why the points cannot have been imaged under this value"
+    ),
 )
 QUESTION: Record[tuple[Answer, ...]] = Record(
-    "A convention: as stated, as found, and whether the points tell it.",
+    "A convention: its stated and its best value, and whether the points determine it.",
     Quantity("stated", lambda answers: next(one.value for one in answers if one.stated), "value in the test's file"),
     Quantity("best", lambda answers: next(one.value for one in answers if one.best), "value in the best reading"),
-    Quantity("told", lambda answers: sum(one.possible for one in answers) == 1, "whether one value alone is possible"),
-    Quantity("values", lambda answers: answers, "what the points say of each value", record=ANSWER),
+    Quantity("determined", lambda answers: sum(one.possible for one in answers) == 1, "true if one value is possible"),
+    Quantity("values", lambda answers: answers, "test of each value", record=ANSWER),
 )
 
 
@@ -78,11 +86,11 @@ def places_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
 
     A row has longitude, latitude and the distance from the ground point, east and north in metres.
     """
-    found = run.places[changes]
-    if isinstance(found, str):
+    positions = run.places[changes]
+    if isinstance(positions, str):
         return []
     rows, known = [], run.readings.ground.points
-    for camera, at in found.items():
+    for camera, at in positions.items():
         raw = run.first_points[camera]
         lon, lat, _ = Earth().geodetic(at)
         here = known.itrs[raw]
@@ -96,14 +104,14 @@ def places_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
 
 
 PLACE: Record[Placed] = Record(
-    "Where a reading puts the first points; east and north of the ground points that they show.",
-    Quantity("changes", lambda of: dict(of[1]), "question -> value that is not the stated one"),
+    "Ground positions of the first image points under a reading, east and north of their ground points.",
+    Quantity("changes", lambda of: dict(of[1]), "conventions that differ from the stated ones, with their values"),
     Quantity(
         "why_impossible",
         lambda of: at if isinstance(at := of[0].places[of[1]], str) else None,
-        "why the points lie nowhere",
+        "reason why the points have no ground position",
     ),
-    Quantity("points", lambda of: places_of(*of), "row by row"),
+    Quantity("points", lambda of: places_of(*of), "one entry for each point"),
 )
 
 
@@ -114,24 +122,36 @@ def _best(run: Check) -> dict[str, Any]:
 
 
 CHECK: Record[Check] = Record(
-    "check.json. Which readings of a pass explain its ground points.",
-    Quantity("result", lambda run: run.verdict, "stands, another or none: what became of the stated reading"),
-    Quantity("best", lambda run: dict(run.best.changes), "what the best reading takes otherwise than stated"),
-    Quantity("alike", lambda run: [dict(one) for one in run.alike], "other readings that are as likely"),
+    "check.json. Conventions under which a pass explains its ground points.",
+    Quantity(
+        "result", lambda run: run.verdict, "confirmed (the stated conventions), another (other conventions fit) or none"
+    ),
+    Quantity(
+        "best", lambda run: dict(run.best.changes), "conventions of the best reading that differ from the stated ones"
+    ),
+    Quantity(
+        "alike", lambda run: [dict(one) for one in run.alike], "changes of other readings that are equally likely"
+    ),
     Quantity("reading", _best, "every convention of the best reading"),
-    Quantity("readings_tried", lambda run: run.count, "how many readings were tried"),
-    Quantity("decided_by_cost", lambda run: DECIDED, "cost by which two readings are separated"),
-    Quantity("factor_of_variance", lambda run: run.factor, "by how much the sigmas' squares are too small"),
-    Quantity("ground_accuracy_m", lambda run: run.readings.ground.accuracy, "of the way to the ITRS, as stated"),
+    Quantity("readings_tried", lambda run: run.count, "number of readings that were tried"),
+    Quantity("decided_by_cost", lambda run: DECIDED, "difference of cost from which two readings are separated"),
+    Quantity("factor_of_variance", lambda run: run.factor, "factor by which the variances are too small"),
+    Quantity(
+        "ground_accuracy_m",
+        lambda run: run.readings.ground.accuracy,
+        "stated accuracy of the transformation to the ITRS",
+    ),
     Quantity(
         "image_points",
         lambda run: {name: len(raw.line) for name, raw in run.readings.images.items()},
-        "line -> number of its points",
+        "number of image points of each line",
     ),
-    Quantity("gross_errors", lambda run: run.wrong, "line -> points that were left out"),
-    Quantity("questions", lambda run: run.answers, "every convention by itself", record=QUESTION),
-    Quantity("ranking", lambda run: [(run, one) for one in run.tried], "readings, likeliest first", record=READING),
-    Quantity("places", lambda run: [(run, one) for one in run.places], "where the first points fall", record=PLACE),
+    Quantity("gross_errors", lambda run: run.wrong, "rejected points of each line"),
+    Quantity("questions", lambda run: run.answers, "tests of each convention", record=QUESTION),
+    Quantity("ranking", lambda run: [(run, one) for one in run.tried], "readings, the likeliest first", record=READING),
+    Quantity(
+        "places", lambda run: [(run, one) for one in run.places], "ground positions of the first points", record=PLACE
+    ),
 )
 
 
@@ -145,7 +165,7 @@ _NAMED = 6
 
 def check_report(run: Check) -> Report:
     """Return the report of a check."""
-    code = {"stands": 0, "another": ANOTHER, "none": NONE}[run.verdict]
+    code = {"confirmed": 0, "another": ANOTHER, "none": NONE}[run.verdict]
     verdict, more = _verdict(run)
     return Report(
         "Conventions of a pass",
@@ -163,30 +183,30 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
     """Return the verdict and the sentences after it."""
     best, stated = run.best.fit, run.stated_fit
     if run.verdict == "none" or best is None:
-        left = "no reading can have imaged the points" if best is None else (
-            f"the best of {run.count} readings ({changes_text(run.best.changes)}) leaves {_metres(best.rms)}, "
-            f"chi-square {best.chi_square / best.freedom:.3g} times its freedom"
+        left = "the points cannot have been imaged under any of them" if best is None else (
+            f"the best of {run.count} readings ({changes_text(run.best.changes)}) leaves {_metres(best.rms)} rms, "
+            f"chi-square {best.chi_square / best.freedom:.3g} per degree of freedom"
         )  # fmt: skip
         return answer(
-            "None of the readings explains the points",
+            "No combination of conventions explains the ground points",
             left,
-            "three conventions may be wrong at once, or camera, ground points or uncertainty are",
+            "more than two conventions may be wrong at once, or the camera, the ground points or the uncertainty",
         )
-    size = f"{_metres(best.rms)} and {best.rms_pixels:.3g} px on the ground"
+    size = f"{_metres(best.rms)} rms on the ground ({best.rms_pixels:.3g} px)"
     open_ones = [QUESTIONS[name].title for name, answers in run.answers.items() if _open(answers)]
     cannot = "the points determine every convention"
     if open_ones:
         cannot = f"the points do not determine these conventions: {', '.join(open_ones)}"
-    if run.verdict == "stands":
-        return answer(f"The stated conventions explain the points, leaving {size}", cannot)
-    was = f"under them {stated.why}" if stated.fit is None else f"which leave {_metres(stated.fit.rms)}"
-    right = f"the points agree with {changes_text(run.best.changes)}, leaving {size}"
+    if run.verdict == "confirmed":
+        return answer(f"The stated conventions are confirmed: they fit the ground points to {size}", cannot)
+    was = f"under them {stated.why}" if stated.fit is None else f"with residuals of {_metres(stated.fit.rms)} rms"
+    right = f"the points agree with {changes_text(run.best.changes)}, to {size}"
     return answer(f"The stated conventions are wrong, {was}", right, cannot)
 
 
 def _open(answers: tuple[Answer, ...]) -> bool:
     """Return whether more than one value of a convention is possible."""
-    return sum(one.possible for one in answers) > 1
+    return sum(candidate.possible for candidate in answers) > 1
 
 
 def _metres(value: float) -> str:
@@ -196,19 +216,19 @@ def _metres(value: float) -> str:
 
 def _lead(run: Check) -> tuple[str, ...]:
     """Return sentences on wrong and undetermined conventions."""
-    lines = [f"Fits alike: {changes_text(one)}." for one in run.alike]
+    lines = [f"Equally likely: {changes_text(alternative)}." for alternative in run.alike]
     for name, answers in run.answers.items():
         question = QUESTIONS[name]
-        stated = next(one for one in answers if one.stated)
-        best = next(one for one in answers if one.best)
+        stated = next(alternative for alternative in answers if alternative.stated)
+        best = next(alternative for alternative in answers if alternative.best)
         if run.verdict == "another" and not stated.possible:
-            lines.append(f"{question.title}: {question.text(best.value)}, and not {question.text(stated.value)}.")
+            lines.append(f"{question.title}: {question.text(best.value)} instead of {question.text(stated.value)}.")
         elif _open(answers):
-            others = [one for one in answers if one.possible and not one.best]
-            moved = max(one.moved or 0.0 for one in others)
-            texts = ", ".join(question.text(one.value) for one in (best, *others))
+            others = [alternative for alternative in answers if alternative.possible and not alternative.best]
+            moved = max(alternative.moved or 0.0 for alternative in others)
+            texts = ", ".join(question.text(alternative.value) for alternative in (best, *others))
             lines.append(
-                f"{question.title}: {texts} fit alike; they differ by {_metres(moved)}, which the uncertainty hides."
+                f"{question.title}: {texts} fit equally well; they differ by {_metres(moved)}, within the uncertainty."
             )
     return tuple(lines)
 
@@ -219,38 +239,40 @@ def _facts(run: Check) -> tuple[tuple[str, str], ...]:
     return (
         ("Camera", run.setup.camera.name),
         ("Image points", ", ".join(f"{name} {len(raw.line)}" for name, raw in images.items())),
-        ("Attitude may be wrong by", f"{np.degrees(size.attitude) * 3600.0:.4g} arcsec about each axis"),
-        ("Orbit may be wrong by", f"{size.position:.4g} m"),
-        ("Lines may be wrong by", f"{size.interior:.4g} px in place, {1e6 * size.scale:.4g} ppm in principal distance"),
-        ("Line times may be wrong by", f"{1e3 * size.time:.4g} ms"),
+        ("Uncertainty of the attitude", f"{np.degrees(size.attitude) * 3600.0:.4g} arcsec about each axis"),
+        ("Uncertainty of the orbit", f"{size.position:.4g} m"),
+        (
+            "Uncertainty of the lines",
+            f"{size.interior:.4g} px in position, {1e6 * size.scale:.4g} ppm in principal distance",
+        ),
+        ("Uncertainty of the line times", f"{1e3 * size.time:.4g} ms"),
     )
 
 
-def _row(one: Tried, run: Check) -> tuple[Cell, ...]:
+def _row(tried: Tried, run: Check) -> tuple[Cell, ...]:
     """Return the table row of a reading."""
-    if one.fit is None:
-        return changes_text(one.changes), None, None, None, None, one.why
-    excess = run.excess(one)
-    told = "best" if one is run.best else "fits alike" if excess < DECIDED else "excluded"
-    ratio = one.fit.chi_square / one.fit.freedom
-    return changes_text(one.changes), one.fit.rms, one.fit.rms_pixels, ratio, max(excess, 0.0), told
+    if tried.fit is None:
+        return changes_text(tried.changes), None, None, None, None, tried.why
+    excess = run.excess(tried)
+    verdict = "best" if tried is run.best else "equally likely" if excess < DECIDED else "excluded"
+    ratio = tried.fit.chi_square / tried.fit.freedom
+    return changes_text(tried.changes), tried.fit.rms, tried.fit.rms_pixels, ratio, max(excess, 0.0), verdict
 
 
 def _ranking(run: Check) -> Table:
     """Return the table of the likeliest readings."""
-    stated, single = run.stated_fit, [one for one in run.tried if len(one.changes) <= 1 and one is not run.best]
-    first = [run.best, *(one for one in run.tried if one.changes in run.alike)]
+    stated, single = run.stated_fit, [tried for tried in run.tried if len(tried.changes) <= 1 and tried is not run.best]
+    first = [run.best, *(tried for tried in run.tried if tried.changes in run.alike)]
     first += [stated] if stated not in first else []
-    rest = [one for one in single if one not in first][: _LISTED - len(first)]
+    rest = [tried for tried in single if tried not in first][: _LISTED - len(first)]
     return Table(
         "ranking",
         "Readings, the likeliest first",
-        f"Those that change one convention; check.json has all of {run.count}. Residuals in plan, as they are; "
-        "chi-square over its freedom with what camera and platform may be wrong by; cost: minus twice the log "
-        "of the likelihood "
-        "over the best one's.",
+        f"Readings with one changed convention; check.json has those fitted of {run.count} tried. Residuals in plan; "
+        "chi-square per degree of freedom, including the uncertainty of camera and platform; cost: minus twice the "
+        "log likelihood ratio to the best reading.",
         ("reading", "rms [m]", "rms [px]", "chi-square", "cost", "verdict"),
-        [_row(one, run) for one in (*first, *rest)],
+        [_row(tried, run) for tried in (*first, *rest)],
         (None, 1, 1, 2, 1, None),
     )
 
@@ -260,63 +282,78 @@ def _questions(run: Check) -> Section:
     rows: list[tuple[Cell, ...]] = []
     for name, answers in run.answers.items():
         question = QUESTIONS[name]
-        for one in answers:
-            told = "best" if one.best else "cannot be told from the best" if one.possible else one.why or "excluded"
-            cost = max(one.excess, 0.0) if np.isfinite(one.excess) else None
-            rows.append((question.title, question.text(one.value), "yes" if one.stated else "", one.moved, cost, told))
+        for candidate in answers:
+            verdict = (
+                "best" if candidate.best else "not excluded" if candidate.possible else candidate.why or "excluded"
+            )
+            cost = max(candidate.excess, 0.0) if np.isfinite(candidate.excess) else None
+            rows.append(
+                (
+                    question.title,
+                    question.text(candidate.value),
+                    "yes" if candidate.stated else "",
+                    candidate.moved,
+                    cost,
+                    verdict,
+                )
+            )
     text = (
-        "Each convention by itself, the others as in the best reading. A value cannot be told from the best if the"
-        " points would lie elsewhere by no more than camera and platform may be wrong by: give smaller uncertainties, "
-        "after a calibration, or more points, if it matters.",
+        "Each convention by itself, the others as in the best reading. A value is not excluded if it moves the points "
+        "by no more than the uncertainty of camera and platform. If it matters, give smaller uncertainties after a "
+        "calibration, or more points.",
     )
     table = Table(
         "questions",
         "Conventions",
-        "Moved: root mean square by which the points lie elsewhere than in the best reading.",
-        ("convention", "value", "stated", "moved [m]", "cost", "what the points say"),
+        "Moved: root mean square displacement of the points from the best reading.",
+        ("convention", "value", "stated", "moved [m]", "cost", "verdict"),
         rows,
         (None, None, None, 1, 1, None),
     )
-    return Section("What the points say of each convention", text, (table,))
+    return Section("Test of each convention", text, (table,))
 
 
 def _places(run: Check) -> Section:
     """Return the report section on the ground positions of the first points."""
     rows: list[tuple[Cell, ...]] = []
-    for changes, found in run.places.items():
-        if isinstance(found, str):
-            rows.append((changes_text(changes), "", "", None, None, None, None, found))
+    for changes, positions in run.places.items():
+        if isinstance(positions, str):
+            rows.append((changes_text(changes), "", "", None, None, None, None, positions))
         for k, place in enumerate(places_of(run, changes)):
             numbers = [place[key] for key in ("longitude_deg", "latitude_deg", "east_m", "north_m")]
             rows.append((changes_text(changes) if k == 0 else "", place["point"], place["camera"], *numbers, ""))
     table = Table(
         "places",
-        "Where the first points fall",
-        "At the heights of their ground points; east and north of them.",
-        ("reading", "point", "line", "longitude [deg]", "latitude [deg]", "east [m]", "north [m]", "else"),
+        "Ground positions of the first points",
+        "Image points followed to the heights of their ground points; east and north of these.",
+        ("reading", "point", "line", "longitude [deg]", "latitude [deg]", "east [m]", "north [m]", "problem"),
         rows,
         (None, None, None, 6, 6, 1, 1, None),
     )
-    text = ("With one convention changed at a time, from the stated reading.",)
-    return Section("Where the first points fall", text, (table,))
+    text = ("The stated reading, with one convention changed at a time.",)
+    return Section("Ground positions of the first points", text, (table,))
 
 
 def _warnings(run: Check) -> tuple[str, ...]:
     """Return warnings on gross errors, underestimated sigmas, datum and Earth orientation."""
-    found = []
+    texts = []
     for name, points in run.wrong.items():
         if points:
             more = f" and {len(points) - _NAMED} more" if len(points) > _NAMED else ""
-            found.append(f"left out as gross errors in {name}: {', '.join(points[:_NAMED])}{more}")
+            texts.append(f"rejected as gross errors in {name}: {', '.join(points[:_NAMED])}{more}")
     if run.factor > 2.0:
-        found.append(f"residuals are {np.sqrt(run.factor):.1f} times as large as the sigmas and uncertainties predict")
+        texts.append(
+            f"residuals are {np.sqrt(run.factor):.1f} times as large as predicted by the sigmas and uncertainties"
+        )
     accuracy = run.readings.ground.accuracy
     if accuracy is None:
-        found.append("how good the way of the ground points' datum to WGS 84 is, is not stated by its authority")
+        texts.append(
+            "the accuracy of the datum transformation of the ground points to WGS 84 is not stated by its authority"
+        )
     elif accuracy > 0.1:
-        found.append(f"the way of the ground points' datum to WGS 84 is good to {accuracy:g} m only")
+        texts.append(f"the datum transformation of the ground points to WGS 84 is accurate to {accuracy:g} m only")
     if run.readings.platform.earth is None:
-        found.append(
+        texts.append(
             "no Earth orientation was given, so that inertial frames were tried with UT1 - UTC and polar motion of 0"
         )
-    return tuple(found)
+    return tuple(texts)

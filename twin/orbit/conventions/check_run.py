@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.orbit.setup import CheckSetup
 
-Verdict = Literal["stands", "another", "none"]
+Verdict = Literal["confirmed", "another", "none"]
 DECIDED = 20.0
 """Difference of cost from which two readings are separated.
 
@@ -164,26 +164,26 @@ class Check:
     count: int
     wrong: dict[str, tuple[str, ...]]
 
-    def excess(self, one: Tried) -> float:
+    def excess(self, tried: Tried) -> float:
         """Return the cost of a reading beyond that of the best one, divided by the factor of the variances.
 
         It is infinite for an impossible reading.
         """
-        return (one.cost - self.best.cost) / self.factor
+        return (tried.cost - self.best.cost) / self.factor
 
     @property
     def alike(self) -> tuple[Changes, ...]:
         """Equally likely readings with no more changes than the best one, which the points do not separate."""
         return tuple(
-            one.changes
-            for one in self.tried
-            if one is not self.best and len(one.changes) <= len(self.best.changes) and self.excess(one) < DECIDED
+            tried.changes
+            for tried in self.tried
+            if tried is not self.best and len(tried.changes) <= len(self.best.changes) and self.excess(tried) < DECIDED
         )
 
     @property
     def stated_fit(self) -> Tried:
         """Stated reading with its fit."""
-        return next(one for one in self.tried if not one.changes)
+        return next(tried for tried in self.tried if not tried.changes)
 
 
 def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> Check:
@@ -208,15 +208,15 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
             ids, images = readings.ground.points.ids, bench.readings.images
             wrong = {name: tuple(map(str, ids[images[name].point[mask]])) for name, mask in masks.items()}
             bench = bench.without(masks)
-            tried = [_tried(bench, stated, one.changes) for one in tried]
+            tried = [_tried(bench, stated, item.changes) for item in tried]
             best = _best(tried)
     advance("readings", 2, 3)
     ratio = np.inf if best.fit is None else best.fit.chi_square / best.fit.freedom
-    verdict: Verdict = "none" if ratio > _FITS else "another" if best.changes else "stands"
+    verdict: Verdict = "none" if ratio > _FITS else "another" if best.changes else "confirmed"
     factor = max(float(ratio), 1.0) if np.isfinite(ratio) else 1.0
     answers = {name: _answers(bench, stated, best, name, values, factor) for name, values in others.items()}
-    places = {one: _first_places(bench, stated, one, setup.test.shown) for one in _shown(others, best)}
-    tried.sort(key=lambda one: (one.cost, len(one.changes)))
+    places = {item: _first_places(bench, stated, item, setup.test.shown) for item in _shown(others, best)}
+    tried.sort(key=lambda item: (item.cost, len(item.changes)))
     advance("readings", 3, 3)
     first = {name: raw.point[: setup.test.shown] for name, raw in bench.readings.images.items()}
     return Check(setup, readings, stated, tuple(tried), best, verdict, factor, answers, first, places, count, wrong)
@@ -232,9 +232,7 @@ def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -
     total = sum(len(raw.line) for raw in images.values())
     if total < 3:
         file = setup.test.image_points.file
-        raise InputError(
-            Issue("too few image points to tell anything", file, found=str(total), allowed="three or more")
-        )
+        raise InputError(Issue("too few image points for a check", file, found=str(total), allowed="three or more"))
     clock = next(iter(readings.lines.values())).clock
     epoch = epoch_before(clock.instants("TAI"))
     part = PassReadings(readings.platform, readings.lines, readings.ground, images)
@@ -258,8 +256,8 @@ def _searched(
             size = _rough(bench, changed(stated, changes))
             if len(changes) <= 1 or np.isfinite(size):
                 rough.append((size, len(changes), changes))
-        rough.sort(key=lambda one: one[:2])
-        chosen = [one[2] for k, one in enumerate(rough) if k < _CANDIDATES or one[1] <= 1]
+        rough.sort(key=lambda item: item[:2])
+        chosen = [item[2] for k, item in enumerate(rough) if k < _CANDIDATES or item[1] <= 1]
         fitted |= {_key(changes): _tried(bench, stated, changes) for changes in chosen}
         best = _best(list(fitted.values()))
         if best.fit is None or best.fit.chi_square / best.fit.freedom <= _FITS or best.changes == start:
@@ -291,12 +289,12 @@ def _tried(bench: PassBench, stated: PassConventions, changes: Changes) -> Tried
 
 def _best(tried: Sequence[Tried]) -> Tried:
     """Return the reading with the fewest changes among those that are as likely as any."""
-    least = min(tried, key=lambda one: one.cost)
+    least = min(tried, key=lambda reading: reading.cost)
     if least.fit is None:
-        return next(one for one in tried if not one.changes)
+        return next(reading for reading in tried if not reading.changes)
     factor = max(least.fit.chi_square / least.fit.freedom, 1.0)
-    likely = [one for one in tried if (one.cost - least.cost) / factor < DECIDED]
-    return min(likely, key=lambda one: (len(one.changes), one.cost))
+    likely = [reading for reading in tried if (reading.cost - least.cost) / factor < DECIDED]
+    return min(likely, key=lambda reading: (len(reading.changes), reading.cost))
 
 
 def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
@@ -304,11 +302,11 @@ def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
     square = np.einsum("ni,nij,nj->n", fit.left, np.linalg.inv(fit.noise), fit.left)
     scale = max(float(np.median(square)) / float(chi2.median(2)), 1.0)
     bad = square > scale * chi2.isf(_WRONG_SHARE, 2)
-    found, start = {}, 0
+    masks, start = {}, 0
     for name, raw in bench.readings.images.items():
-        found[name] = bad[start : start + len(raw.line)]
+        masks[name] = bad[start : start + len(raw.line)]
         start += len(raw.line)
-    return found
+    return masks
 
 
 def _answers(
@@ -316,21 +314,23 @@ def _answers(
 ) -> tuple[Answer, ...]:
     """Test every value of a convention, with the others as in the best reading."""
     question, reading = QUESTIONS[name], changed(stated, best.changes)
-    said, here = question.get(stated), question.get(reading)
-    found = []
-    for value in (said, *values):
-        one = question.put(reading, value)
+    stated_value, best_value = question.get(stated), question.get(reading)
+    answers = []
+    for value in (stated_value, *values):
+        conventions = question.put(reading, value)
         try:
-            fit = bench.fit(one)
+            fit = bench.fit(conventions)
             moved = (
                 None
                 if best.fit is None
                 else float(np.sqrt(np.mean(np.sum((fit.residual - best.fit.residual) ** 2, 1))))
             )
-            found.append(Answer(value, value == said, value == here, (fit.cost - best.cost) / factor, moved, ""))
+            answers.append(
+                Answer(value, value == stated_value, value == best_value, (fit.cost - best.cost) / factor, moved, "")
+            )
         except ImpossibleError as error:
-            found.append(Answer(value, value == said, value == here, np.inf, None, str(error)))
-    return tuple(found)
+            answers.append(Answer(value, value == stated_value, value == best_value, np.inf, None, str(error)))
+    return tuple(answers)
 
 
 def _shown(others: dict[str, tuple[Any, ...]], best: Tried) -> list[Changes]:
@@ -357,8 +357,8 @@ def exported(run: Check) -> dict[str, str]:
     InputError
         The stated conventions were not confirmed.
     """
-    if run.verdict != "stands":
-        problem = "nothing is exported of a pass whose stated conventions do not stand"
+    if run.verdict != "confirmed":
+        problem = "nothing is exported of a pass whose stated conventions are not confirmed"
         raise InputError(Issue(problem, run.setup.test.source.file, allowed="conventions that `check` confirms"))
     return campaign_files([measurements(run)], run.setup.camera.plain())
 
@@ -373,7 +373,7 @@ def measurements(run: Check) -> PassMeasurements:
         middle, _ = line_times(clock, meant, table.epoch, clock.line)
         times[name] = LineTimes.of(clock.line - clock.line[0], middle)
         pixels = run.setup.camera.pixels_of(name)
-        # a mirrored axis turns the sign of the correlation
+        # A mirrored axis changes the sign of the correlation.
         signs = np.array([-1.0 if meant.backward else 1.0, 1.0 if meant.sees == "right" else -1.0])
         spread = raw.covariance * signs[:, None] * signs
         line = line_of(meant, raw, clock) - clock.line[0]

@@ -186,19 +186,23 @@ def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: 
     clock = clock_of(table, spec)
     names = table["camera"].astype(str)
     require_known(table, "camera", cameras)
-    found = {}
+    clocks = {}
     for name in dict.fromkeys(names.tolist()):
         rows = np.flatnonzero(names == name)
         if len(rows) < 2:
-            raise table.error(int(rows[0]), "line", f"one line of {name} tells no line time", None, "two or more")
-        line, taken = table["line"][rows], clock.taken(rows)
-        step = np.diff(taken.day) * 86400.0 + np.diff(taken.second)
+            raise table.error(
+                int(rows[0]), "line", f"one line of {name} does not define a line time", None, "two or more"
+            )
+        line, times = table["line"][rows], clock.taken(rows)
+        step = np.diff(times.day) * 86400.0 + np.diff(times.second)
         for what, rise in (("line", np.diff(line)), ("time", step)):
             if np.any(rise <= 0.0):
                 row, head = int(rows[int(np.argmax(rise <= 0.0)) + 1]), what if what in table else "date_time"
-                raise table.error(row, head, f"{what}s of {name} do not rise", None, "rows in order, each line once")
-        found[name] = LineClock(line, taken)
-    return found
+                raise table.error(
+                    row, head, f"{what}s of {name} do not increase", None, "rows in order, each line once"
+                )
+        clocks[name] = LineClock(line, times)
+    return clocks
 
 
 def _scene_lines(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path) -> dict[str, LineClock]:
@@ -228,7 +232,7 @@ def _image_points(
     for row in np.flatnonzero(number < 0)[:1]:
         name = str(names[row])
         raise table.error(int(row), "point", "no such ground point", shown(name), None, nearest(name, known))
-    found = {}
+    points = {}
     for camera in dict.fromkeys(cameras.tolist()):
         rows = np.flatnonzero(cameras == camera)
         _, first = np.unique(number[rows], return_index=True)
@@ -236,8 +240,8 @@ def _image_points(
             row = int(rows[np.setdiff1d(np.arange(len(rows)), first)[0]])
             raise table.error(row, "point", f"twice in {camera}", shown(str(names[row])), "each point once")
         spread = image_covariance(table, rows)
-        found[camera] = ImagePoints(number[rows], table["line"][rows], table["pixel"][rows], spread)
-    return FrozenMap(found)
+        points[camera] = ImagePoints(number[rows], table["line"][rows], table["pixel"][rows], spread)
+    return FrozenMap(points)
 
 
 def _gcp_points(
@@ -248,21 +252,18 @@ def _gcp_points(
     if (folder / file) != (folder / spec.ground.file):
         allowed = "the file of `ground`, or a table"
         raise spec.image_points.error("image points of another .gcp file", ("file",), found=file, allowed=allowed)
-    found = {}
+    points = {}
     for image, rows in ground.images.items():
         camera = Path(image).stem
         if camera not in lines:
-            problem, allowed = (
-                "an image that is none of the camera's lines",
-                names_text(f"{name}.tif" for name in lines),
-            )
+            problem, allowed = ("an image of none of the camera's lines", names_text(f"{name}.tif" for name in lines))
             raise spec.image_points.error(problem, ("file",), found=shown(image), allowed=allowed)
         number = rows[:, 0].astype(np.intp)
         covariance = rows[:, 3:, None] ** 2 * np.eye(2)
-        found[camera] = ImagePoints.of(number, rows[:, 1], rows[:, 2], covariance)
-    if not found:
+        points[camera] = ImagePoints.of(number, rows[:, 1], rows[:, 2], covariance)
+    if not points:
         raise spec.image_points.error("a .gcp file without images", ("file",), allowed="image, column, row, two sigmas")
-    return FrozenMap(found)
+    return FrozenMap(points)
 
 
 def _around(platform: PlatformReadings, lines: Mapping[str, LineClock]) -> PlatformReadings:
@@ -279,7 +280,7 @@ def _around(platform: PlatformReadings, lines: Mapping[str, LineClock]) -> Platf
     orbit, attitude = platform.orbit, platform.attitude
     a, b = cut(orbit.clock), cut(attitude.clock)
     if len(orbit.clock.taken(a)) < 2 or len(attitude.clock.taken(b)) < 2:
-        return platform  # told by what needs it
+        return platform  # the caller reports missing readings
     return replace(platform, orbit=orbit.taken(a), attitude=attitude.taken(b))
 
 
@@ -384,13 +385,13 @@ def asked(stated: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ..
         True if the attitude is quaternions, False if it is angles.
     """
     without = {"angle_sequence"} if quaternions else {"quaternion_scalar", "quaternion_turns"}
-    found = {}
+    values = {}
     for name, question in QUESTIONS.items():
         here = question.get(stated)
         if name in without or (name == "attitude_frame" and here == "orbital"):
             continue
-        found[name] = tuple(v for v in question.values(stated) if v != here)
-    return found
+        values[name] = tuple(v for v in question.values(stated) if v != here)
+    return values
 
 
 Changes = tuple[tuple[str, Any], ...]
@@ -409,11 +410,11 @@ def singles_and_pairs(others: Mapping[str, tuple[Any, ...]], start: Changes = ()
     """
     yield start
     taken = {name for name, _ in start}
-    one = [(name, value) for name, values in others.items() if name not in taken for value in values]
-    for change in one:
+    singles = [(name, value) for name, values in others.items() if name not in taken for value in values]
+    for change in singles:
         yield (*start, change)
-    for k, first in enumerate(one):
-        for second in one[k + 1 :]:
+    for k, first in enumerate(singles):
+        for second in singles[k + 1 :]:
             if first[0] != second[0]:
                 yield (*start, first, second)
 
@@ -444,16 +445,16 @@ class _Turned:
     shift: np.ndarray | None = None
 
     def position(self, seconds: Any) -> np.ndarray:
-        found = self.path.position(seconds)
-        # the sensor also asks for its first and last line
-        return found if self.shift is None or len(found) != len(self.shift) else found + self.shift
+        position = self.path.position(seconds)
+        # The sensor also requests its first and last line.
+        return position if self.shift is None or len(position) != len(self.shift) else position + self.shift
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
         return self.path.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
-        found = self.path.body_to_itrs(seconds)
-        return found if self.turn is None else found @ self.turn
+        matrix = self.path.body_to_itrs(seconds)
+        return matrix if self.turn is None else matrix @ self.turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -518,23 +519,23 @@ class PassBench:
     def without(self, wrong: Mapping[str, np.ndarray]) -> PassBench:
         """Return the bench without wrong image points, given as a mask (n,) for each line."""
         images = {name: raw.taken(~wrong[name]) for name, raw in self.readings.images.items()}
-        kept = {name: raw for name, raw in images.items() if len(raw.line)}
-        return replace(self, readings=replace(self.readings, images=kept), _paths=self._paths)
+        remaining = {name: raw for name, raw in images.items() if len(raw.line)}
+        return replace(self, readings=replace(self.readings, images=remaining), _paths=self._paths)
 
     def path(self, meant: Conventions) -> TabulatedTrajectory:
         """Return the trajectory under the conventions of a platform, or raise ImpossibleError."""
         if meant not in self._paths:
             self._paths[meant] = self._made(meant)
-        found = self._paths[meant]
-        if isinstance(found, ImpossibleError):
-            raise found
-        return found
+        path = self._paths[meant]
+        if isinstance(path, ImpossibleError):
+            raise path
+        return path
 
     def _made(self, meant: Conventions) -> TabulatedTrajectory | ImpossibleError:
         """Return the trajectory under the conventions of a platform, or the error that prevents it."""
         platform = self.readings.platform
         if platform.earth is None:
-            # UT1 - UTC is below a second, some hundred metres; no reading of an inertial frame is as near
+            # UT1 - UTC is below a second, some hundred metres; other readings of an inertial frame are farther off.
             platform = replace(platform, earth=constant_orientation(self.epoch, 0.0, (0.0, 0.0)))
         try:
             return TabulatedTrajectory(platform_table(platform, meant, self.epoch), meant.law)
@@ -556,47 +557,47 @@ class PassBench:
         ImpossibleError
             The points have no position on the ground.
         """
-        found = {}
+        places = {}
         for name, raw in self.readings.images.items():
             part = raw if most is None else raw.taken(spread(len(raw.line), most))
-            found[name] = self._ground(name, meant, part, _Turned(self.path(meant.platform)))[0]
-        return found
+            places[name] = self._ground(name, meant, part, _Turned(self.path(meant.platform)))[0]
+        return places
 
     def residuals(self, meant: PassConventions, most: int | None = None) -> np.ndarray:
         """Return the residuals of all lines, east and north, (n, 2), in metres; arguments and errors as `places`."""
-        known, found = self.readings.ground.points.itrs, []
+        known, residuals = self.readings.ground.points.itrs, []
         for name, at in self.places(meant, most).items():
             point = self.readings.images[name].point
-            found.append(_plan(known[point[spread(len(point), most or len(point))]], at))
-        return np.concatenate(found)
+            residuals.append(_plan(known[point[spread(len(point), most or len(point))]], at))
+        return np.concatenate(residuals)
 
     def fit(self, meant: PassConventions) -> Fit:
         """Fit a reading to the ground points, or raise ImpossibleError."""
         path, rows, common, noise, sizes = self.path(meant.platform), [], [], [], []
         size = self.uncertainty
-        own: list[np.ndarray] = []
+        line_terms: list[np.ndarray] = []
         for name, raw in self.readings.images.items():
             steps, pixel_step, line_time = self._steps(name, meant, raw, path)
             known = self.readings.ground.points
             itrs = known.itrs[raw.point]
             base = steps[0]
             here = _plan(itrs, base)
-            slope = [(_plan(itrs, one) - here) for one in steps[1:]]
-            turn = np.stack(slope[:3], axis=-1) / _TURN * size.attitude
+            slope = [(_plan(itrs, step) - here) for step in steps[1:]]
+            rotation = np.stack(slope[:3], axis=-1) / _TURN * size.attitude
             shift = np.stack(slope[3:6], axis=-1) / _SHIFT * size.position
             delay = slope[6] / _DELAY
             line, pixel, rise = delay * line_time[:, None], slope[7] / pixel_step[:, None], slope[8] / _RISE
             rows.append(here)
-            common.append(np.concatenate([turn, shift, delay[..., None] * size.time], axis=-1))
+            common.append(np.concatenate([rotation, shift, delay[..., None] * size.time], axis=-1))
             camera = self.cameras[name]
             from_middle = pixel_of(meant, raw, camera.pixels) - 0.5 * (camera.pixels - 1)
             scale = size.scale * from_middle[:, None]
-            own.append(np.stack([line * size.interior, pixel * size.interior, pixel * scale], axis=-1))
+            line_terms.append(np.stack([line * size.interior, pixel * size.interior, pixel * scale], axis=-1))
             image = np.stack([line, pixel], axis=-1)
             noise.append(image @ raw.covariance @ np.swapaxes(image, 1, 2) + _ground_noise(known, raw.point, rise))
             sizes.append(np.sqrt(0.5 * np.sum(line**2 + pixel**2, axis=1)))
         residual = np.concatenate(rows)
-        covariance, shared = _covariance(noise, common, own)
+        covariance, shared = _covariance(noise, common, line_terms)
         r = residual.ravel()
         factor = cho_factor(covariance, lower=True)
         weighted = cho_solve(factor, r)
@@ -617,16 +618,16 @@ class PassBench:
         The positions are those as read, with rotations, shifts, a delay, the next pixel and a height.
         """
         n, pixels = len(raw.line), self.cameras[name].pixels
-        turn, shift = np.broadcast_to(np.eye(3), (10, n, 3, 3)).copy(), np.zeros((10, n, 3))
-        turn[1:4] = rotation_matrix(_TURN * np.eye(3))[:, None]
+        rotation, shift = np.broadcast_to(np.eye(3), (10, n, 3, 3)).copy(), np.zeros((10, n, 3))
+        rotation[1:4] = rotation_matrix(_TURN * np.eye(3))[:, None]
         shift[4:7] = _SHIFT * np.eye(3)[:, None]
         delay, step, rise = np.zeros((10, n)), np.zeros((10, n)), np.zeros((10, n))
-        one = np.where(pixel_of(meant, raw, pixels) + 1.0 <= pixels - 0.5, 1.0, -1.0)
-        delay[7], step[8], rise[9] = _DELAY, one, _RISE
-        moved = _Turned(path, turn.reshape(-1, 3, 3), shift.reshape(-1, 3))
-        every = raw.taken(np.tile(np.arange(n), 10))
-        found, line_time = self._ground(name, meant, every, moved, delay.ravel(), step.ravel(), rise.ravel())
-        return list(found.reshape(10, n, 3)), one, line_time[:n]
+        direction = np.where(pixel_of(meant, raw, pixels) + 1.0 <= pixels - 0.5, 1.0, -1.0)
+        delay[7], step[8], rise[9] = _DELAY, direction, _RISE
+        moved = _Turned(path, rotation.reshape(-1, 3, 3), shift.reshape(-1, 3))
+        repeated = raw.taken(np.tile(np.arange(n), 10))
+        ground, line_time = self._ground(name, meant, repeated, moved, delay.ravel(), step.ravel(), rise.ravel())
+        return list(ground.reshape(10, n, 3)), direction, line_time[:n]
 
     def _ground(
         self,
@@ -642,13 +643,13 @@ class PassBench:
         clock = self.readings.lines[name]
         number = line_of(meant, raw, clock)
         for worst in number[~in_span(number, clock.line[0] - 1.0, clock.line[-1] + 1.0)][:1]:
-            told = f"{clock.line[0]:.10g} to {clock.line[-1]:.10g}"
-            raise ImpossibleError(f"line {worst:.10g} of {name} has no time in the table, which tells those of {told}")
+            span = f"{clock.line[0]:.10g} to {clock.line[-1]:.10g}"
+            raise ImpossibleError(f"line {worst:.10g} of {name} is not in the table of times, which covers {span}")
         times, line_time = line_times(clock, meant, self.epoch, number)
         path, camera = platform.path, self.cameras[name]
         pixel = pixel_of(meant, raw, camera.pixels) + step
         for worst in pixel[~in_span(pixel, -0.5, camera.pixels - 0.5)][:1]:
-            raise ImpossibleError(f"pixel {worst:.6g} of {name} does not exist, which has {camera.pixels}")
+            raise ImpossibleError(f"pixel {worst:.6g} of {name} does not exist; the line has {camera.pixels} pixels")
         first, last = path.first, path.last
         if not np.all(in_span(times, first, last)):
             raise ImpossibleError(f"{name} was exposed outside of orbit and attitude")
@@ -657,12 +658,12 @@ class PassBench:
         try:
             sensor = Sensor(camera, platform, Earth(), tick, first + 0.5 * tick, _TICKS, self.effects)
             line = np.clip((times + delay - first) / tick - 0.5, -0.5, _TICKS - 0.5)
-            found = sensor.ground(line, pixel, height)
+            ground = sensor.ground(line, pixel, height)
         except ValueError as error:
             raise ImpossibleError(str(error)) from None
-        if not np.all(np.isfinite(found)):
+        if not np.all(np.isfinite(ground)):
             raise ImpossibleError(f"looks of {name} miss the Earth")
-        return found, line_time
+        return ground, line_time
 
 
 def line_times(clock: LineClock, meant: PassConventions, epoch: str, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -711,11 +712,11 @@ def pixel_of(meant: PassConventions, raw: ImagePoints, pixels: int) -> np.ndarra
     return number if meant.sees == "right" else pixels - 1.0 - number
 
 
-def _plan(known: np.ndarray, found: np.ndarray) -> np.ndarray:
+def _plan(known: np.ndarray, computed: np.ndarray) -> np.ndarray:
     """Return east and north (n, 2) from known to computed points, in metres."""
     lon, lat, _ = Earth().geodetic(known)
     axes = east_north_up(lon, lat)[:, :2]
-    return np.asarray(np.einsum("nij,nj->ni", axes, found - known))
+    return np.asarray(np.einsum("nij,nj->ni", axes, computed - known))
 
 
 def _ground_noise(known: Any, point: np.ndarray, rise: np.ndarray) -> np.ndarray:
@@ -726,19 +727,19 @@ def _ground_noise(known: Any, point: np.ndarray, rise: np.ndarray) -> np.ndarray
     lon, lat, _ = Earth().geodetic(known.itrs[point])
     axes = east_north_up(lon, lat)
     level = axes @ known.covariance[point] @ np.swapaxes(axes, 1, 2)
-    way = np.concatenate([np.broadcast_to(-np.eye(2), (len(point), 2, 2)), rise[:, :, None]], axis=-1)
-    return np.asarray(way @ level @ np.swapaxes(way, 1, 2))
+    jacobian = np.concatenate([np.broadcast_to(-np.eye(2), (len(point), 2, 2)), rise[:, :, None]], axis=-1)
+    return np.asarray(jacobian @ level @ np.swapaxes(jacobian, 1, 2))
 
 
 def _covariance(
-    noise: list[np.ndarray], common: list[np.ndarray], own: list[np.ndarray]
+    noise: list[np.ndarray], common: list[np.ndarray], line_terms: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the covariance of all residuals, and the part of it that they share, (2n, 2n) each, in m^2."""
-    every = np.concatenate(common).reshape(-1, common[0].shape[-1])
-    shared = every @ every.T
+    common_terms = np.concatenate(common).reshape(-1, common[0].shape[-1])
+    shared = common_terms @ common_terms.T
     start = 0
-    for one in own:
-        flat = one.reshape(-1, one.shape[-1])
+    for terms in line_terms:
+        flat = terms.reshape(-1, terms.shape[-1])
         part = slice(start, start + len(flat))
         shared[part, part] += flat @ flat.T
         start += len(flat)

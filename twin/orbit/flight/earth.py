@@ -45,7 +45,7 @@ _DIFFERENCE_STEP = 600.0
 @contextmanager
 def years_without_announced_leap_seconds() -> Iterator[None]:
     """Suppress ERFA's warning about UTC years for which leap seconds are not announced yet."""
-    # ERFA calls a year dubious for which leap seconds have not been announced yet; it then takes none, and so do we.
+    # ERFA calls a year dubious for which leap seconds are not announced yet; it then assumes none, as is done here.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         yield
@@ -66,13 +66,13 @@ def tai_of(epoch: str) -> tuple[float, float]:
     """
     time = datetime.fromisoformat(epoch)
     if time.tzinfo is None:
-        raise ValueError(f"{epoch!r} does not say its zone; UTC ends in Z")
+        raise ValueError(f"{epoch!r} has no time zone; UTC is written with a final Z")
     time = time.astimezone(UTC)
     second = time.second + 1e-6 * time.microsecond
     with years_without_announced_leap_seconds():
         utc = erfa.dtf2d("UTC", time.year, time.month, time.day, time.hour, time.minute, second)
-        one, two = erfa.utctai(*utc)
-    return float(one), float(two)
+        tai_1, tai_2 = erfa.utctai(*utc)
+    return float(tai_1), float(tai_2)
 
 
 def ut1_of(epoch: str, dut1: float) -> tuple[float, float]:
@@ -86,8 +86,8 @@ def ut1_of(epoch: str, dut1: float) -> tuple[float, float]:
         UT1 - UTC, seconds.
     """
     with years_without_announced_leap_seconds():
-        one, two = erfa.utcut1(*erfa.taiutc(*tai_of(epoch)), dut1)
-    return float(one), float(two)
+        ut1_1, ut1_2 = erfa.utcut1(*erfa.taiutc(*tai_of(epoch)), dut1)
+    return float(ut1_1), float(ut1_2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class EarthRotation:
     polar: np.ndarray
 
     def celestial(self, seconds: Any) -> np.ndarray:
-        """Return the rotation GCRS -> CIRS, the frame of the celestial pole and origin of date; (...) -> (..., 3, 3)."""
+        """Return the rotation GCRS -> CIRS, the frame of the pole and origin of date; (...) -> (..., 3, 3)."""
         x, y, s = np.moveaxis(self.pole(np.asarray(seconds, dtype=np.float64)), -1, 0)
         return np.asarray(erfa.c2ixys(x, y, s))
 
@@ -126,10 +126,10 @@ class EarthRotation:
         """
         t = np.asarray(seconds, dtype=np.float64)
         after, before = (self.celestial(t + step) for step in (_DIFFERENCE_STEP, -_DIFFERENCE_STEP))
-        # C' C^T = -[q x] with q the angular velocity of the CIRS in its own axes, without a part about the pole: its
-        # origin does not rotate
-        turn = (after - before) @ np.swapaxes(self.celestial(t), -1, -2) / (2.0 * _DIFFERENCE_STEP)
-        x, y = 0.5 * (turn[..., 1, 2] - turn[..., 2, 1]), 0.5 * (turn[..., 2, 0] - turn[..., 0, 2])
+        # C' C^T = -[q x] with q the angular velocity of the CIRS in its own axes, without a part about the pole,
+        # because its origin does not rotate.
+        spin = (after - before) @ np.swapaxes(self.celestial(t), -1, -2) / (2.0 * _DIFFERENCE_STEP)
+        x, y = 0.5 * (spin[..., 1, 2] - spin[..., 2, 1]), 0.5 * (spin[..., 2, 0] - spin[..., 0, 2])
         angle = self.angle + RATE * t
         c, s = np.cos(angle), np.sin(angle)
         tirs = np.stack([c * x + s * y, c * y - s * x, np.full_like(x, RATE)], axis=-1)
@@ -148,10 +148,10 @@ def celestial_pole(epoch: str, first: float, last: float) -> CubicSpline:
     last : float
         End of the span, in seconds from the epoch.
     """
-    one, two = tai_of(epoch)
-    around = np.ceil(0.5 * (last - first) / _NODE_STEP) + _NODES_AROUND
-    node = 0.5 * (first + last) + _NODE_STEP * np.arange(-around, around + 1.0)
-    return CubicSpline(node, np.stack(erfa.xys06a(one, two + erfa.TTMTAI / DAY + node / DAY), axis=-1))
+    tai_1, tai_2 = tai_of(epoch)
+    half_count = np.ceil(0.5 * (last - first) / _NODE_STEP) + _NODES_AROUND
+    nodes = 0.5 * (first + last) + _NODE_STEP * np.arange(-half_count, half_count + 1.0)
+    return CubicSpline(nodes, np.stack(erfa.xys06a(tai_1, tai_2 + erfa.TTMTAI / DAY + nodes / DAY), axis=-1))
 
 
 _WGS84 = pyproj.Geod(ellps="WGS84")
@@ -219,8 +219,8 @@ class Earth:
         last : float
             End of the span, in seconds from the epoch.
         """
-        one, two = tai_of(epoch)
-        polar = np.asarray(erfa.pom00(*self.polar_motion, erfa.sp00(one, two + erfa.TTMTAI / DAY)))
+        tai_1, tai_2 = tai_of(epoch)
+        polar = np.asarray(erfa.pom00(*self.polar_motion, erfa.sp00(tai_1, tai_2 + erfa.TTMTAI / DAY)))
         polar.setflags(write=False)
         angle = float(erfa.era00(*ut1_of(epoch, self.dut1)))
         return EarthRotation(celestial_pole(epoch, first, last), angle, polar)
@@ -275,7 +275,7 @@ class Earth:
         start = _cartesian().transform(p[..., 0], p[..., 1], p[..., 2], radians=True, direction="INVERSE")
         lon, lat, h = (np.asarray(a) for a in start)
         rest = np.einsum("...ij,...j->...i", east_north_up(lon, lat), p - self.ecef(lon, lat, h))
-        # PROJ's longitude is exact, so the rest lies in the meridian
+        # PROJ's longitude is exact, so the remaining error lies in the meridian.
         return lon, lat + rest[..., 1] / (curvature_radii(lat)[0] + h), h + rest[..., 2]
 
     def intersect(self, origin: Any, direction: Any, height: Any = 0.0) -> np.ndarray:
@@ -304,9 +304,9 @@ class Earth:
         o, d, h = np.broadcast_to(o, (*shape, 3)), np.broadcast_to(d, (*shape, 3)), np.broadcast_to(h, shape)
         along = _nearer_root(o, d, h)
         for _ in range(_NEWTON_STEPS):
-            lon, lat, found = self.geodetic(o + along[..., None] * d)
+            lon, lat, reached = self.geodetic(o + along[..., None] * d)
             slope = np.sum(east_north_up(lon, lat)[..., 2, :] * d, axis=-1)
-            excess = found - h
+            excess = reached - h
             far = np.abs(excess) > _HEIGHT_TOLERANCE
             if not np.any(far):
                 break
@@ -326,6 +326,6 @@ def _nearer_root(o: np.ndarray, d: np.ndarray, h: np.ndarray) -> np.ndarray:
     p, q = o / axes, d / axes
     a, b, c = np.sum(q * q, axis=-1), np.sum(p * q, axis=-1), np.sum(p * p, axis=-1) - 1.0
     square = b * b - a * c
-    # beside the root the quantity is a squared relative distance, times a
+    # Near the root the quantity is a squared relative distance times a.
     square = np.where(square < -1e-6 * a, np.nan, np.maximum(square, 0.0))
     return np.asarray((-b - np.sqrt(square)) / a)

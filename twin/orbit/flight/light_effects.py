@@ -24,17 +24,17 @@ EARTH_RATE = 7.292115146706979e-5
 _FIXED_POINT_STEPS = 3
 
 
-def carried_with_earth(place: np.ndarray) -> np.ndarray:
+def carried_with_earth(position: np.ndarray) -> np.ndarray:
     """Return the inertial velocity of points that rotate with the Earth, in axes of the ITRS, in m/s.
 
     The Earth's axis is taken as Z: polar motion (1e-6 rad) changes the velocity by 1 mm/s.
 
     Parameters
     ----------
-    place : ndarray
+    position : ndarray
         Positions in the ITRS, metres, (..., 3).
     """
-    return EARTH_RATE * np.stack([-place[..., 1], place[..., 0], np.zeros(place.shape[:-1])], axis=-1)
+    return EARTH_RATE * np.stack([-position[..., 1], position[..., 0], np.zeros(position.shape[:-1])], axis=-1)
 
 
 # Standard atmosphere (ICAO, 1993), dry air.
@@ -105,7 +105,7 @@ def aberrated(direction: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     shrink = np.sqrt(1.0 - np.sum(beta**2, axis=-1, keepdims=True))
     along = np.sum(direction * beta, axis=-1, keepdims=True)
     apparent = (shrink * direction + (1.0 + along / (1.0 + shrink)) * beta) / (1.0 + along)
-    # the formula keeps the length, but for rounding
+    # The formula keeps the length, except for rounding.
     return apparent / np.linalg.norm(apparent, axis=-1, keepdims=True)
 
 
@@ -187,7 +187,7 @@ def refractive_shift(zenith: np.ndarray, height: np.ndarray, radius: np.ndarray,
     decay = np.asarray(at_ground)[..., None]
     n = 1.0 + decay * np.exp(-nodes)
     straight, bent = np.sqrt(r**2 - p**2), np.sqrt((n * r) ** 2 - p**2)
-    # the difference of the two roots without cancellation, and without the factor exp(-x) that the weights hold
+    # The difference of the two roots is written without cancellation, and without the factor exp(-x) of the weights.
     integrand = p * r * decay * (n + 1.0) / (straight * bent * (straight + bent))
     return (radius + height) * scale_height * np.sum(weights * integrand, axis=-1)
 
@@ -219,15 +219,16 @@ def refracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: 
     sine = np.linalg.norm(horizontal, axis=-1)
     radius = np.sqrt(np.multiply(*curvature_radii(lat)))
     shift = refractive_shift(np.arcsin(np.minimum(sine, 1.0)), height, radius, wavelength)
-    share = np.divide(shift, sine, out=np.zeros_like(sine), where=sine > 0.0)
+    scale = np.divide(shift, sine, out=np.zeros_like(sine), where=sine > 0.0)
     drop = 0.5 * shift**2 / (radius + height)  # the level surface falls away from its tangent plane
-    return point + share[..., None] * horizontal - drop[..., None] * vertical
+    return point + scale[..., None] * horizontal - drop[..., None] * vertical
 
 
 def unrefracted(point: np.ndarray, station: np.ndarray, earth: Earth, wavelength: float) -> np.ndarray:
     """Return the points that straight looks would reach if refracted looks meet `point`.
 
-    The inverse of `refracted`, by fixed-point steps; each makes the error smaller by the shift over the distance, 3e-6 at 500 km.
+    The inverse of `refracted`, by fixed-point steps; each makes the error smaller by the shift over the distance, 3e-6
+    at 500 km.
     """
     straight = point
     for _ in range(_FIXED_POINT_STEPS):

@@ -1,9 +1,9 @@
 """Line cameras in orbit: looks of pixels in the body frame, exposure times of lines, changes of geometry.
 
-Body frame (the instrument's base): X forward, Z toward the scene, Y = Z x X. A pixel's ray has an origin as well as a
-direction, because the chief rays of a mirror camera do not meet in one exact point. Both are smooth functions of the
-pixel and are kept as Chebyshev series over the line: exact for an ideal projection with distortion, which is a
-polynomial, and for a traced line as good as the trace.
+Body frame (the instrument's base): X forward, Z toward the scene, Y = Z x X. The look of a pixel is its line of sight,
+a direction toward the scene. A pixel's ray has an origin as well as a direction, because the chief rays of a mirror
+camera do not meet in one exact point. Both are smooth functions of the pixel and are kept as Chebyshev series over the
+line: exact for an ideal projection with distortion, which is a polynomial, and for a traced line as good as the trace.
 
 The module also corrects the lines of an instrument for changes that its on-board monitor has estimated. The effect of a
 change on the looks of a line is `analysis.orbit.forward_intersection.CalibratedLine.corrected`, which also corrects
@@ -75,7 +75,7 @@ class LineTimes:
         """
         at, moment = np.array(line, np.float64), np.array(time, np.float64)
         if at.ndim != 1 or at.shape != moment.shape or len(at) < 2:
-            raise ValueError("line times: two lines or more, with a time for each")
+            raise ValueError("line times: at least two lines are needed, each with a time")
         if not (np.all(np.isfinite(at)) and np.all(np.isfinite(moment))):
             raise ValueError("line times: a value is not finite")
         if not (np.all(np.diff(at) > 0.0) and np.all(np.diff(moment) > 0.0)):
@@ -137,14 +137,14 @@ def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray
         Changes d_alpha, d_beta, d_gamma (radians) and d_f (metres) by name of the line.
     """
     lines = dict(payload.lines)
-    for name, (alpha, beta, gamma, longer) in drift.items():
+    for name, (alpha, beta, gamma, d_f) in drift.items():
         line = lines[name]
-        turn = (
+        rotation = (
             rotation_matrix(np.array(line.rotate)) @ about_axis(0, beta) @ about_axis(1, alpha) @ about_axis(2, gamma)
         )
-        rotate = tuple(Rotation.from_matrix(turn).as_rotvec().tolist())
+        rotate = tuple(Rotation.from_matrix(rotation).as_rotvec().tolist())
         lines[name] = line.model_copy(
-            update={"rotate": rotate, "principal_distance": line.principal_distance + float(longer)}
+            update={"rotate": rotate, "principal_distance": line.principal_distance + float(d_f)}
         )
     return payload.model_copy(update={"lines": FrozenMap(lines)})
 
@@ -207,10 +207,10 @@ class LineCamera:
     origins: np.ndarray
     pieces: tuple[LinePiece, ...] = ()
 
-    def turned(self, turn: np.ndarray) -> LineCamera:
-        """Return the line with its looks rotated in body axes, look @ turn, (3, 3)."""
-        pieces = tuple(replace(piece, directions=piece.directions @ turn) for piece in self.pieces)
-        return replace(self, directions=self.directions @ turn, pieces=pieces)
+    def turned(self, rotation: np.ndarray) -> LineCamera:
+        """Return the line with its looks rotated in body axes, look @ rotation, (3, 3)."""
+        pieces = tuple(replace(piece, directions=piece.directions @ rotation) for piece in self.pieces)
+        return replace(self, directions=self.directions @ rotation, pieces=pieces)
 
     def look(self, pixel: np.ndarray) -> np.ndarray:
         """Return unit directions toward the scene, body frame: pixels (N,) -> (N, 3).
@@ -261,28 +261,30 @@ class LineCamera:
 
     def _vector(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a vector along the look and its derivative by the pixel, both (N, 3)."""
-        at = self._checked(pixel)
-        change = self._series(chebyshev.chebder(self.directions), at) * (2.0 / self.pixels)
-        vector = self._series(self.directions, at)
+        pixels = self._checked(pixel)
+        change = self._series(chebyshev.chebder(self.directions), pixels) * (2.0 / self.pixels)
+        vector = self._series(self.directions, pixels)
         for piece in self.pieces:
-            here = (at >= piece.first - 0.5) & (at <= piece.last + 0.5)
+            inside = (pixels >= piece.first - 0.5) & (pixels <= piece.last + 0.5)
             width = piece.last - piece.first + 1
-            place = (2.0 * (at[here] - piece.first) + 1.0) / width - 1.0
+            x = (2.0 * (pixels[inside] - piece.first) + 1.0) / width - 1.0
             slope = chebyshev.chebder(piece.directions) * (2.0 / width)
-            vector[here] = np.moveaxis(chebyshev.chebval(place, piece.directions), 0, -1)
-            change[here] = np.moveaxis(chebyshev.chebval(place, slope), 0, -1)
+            vector[inside] = np.moveaxis(chebyshev.chebval(x, piece.directions), 0, -1)
+            change[inside] = np.moveaxis(chebyshev.chebval(x, slope), 0, -1)
         return vector, change
 
     def _checked(self, pixel: np.ndarray) -> np.ndarray:
         """Return pixels on the line; those outside it by rounding are clipped to its end."""
         if not np.all(in_span(pixel, -0.5, self.pixels - 0.5)):
-            raise ValueError(f"a pixel outside the line {self.name!r}: it reaches from -0.5 to {self.pixels - 0.5}")
+            raise ValueError(
+                f"a pixel lies outside the line {self.name!r}, which extends from -0.5 to {self.pixels - 0.5}"
+            )
         return np.clip(pixel, -0.5, self.pixels - 0.5)
 
     def _series(self, coefficients: np.ndarray, pixel: np.ndarray) -> np.ndarray:
         """Evaluate a Chebyshev series over the line at pixels."""
-        place = (2.0 * pixel + 1.0) / self.pixels - 1.0
-        return np.moveaxis(chebyshev.chebval(place, coefficients), 0, -1)
+        x = (2.0 * pixel + 1.0) / self.pixels - 1.0
+        return np.moveaxis(chebyshev.chebval(x, coefficients), 0, -1)
 
 
 def line_cameras(spec: ThreeLineCameraSpec) -> dict[str, LineCamera]:
@@ -357,11 +359,11 @@ def pixel_places(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch: fl
         Positions x and y, metres.
     """
     at = np.asarray(pixel, dtype=np.float64)
-    found = _ccd_places(line, None, at, pixels, pitch)
+    position = _ccd_places(line, None, at, pixels, pitch)
     for ccd in line.ccds:
         here = (at >= ccd.first - 0.5) & (at <= ccd.last + 0.5)
-        found[here] = _ccd_places(line, ccd, at[here], pixels, pitch)
-    return found
+        position[here] = _ccd_places(line, ccd, at[here], pixels, pitch)
+    return position
 
 
 def _ccd_places(line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
@@ -373,8 +375,8 @@ def _ccd_places(line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pi
         x, y = (np.tan(np.polynomial.polynomial.polyval(pixel, c)) for c in (ccd.psi_x, ccd.psi_y))
         return np.array(line.principal_point) - line.principal_distance * np.stack([x, y], axis=-1)
     middle = (0.5 * (ccd.first + ccd.last) - 0.5 * (pixels - 1)) * pitch
-    along, turn = straight - middle, ccd.rotate
-    return np.stack([ccd.shift[0] - along * np.sin(turn), ccd.shift[1] + middle + along * np.cos(turn)], axis=-1)
+    along, angle = straight - middle, ccd.rotate
+    return np.stack([ccd.shift[0] - along * np.sin(angle), ccd.shift[1] + middle + along * np.cos(angle)], axis=-1)
 
 
 def traced_line_cameras(instrument: Instrument, backend: Backend, state: State | None = None) -> dict[str, LineCamera]:
@@ -444,15 +446,15 @@ def along_track_angle(a: LineCamera, b: LineCamera) -> float:
 
 
 def dihedral_angle(
-    a: LineCamera, b: LineCamera, places: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
+    a: LineCamera, b: LineCamera, pixels: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
 ) -> float:
     """Return the angle between the planes of two lines, in radians, 0 to pi/2.
 
     A line's plane is the one through the station that its looks depart from least (total least squares over the whole
-    line, or over the pixels `places`, each (N,)). Ground points of the strips give this angle (paper 000, eqs. 1 to 7).
+    line, or over `pixels`, each (N,)). Ground points of the strips give this angle (paper 000, eqs. 1 to 7).
     It differs from `look_angle` when the lines are not parallel.
     """
-    angle = _angle(*(line_normal(camera, place) for camera, place in zip((a, b), places, strict=True)))
+    angle = _angle(*(line_normal(camera, pixel) for camera, pixel in zip((a, b), pixels, strict=True)))
     return min(angle, np.pi - angle)
 
 
@@ -504,7 +506,7 @@ def line_normal(camera: LineCamera, pixel: np.ndarray | None = None) -> np.ndarr
         Pixels to which the plane is fitted; None for the whole line.
     """
     looks = camera.look(np.linspace(0.0, camera.pixels - 1.0, _PLANE_POINTS) if pixel is None else pixel)
-    # the singular vector itself, not that of the normal equations: half of the digits would be lost there
+    # The singular vector is not taken from the normal equations, which would lose half of the digits.
     normal = np.linalg.svd(looks, full_matrices=False)[2][-1]
     return normal if normal[0] > 0.0 else -normal
 
@@ -525,7 +527,7 @@ def _through(values: np.ndarray) -> np.ndarray:
     basis = chebyshev.chebvander(chebyshev.chebpts1(count), count - 1)
     weight = np.full(count, 2.0 / count)
     weight[0] = 1.0 / count
-    return weight[:, None] * (basis.T @ values)  # the points are orthogonal: no equations to solve
+    return weight[:, None] * (basis.T @ values)  # the basis is orthogonal at the points, so no equations are solved
 
 
 def _coefficients(function: Callable[[np.ndarray], np.ndarray], pixels: int, count: int) -> np.ndarray:

@@ -162,7 +162,7 @@ class Orbit:
         t = np.asarray(seconds, dtype=np.float64)
         if not np.all(in_span(t, self.first, self.last)):
             raise UnphysicalError(
-                f"time outside the orbit, which is known from {self.first:g} s to {self.last:g} s: found "
+                f"time outside the orbit, which covers {self.first:g} s to {self.last:g} s; requested "
                 f"{np.min(t):g} s to {np.max(t):g} s"
             )
         flat = t.ravel()
@@ -185,18 +185,18 @@ class Orbit:
         read-only. Raises as `equatorial`.
         """
         t = np.asarray(seconds, dtype=np.float64)
-        # position, velocity and attitude are asked for one after the other at the same times
-        if (known := self._last.get("itrs")) is not None and np.array_equal(known[0], t):
-            return known[1]
+        # Callers request position, velocity and attitude one after the other at the same times.
+        if (cached := self._last.get("itrs")) is not None and np.array_equal(cached[0], t):
+            return cached[1]
         r, v = self.gcrs(t)
         matrix = self.rotation.matrix(t)
         position, inertial = (np.einsum("...ij,...j->...i", matrix, a) for a in (r, v))
-        found = position, inertial - np.cross(self.rotation.rate(t), position), inertial
-        for one in found:
-            one.flags.writeable = False
+        motion = position, inertial - np.cross(self.rotation.rate(t), position), inertial
+        for array in motion:
+            array.flags.writeable = False
         if t.size <= _MOST_KEPT:
-            self._last["itrs"] = t.copy(), found
-        return found
+            self._last["itrs"] = t.copy(), motion
+        return motion
 
 
 def propagate(spec: OrbitSpec, earth: Earth, tolerance: float = TOLERANCE) -> Orbit:
@@ -232,7 +232,7 @@ def propagate(spec: OrbitSpec, earth: Earth, tolerance: float = TOLERANCE) -> Or
 
 def _local_time(right_ascension: float, angle: float, ut1: tuple[float, float]) -> float:
     """Return UT1 plus the longitude of the meridian, in seconds of the day."""
-    # a Julian day begins at noon
+    # A Julian day begins at noon.
     noon = (ut1[0] % 1.0 + ut1[1] % 1.0 + 0.5) * DAY
     return (noon + (right_ascension - angle) / (2.0 * math.pi) * DAY) % DAY
 
@@ -251,7 +251,7 @@ def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
         return float(np.linalg.norm(y[:3])) - _POLAR_RADIUS
 
     above_ground.terminal = True  # type: ignore[attr-defined]
-    found = solve_ivp(
+    solution = solve_ivp(
         derivative,
         (0.0, end),
         state,
@@ -262,10 +262,10 @@ def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
         max_step=_LONGEST_STEP,
         events=above_ground,
     )
-    if found.status == 1 or above_ground(0.0, state) < 0.0:
-        raise UnphysicalError(f"the orbit runs into the Earth {found.t[-1]:.0f} s from its epoch")
-    assert found.success, found.message
-    return found.sol
+    if solution.status == 1 or above_ground(0.0, state) < 0.0:
+        raise UnphysicalError(f"the orbit runs into the Earth {solution.t[-1]:.0f} s from its epoch")
+    assert solution.success, solution.message
+    return solution.sol
 
 
 def _radial_and_along(inclination: float, node: float, argument: float) -> np.ndarray:
@@ -304,9 +304,9 @@ def _passing_state(spec: PassingSpec, earth: Earth, from_itrs: np.ndarray) -> np
     z = position[2] / a
     inclination = spec.inclination
     if inclination is None:
-        # near the turning points there may be none; then the mean inclination says so below
-        reach = abs(z) < abs(math.sin(sun_synchronous_inclination(a)))
-        inclination = _osculating_inclination(a, 0.0, None, z) if reach else sun_synchronous_inclination(a)
+        # Near the turning points no such orbit may exist; the mean inclination then leads to the error below.
+        reachable = abs(z) < abs(math.sin(sun_synchronous_inclination(a)))
+        inclination = _osculating_inclination(a, 0.0, None, z) if reachable else sun_synchronous_inclination(a)
     if abs(z) > math.sin(inclination):
         raise UnphysicalError(
             f"an orbit of inclination {math.degrees(inclination):.3f} deg never passes latitude "

@@ -104,9 +104,9 @@ class PlatformTable:
             four numbers are not a rotation.
         """
         times, looks = (np.array(v, np.float64) for v in (orbit_time, attitude_time))
-        place, turn = np.array(position, np.float64), np.array(quaternion, np.float64)
+        positions, rotation = np.array(position, np.float64), np.array(quaternion, np.float64)
         speed = None if velocity is None else np.array(velocity, np.float64)
-        rows = (("position", times, place, 3), ("velocity", times, speed, 3), ("quaternion", looks, turn, 4))
+        rows = (("position", times, positions, 3), ("velocity", times, speed, 3), ("quaternion", looks, rotation, 4))
         for what, time, values, width in rows:
             if values is None:
                 continue
@@ -116,18 +116,18 @@ class PlatformTable:
                 raise ValueError(f"platform: a {what} or its time is not finite")
             if not np.all(np.diff(time) > 0.0):
                 raise ValueError(f"platform: times of {what} do not increase")
-        norm = np.linalg.norm(turn, axis=1)
+        norm = np.linalg.norm(rotation, axis=1)
         if np.any(np.abs(norm - 1.0) > _UNIT_TOLERANCE):
             raise ValueError("platform: a quaternion is not of unit length")
-        return cls(epoch, times, place, speed, looks, joined_quaternions(turn / norm[:, None]))
+        return cls(epoch, times, positions, speed, looks, joined_quaternions(rotation / norm[:, None]))
 
     @classmethod
     def sampled(cls, trajectory: Trajectory, orbit_interval: float, attitude_interval: float) -> PlatformTable:
         """Sample a trajectory at whole multiples of the intervals, in seconds, and at both ends of its span."""
         fixes, looks = (_moments(trajectory, step) for step in (orbit_interval, attitude_interval))
-        turn = Rotation.from_matrix(trajectory.body_to_itrs(looks)).as_quat(canonical=False)
-        place, speed = trajectory.position(fixes), trajectory.velocity(fixes)
-        return cls.of(str(trajectory.orbit.epoch), fixes, place, speed, looks, turn)
+        rotation = Rotation.from_matrix(trajectory.body_to_itrs(looks)).as_quat(canonical=False)
+        positions, speed = trajectory.position(fixes), trajectory.velocity(fixes)
+        return cls.of(str(trajectory.orbit.epoch), fixes, positions, speed, looks, rotation)
 
 
 def joined_quaternions(quaternion: Array) -> Array:
@@ -153,8 +153,8 @@ def _moments(trajectory: Trajectory, step: float) -> Array:
     A reading that all but coincides with an end is dropped.
     """
     first, last = trajectory.first, trajectory.last
-    every = readings(first, last, step)
-    inside = every[(every > first + 1e-3 * step) & (every < last - 1e-3 * step)]
+    times = readings(first, last, step)
+    inside = times[(times > first + 1e-3 * step) & (times < last - 1e-3 * step)]
     return np.concatenate([[first], inside, [last]])
 
 
@@ -208,15 +208,15 @@ class TabulatedTrajectory:
         return "spline" if widest**4 * _FOURTH_DERIVATIVE / 384.0 <= _SPLINE_ERROR else "lagrange"
 
     def known(self, seconds: ArrayLike) -> np.ndarray:
-        """Return whether readings of orbit and attitude cover the times (...): not before, after, or in a gap of them."""
+        """Return whether readings of orbit and attitude cover times (...), which lie within them and not in a gap."""
         t = np.asarray(seconds, dtype=np.float64)
-        found = in_span(t, self.first, self.last)
+        covered = in_span(t, self.first, self.last)
         for time in (self.table.orbit_time, self.table.attitude_time):
             after = np.clip(np.searchsorted(time, t, side="right") - 1, 0, len(time) - 2)
             begin, end = time[after], time[after + 1]
-            # a reading at the end of a gap is known
-            found &= ~self._gaps(time)[after] | in_span(t, begin, begin) | in_span(t, end, end)
-        return found
+            # Readings at the ends of a gap are known themselves.
+            covered &= ~self._gaps(time)[after] | in_span(t, begin, begin) | in_span(t, end, end)
+        return covered
 
     def position(self, seconds: Any) -> np.ndarray:
         """Return the position in the ITRS, in metres; (...) -> (..., 3)."""
@@ -233,8 +233,8 @@ class TabulatedTrajectory:
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
         """Return the axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
         t = self._checked(seconds)
-        turn = Rotation.from_quat(self._quaternion(np.ravel(t))).as_matrix()
-        return np.asarray(turn).reshape(*t.shape, 3, 3)
+        matrix = Rotation.from_quat(self._quaternion(np.ravel(t))).as_matrix()
+        return np.asarray(matrix).reshape(*t.shape, 3, 3)
 
     def orbital_to_itrs(self, seconds: Any) -> np.ndarray:
         """Return the axes of the orbital frame by the measured orbit as columns, (...) -> (..., 3, 3)."""
@@ -249,8 +249,8 @@ class TabulatedTrajectory:
     def _velocity(self) -> Any:
         if self.table.velocity is not None:
             return self._joined(self.table.velocity)
-        found = self._position
-        return found.derivative() if isinstance(found, CubicSpline) else found.slope
+        interpolation = self._position
+        return interpolation.derivative() if isinstance(interpolation, CubicSpline) else interpolation.slope
 
     @cached_property
     def _quaternion(self) -> CubicSpline:
@@ -265,12 +265,12 @@ class TabulatedTrajectory:
     def _checked(self, seconds: Any) -> np.ndarray:
         """Return the times as an array, or raise UnphysicalError if one of them is not covered by readings."""
         t = np.asarray(seconds, dtype=np.float64)
-        good = self.known(t)
-        if not np.all(good):
-            wrong = float(np.ravel(t)[int(np.argmin(np.ravel(good)))])
-            where = f"which reach from {self.first:.9g} s to {self.last:.9g} s"
-            kind = "in a gap of" if in_span(wrong, self.first, self.last) else "outside of"
-            raise UnphysicalError(f"the time {wrong:.9g} s lies {kind} the readings of orbit and attitude, {where}")
+        covered = self.known(t)
+        if not np.all(covered):
+            worst = float(np.ravel(t)[int(np.argmin(np.ravel(covered)))])
+            where = f"which cover {self.first:.9g} s to {self.last:.9g} s"
+            kind = "in a gap of" if in_span(worst, self.first, self.last) else "outside of"
+            raise UnphysicalError(f"the time {worst:.9g} s lies {kind} the readings of orbit and attitude, {where}")
         return t
 
     @cached_property
@@ -281,23 +281,23 @@ class TabulatedTrajectory:
         table by the order of the interpolation, 4 or 10. The error is zero where the deviation is the noise of the
         readings, which does not grow with the step.
         """
-        time, place = self.table.orbit_time, self.table.position
+        time, positions = self.table.orbit_time, self.table.position
         step = np.diff(time)
         if len(time) < _LEAST_ROWS or np.any(np.abs(step - np.median(step)) > 0.01 * np.median(step)):
             return 0.0
-        found = []
-        for every in (2, 4):
-            kept = slice(0, None, every)
+        errors = []
+        for stride in (2, 4):
+            part = slice(0, None, stride)
             joined = (
-                CubicSpline(time[kept], place[kept])
+                CubicSpline(time[part], positions[part])
                 if self.interpolation == "spline"
-                else _Lagrange(time[kept], place[kept])
+                else _Lagrange(time[part], positions[part])
             )
-            # one interval from the ends, where any interpolation is worse
-            inner = (time > time[every]) & (time < time[::every][-2]) & (np.arange(len(time)) % every == every // 2)
-            found.append(float(np.sqrt(np.mean(np.sum((joined(time[inner]) - place[inner]) ** 2, axis=1)))))
+            # Stay one interval from the ends, where any interpolation is worse.
+            inner = (time > time[stride]) & (time < time[::stride][-2]) & (np.arange(len(time)) % stride == stride // 2)
+            errors.append(float(np.sqrt(np.mean(np.sum((joined(time[inner]) - positions[inner]) ** 2, axis=1)))))
         order = 4 if self.interpolation == "spline" else min(_LAGRANGE_NODES, len(time) // 2)
-        return found[0] / 2.0**order if found[0] > _SURELY or found[1] > _GROWS * found[0] else 0.0
+        return errors[0] / 2.0**order if errors[0] > _SURELY or errors[1] > _GROWS * errors[0] else 0.0
 
     @staticmethod
     def _gaps(time: Array) -> np.ndarray:
@@ -325,11 +325,11 @@ class _Lagrange:
         t = np.ravel(np.asarray(seconds, dtype=np.float64))
         at = np.searchsorted(self._time, t, side="right") - self._count // 2
         at = np.clip(at, 0, len(self._time) - self._count)
-        found = np.empty((len(t), self._values.shape[1]))
+        values = np.empty((len(t), self._values.shape[1]))
         for begin in np.unique(at):
             part = slice(begin, begin + self._count)
             middle = self._time[begin + self._count // 2]
             joined = KroghInterpolator(self._time[part] - middle, self._values[part])
             here = at == begin
-            found[here] = joined(t[here] - middle) if order == 0 else joined.derivative(t[here] - middle)
-        return found.reshape(*np.shape(seconds), self._values.shape[1])
+            values[here] = joined(t[here] - middle) if order == 0 else joined.derivative(t[here] - middle)
+        return values.reshape(*np.shape(seconds), self._values.shape[1])

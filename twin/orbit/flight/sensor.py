@@ -1,4 +1,4 @@
-"""Line sensor in orbit: from pixel and time to the ground and back.
+"""Line sensor in orbit: from pixel and time to the ground and back. The look of a pixel is its line of sight.
 
 Nothing is interpolated along the track, so that no smoothness of attitude or orbit is assumed.
 
@@ -176,10 +176,10 @@ class Sensor:
             look = aberrated(look, -self.trajectory.inertial_velocity(seconds))
         point = self.earth.intersect(station, look, height)
         if self.effects.light_time:
-            # heights do not change as the Earth turns: the point is brought to where it is in the axes of the moment
-            # at which its light left
-            way = np.linalg.norm(point - station, axis=-1) / SPEED_OF_LIGHT
-            point, station = turned_with_earth(point, way), turned_with_earth(station, way)
+            # Heights do not change as the Earth rotates: the point is expressed in the Earth-fixed axes of the moment
+            # at which its light left.
+            delay = np.linalg.norm(point - station, axis=-1) / SPEED_OF_LIGHT
+            point, station = turned_with_earth(point, delay), turned_with_earth(station, delay)
         if self.effects.refraction:
             point = light_effects.refracted(point, station, self.earth, self.effects.wavelength)
         return point
@@ -212,7 +212,7 @@ class Sensor:
                 break
             here = np.stack([line[moving], pixel[moving]], axis=-1)
             step = self._step(point[moving], *here.T)
-            # a place that would leave the image is held at its border; one that stays there has its image outside
+            # A position that would leave the image is held at its border; one that stays there is imaged outside.
             there = np.clip(here + step, lowest, highest)
             line[moving], pixel[moving] = there.T
             close = np.max(np.abs(step), axis=-1) <= _ARRIVED
@@ -246,15 +246,15 @@ class Sensor:
         station = self._station(seconds, to_itrs, pixel)
         source = point
         if self.effects.refraction or self.effects.light_time:
-            way = np.zeros(len(point))
+            delay = np.zeros(len(point))
             if self.effects.light_time:
-                way = np.linalg.norm(source - station, axis=-1) / SPEED_OF_LIGHT
-            left_station = turned_with_earth(station, way)
+                delay = np.linalg.norm(source - station, axis=-1) / SPEED_OF_LIGHT
+            left_station = turned_with_earth(station, delay)
             if self.effects.refraction:
                 source = light_effects.unrefracted(source, left_station, self.earth, self.effects.wavelength)
             if self.effects.light_time:
-                way = np.linalg.norm(source - left_station, axis=-1) / SPEED_OF_LIGHT
-                source = turned_with_earth(source, -way)
+                delay = np.linalg.norm(source - left_station, axis=-1) / SPEED_OF_LIGHT
+                source = turned_with_earth(source, -delay)
         direction = source - station
         direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
         if self.effects.aberration:
@@ -274,4 +274,4 @@ class Sensor:
     def _require_inside(self, line: np.ndarray) -> None:
         """Raise ValueError if a line lies outside the image."""
         if not np.all(in_span(line, -0.5, self.lines - 0.5)):
-            raise ValueError(f"a line outside the image, which reaches from -0.5 to {self.lines - 0.5}")
+            raise ValueError(f"a line lies outside the image, which extends from -0.5 to {self.lines - 0.5}")

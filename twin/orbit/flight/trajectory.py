@@ -80,13 +80,13 @@ class Jitter:
         if not spec.stated:
             return None
         streams, terms = seed.spawn(len(spec.lines) + len(spec.bands)), []
-        for line, own in zip(spec.lines, streams, strict=False):
-            drawn = np.random.default_rng(own).uniform(0.0, 2.0 * np.pi, 3)
+        for line, generator in zip(spec.lines, streams, strict=False):
+            drawn = np.random.default_rng(generator).uniform(0.0, 2.0 * np.pi, 3)
             phase = drawn if line.phase is None else np.array(line.phase)
-            both = (np.array([line.amplitude]) * turn(phase) for turn in (np.cos, np.sin))
+            both = (np.array([line.amplitude]) * function(phase) for function in (np.cos, np.sin))
             terms.append((np.array([line.frequency]), *both))
-        for band, own in zip(spec.bands, streams[len(spec.lines) :], strict=True):
-            random, width = np.random.default_rng(own), band.last - band.first
+        for band, generator in zip(spec.bands, streams[len(spec.lines) :], strict=True):
+            random, width = np.random.default_rng(generator), band.last - band.first
             count = int(np.clip(np.ceil(_RESOLVED * width), _LEAST, _MOST))
             frequency = band.first + width * (np.arange(count) + random.uniform(size=count)) / count
             sigma = np.sqrt(np.array(band.level) * width / count)
@@ -97,16 +97,16 @@ class Jitter:
     def __call__(self, seconds: np.ndarray) -> np.ndarray:
         """Return rotation vectors in body axes at times (...), seconds: (..., 3), in radians."""
         t = np.asarray(seconds, np.float64)
-        # image lines are asked for at many pixels
-        moments, where = np.unique(t, return_inverse=True)
-        kept = 1.0 if self.collection is None else self.collection.mean(self.frequency)[:, None]
-        sine, cosine = kept * self.sine, kept * self.cosine
-        found = np.empty((len(moments), 3))
+        # Each image line is requested at many pixels.
+        moments, index = np.unique(t, return_inverse=True)
+        gain = 1.0 if self.collection is None else self.collection.mean(self.frequency)[:, None]
+        sine, cosine = gain * self.sine, gain * self.cosine
+        rotation = np.empty((len(moments), 3))
         size = max(_AT_ONCE // len(self.frequency), 1)
         for part in (slice(k, k + size) for k in range(0, len(moments), size)):
             angle = 2.0 * np.pi * (moments[part, None] * self.frequency)
-            found[part] = np.sin(angle) @ sine + np.cos(angle) @ cosine
-        return np.asarray(found[where.reshape(t.shape)])
+            rotation[part] = np.sin(angle) @ sine + np.cos(angle) @ cosine
+        return np.asarray(rotation[index.reshape(t.shape)])
 
     @property
     def amplitude(self) -> np.ndarray:
@@ -141,20 +141,20 @@ class Jitter:
         ValueError
             An oscillation is so fast and large that no reasonable number of moments is enough.
         """
-        own, size = replace(self, collection=None), self.amplitude / pixel
+        instantaneous, size = replace(self, collection=None), self.amplitude / pixel
         exact = [collection.mean(k * self.frequency) for k in (1, 2)]
         for count in _MOMENTS:
             moments, weights = collection.moments(count)
             angle = 2.0 * np.pi * self.frequency[:, None] * moments
-            # what is even in time is all there is: the rule is symmetric
+            # The rule is symmetric, so only parts even in time have an error.
             off = [np.abs(np.cos(k * angle) @ weights - w) for k, w in zip((1, 2), exact, strict=True)]
-            # at Nyquist the second harmonic of an oscillation of A pixels weighs J_2(pi A), or (pi A)^2 / 8
+            # At Nyquist the second harmonic of an oscillation of A pixels has the weight J_2(pi A), about (pi A)^2 / 8.
             if np.sqrt(np.sum((size * off[0] + np.minimum(1.25 * size**2, size) * off[1]) ** 2)) <= tolerance:
-                return [(float(w), own.later(float(s))) for s, w in zip(moments, weights, strict=True)]
+                return [(float(w), instantaneous.later(float(s))) for s, w in zip(moments, weights, strict=True)]
         highest = float(np.max(self.frequency))
         raise ValueError(
             f"jitter of up to {highest:g} Hz and {float(np.max(size)):.3g} pixels within {collection.length:.3g} s of "
-            "collection is too fast to be imaged moment by moment"
+            "collection is too fast to be averaged over moments of the collection"
         )
 
     def read(self, times: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -206,27 +206,28 @@ class Attitude:
         (..., 3, 3) ndarray
             Rotation matrices.
         """
-        chosen = velocity if self.yaw_steering else inertial_velocity
+        along = velocity if self.yaw_steering else inertial_velocity
         if self.geodetic:
             lon, lat, height = Earth().geodetic(position)
             level = east_north_up(lon, lat)
             up = level[..., 2, :]
-            east, north = (np.sum(level[..., k, :] * chosen, axis=-1) for k in (0, 1))
+            east, north = (np.sum(level[..., k, :] * along, axis=-1) for k in (0, 1))
             if self.yaw_steering:
-                # the point below moves slower than the satellite, and not alike along and across the meridian
+                # The nadir point moves slower than the satellite, and differently along and across the meridian.
                 meridian, normal = curvature_radii(lat)
                 east, north = east * normal / (normal + height), north * meridian / (meridian + height)
             forward = east[..., None] * level[..., 0, :] + north[..., None] * level[..., 1, :]
         else:
-            # the point below runs along its own radius as well, which moves it along the line of sight only
+            # The nadir point moves along its own radius as well, which is along the line of sight only.
             up = position / np.linalg.norm(position, axis=-1, keepdims=True)
-            forward = chosen - np.sum(chosen * up, axis=-1, keepdims=True) * up
+            forward = along - np.sum(along * up, axis=-1, keepdims=True) * up
         x = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
         return np.stack([x, np.cross(-up, x), -up], axis=-1)
 
     def body_to_itrs(self, position: np.ndarray, velocity: np.ndarray, inertial_velocity: np.ndarray) -> np.ndarray:
-        """Return the axes of the body as columns, (..., 3, 3): x_itrs = matrix @ x_body; arguments as
-        `orbital_to_itrs`.
+        """Return the axes of the body as columns, (..., 3, 3): x_itrs = matrix @ x_body.
+
+        The arguments are those of `orbital_to_itrs`.
         """
         return self.orbital_to_itrs(position, velocity, inertial_velocity) @ rotation_matrix(self.offset)
 
@@ -272,9 +273,9 @@ def _walk(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> 
 def _drift(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence, correlation_time: float) -> Series:
     """Return a stationary first-order Gauss-Markov process with correlation exp(-|dt| / correlation_time)."""
     draws = np.random.default_rng(seed).standard_normal((time.size, 3))
-    kept = np.exp(-(time[1] - time[0]) / correlation_time)
-    draws[1:] *= np.sqrt(1.0 - kept * kept)
-    return CubicSpline(time, sigma * lfilter([1.0], [1.0, -kept], draws, axis=0))
+    correlation = np.exp(-(time[1] - time[0]) / correlation_time)
+    draws[1:] *= np.sqrt(1.0 - correlation * correlation)
+    return CubicSpline(time, sigma * lfilter([1.0], [1.0, -correlation], draws, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,7 +361,7 @@ def _draw_errors(
     """
     unknown = sorted(set(terms) - set(TERMS))
     if unknown:
-        raise ValueError(f"no such error: {', '.join(unknown)}; there are {', '.join(TERMS)}")
+        raise ValueError(f"unknown error term: {', '.join(unknown)}; allowed: {', '.join(TERMS)}")
     streams = dict(zip(TERMS, np.random.SeedSequence(seed).spawn(len(TERMS)), strict=True))
     gps, star = spec.gps, spec.star_tracker
 
@@ -391,7 +392,7 @@ def _draw_errors(
 def _sum(series: tuple[Series, ...], seconds: np.ndarray) -> np.ndarray:
     """Return the sum of series at times, (..., 3)."""
     t = np.asarray(seconds, dtype=np.float64)
-    return sum((one(t) for one in series), np.zeros((*t.shape, 3)))
+    return sum((term(t) for term in series), np.zeros((*t.shape, 3)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,8 +67,8 @@ class GroundFrame:
     def plane(self, longitude: np.ndarray, latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return east and north (...), in metres, of longitude (in any range) and latitude (...), in radians."""
         per_longitude, per_latitude = self.scale
-        turn = (longitude - self.longitude + np.pi) % (2.0 * np.pi) - np.pi
-        return turn * per_longitude, (latitude - self.latitude) * per_latitude
+        difference = (longitude - self.longitude + np.pi) % (2.0 * np.pi) - np.pi
+        return difference * per_longitude, (latitude - self.latitude) * per_latitude
 
 
 _CORRELATION_MARGIN = 4.0
@@ -140,7 +140,7 @@ def correlated_field(shape: tuple[int, int], spacing: float, length: float, seed
 def _root_of_covariance(count: int, step: float) -> np.ndarray:
     """Return the square root of the spectrum of the covariance along one periodic axis, (count,)."""
     distance = step * np.minimum(np.arange(count), count - np.arange(count))
-    # the covariance of a ring is not quite positive: what is below zero is rounding
+    # The covariance of a periodic axis is not quite positive: values below zero are rounding.
     return np.sqrt(np.maximum(fft.fft(np.exp(-0.5 * distance**2)).real, 0.0)).astype(np.float32)
 
 
@@ -179,7 +179,7 @@ class SplineGrid:
     def reach(self) -> tuple[float, float, float, float]:
         """West, east, south and north bound of its domain, metres, if it is not continued beyond the grid."""
         (rows, columns), (east, north) = self.coefficients.shape, self.first
-        # a place needs one B-spline before its cell and two after
+        # A position needs one B-spline before its cell and two after.
         return (
             east + self.spacing[0],
             east + (columns - 2) * self.spacing[0],
@@ -231,10 +231,10 @@ class SplineGrid:
         )
         return np.asarray((along @ (across @ self.coefficients).T).T)
 
-    def _weights(self, place: np.ndarray, count: int, derivative: int) -> csr_array:
+    def _weights(self, position: np.ndarray, count: int, derivative: int) -> csr_array:
         """Return the matrix from coefficients along one axis to values at positions in cells, (positions, count)."""
-        cell = np.floor(place).astype(np.intp)
-        t = (place - cell)[:, None]
+        cell = np.floor(position).astype(np.intp)
+        t = (position - cell)[:, None]
         if derivative:
             weight = np.hstack([-0.5 * (1.0 - t) ** 2, 1.5 * t**2 - 2.0 * t, 0.5 + t - 1.5 * t**2, 0.5 * t**2])
         else:
@@ -250,8 +250,8 @@ class SplineGrid:
                 column = np.minimum(column, 2 * (count - 1) - column)
             case _:
                 assert_never(self.beyond)
-        row = np.repeat(np.arange(len(place)), 4)
-        return csr_array((weight.ravel(), (row, column.ravel())), shape=(len(place), count))
+        row = np.repeat(np.arange(len(position)), 4)
+        return csr_array((weight.ravel(), (row, column.ravel())), shape=(len(position), count))
 
     def _require_inside(self, east: np.ndarray, north: np.ndarray) -> None:
         """Raise UnphysicalError if positions lie outside the domain."""
@@ -259,8 +259,8 @@ class SplineGrid:
         low, high = (np.min(east), np.min(north)), (np.max(east), np.max(north))
         if not (low[0] >= west_end and high[0] <= east_end and low[1] >= south_end and high[1] <= north_end):
             raise UnphysicalError(
-                f"ground beyond what is known: east {np.min(east):.0f} to {np.max(east):.0f} m, north "
-                f"{np.min(north):.0f} to {np.max(north):.0f} m; it reaches from {west_end:.0f} to {east_end:.0f} m and "
+                f"position outside the grid of the ground: east {np.min(east):.0f} to {np.max(east):.0f} m, north "
+                f"{np.min(north):.0f} to {np.max(north):.0f} m; the grid covers {west_end:.0f} to {east_end:.0f} m and "
                 f"from {south_end:.0f} to {north_end:.0f} m"
             )
 
@@ -357,18 +357,18 @@ class Terrain:
     @cached_property
     def limits(self) -> tuple[float, float]:
         """Bounds of its heights, metres."""
-        # a B-spline lies between its coefficients
+        # A B-spline lies between its coefficients.
         return float(self.surface.coefficients.min()), float(self.surface.coefficients.max())
 
 
 @cache
 def _jacksboro() -> tuple[np.ndarray, tuple[float, float]]:
     """Return heights (rows to the north), in metres, and the posts' distance east and north, in metres."""
-    # found without importing matplotlib, which only draws
-    found = find_spec("matplotlib")
-    assert found is not None
-    assert found.origin is not None
-    with np.load(Path(found.origin).parent / "mpl-data" / "sample_data" / "jacksboro_fault_dem.npz") as data:
+    # Locate the data without importing matplotlib, which is only needed for figures.
+    package = find_spec("matplotlib")
+    assert package is not None
+    assert package.origin is not None
+    with np.load(Path(package.origin).parent / "mpl-data" / "sample_data" / "jacksboro_fault_dem.npz") as data:
         posts = data["elevation"][::-1].astype(np.float64)
         step = np.radians([float(data["dx"]), float(data["dy"])])
         latitude = 0.5 * np.radians(float(data["ymin"]) + float(data["ymax"]))

@@ -116,7 +116,7 @@ def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence,
         where = fractal_field(shape, spec.spacing, 2.0, longest, mask)
         covered &= where < np.quantile(where[::16, ::16], spec.parcels)
         del where
-        # a field is even, with a little of the soil's own pattern
+        # A field is uniform, with a little of the soil's pattern.
         relative[covered] = 0.97 * fields[covered] + 0.25 * relative[covered]
     level = spec.mean * (1.0 + spec.contrast * relative)
     _draw_roads(level, extent, spec, (east[0], north[0]), ways)
@@ -154,8 +154,8 @@ def apparent(ground: SplineGrid, terrain: Terrain, light: LightSpec) -> SplineGr
     for part in (slice(i, i + _ROWS) for i in range(0, rows, _ROWS)):
         to_east, to_north = terrain.slopes(east, north[part])
         incidence = (sun[2] - to_east * sun[0] - to_north * sun[1]) / np.sqrt(1.0 + to_east**2 + to_north**2)
-        lit = (1.0 - light.sky) * np.maximum(incidence, 0.0) + light.sky * sine
-        out[part] = light.transmission * lit * ground.coefficients[part] + light.path
+        illumination = (1.0 - light.sky) * np.maximum(incidence, 0.0) + light.sky * sine
+        out[part] = light.transmission * illumination * ground.coefficients[part] + light.path
     return SplineGrid(out, ground.spacing, ground.first)
 
 
@@ -174,8 +174,8 @@ def _fields(
     columns, rows = (int(np.ceil(d / block)) + 1 for d in (extent.east - extent.west, extent.north - extent.south))
     for k in range(rows * columns):
         middle = np.array([extent.west + (k % columns) * block, extent.south + (k // columns) * block])
-        turn = random.normal(0.2, 0.25)
-        axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        rotation = random.normal(0.2, 0.25)
+        axes = np.array([[np.cos(rotation), -np.sin(rotation)], [np.sin(rotation), np.cos(rotation)]])
         for west, east, south, north in _split(0.5 * block, spec.parcel_size, random):
             old, new, change = random.standard_normal(), random.standard_normal(), random.random()
             corners = _LANE * np.array([[west, south], [east, south], [east, north], [west, north]])
@@ -219,11 +219,11 @@ def _draw_roads(
     ):
         count = int(np.ceil(length / step)) + 3
         for k in range(int(np.ceil(width / spec.roads))):
-            way = (k + random.uniform(0.1, 0.9)) * spec.roads + np.cumsum(
+            path = (k + random.uniform(0.1, 0.9)) * spec.roads + np.cumsum(
                 random.normal(0.0, 0.12 * step, count).cumsum()
             )
             along = step * (np.arange(count) - 1)
-            place = np.stack([way, along] if axis == 0 else [along, way], axis=-1)
+            place = np.stack([path, along] if axis == 0 else [along, path], axis=-1)
             place = (place + np.array([extent.west - first[0], extent.south - first[1]])) / spec.spacing
             points = np.rint(place * 2**_SHIFT_BITS).astype(np.int32)
             thickness = max(1, round(_ROAD_WIDTH / spec.spacing))
@@ -381,7 +381,7 @@ def make_control(
         return Raster(values, frame, float(east[0]), float(north[-1]), spacing)
 
     photo, dem = sampled(full, spec.spacing), sampled(terrain.height, spec.dem.post)
-    # a Gaussian has the transfer exp(-2 (pi sigma f)^2), at Nyquist f = 1/2
+    # A Gaussian has the transfer exp(-2 (pi sigma f)^2), at Nyquist f = 1/2.
     values = gaussian_filter(photo.values, np.sqrt(-2.0 * np.log(spec.mtf)) / np.pi, mode="nearest")
     random = np.random.Generator(np.random.SFC64(noise_seed))
     values += np.float32(spec.noise) * random.standard_normal(values.shape, dtype=np.float32)

@@ -57,7 +57,7 @@ def optics_of(
     for name in lines:
         image = camera.image_of(name)
         if image is None:
-            raise ValueError(f"{camera.name} does not say how its line {name} forms an image")
+            raise ValueError(f"{camera.name} has no image section for its line {name}")
         key = image.model_dump_json(), camera.pixels_of(name), camera.pitch_of(name)
         if key not in made:
             sheet = detectors[image.detector]
@@ -102,13 +102,13 @@ class ImageMotion:
         point = sensor.ground(np.array([middle]), np.array([pixel]), height)
         seconds = sensor.time(np.array([middle - step, middle + step]))
         to_itrs = sensor.trajectory.body_to_itrs(seconds)
-        way = point - sensor.trajectory.position(seconds)
-        direction = np.einsum("nij,ni->nj", to_itrs, way / np.linalg.norm(way, axis=-1, keepdims=True))
+        ray = point - sensor.trajectory.position(seconds)
+        direction = np.einsum("nij,ni->nj", to_itrs, ray / np.linalg.norm(ray, axis=-1, keepdims=True))
         change = (direction[1] - direction[0]) / (2.0 * step)
         look, slope = (v[0] for v in camera.look_and_slope(np.array([pixel])))
         rate = float(np.linalg.norm(slope))
         across = np.cross(look, slope / rate)
-        # at a field angle w a pixel is seen under p cos^2 w / f along the line and p cos w / f across it
+        # At a field angle w a pixel subtends p cos^2 w / f along the line and p cos w / f across it.
         cosine = float(look @ camera.look(np.array([0.5 * (camera.pixels - 1)]))[0])
         return cls(abs(float(change @ across)) / rate * cosine, float(change @ slope) / rate**2)
 
@@ -324,5 +324,5 @@ def exposures(sensor: Sensor, optics: LineOptics) -> list[tuple[float, Sensor]]:
     if jitter is None:
         return [(1.0, sensor)]
     slope = sensor.camera.look_and_slope(np.array([0.5 * (sensor.camera.pixels - 1)]))[1]
-    found = jitter.exposures(_collection(sensor, optics), float(np.linalg.norm(slope)), JITTER_TOLERANCE)
-    return [(share, _with(sensor, one)) for share, one in found]
+    moments = jitter.exposures(_collection(sensor, optics), float(np.linalg.norm(slope)), JITTER_TOLERANCE)
+    return [(share, _with(sensor, moment_jitter)) for share, moment_jitter in moments]

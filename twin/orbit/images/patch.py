@@ -1,7 +1,8 @@
 """Images of one patch of ground by the lines of a camera, with control, and comparison with the truth.
 
-    lines = imaged_lines(sensors, measured, optics, seed) patch = fly_patch(lines, place, (600, 600), ground, control,
-    seed) patch.images["nadir"].frame          # uint16, grey values of the detector
+    lines = imaged_lines(sensors, measured, optics, seed)
+    patch = fly_patch(lines, place, (600, 600), ground, control, seed)
+    patch.images["nadir"].frame          # uint16, grey values of the detector
     patch.images["nadir"].image_point(row, column)      # line and pixel of the whole image
     patch.images["nadir"].measured       # Sensor: the laboratory's camera on the measured trajectory
     patch.control.orthophoto, patch.control.dem
@@ -128,12 +129,12 @@ class Patch(ImagedGround):
         image = self.images[name]
         line, pixel = (np.ravel(v) for v in image.image_point(row, column))
         height = np.full(line.shape, 0.5 * sum(self.terrain.limits))
-        # as followed from the look: the terrain's slope times the look's makes each step smaller
+        # Each step is smaller by the terrain's slope times the look's.
         for _ in range(60):
             points = image.sensor.ground(line, pixel, height)
             east, north, _ = self.frame.local(points)
-            found = self.terrain.height(east, north)
-            away, height = np.max(np.abs(found - height)), 0.5 * (found + height)
+            ground_height = self.terrain.height(east, north)
+            away, height = np.max(np.abs(ground_height - height)), 0.5 * (ground_height + height)
             if away < 1e-5:
                 return points
         raise PatchError("the terrain is as steep as the look", "terrain", name)
@@ -180,17 +181,17 @@ def fly_patch(
     """
     for_terrain, for_ground, for_control, for_frames = (stream(seed, k) for k in range(4))
     frame = GroundFrame(*place)
-    guess = {name: window_of(name, one.sensor, frame, ground.terrain.height, size) for name, one in lines.items()}
-    side = max(_side(one.sensor, guess[name], frame, ground.terrain.height) for name, one in lines.items())
+    guess = {name: window_of(name, line.sensor, frame, ground.terrain.height, size) for name, line in lines.items()}
+    side = max(_side(line.sensor, guess[name], frame, ground.terrain.height) for name, line in lines.items())
     if side > LARGEST_GROUND:
         raise PatchError(f"the patch is {side / 1e3:.0f} km long, more than {LARGEST_GROUND / 1e3:g} km", "size")
     terrain = Terrain.from_spec(ground.terrain, side, for_terrain)
     middle = float(terrain.height(np.zeros(1), np.zeros(1))[0])
-    windows = {name: window_of(name, one.sensor, frame, middle, size) for name, one in lines.items()}
+    windows = {name: window_of(name, line.sensor, frame, middle, size) for name, line in lines.items()}
     looks, extents = {}, []
-    for name, one in lines.items():
+    for name, line in lines.items():
         try:
-            looks[name] = pushbroom.look_map(one.sensor, frame, terrain, windows[name])
+            looks[name] = pushbroom.look_map(line.sensor, frame, terrain, windows[name])
             extents.append(pushbroom.extent_of(looks[name]))
             pushbroom.require_open(looks[name], extents[-1])
         except pushbroom.SteepTerrainError as error:
@@ -200,8 +201,8 @@ def fly_patch(
     seen = apparent(reflectance(extent, ground.texture, for_ground), terrain, ground.light)
     scene = PushbroomScene(frame, terrain, seen)
     images = {}
-    for k, (name, one) in enumerate(lines.items()):
-        images[name] = _recorded(one, scene, windows[name], looks[name], oversampling, stream(for_frames, k))
+    for k, (name, line) in enumerate(lines.items()):
+        images[name] = _recorded(line, scene, windows[name], looks[name], oversampling, stream(for_frames, k))
         advance(k + 1)
     known = make_control(frame, extent, terrain, ground.texture, control, for_ground, for_control)
     return Patch(frame, FrozenMap(images), known, terrain)
@@ -287,7 +288,9 @@ def _not_seen(name: str, sensor: Sensor, frame: GroundFrame, height: float) -> P
     if 0.0 <= share <= 1.0:
         beside = float(np.linalg.norm(begin + share * track))
         return PatchError(
-            f"the {name} line does not see the patch, {beside / 1e3:.0f} km beside its middle pixel", "place", name
+            f"the patch lies outside the swath of the {name} line, {beside / 1e3:.0f} km beside its middle pixel",
+            "place",
+            name,
         )
     early = -share if share < 0.0 else share - 1.0
     seconds = early * sensor.lines * sensor.line_time
@@ -304,7 +307,7 @@ def _side(sensor: Sensor, window: Window, frame: GroundFrame, height: float) -> 
 
 
 def _recorded(
-    one: ImagedLine,
+    imaged: ImagedLine,
     scene: PushbroomScene,
     window: Window,
     looks: LookMap,
@@ -312,21 +315,21 @@ def _recorded(
     seed: np.random.SeedSequence,
 ) -> LineImage:
     """Return the image of one line, rendered and exposed."""
-    done = pushbroom.render_patch(one.sensor, one.optics, scene, window, oversampling, looks)
-    frame = one.optics.ccd.expose(done.photons[None], window.first_pixel, one.pattern, 1, seed)[0, 0]
+    done = pushbroom.render_patch(imaged.sensor, imaged.optics, scene, window, oversampling, looks)
+    frame = imaged.optics.ccd.expose(done.photons[None], window.first_pixel, imaged.pattern, 1, seed)[0, 0]
     line, pixel = window.middle
     height = float(looks.ground(np.array([line]), np.array([pixel]))[2][0, 0])
     half = np.array([0.5, 0.0])
-    along, across = np.abs(one.optics.transfer(half, half[::-1], done.motion))
+    along, across = np.abs(imaged.optics.transfer(half, half[::-1], done.motion))
     return LineImage(
         frame=frame,
         window=window,
-        measured=one.measured,
-        sample=window.sample(one.sensor, height),
-        sensor=one.sensor,
+        measured=imaged.measured,
+        sample=window.sample(imaged.sensor, height),
+        sensor=imaged.sensor,
         motion=done.motion,
         nyquist=(float(along), float(across)),
-        saturated=int(one.optics.ccd.detector.saturated(frame[None]).pixels),
+        saturated=int(imaged.optics.ccd.detector.saturated(frame[None]).pixels),
         error=done.error,
     )
 
@@ -404,18 +407,18 @@ def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
 def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineJudgement]:
     """Compare measured points with the truth, by line; the frame that ties were chosen in is left out."""
     truth = true_ground(patch, points)
-    found = {}
+    judgements = {}
     for name, line in points.sought_in.items():
         true = np.stack(patch.images[name].sensor.image(truth), axis=-1)
         error = line.image - true
         size = np.linalg.norm(error, axis=1)
         worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(line.covariance))[:, 1])
-        # NaN compares false
+        # Comparisons with NaN are false.
         wrong = (size > WRONG_PIXELS) | (size > WRONG_SIGMAS * worst + WRONG_FLOOR)
         right = line.accepted & ~wrong
         good = error[right]
         square = float(np.einsum("ni,nij,nj->", good, np.linalg.inv(line.covariance[right]), good))
-        found[name] = LineJudgement(
+        judgements[name] = LineJudgement(
             found=int(np.isfinite(size).sum()),
             matched=int(line.matched.sum()),
             accepted=int(line.accepted.sum()),
@@ -430,4 +433,4 @@ def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineJudgement]:
             chi_square=square,
             degrees_of_freedom=2 * len(good),
         )
-    return FrozenMap(found)
+    return FrozenMap(judgements)

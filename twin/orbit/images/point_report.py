@@ -74,19 +74,19 @@ class PointListing(Data):
 def listing(patch: ImagedGround, points: PatchPoints) -> list[list[Any]]:
     """Return a row for each point and line."""
     rows: list[list[Any]] = []
-    for sort, one in points.sorts.items():
-        degrees = np.degrees(patch.frame.geographic(one.east, one.north)).T
-        for name, line in one.lines.items():
+    for sort, group in points.sorts.items():
+        degrees = np.degrees(patch.frame.geographic(group.east, group.north)).T
+        for name, line in group.lines.items():
             image, expected = line.image, line.predicted + np.array(line.first)
             sigma = np.sqrt(np.diagonal(line.covariance, axis1=1, axis2=2))
             with np.errstate(invalid="ignore", divide="ignore"):
                 together = line.covariance[:, 0, 1] / np.prod(sigma, axis=1)
-            for k in range(len(one.ground)):
-                kind = "check" if one.check[k] else sort
+            for k in range(len(group.ground)):
+                kind = "check" if group.check[k] else sort
                 numbers = (*expected[k], *image[k], *sigma[k], together[k], line.correlation[k])
                 shown = [float(v) if np.isfinite(v) else None for v in numbers]
                 code = int(line.status[k])
-                ground = [*map(float, degrees[k]), float(one.height[k]), *map(float, one.ground[k])]
+                ground = [*map(float, degrees[k]), float(group.height[k]), *map(float, group.ground[k])]
                 rows.append([kind, k, name, *ground, *shown, int(line.accepted[k]), status_text(code)])
     return rows
 
@@ -109,10 +109,10 @@ def how_measured(spec: ImagePointsSpec, known: str) -> str:
         Sensor that brings the points into each line's geometry.
     """
     return (
-        "Distinct places of the orthophoto, with heights of the elevation model, and distinct places of one line's "
-        f"image are brought into each line's geometry by {known}, templates of {spec.template} pixels, sought "
-        f"{spec.reach} pixels to each side, and fitted by least squares. Rejected is what fails a threshold of the "
-        "matching, and what does not follow the smooth displacement of its neighbours."
+        "Distinct points of the orthophoto, with heights of the elevation model, and distinct points of one line's "
+        f"image are transformed to each line's geometry by {known}. Templates of {spec.template} pixels are searched "
+        f"{spec.reach} pixels to each side and fitted by least squares. Points are rejected that fail a threshold of "
+        "the matching or do not follow the smooth displacement of their neighbours."
     )
 
 
@@ -127,30 +127,30 @@ def point_artefacts(patch: ImagedGround, points: PatchPoints, *tables: Table) ->
     figures = [
         PngFigure(
             f"points-{sort}",
-            f"From predicted to found, {SORTS[sort]} points",
-            "Arrows as long as they are in the image, after the median displacement in the title was taken off, "
-            "enlarged as the title says; crosses: rejected by the neighbours; points: not matched.",
-            points_png(patch, one),
+            f"Displacement from predicted to measured, {SORTS[sort]} points",
+            "Arrows: displacements less their median in the title, enlarged by the factor there; crosses: rejected "
+            "by the consensus of the neighbours; points: not matched.",
+            points_png(patch, group),
         )
-        for sort, one in points.sorts.items()
+        for sort, group in points.sorts.items()
     ]
-    caption = "Every point in every line: ground coordinates, image coordinates, sigmas of the fit, verdict."
+    caption = "Each point in each line: ground coordinates, image coordinates, sigmas of the fit, status."
     listed = PointListing("points", "Points", caption, listing(patch, points))
     return *tables, *figures, _lost_table(points), listed
 
 
 def flat(points: PatchPoints, below: Callable[[MatchedPoints], Mapping[str, T]]) -> dict[str, T]:
     """Return results of points by line under a combined name of kind and line."""
-    found = ((sort, below(one)) for sort, one in points.sorts.items())
-    return {f"{SORTS[sort]}, {name}": line for sort, lines in found for name, line in lines.items()}
+    groups = ((sort, below(group)) for sort, group in points.sorts.items())
+    return {f"{SORTS[sort]}, {name}": line for sort, lines in groups for name, line in lines.items()}
 
 
 def found_table(points: PatchPoints) -> Table:
     """Return the table of the points that were matched, by kind and line."""
-    found = flat(points, lambda one: one.sought_in)
-    rows = {name: MATCHED(line) for name, line in found.items() if line.accepted.any()}
+    matches = flat(points, lambda group: group.sought_in)
+    rows = {name: MATCHED(line) for name, line in matches.items() if line.accepted.any()}
     caption = (
-        "Displacement from predicted to found and sigma: medians of the accepted, px along the track and the line."
+        "Displacement from predicted to measured and sigma: medians of the accepted, px along the track and the line."
     )
     moved = ("displacement_lines_px", "displacement_pixels_px")
     keys = ("found", "matched", "accepted", *moved, *(f"{key}_sigma" for key in moved))
@@ -159,26 +159,26 @@ def found_table(points: PatchPoints) -> Table:
 
 def _true(patch: Patch, points: PatchPoints) -> Table:
     """Return the table of measured points compared with the truth."""
-    rows = {name: JUDGED(line) for name, line in flat(points, lambda one: judged(patch, one)).items()}
+    rows = {name: JUDGED(line) for name, line in flat(points, lambda quantity: judged(patch, quantity)).items()}
     caption = (
-        f"Wrong: {WRONG}; of all places that a fit gave, of those that matching let pass, of those that the neighbours "
-        "agree with. RMS and mean error, px, and chi-square, of right places."
+        f"Wrong: {WRONG}; counted among all measured points, those that passed the matching, and those that passed the "
+        "consensus. RMS and mean error, px, and chi-square of the right points."
     )
-    keys = [one.key for one in JUDGED][:-1]
-    return JUDGED.table("points-truth", "Against the truth", caption, rows, keys, "points, line", digits=4)
+    keys = [quantity.key for quantity in JUDGED][:-1]
+    return JUDGED.table("points-truth", "Comparison with the truth", caption, rows, keys, "points, line", digits=4)
 
 
 def _lost_table(points: PatchPoints) -> Table:
     """Return the table of the reasons why points were not accepted."""
     rows: list[tuple[Cell, ...]] = []
-    for sort, one in points.sorts.items():
-        count = {name: line.lost for name, line in one.sought_in.items()}
+    for sort, group in points.sorts.items():
+        count = {name: line.lost for name, line in group.sought_in.items()}
         total: Counter[str] = Counter()
-        for found in count.values():
-            total.update(found)
+        for reasons in count.values():
+            total.update(reasons)
         for text, _ in total.most_common():
             rows.append((SORTS[sort], text, ", ".join(f"{n} {c.get(text, 0)}" for n, c in count.items())))
-    return Table("points-lost", "Why points were not accepted", "", ("points", "reason", "how many"), rows)
+    return Table("points-lost", "Why points were not accepted", "", ("points", "reason", "number"), rows)
 
 
 def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
@@ -191,7 +191,7 @@ def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
             _panel(axes, name, patch.images[name], points)
         marks = [
             Line2D([], [], color=YELLOW, marker=r"$\rightarrow$", ls="", ms=9, label="accepted"),
-            Line2D([], [], color=VERMILION, marker="x", ls="", label="rejected by its neighbours"),
+            Line2D([], [], color=VERMILION, marker="x", ls="", label="rejected by consensus"),
             Line2D([], [], color=SKY, marker=".", ls="", label="not matched"),
         ]
         figure.legend(handles=marks, loc="outside lower center", ncols=3, labelcolor="black")
@@ -207,7 +207,7 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
     ends = (column - 0.5, column + columns - 0.5, row + rows - 0.5, row - 0.5)
     axes.imshow(image.frame, cmap="gray", vmin=low, vmax=high, extent=ends, interpolation="antialiased", alpha=0.75)
     at, to = line.predicted + np.array(line.first), line.image
-    # no minus before zero
+    # Adding zero removes a minus before zero.
     middle = np.round(line.moved, 1) + 0.0
     rest = to - at - middle
     good, against = line.accepted, line.status == CONSENSUS
@@ -218,10 +218,10 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
     axes.quiver(to[good, 1], to[good, 0], rest[good, 1], rest[good, 0], color=YELLOW, path_effects=effects, **arrow)
     axes.plot(to[against, 1], to[against, 0], "x", color=VERMILION, ms=6, mew=1.6)
     lost = ~good & ~against
-    # where it would be, for a point that was not matched
+    # Points that were not matched are drawn at their expected position.
     axes.plot(at[lost, 1] + middle[1], at[lost, 0] + middle[0], ".", color=SKY, ms=5, mec="black", mew=0.4)
     axes.set(
-        title=f"{name}: moved by {middle[0]:.1f} lines, {middle[1]:.1f} pixels\nrest shown {enlarged:g} × enlarged",
+        title=f"{name}: median {middle[0]:.1f} lines, {middle[1]:.1f} pixels\nresiduals enlarged {enlarged:g} ×",
         xlim=ends[:2],
         ylim=ends[2:],
     )

@@ -85,7 +85,7 @@ class LookMap:
         Raises
         ------
         ValueError
-            The part lies outside the image, a line of sight misses the Earth, or the attitude is too rough for the nodes.
+            The part lies outside the image, a line of sight misses the Earth, or the attitude is too rough.
         """
         low, high = terrain.limits
         span = np.array([lines, pixels, (low - 1.0, high + 1.0)])
@@ -98,8 +98,8 @@ class LookMap:
             grid = [a.ravel() for a in np.meshgrid(nodes[2], nodes[0], nodes[1], indexing="ij")]
             known = [v.reshape(_HEIGHTS, count, along) for v in _local(sensor, frame, grid[1], grid[2], grid[0])]
             east, north = (_coefficients(v) for v in known)
-            one = cls(frame, terrain, span, east, north, error)
-            error = float(np.max(np.abs(one._at(*probe) - exact)))
+            interpolation = cls(frame, terrain, span, east, north, error)
+            error = float(np.max(np.abs(interpolation._at(*probe) - exact)))
             if error <= tolerance:
                 return cls(frame, terrain, span, east, north, error)
         raise UnphysicalError(
@@ -342,8 +342,8 @@ def extent_of(looks: LookMap, step: int = 16) -> Extent:
     east, north, _ = looks.ground(lines, pixels)
     # Between two samples the terrain displaces the point by less than their distance.
     spare = max(float(np.max(np.abs(np.diff(v, axis=k)))) for v in (east, north) for k in (0, 1))
-    found = Extent(float(east.min()), float(east.max()), float(north.min()), float(north.max()))
-    return found.grown(spare)
+    extent = Extent(float(east.min()), float(east.max()), float(north.min()), float(north.max()))
+    return extent.grown(spare)
 
 
 def require_open(looks: LookMap, extent: Extent) -> None:
@@ -410,7 +410,10 @@ def render_patch(
     motion = ImageMotion.of(steady(sensor), line, pixel, height)
     moments = exposures(sensor, optics)
     if len(moments) > 1 or moments[0][1] is not sensor:
-        seen = [(share, _expected(one, optics, scene, window, oversampling, motion, None)) for share, one in moments]
+        seen = [
+            (share, _expected(moment_sensor, optics, scene, window, oversampling, motion, None))
+            for share, moment_sensor in moments
+        ]
         photons = np.sum([share * photons for share, (photons, _) in seen], axis=0)
         return RenderedPatch(np.maximum(photons, 0.0), window, motion, max(error for _, (_, error) in seen))
     photons, error = _expected(sensor, optics, scene, window, oversampling, motion, looks)
@@ -525,9 +528,9 @@ def _interpolation_error(sensor: Sensor, looks: LookMap, window: Window, oversam
         if fine < oversampling:
             east, north = (_spread(_spread(v, oversampling, 0), oversampling, 1) for v in (east, north))
             lines, pixels = (v[1] + np.arange(len(east)) / oversampling for v in (lines, pixels))
-        some = random.integers(0, len(lines), (2, size**2))
-        taken.append(np.stack([lines[some[0]], pixels[some[1]]]))
-        places.append(np.stack([east[some[0], some[1]], north[some[0], some[1]]]))
+        index = random.integers(0, len(lines), (2, size**2))
+        taken.append(np.stack([lines[index[0]], pixels[index[1]]]))
+        places.append(np.stack([east[index[0], index[1]], north[index[0], index[1]]]))
     (east, north), expected = np.concatenate(places, axis=1), np.concatenate(taken, axis=1)
-    found = sensor.image(looks.frame.itrs(east, north, looks.terrain.height(east, north)))
-    return float(np.max(np.hypot(found[0] - expected[0], found[1] - expected[1])))
+    imaged = sensor.image(looks.frame.itrs(east, north, looks.terrain.height(east, north)))
+    return float(np.max(np.hypot(imaged[0] - expected[0], imaged[1] - expected[1])))

@@ -155,14 +155,17 @@ def sections(run: Simulation) -> tuple[Section, ...]:
 def _images(run: Simulation) -> Section:
     worst = max(image.error for image in run.patch.images.values())
     text = (
-        "Each line's window of the same size has the patch in its middle. Places that are interpolated between "
-        f"rigorous ones are off by {worst:.1g} pixels at most. A line's pixels differ by the detector's fixed pattern, "
-        "and no radiometric correction has been made.",
+        "Each line's window of the same size has the patch in its middle. Interpolation of the rigorous geometry is in "
+        f"error by {worst:.1g} pixels at most. The images contain the detector's fixed pattern, without radiometric "
+        "correction.",
     )
     figure = PngFigure(
-        "lines", "What the lines recorded", "Grey values between 0.5% and 99.5% of each image.", _images_png(run)
+        "lines",
+        "Images of the lines",
+        "Each image is stretched between its 0.5 % and 99.5 % grey values.",
+        _images_png(run),
     )
-    caption = "Lines count from the begin of the orbit data, pixels from the first of the line."
+    caption = "Lines are counted from the start of the orbit data, pixels from the first of the line."
     keys = ("first_line", "first_pixel", "mean_dn", "smallest_dn", "largest_dn", "saturated_pixels")
     return Section("Images", text, (figure, _lines(run, "windows", "Windows and grey values", caption, keys)))
 
@@ -176,13 +179,16 @@ def _lines(run: Simulation, name: str, title: str, caption: str, keys: Sequence[
 def _control(run: Simulation) -> Section:
     spec = run.spec.control
     text = (
-        f"The orthophoto has {spec.spacing:g} m and was taken on another date: another sun, and {spec.changed:.0%} of "
-        f"the fields look different. The elevation model has posts every {spec.dem.post:g} m and errors of "
-        f"{spec.dem.sigma:g} m that are alike over {spec.dem.correlation:g} m. Both share an error in plan, a shift of "
-        f"[{spec.shift[0]:g}, {spec.shift[1]:g}] m and a smooth part of {spec.sigma:g} m.",
+        f"The orthophoto has pixels of {spec.spacing:g} m and another date: another sun, and {spec.changed:.0%} of the "
+        f"fields look different. The elevation model has posts every {spec.dem.post:g} m and errors of "
+        f"{spec.dem.sigma:g} m with a correlation length of {spec.dem.correlation:g} m. Both share an error in plan, a "
+        f"shift of [{spec.shift[0]:g}, {spec.shift[1]:g}] m and a smooth part of {spec.sigma:g} m.",
     )
     figure = PngFigure(
-        "control", "Control", "East and north of the patch's middle; rows of the files go south.", _control_png(run)
+        "control",
+        "Control",
+        "Coordinates east and north of the patch's middle; rows of the files run south.",
+        _control_png(run),
     )
     return Section("Orthophoto and elevation model", text, (figure,))
 
@@ -190,7 +196,7 @@ def _control(run: Simulation) -> Section:
 def _sharpness(run: Simulation) -> Section:
     with look("simulate-transfer"):
         drawing = to_svg(_transfer_figure(run))
-    caption = "Up to half a cycle per sample; before any noise."
+    caption = "Up to half a cycle per sample."
     return Section("Sharpness", (), (SvgFigure("transfer", "Modulation transfer", caption, drawing),))
 
 
@@ -200,15 +206,15 @@ def _data(run: Simulation) -> Section:
     rasters = described("georeference", georeference_data(run))
     truth = described("simulate-truth", TRUTH(run))
     parts = (
-        Data("camera", "Camera", "As the laboratory measured it.", camera),
-        Data("trajectory", "Orbit and attitude", "As measured.", path),
-        Data("georeference", "Georeference", "Of orthophoto and elevation model.", rasters),
-        Data("truth", "Truth", "Camera, orbit, attitude, ground points; not for an analysis.", truth),
+        Data("camera", "Camera", "Camera as measured in the laboratory.", camera),
+        Data("trajectory", "Orbit and attitude", "Measured orbit and attitude.", path),
+        Data("georeference", "Georeference", "Georeference of orthophoto and elevation model.", rasters),
+        Data("truth", "Truth", "True camera, orbit, attitude and ground points; not for an analysis.", truth),
     )
     text = (
         "For other software: the images as TIFF, orthophoto (10 000 for a reflectance of 1) and elevation model "
         "(metres, 32-bit floating point) as GeoTIFF, the laboratory's camera, the measured orbit "
-        "and attitude. What only the truth knows is kept apart in truth.json.",
+        "and attitude. The truth is in truth.json alone.",
     )
     return Section("Data", text, parts)
 
@@ -272,17 +278,19 @@ def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
     """Return the input quantities listed in the report."""
     test, camera = setup.test, setup.camera
     terrain, light = test.ground.terrain, test.ground.light
-    relief = "its own relief" if terrain.relief is None else f"relief {format_quantity(terrain.relief, LENGTH)} rms"
+    relief = "original relief" if terrain.relief is None else f"relief {format_quantity(terrain.relief, LENGTH)} rms"
     kind = (
-        "Jacksboro fault, 3 arc seconds, moved" if terrain.kind == "real" else f"fractal, exponent {terrain.exponent:g}"
+        "Jacksboro fault, 3 arc seconds, shifted"
+        if terrain.kind == "real"
+        else f"fractal, exponent {terrain.exponent:g}"
     )
-    sun = f"{format_quantity(light.elevation, ANGLE)} high in {format_quantity(light.azimuth, ANGLE)}"
+    sun = f"elevation {format_quantity(light.elevation, ANGLE)}, azimuth {format_quantity(light.azimuth, ANGLE)}"
     bias = ", ".join(format_quantity(v, ANGLE) for v in test.errors.star_tracker.bias)
     return (
         ("Camera", f"{camera.name}, {camera.description}"),
         ("Changed since the laboratory", changes_text(test.perturb)),
         ("Bias of the star trackers", f"[{bias}]"),
-        ("Terrain", f"{kind}; {format_quantity(terrain.height, LENGTH)} high, {relief}"),
+        ("Terrain", f"{kind}; height {format_quantity(terrain.height, LENGTH)}, {relief}"),
         ("Ground", f"cells of {test.ground.texture.spacing:g} m, reflectance {test.ground.texture.mean:g}"),
         ("Sun", sun),
         ("Samples", f"{test.oversampling} along each side of a pixel"),

@@ -241,26 +241,46 @@ def _line_time(image: LineImage, row: int) -> float:
 
 
 LINE: Record[LineImage] = Record(
-    "One line's image.",
-    Quantity("first_line", lambda image: image.window.first_line, "of the window in the line's whole image"),
-    Quantity("first_pixel", lambda image: image.window.first_pixel, "of the window on the line"),
-    Quantity("lines", lambda image: image.window.lines, "how many"),
-    Quantity("pixels", lambda image: image.window.pixels, "how many"),
-    Quantity("first_line_time_s", lambda image: _line_time(image, 0), "middle of its exposure, from the epoch"),
-    Quantity("last_line_time_s", lambda image: _line_time(image, image.window.lines - 1), "the same of the last line"),
-    Quantity("line_time_s", lambda image: image.measured.line_time, "from one line to the next"),
+    "Image of one line.",
+    Quantity("first_line", lambda image: image.window.first_line, "first line of the window in the line's whole image"),
+    Quantity("first_pixel", lambda image: image.window.first_pixel, "first pixel of the window on the line"),
+    Quantity("lines", lambda image: image.window.lines, "number of lines"),
+    Quantity("pixels", lambda image: image.window.pixels, "number of pixels"),
+    Quantity(
+        "first_line_time_s",
+        lambda image: _line_time(image, 0),
+        "middle of the exposure of the first line, from the epoch",
+    ),
+    Quantity(
+        "last_line_time_s",
+        lambda image: _line_time(image, image.window.lines - 1),
+        "middle of the exposure of the last line",
+    ),
+    Quantity("line_time_s", lambda image: image.measured.line_time, "time from one line to the next"),
     Quantity("mean_dn", lambda image: image.frame.mean(), "mean grey value", "mean [DN]"),
     Quantity("smallest_dn", lambda image: image.frame.min(), "smallest grey value", "smallest [DN]"),
     Quantity("largest_dn", lambda image: image.frame.max(), "largest grey value", "largest [DN]"),
     Quantity("rms_contrast", lambda i: i.frame.std() / i.frame.mean(), "standard deviation over mean", shown="percent"),
-    Quantity("saturated_pixels", lambda image: image.saturated, "at the end of the detector's range"),
-    Quantity("sample_along_line_m", lambda image: image.sample[0], "distance of two pixels on the ground"),
-    Quantity("sample_along_track_m", lambda image: image.sample[1], "distance of two lines on the ground"),
-    Quantity("mtf_nyquist_along_line", lambda image: image.nyquist[0], "at half a cycle per pixel", "MTF line"),
-    Quantity("mtf_nyquist_along_track", lambda image: image.nyquist[1], "at half a cycle per line", "MTF track"),
+    Quantity("saturated_pixels", lambda image: image.saturated, "number of saturated pixels"),
+    Quantity("sample_along_line_m", lambda image: image.sample[0], "distance of neighbouring pixels on the ground"),
+    Quantity("sample_along_track_m", lambda image: image.sample[1], "distance of neighbouring lines on the ground"),
+    Quantity(
+        "mtf_nyquist_along_line",
+        lambda image: image.nyquist[0],
+        "modulation transfer at half a cycle per pixel",
+        "MTF line",
+    ),
+    Quantity(
+        "mtf_nyquist_along_track",
+        lambda image: image.nyquist[1],
+        "modulation transfer at half a cycle per line",
+        "MTF track",
+    ),
     Quantity("advance_px_per_line", lambda image: image.motion.advance, "motion of the image across the line"),
     Quantity("drift_px_per_line", lambda image: image.motion.drift, "motion of the image along the line"),
-    Quantity("geometry_error_px", lambda image: image.error, "largest of places that the renderer interpolates"),
+    Quantity(
+        "geometry_error_px", lambda image: image.error, "largest error of positions that the renderer interpolates"
+    ),
 )
 
 
@@ -270,54 +290,66 @@ def _per_pixel(raster: Raster) -> Array:
 
 
 GEOREFERENCE: Record[Raster] = Record(
-    "Where a raster's pixels lie, exactly: longitude and latitude are linear in column and row.",
-    Quantity("rows", lambda raster: raster.values.shape[0], "how many"),
-    Quantity("columns", lambda raster: raster.values.shape[1], "how many"),
-    Quantity("spacing_m", lambda raster: raster.spacing, "of rows and columns on the ground"),
+    "Georeference of a raster: longitude and latitude are exactly linear in column and row.",
+    Quantity("rows", lambda raster: raster.values.shape[0], "number of rows"),
+    Quantity("columns", lambda raster: raster.values.shape[1], "number of columns"),
+    Quantity("spacing_m", lambda raster: raster.spacing, "spacing of rows and columns on the ground"),
     Quantity(
         "first_longitude_deg",
         lambda raster: raster.frame.longitude + raster.west / raster.frame.scale[0],
-        "of the middle of the first column",
+        "longitude of the middle of the first column",
     ),
     Quantity(
         "first_latitude_deg",
         lambda raster: raster.frame.latitude + raster.north / raster.frame.scale[1],
-        "of the middle of the first row",
+        "latitude of the middle of the first row",
     ),
-    Quantity("longitude_per_column_deg", lambda raster: _per_pixel(raster)[0], "from one column to the next"),
-    Quantity("latitude_per_row_deg", lambda raster: _per_pixel(raster)[1], "from one row to the next, negative"),
+    Quantity("longitude_per_column_deg", lambda raster: _per_pixel(raster)[0], "step from one column to the next"),
+    Quantity("latitude_per_row_deg", lambda raster: _per_pixel(raster)[1], "step from one row to the next, negative"),
 )
 MATCHED: Record[MatchedLine] = Record(
-    "Points of one sort in one line. Displacements from where the line is known to have the points, and sigmas of the "
-    "fit, are medians of the accepted.",
-    Quantity("found", lambda line: np.isfinite(line.place[:, 0]).sum(), "places that a fit gave"),
-    Quantity("matched", lambda line: line.matched.sum(), "of these, places that matching let pass"),
-    Quantity("accepted", lambda line: line.accepted.sum(), "of these, places that the neighbours agree with"),
-    Quantity("rejected_by_consensus", lambda line: (line.status == CONSENSUS).sum(), "that the neighbours contradict"),
-    Quantity("not_accepted", lambda line: line.lost, "reason -> number of points, the most frequent first"),
-    Quantity("displacement_lines_px", lambda line: line.moved[0], "found minus predicted along track", "moved, track"),
-    Quantity("displacement_pixels_px", lambda line: line.moved[1], "found minus predicted along line", "moved, line"),
+    "Points of one kind in one line. Displacements from the predicted positions, and sigmas of the fit, are medians of "
+    "the accepted points.",
+    Quantity("found", lambda line: np.isfinite(line.place[:, 0]).sum(), "points for which the fit gave a position"),
+    Quantity("matched", lambda line: line.matched.sum(), "of these, points that passed the thresholds of the matching"),
+    Quantity("accepted", lambda line: line.accepted.sum(), "of these, points that agree with their neighbours"),
+    Quantity(
+        "rejected_by_consensus",
+        lambda line: (line.status == CONSENSUS).sum(),
+        "points that contradict their neighbours",
+    ),
+    Quantity("not_accepted", lambda line: line.lost, "number of points by reason, the most frequent first"),
+    Quantity(
+        "displacement_lines_px", lambda line: line.moved[0], "measured minus predicted along track", "moved, track"
+    ),
+    Quantity(
+        "displacement_pixels_px", lambda line: line.moved[1], "measured minus predicted along line", "moved, line"
+    ),
     Quantity("displacement_lines_px_sigma", lambda line: line.usual_sigma[0], "1 sigma along track", "σ track"),
     Quantity("displacement_pixels_px_sigma", lambda line: line.usual_sigma[1], "1 sigma along line", "σ line"),
-    Quantity("consensus_scatter_px", lambda line: line.scatter, "of the displacements beyond their covariances"),
+    Quantity(
+        "consensus_scatter_px", lambda line: line.scatter, "scatter of the displacements beyond their covariances"
+    ),
 )
 POINTS: Record[MatchedPoints] = Record(
-    "Points of one sort; ties are chosen in one line, which is left out.",
-    Quantity("sought", lambda points: len(points.ground), "how many"),
-    Quantity("in_all_lines", lambda points: points.in_all.sum(), "accepted in every line"),
-    Quantity("lines", lambda points: points.sought_in, "every line that was searched", record=MATCHED),
+    "Points of one kind; for ties without the line in which they are chosen.",
+    Quantity("sought", lambda points: len(points.ground), "number of points"),
+    Quantity("in_all_lines", lambda points: points.in_all.sum(), "points accepted in every line"),
+    Quantity("lines", lambda points: points.sought_in, "each line that was searched", record=MATCHED),
 )
 SIMULATE: Record[Simulation] = Record(
-    "simulate.json. What the user of the images may know.",
-    Quantity("seed", lambda run: run.seed, "of all random numbers"),
-    Quantity("epoch_utc", lambda run: str(run.spec.orbit.epoch), "from which times count"),
-    Quantity("longitude_deg", lambda run: run.place[0], "of the patch's middle"),
-    Quantity("latitude_deg", lambda run: run.place[1], "of the patch's middle"),
-    Quantity("lines", lambda run: run.patch.images, "every line's image", record=LINE),
-    Quantity("orthophoto", lambda run: run.patch.control.orthophoto, "grey values of the map", record=GEOREFERENCE),
-    Quantity("dem", lambda run: run.patch.control.dem, "the elevation model", record=GEOREFERENCE),
+    "simulate.json. Quantities that the user of the images may know.",
+    Quantity("seed", lambda run: run.seed, "seed of all random numbers"),
+    Quantity("epoch_utc", lambda run: str(run.spec.orbit.epoch), "zero of the times"),
+    Quantity("longitude_deg", lambda run: run.place[0], "longitude of the patch's middle"),
+    Quantity("latitude_deg", lambda run: run.place[1], "latitude of the patch's middle"),
+    Quantity("lines", lambda run: run.patch.images, "image of each line", record=LINE),
     Quantity(
-        "points", lambda run: run.points and run.points.sorts, "sort -> points measured in the images", record=POINTS
+        "orthophoto", lambda run: run.patch.control.orthophoto, "georeference of the orthophoto", record=GEOREFERENCE
+    ),
+    Quantity("dem", lambda run: run.patch.control.dem, "georeference of the elevation model", record=GEOREFERENCE),
+    Quantity(
+        "points", lambda run: run.points and run.points.sorts, "points measured in the images, by kind", record=POINTS
     ),
 )
 
@@ -349,10 +381,12 @@ def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
     errors = run.spec.errors
     fixes, looks = (
         times[in_span(times, path.first, path.last)]
-        for times in (readings(path.first, path.last, one.interval) for one in (errors.gps, errors.star_tracker))
+        for times in (
+            readings(path.first, path.last, instrument.interval) for instrument in (errors.gps, errors.star_tracker)
+        )
     )
     quaternion = Rotation.from_matrix(path.body_to_itrs(looks)).as_quat(canonical=False)
-    found = {
+    data = {
         "epoch_utc": str(path.orbit.epoch),
         "orbit_s": fixes,
         "position_m": path.position(fixes),
@@ -361,7 +395,7 @@ def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
         "attitude_s": looks,
         "quaternion": joined_quaternions(quaternion),
     }
-    return {key: plain_data(value) for key, value in found.items()}
+    return {key: plain_data(value) for key, value in data.items()}
 
 
 def georeference_data(run: Simulation) -> dict[str, Any]:
@@ -370,37 +404,37 @@ def georeference_data(run: Simulation) -> dict[str, Any]:
     return {"orthophoto": GEOREFERENCE(control.orthophoto), "dem": GEOREFERENCE(control.dem)}
 
 
-def _errors(one: LineJudgement) -> list[list[float | None]]:
+def _errors(judgement: LineJudgement) -> list[list[float | None]]:
     """Return the errors of every point, None where it was not measured."""
-    return [[float(v) if np.isfinite(v) else None for v in row] for row in one.error]
+    return [[float(v) if np.isfinite(v) else None for v in row] for row in judgement.error]
 
 
 MATCH_COUNTS = {
-    "found": "places that were found, before any is rejected",
-    "matched": "places that the thresholds of matching let pass",
-    "accepted": "places that consensus lets pass, too",
-    "wrong_found": "wrong places among those that were found",
-    "wrong_matched": "wrong places among those that matching let pass",
-    "wrong_accepted": "wrong places among those that consensus let pass",
-    "right_rejected_by_consensus": "right matches that consensus rejected",
+    "found": "points with a measured position, before any is rejected",
+    "matched": "points that passed the thresholds of the matching",
+    "accepted": "points that also passed the consensus",
+    "wrong_found": "wrong ones among all measured points",
+    "wrong_matched": "wrong ones among those that passed the matching",
+    "wrong_accepted": "wrong ones among those that passed the consensus",
+    "right_rejected_by_consensus": "right matches that the consensus rejected",
 }
 """Meaning of each count of points in one line."""
 
 JUDGED: Record[LineJudgement] = Record(
-    "Points of one sort in one line against the truth; RMS and mean of those that are not wrong.",
+    "Points of one kind in one line compared with the truth; RMS and mean of those that are not wrong.",
     *(Quantity(key, attrgetter(key), meaning) for key, meaning in MATCH_COUNTS.items()),
     Quantity("rms_lines_px", lambda one: one.rms[0], "root mean square error along the track", "RMS track"),
     Quantity("rms_pixels_px", lambda one: one.rms[1], "root mean square error along the line", "RMS line"),
     Quantity("mean_lines_px", lambda one: one.mean[0], "mean error along the track", "mean track"),
     Quantity("mean_pixels_px", lambda one: one.mean[1], "mean error along the line", "mean line"),
-    Quantity("chi_square", lambda one: one.chi_square, "of their errors over their covariances", "χ²"),
-    Quantity("degrees_of_freedom", lambda one: one.degrees_of_freedom, "two for each place"),
-    Quantity("error_px", _errors, "found minus true, lines and pixels, of every point"),
+    Quantity("chi_square", lambda one: one.chi_square, "of their errors under their covariances", "χ²"),
+    Quantity("degrees_of_freedom", lambda one: one.degrees_of_freedom, "two for each point"),
+    Quantity("error_px", _errors, "measured minus true, lines and pixels, of each point"),
 )
 TRUE_POINTS: Record[tuple[Patch, MatchedPoints]] = Record(
-    "True places of what the points of one sort show, in the order of points.csv.",
-    Quantity("itrs_m", lambda of: true_ground(*of), "ITRS"),
-    Quantity("lines", lambda of: judged(*of), "every line that was searched", record=JUDGED),
+    "True ground positions of the points of one kind, in the order of points.csv.",
+    Quantity("itrs_m", lambda of: true_ground(*of), "ITRS coordinates"),
+    Quantity("lines", lambda of: judged(*of), "each line that was searched", record=JUDGED),
 )
 
 
@@ -426,21 +460,29 @@ def _control_error(patch: Patch) -> dict[str, Any]:
 
 
 TRUTH: Record[Simulation] = Record(
-    "What only the truth of a pass knows.",
+    "Truth of a pass, unknown to an analysis.",
     Quantity(
         "points",
         lambda run: run.points and {sort: (run.patch, one) for sort, one in run.points.sorts.items()},
-        "sort -> true places, and the measured ones against them",
+        "true ground positions by kind, and the measured points compared with them",
         record=TRUE_POINTS,
     ),
-    Quantity("camera", lambda run: described("camera", camera_data(run.truth)), "as it is"),
-    Quantity("trajectory", lambda run: described("trajectory", trajectory_data(run, run.trajectory)), "the true one"),
+    Quantity("camera", lambda run: described("camera", camera_data(run.truth)), "true camera"),
+    Quantity(
+        "trajectory",
+        lambda run: described("trajectory", trajectory_data(run, run.trajectory)),
+        "true orbit and attitude",
+    ),
     Quantity(
         "ground_points",
         lambda run: {name: _true_grid(run.patch, name) for name in run.patch.images},
-        "line -> true places of a grid of its image",
+        "true ground positions of a grid of each line's image",
     ),
-    Quantity("control_error", lambda run: _control_error(run.patch), "error in plan at a grid of the orthophoto"),
+    Quantity(
+        "control_error",
+        lambda run: _control_error(run.patch),
+        "error in plan of the control at a grid of the orthophoto",
+    ),
 )
 
 
@@ -458,7 +500,11 @@ def simulation_exported(run: Simulation) -> dict[str, str]:
     """
     spec = run.spec
     if run.points is None or run.points.control is None or spec.points is None:
-        raise spec.error("images alone give no tables", ("points",), allowed="`points:` with control and check points")
+        raise spec.error(
+            "only measured points can be exported as tables",
+            ("points",),
+            allowed="`points:` with control and check points",
+        )
     errors = spec.errors
     plain = spec.plain()
     platform = PlatformTable.sampled(run.measured, errors.gps.interval, errors.star_tracker.interval)
@@ -469,7 +515,7 @@ def simulation_exported(run: Simulation) -> dict[str, str]:
     role = np.concatenate([np.where(known.check, "check", "control"), *(["tie"] * len(s.ground) for s in sorts[1:])])
     ground = np.concatenate([known.ground, *(np.full((len(s.ground), 3), np.nan) for s in sorts[1:])])
     covariance = np.zeros((len(role), 3, 3))
-    # one error in plan moves all points of a patch: each of n weighs as if it had n times the variance
+    # One error in plan moves all points of a patch, so each of n gets n times the variance.
     share = float(np.sqrt(max(int(np.sum(known.in_all & ~known.check)), 1)))
     plan, tall = max(spec.control.sigma * share, _EXACT), max(spec.points.height_sigma, _EXACT)
     covariance[: len(known.ground)] = level_covariance(known.ground, plan, tall)
@@ -479,7 +525,7 @@ def simulation_exported(run: Simulation) -> dict[str, str]:
         parts = [sort.lines[name].measured(rows, rows) for sort, rows in zip(sorts, good, strict=True)]
         images[name] = ImagePoints.joined([parts[0], *(part.numbered(-len(known.ground)) for part in parts[1:])])
     points = GroundPoints.of(point_names(role), ground, covariance, role.astype(object))
-    one = PassMeasurements(spec.name, platform, dict.fromkeys(known.lines, times), points, images)
+    measured = PassMeasurements(spec.name, platform, dict.fromkeys(known.lines, times), points, images)
     gps, tracker = plain["errors"]["gps"], plain["errors"]["star_tracker"]
     test = {
         "name": spec.name,
@@ -493,4 +539,4 @@ def simulation_exported(run: Simulation) -> dict[str, str]:
             "star_tracker": {key: tracker[key] for key in ("noise", "slow", "interval")},
         },
     }
-    return campaign_files([one], run.laboratory.plain()) | {TEST_FILE: dump_yaml(test)}
+    return campaign_files([measured], run.laboratory.plain()) | {TEST_FILE: dump_yaml(test)}

@@ -28,18 +28,18 @@ def _verdict(run: Match) -> tuple[str, tuple[str, ...]]:
     """Return the verdict and the sentences after it."""
     role = run.measurements.ground.role
     counts = [f"{int(np.sum(role == name))} {name}" for name in ("control", "check", "tie") if np.any(role == name)]
-    ways = [
+    displacements = [
         (float(np.linalg.norm(line.moved)), name)
-        for one in run.points.sorts.values()
-        for name, line in one.lines.items()
-        if one.kind == "map" and line.accepted.any()
+        for group in run.points.sorts.values()
+        for name, line in group.lines.items()
+        if group.kind == "map" and line.accepted.any()
     ]
     far = ""
-    if ways:
-        way, name = max(ways)
-        far = f"the largest difference from camera and platform is {way:.1f} px, in {name}"
+    if displacements:
+        displacement, name = max(displacements)
+        far = f"the largest displacement from the prediction by camera and platform is {displacement:.1f} px, in {name}"
     shares = [
-        (float(line.accepted.mean()), name) for one in run.points.sorts.values() for name, line in one.lines.items()
+        (float(line.accepted.mean()), name) for group in run.points.sorts.values() for name, line in group.lines.items()
     ]
     share, name = min(shares)
     return answer(
@@ -57,33 +57,37 @@ def _facts(run: Match) -> tuple[tuple[str, str], ...]:
         ("Camera", run.setup.camera.name),
         ("Orthophoto", f"{maps.orthophoto.raster.crs.name}, {maps.orthophoto.spacing:.3g} m"),
         ("Elevation model", f"{maps.dem.raster.crs.name}, {maps.dem.spacing:.3g} m"),
-        ("Control is good to", f"{plan:g} m in plan, {height:g} m in height"),
+        ("Accuracy of the control", f"{plan:g} m in plan, {height:g} m in height"),
         ("Description", spec.description),
     )
 
 
 def _measured(run: Match) -> Section:
     """Return the report section on the measured points."""
-    text = how_measured(run.setup.test.points, "camera and platform as they are known")
+    text = how_measured(run.setup.test.points, "the laboratory's camera on the measured platform")
     return Section("Measured points", (text,), point_artefacts(run.ground, run.points))
 
 
 def _images(run: Match) -> Section:
     """Return the report section on the images."""
     rows = {name: IMAGE(image) for name, image in run.ground.images.items()}
-    caption = "Lines count from the first of the table of times, pixels from the one that sees farthest to the right."
+    caption = (
+        "Lines are counted from the first in the table of times, pixels from the one that looks farthest to the right."
+    )
     return Section("Images", (), (IMAGE.table("windows", "Images", caption, rows, label="line", digits=4),))
 
 
 def _warnings(run: Match) -> tuple[str, ...]:
     """Return warnings on the search range and the accuracy of the datum."""
-    found, reach = [], run.setup.test.points.reach
-    for one in run.points.sorts.values():
-        for name, line in one.lines.items():
-            if one.kind == "map" and line.accepted.any() and np.max(np.abs(line.moved)) > _FAR * reach:
-                found.append(f"points of {name} lie near the end of the reach; a larger `points.reach` may find more")
+    texts, reach = [], run.setup.test.points.reach
+    for group in run.points.sorts.values():
+        for name, line in group.lines.items():
+            if group.kind == "map" and line.accepted.any() and np.max(np.abs(line.moved)) > _FAR * reach:
+                texts.append(
+                    f"points of {name} lie near the limit of the search; a larger `points.reach` may find more"
+                )
     if run.accuracy is None or run.accuracy < 0.0:
-        found.append("how good the way of the maps' system to WGS 84 is, is not stated by its authority")
+        texts.append("the accuracy of the datum transformation of the maps to WGS 84 is not stated by its authority")
     elif run.accuracy > 0.1:
-        found.append(f"the way of the maps' system to WGS 84 is good to {run.accuracy:g} m only")
-    return tuple(found)
+        texts.append(f"the datum transformation of the maps to WGS 84 is accurate to {run.accuracy:g} m only")
+    return tuple(texts)

@@ -121,7 +121,9 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
     photo = UserMap.open(spec.orthophoto, folder)
     dem = UserMap.open(spec.dem, folder, heights=True)
     sensors = {name: _sensor(spec, name, cameras[name], path, times[name], light) for name in spec.images}
-    images = {name: _image(one, name, sensors[name], folder, len(sensors)) for name, one in spec.images.items()}
+    images = {
+        name: _image(image_spec, name, sensors[name], folder, len(sensors)) for name, image_spec in spec.images.items()
+    }
     limits = dem.limits()
     frame, ends = _extent(spec, images, limits)
     maps = Maps(photo.part(frame, ends), dem.part(frame, ends, heights=True))
@@ -219,7 +221,9 @@ def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
         require_memory(Lowered(spec, key, rows, unit, lambda n: n * columns * count * _PIXEL, 32))
         values = np.asarray(source.read(spec.band, window=Part(column, row, columns, rows)))
     if values.dtype.kind not in "uif":
-        raise InputError(Issue("values that are no grey values", file, found=str(values.dtype), allowed="real numbers"))
+        raise InputError(
+            Issue("values that are not grey values", file, found=str(values.dtype), allowed="real numbers")
+        )
     if not np.all(np.isfinite(values)):
         raise InputError(Issue("grey values that are not finite", file, allowed="images without gaps, or a `window:`"))
     return values if values.dtype == np.uint16 else values.astype(np.float32)
@@ -240,13 +244,13 @@ def _extent(
         for height in heights:
             points = sensor.ground(line, pixel, height)
             if not np.all(np.isfinite(points)):
-                remedy = "conventions under which the lines look at the Earth: `twin.orbit check` tells"
-                raise spec.error(f"{name} looks past the Earth", ("images", name), allowed=remedy)
+                remedy = "conventions under which the lines look at the Earth; find them with `twin.orbit check`"
+                raise spec.error(f"the image of {name} looks past the Earth", ("images", name), allowed=remedy)
             seen.append(points)
-    every = np.concatenate(seen)
-    longitude, latitude, _ = Earth().geodetic(np.mean(every, axis=0))
+    corners = np.concatenate(seen)
+    longitude, latitude, _ = Earth().geodetic(np.mean(corners, axis=0))
     frame = GroundFrame(float(longitude), float(latitude))
-    east, north, _ = frame.local(every)
+    east, north, _ = frame.local(corners)
     ends = (east.min() - _SPARE, east.max() + _SPARE, north.min() - _SPARE, north.max() + _SPARE)
     return frame, (float(ends[0]), float(ends[1]), float(ends[2]), float(ends[3]))
 
@@ -256,22 +260,22 @@ def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, 
     ids: list[str] = []
     places, roles = [], []
     rows: dict[str, list[ImagePoints]] = {name: [] for name in spec.images}
-    for sort, one in points.sorts.items():
-        keep = _used(one)
+    for sort, group in points.sorts.items():
+        keep = _used(group)
         start = len(ids)
         number = {int(k): start + n for n, k in enumerate(np.flatnonzero(keep))}
         ids += [f"{sort[0]}{k}" for k in number]
-        places.append(np.where(sort == "tie", np.nan, one.ground[keep]))
-        roles += ["tie" if sort == "tie" else "check" if one.check[k] else "control" for k in number]
-        for name, line in one.lines.items():
+        places.append(np.where(sort == "tie", np.nan, group.ground[keep]))
+        roles += ["tie" if sort == "tie" else "check" if group.check[k] else "control" for k in number]
+        for name, line in group.lines.items():
             good = np.flatnonzero(line.accepted & keep)
             rows[name].append(line.measured(good, np.array([number[int(k)] for k in good], np.intp)))
     itrs, role = np.concatenate(places), np.array(roles, object)
     covariance = np.zeros((len(ids), 3, 3))
-    given = role != "tie"
+    known = role != "tie"
     plan, height = spec.control_sigma
-    each = np.ones(int(given.sum()))
-    covariance[given] = level_covariance(itrs[given], plan * each, height * each)
+    each = np.ones(int(known.sum()))
+    covariance[known] = level_covariance(itrs[known], plan * each, height * each)
     return GroundPoints.of(np.array(ids, object), itrs, covariance, role), FrozenMap(
         {name: ImagePoints.joined(parts) for name, parts in rows.items()}
     )
@@ -284,35 +288,45 @@ def _used(points: MatchedPoints) -> np.ndarray:
 
 
 IMAGE: Record[LineFrame] = Record(
-    "A line's image: which part was matched, and its samples on the ground.",
-    Quantity("first_line", lambda image: image.window.first_line, "counted from the first of the table of times"),
-    Quantity("first_pixel", lambda image: image.window.first_pixel, "from the one that sees farthest to the right"),
-    Quantity("lines", lambda image: image.window.lines, "how many"),
-    Quantity("pixels", lambda image: image.window.pixels, "how many"),
-    Quantity("sample_along_line_m", lambda image: image.sample[0], "distance of two pixels on the ground"),
-    Quantity("sample_along_track_m", lambda image: image.sample[1], "distance of two lines on the ground"),
+    "A line's image: the part that was matched, and its sample distances on the ground.",
+    Quantity(
+        "first_line", lambda image: image.window.first_line, "first line, counted from the first in the table of times"
+    ),
+    Quantity(
+        "first_pixel",
+        lambda image: image.window.first_pixel,
+        "first pixel, counted from the one that looks farthest to the right",
+    ),
+    Quantity("lines", lambda image: image.window.lines, "number of lines"),
+    Quantity("pixels", lambda image: image.window.pixels, "number of pixels"),
+    Quantity("sample_along_line_m", lambda image: image.sample[0], "distance of neighbouring pixels on the ground"),
+    Quantity("sample_along_track_m", lambda image: image.sample[1], "distance of neighbouring lines on the ground"),
 )
 MAP: Record[MapPart] = Record(
-    "The part of a map that was used.",
+    "Part of a map that was used.",
     Quantity("system", lambda part: part.raster.crs.name, "coordinate reference system"),
-    Quantity("first_row", lambda part: part.first[0], "of the part in the map"),
-    Quantity("first_column", lambda part: part.first[1], "of the part in the map"),
-    Quantity("rows", lambda part: part.values.shape[0], "how many"),
-    Quantity("columns", lambda part: part.values.shape[1], "how many"),
-    Quantity("spacing_m", lambda part: part.spacing, "of rows and columns on the ground, geometric mean"),
+    Quantity("first_row", lambda part: part.first[0], "first row of the part in the map"),
+    Quantity("first_column", lambda part: part.first[1], "first column of the part in the map"),
+    Quantity("rows", lambda part: part.values.shape[0], "number of rows"),
+    Quantity("columns", lambda part: part.values.shape[1], "number of columns"),
+    Quantity("spacing_m", lambda part: part.spacing, "spacing of rows and columns on the ground, geometric mean"),
     Quantity(
         "share_without_values",
         lambda part: 0.0 if part.valid is None else 1.0 - float(np.mean(part.valid)),
-        "share of the pixels that hold nothing",
+        "share of the pixels without values",
     ),
 )
 MATCH: Record[Match] = Record(
     "match.json. Points measured in a user's images.",
-    Quantity("epoch_utc", lambda run: run.measurements.platform.epoch, "from which times count"),
-    Quantity("images", lambda run: run.ground.images, "every line's image", record=IMAGE),
-    Quantity("orthophoto", lambda run: run.ground.control.orthophoto, "map of grey values", record=MAP),
-    Quantity("dem", lambda run: run.ground.control.dem, "the elevation model", record=MAP),
-    Quantity("map_accuracy_m", lambda run: run.accuracy, "of the maps' way to WGS 84, as its authority states it"),
+    Quantity("epoch_utc", lambda run: run.measurements.platform.epoch, "zero of the times"),
+    Quantity("images", lambda run: run.ground.images, "image of each line", record=IMAGE),
+    Quantity("orthophoto", lambda run: run.ground.control.orthophoto, "part of the orthophoto", record=MAP),
+    Quantity("dem", lambda run: run.ground.control.dem, "part of the elevation model", record=MAP),
+    Quantity(
+        "map_accuracy_m",
+        lambda run: run.accuracy,
+        "accuracy of the maps' transformation to WGS 84, as its authority states it",
+    ),
     Quantity(
         "control_points",
         lambda run: np.sum(run.measurements.ground.role == "control"),
@@ -322,7 +336,7 @@ MATCH: Record[Match] = Record(
         "check_points", lambda run: np.sum(run.measurements.ground.role == "check"), "points that only test the result"
     ),
     Quantity("tie_points", lambda run: np.sum(run.measurements.ground.role == "tie"), "points without coordinates"),
-    Quantity("points", lambda run: run.points.sorts, "sort -> points measured in the images", record=POINTS),
+    Quantity("points", lambda run: run.points.sorts, "points measured in the images, by kind", record=POINTS),
 )
 
 

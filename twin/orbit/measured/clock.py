@@ -90,16 +90,16 @@ class Readings:
         for k, text in enumerate(texts):
             try:
                 head, _, clock = text.partition("T")
-                one = known.get(head)
-                if one is None:
-                    one = known[head] = _day_of(head)
+                number = known.get(head)
+                if number is None:
+                    number = known[head] = _day_of(head)
                 hour, minute, rest = clock.removesuffix("Z").split(":")
                 if len(hour) != 2 or len(minute) != 2 or not (hour + minute + rest.replace(".", "", 1)).isdigit():
                     raise ValueError
                 seconds = float(rest)
                 if int(hour) > 23 or int(minute) > 59 or seconds >= (61.0 if (hour, minute) == ("23", "59") else 60.0):
                     raise ValueError
-                day[k], second[k] = one, 3600 * int(hour) + 60 * int(minute) + seconds
+                day[k], second[k] = number, 3600 * int(hour) + 60 * int(minute) + seconds
             except ValueError:
                 raise Problem("not a date and time", shown(text), _FORM, within=(k,)) from None
         return cls(day, second)
@@ -164,7 +164,7 @@ def epoch_before(instants: Instants) -> str:
     second = float(instants.second[first])
     rough = int(instants.day[first]) + (second - tai_minus_utc(int(instants.day[first]))) / DAY
     day = int(np.floor(rough))
-    # within a leap second it is the one before
+    # Within a leap second, take the second before.
     second = min((int(instants.day[first]) - day) * DAY + second - tai_minus_utc(day), DAY - 1.0)
     return (datetime.fromordinal(day + _MJD_ZERO) + timedelta(seconds=int(second))).strftime("%Y-%m-%dT%H:%M:%SZ")
 
@@ -197,8 +197,8 @@ def calendar_reading(text: str) -> tuple[int, float]:
     Problem
         The text is not a date and time.
     """
-    one = single_reading(text)
-    return int(one.day[0]), float(one.second[0])
+    reading = single_reading(text)
+    return int(reading.day[0]), float(reading.second[0])
 
 
 def single_reading(text: str) -> Readings:
@@ -224,24 +224,24 @@ def known_scale(name: str) -> str:
         The scale is not supported.
     """
     upper = name.strip().upper()
-    found = {"GPST": "GPS", "GLO": "UTC", "GLONASS": "UTC", "BDS": "BDT", "TDT": "TT"}.get(upper, upper)
-    if found not in SCALES:
-        raise Problem("a time scale that cannot be read", shown(name), names_text(SCALES))
-    return found
+    scale = {"GPST": "GPS", "GLO": "UTC", "GLONASS": "UTC", "BDS": "BDT", "TDT": "TT"}.get(upper, upper)
+    if scale not in SCALES:
+        raise Problem("unknown time scale", shown(name), names_text(SCALES))
+    return scale
 
 
 def _day_of(text: str) -> int:
     """Return the modified Julian day of 2011-03-05, or of day 64 of a year, 2011-064; ValueError if it is neither."""
     if len(text) == 8 and text[4] == "-" and text[5:].isdigit() and text[:4].isdigit():
         start = date(int(text[:4]), 1, 1)
-        found = start + timedelta(days=int(text[5:]) - 1)
-        if found.year != start.year:
+        parsed = start + timedelta(days=int(text[5:]) - 1)
+        if parsed.year != start.year:
             raise ValueError(text)
     elif len(text) == 10:
-        found = date.fromisoformat(text)
+        parsed = date.fromisoformat(text)
     else:
         raise ValueError(text)
-    day = found.toordinal() - _MJD_ZERO
+    day = parsed.toordinal() - _MJD_ZERO
     if not FIRST_DAY <= day < LAST_DAY:
         raise ValueError(text)
     return day

@@ -169,7 +169,7 @@ class DimapPass:
             return self._spanning_samples(self.attitude)
         start, span = float(self.first_line.second[0]), max(self.duration, self.line_time)
         second = start + span * np.linspace(-_MARGIN, 1.0 + _MARGIN, _SAMPLES + 1)
-        # half a line beyond the ends is part of the image
+        # Half a line beyond the ends is part of the image.
         second[0], second[-1] = min(second[0], start - self.line_time), max(second[-1], start + span + self.line_time)
         day = np.floor(second / _DAY)
         clock = Readings(self.attitude.day + day.astype(np.int64), second - _DAY * day)
@@ -195,7 +195,7 @@ class DimapPass:
                 raise InputError(Issue(problem, self.file, None, ("Ephemeris",), found, allowed))
             other, place = (1, 0) if end == 0 else (-2, len(time))
             rate = (velocity[end] - velocity[other]) / (time[end] - time[other])
-            # noise of velocities a few milliseconds apart is no acceleration
+            # Velocities a few milliseconds apart are too noisy for an acceleration.
             rate = rate if abs(time[end] - time[other]) > 0.5 else -_GRAVITY * position[end] / _norm(position[end]) ** 3
             position = np.insert(position, place, position[end] + velocity[end] * step + 0.5 * rate * step**2, axis=0)
             velocity = np.insert(velocity, place, velocity[end] + rate * step, axis=0)
@@ -210,7 +210,7 @@ class DimapPass:
         more = [at for at, end in self._ends_beyond(time) if abs(at - time[end]) <= far]
         if not more:
             return attitude
-        # as the samples are joined everywhere else
+        # This is the interpolation of the samples everywhere else.
         turns = CubicSpline(time, joined_quaternions(attitude.quaternion))(np.array(more))
         order = np.argsort(times := np.concatenate([time, more]))
         quaternion = np.concatenate([attitude.quaternion, turns / np.linalg.norm(turns, axis=1, keepdims=True)])
@@ -282,8 +282,8 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
     forward, right = _looks(calibration, band)
     title = root.maybe("Dataset_Identification", "DATASET_NAME")
     pitch = model.maybe("Instrument_Configuration", "DETECTOR_SIZE_COL")
-    said = root.maybe("Processing_Information", "Product_Settings", "Geometric_Settings")
-    named = root.all("Geoposition", "Geoposition_Models", "Rational_Function_Model", "Component", "COMPONENT_PATH")
+    settings = root.maybe("Processing_Information", "Product_Settings", "Geometric_Settings")
+    components = root.all("Geoposition", "Geoposition_Models", "Rational_Function_Model", "Component", "COMPONENT_PATH")
     return DimapPass(
         str(path),
         profile,
@@ -298,21 +298,21 @@ def read_dimap(path: str | Path, band: str | None = None) -> DimapPass:
         forward,
         right,
         None if pitch is None else pitch.number(least=1e-7, most=1e-3, unit=_LENGTH),
-        _switch(said, "ATMOSPHERIC_REFRACTION_SETTING"),
+        _switch(settings, "ATMOSPHERIC_REFRACTION_SETTING"),
         inertial,
-        _switch(said, "LIGHT_SPEED_SETTING"),
-        tuple(one.attributes["href"] for one in named if one.attributes.get("href")),
+        _switch(settings, "LIGHT_SPEED_SETTING"),
+        tuple(element.attributes["href"] for element in components if element.attributes.get("href")),
     )
 
 
 def _switch(settings: Element | None, name: str) -> bool:
     """Return whether a setting is on; one that the file does not contain is off."""
-    found = None if settings is None else settings.maybe(name)
-    if found is None:
+    element = None if settings is None else settings.maybe(name)
+    if element is None:
         return False
-    if found.text.lower() not in _SWITCHES:
-        found.wrong("neither true nor false", shown(found.text), names_text(_SWITCHES))
-    return _SWITCHES[found.text.lower()]
+    if element.text.lower() not in _SWITCHES:
+        element.wrong("neither true nor false", shown(element.text), names_text(_SWITCHES))
+    return _SWITCHES[element.text.lower()]
 
 
 _SWITCHES: Mapping[str, bool] = FrozenMap({"true": True, "1": True, "false": False, "0": False})
@@ -328,11 +328,11 @@ def _identified(root: Element) -> tuple[str, str]:
     version = form.attributes.get("version", "")
     if form.text != "DIMAP" or version.partition(".")[0] not in _VERSIONS:
         allowed = "DIMAP of version 2 or 3; version 1, of SPOT 1 to 5, has another model"
-        form.wrong("not this format", shown(f"{form.text} {version}"), allowed)
+        form.wrong("unsupported format", shown(f"{form.text} {version}"), allowed)
     profile = identity.one("METADATA_PROFILE")
     if profile.text not in PROFILES:
         allowed = f"{names_text(PROFILES)}; of other profiles only the rational polynomials are read"
-        profile.wrong("a profile that is not read", shown(profile.text), allowed)
+        profile.wrong("unsupported profile", shown(profile.text), allowed)
     return version, profile.text
 
 
@@ -361,9 +361,9 @@ def _times(time: Element, lines: int) -> tuple[Readings, float]:
 
 def _clock(items: list[Element], file: str) -> Readings:
     """Return the times of elements, which must increase."""
-    moments = [_moment(one.one("TIME")) for one in items]
+    moments = [_moment(item.one("TIME")) for item in items]
     clock = Readings(np.array([m.day[0] for m in moments]), np.array([m.second[0] for m in moments]))
-    require_rising(file, clock, [one.line for one in items])
+    require_rising(file, clock, [item.line for item in items])
     return clock
 
 
@@ -372,9 +372,9 @@ def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
     points = ephemeris.all("Point_List", "Point")
     if len(points) < 4:
         ephemeris.wrong("too few points of the orbit", str(len(points)), "4 or more in Point_List")
-    clock, lines = _clock(points, file), [one.line for one in points]
-    position = np.stack([one.one("LOCATION_XYZ").floats(3) for one in points])
-    velocity = np.stack([one.one("VELOCITY_XYZ").floats(3) for one in points])
+    clock, lines = _clock(points, file), [point.line for point in points]
+    position = np.stack([point.one("LOCATION_XYZ").floats(3) for point in points])
+    velocity = np.stack([point.one("VELOCITY_XYZ").floats(3) for point in points])
     require_orbit(file, position, lines)
     share, inertial = velocity_misfit((clock.day - clock.day[0]) * _DAY + clock.second, position, velocity)
     if inertial:
@@ -391,13 +391,13 @@ def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | Att
     samples = attitudes.all("Quaternion_List", "Quaternion")
     if (polynomial is None) == (not samples):
         found = "neither" if polynomial is None else "both"
-        attitudes.wrong("the attitude is not given once", found, "Polynomial_Quaternions or Quaternion_List")
+        attitudes.wrong("the attitude must be given exactly once", found, "Polynomial_Quaternions or Quaternion_List")
     if polynomial is None:
         if len(samples) < 4:
             attitudes.wrong("too few quaternions", str(len(samples)), "4 or more in Quaternion_List")
         clock = _clock(samples, file)
-        values = np.array([[one.number(f"Q{k}") for k in range(4)] for one in samples])
-        require_unit(file, values, [one.line for one in samples])
+        values = np.array([[sample.number(f"Q{k}") for k in range(4)] for sample in samples])
+        require_unit(file, values, [sample.line for sample in samples])
         return AttitudeReadings(file, clock, values, None, "ITRS", "UTC", "first", "body_to_frame")
     offset = polynomial.number("OFFSET", least=0.0, most=2.0 * _DAY)
     scale = polynomial.number("SCALE", least=1e-6, most=1e6)
@@ -407,34 +407,36 @@ def _attitude(attitudes: Element, file: str, day: int) -> AttitudeReadings | Att
         degree = part.whole("DEGREE", least=0, most=_MOST_TERMS - 1)
         rows.append(np.zeros(_MOST_TERMS))
         rows[-1][: degree + 1] = part.one("COEFFICIENTS").floats(degree + 1)
-    made = AttitudePolynomial(day, offset, scale, np.array(rows))
-    # made unit where it is used; at the middle of its range it already is but for the fit
-    require_unit(file, made.coefficients[None, :, 0], [polynomial.line])
-    return made
+    fitted = AttitudePolynomial(day, offset, scale, np.array(rows))
+    # It is normalised where it is used; at the middle of its range it has unit length but for the fit.
+    require_unit(file, fitted.coefficients[None, :, 0], [polynomial.line])
+    return fitted
 
 
 def _looks(calibration: Element, band: str | None) -> tuple[Array, Array]:
     """Return coefficients of the looks' tangents forward and to the right, ascending powers of the pixel from 0."""
     direct = calibration.all("Polynomial_Look_Angles")
     bands = [*calibration.all("Band_Calibration_List", "Band_Calibration"), *calibration.all("Band_Calibration")]
-    named = {one.words("BAND_ID"): one.one("Polynomial_Look_Angles") for one in bands}
+    named = {element.words("BAND_ID"): element.one("Polynomial_Look_Angles") for element in bands}
     if direct and not named:
         named = {"": direct[0]}
     if band is not None:
         if band not in named:
-            calibration.wrong("no such band", shown(band), names_text(named) or "none: the looks are of all bands")
+            calibration.wrong(
+                "no such band", shown(band), names_text(named) or "none: the look angles are common to all bands"
+            )
         named = {band: named[band]}
     if not named:
-        calibration.wrong("no looks", None, "Polynomial_Look_Angles, or Band_Calibration with them")
+        calibration.wrong("no look angles", None, "Polynomial_Look_Angles, or Band_Calibration with them")
     start = calibration.maybe("Swath_Range", "FIRST_COL")
     first = 0 if start is None else int(start.number(least=1, most=1e6)) - 1
-    found = [(_tangent(one, "YLOS", first), -_tangent(one, "XLOS", first)) for one in named.values()]
-    for name, other in zip(named, found, strict=True):
-        if not all(np.array_equal(a, b) for a, b in zip(other, found[0], strict=True)):
-            named[name].wrong("bands do not look alike", names_text(named), "one of them, as `band`")
-    if not found[0][1][1:].any():
-        next(iter(named.values())).wrong("all pixels look one way", "XLOS_1 of 0", "a slope along the line")
-    return found[0]
+    tangents = [(_tangent(element, "YLOS", first), -_tangent(element, "XLOS", first)) for element in named.values()]
+    for name, other in zip(named, tangents, strict=True):
+        if not all(np.array_equal(a, b) for a, b in zip(other, tangents[0], strict=True)):
+            named[name].wrong("bands have different look angles", names_text(named), "one of them, as `band`")
+    if not tangents[0][1][1:].any():
+        next(iter(named.values())).wrong("all pixels have the same look angle", "XLOS_1 of 0", "a slope along the line")
+    return tangents[0]
 
 
 def _tangent(element: Element, name: str, first: int) -> Array:

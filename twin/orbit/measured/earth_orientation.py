@@ -73,9 +73,9 @@ class EarthOrientation:
         begin, end = (day + (second + t) / DAY for t in (first, last))
         if not np.all(in_span(DAY * (np.array([begin, end]) - day), *(DAY * (self.mjd[[0, -1]] - day)))):
             found = f"{calendar(int(self.mjd[0]))} to {calendar(int(self.mjd[-1]))}"
-            needed = f"a table that holds {calendar(int(begin))} to {calendar(int(end))}"
+            needed = f"a table that covers {calendar(int(begin))} to {calendar(int(end))}"
             raise InputError(
-                Issue("the table of Earth orientation ends before the data", self.file, None, (), found, needed)
+                Issue("the table of Earth orientation does not cover the data", self.file, None, (), found, needed)
             )
         return TableRotation(self, epoch, celestial_pole(epoch, first, last))
 
@@ -147,8 +147,8 @@ class TableRotation:
 
     def _polar(self, t: np.ndarray, pole: np.ndarray) -> np.ndarray:
         """Return polar motion, the rotation TIRS -> ITRS, (..., 3, 3)."""
-        one, two = tai_of(self.epoch)
-        return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], erfa.sp00(one, two + (t + erfa.TTMTAI) / DAY)))
+        tai_1, tai_2 = tai_of(self.epoch)
+        return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], erfa.sp00(tai_1, tai_2 + (t + erfa.TTMTAI) / DAY)))
 
 
 def rate_of(matrix: Any, seconds: np.ndarray) -> np.ndarray:
@@ -161,10 +161,14 @@ def rate_of(matrix: Any, seconds: np.ndarray) -> np.ndarray:
     seconds : (N,) ndarray
         Times, seconds.
     """
-    turn = matrix(seconds + _RATE_STEP) @ np.swapaxes(matrix(seconds - _RATE_STEP), -1, -2)
-    # of a rotation by a small angle, whose sine and angle differ by 1e-12 of it
+    rotation = matrix(seconds + _RATE_STEP) @ np.swapaxes(matrix(seconds - _RATE_STEP), -1, -2)
+    # The matrix is a rotation by a small angle, whose sine and angle differ by a relative 1e-12.
     lower = np.stack(
-        [turn[..., 1, 2] - turn[..., 2, 1], turn[..., 2, 0] - turn[..., 0, 2], turn[..., 0, 1] - turn[..., 1, 0]],
+        [
+            rotation[..., 1, 2] - rotation[..., 2, 1],
+            rotation[..., 2, 0] - rotation[..., 0, 2],
+            rotation[..., 0, 1] - rotation[..., 1, 0],
+        ],
         axis=-1,
     )
     sine = 0.5 * np.linalg.norm(lower, axis=-1, keepdims=True)
@@ -221,15 +225,17 @@ def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
     """Parse the rows of a C04 table."""
     cells = [line.split() for _, line in rows]
     lines = [k for k, _ in rows]
-    place = [4, 5, 6, 7, 8, 9] if len(cells[0]) == 21 else [3, 4, 5, 6, 8, 9]
+    columns = [4, 5, 6, 7, 8, 9] if len(cells[0]) == 21 else [3, 4, 5, 6, 8, 9]
     short = next((k for k, row in enumerate(cells) if len(row) != len(cells[0])), None)
     if short is not None:
         found = f"{len(cells[short])} columns"
-        raise InputError(Issue("a row of another length", file, lines[short], (), found, f"{len(cells[0])} columns"))
+        raise InputError(
+            Issue("a row with a different number of columns", file, lines[short], (), found, f"{len(cells[0])} columns")
+        )
     heads = ("MJD", "x", "y", "UT1-UTC", "dX", "dY")
-    table = numbers(file, [[row[k] for k in place] for row in cells], lines, heads)
+    table = numbers(file, [[row[k] for k in columns] for row in cells], lines, heads)
     late = table[:, 0] >= FIRST_DAY
-    lines = [k for k, one in zip(lines, late, strict=True) if one]
+    lines = [k for k, valid in zip(lines, late, strict=True) if valid]
     table = table[late]
     return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * ARCSEC, table[:, 4:6] * ARCSEC)
 
@@ -249,7 +255,7 @@ def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
     for k, line in rows:
         cut = [line[a:b].strip() for a, b in _FINALS.values()]
         if len(line) < 68 and len(line) > 15 and line[15:].strip():
-            raise InputError(Issue("a line that ends early", file, k, (), f"{len(line)} characters", WHAT))
+            raise InputError(Issue("a truncated line", file, k, (), f"{len(line)} characters", WHAT))
         if len(line) < 15:
             raise InputError(Issue("not a line of this table", file, k, (), repr(line[:40]), WHAT))
         final = [line[a:b].strip() for a, b in _FINAL.values()]
@@ -268,13 +274,13 @@ def _checked(
     if len(mjd) < 4:
         raise InputError(Issue("too few days", file, None, (), f"{len(mjd)} days", "four days or more"))
     for row in (*np.flatnonzero(np.diff(mjd) <= 0.0)[:1] + 1, *np.flatnonzero(np.diff(mjd) > 10.0)[:1] + 1):
-        problem = "days that do not rise, or a gap of more than ten"
+        problem = "days that do not increase, or a gap of more than ten"
         raise InputError(Issue(problem, file, lines[row], (), f"MJD {mjd[row]:g}", "days in order"))
     far = (np.abs(ut1_utc) > 1.0) | np.any(np.abs(pole) > 1e-5, axis=1) | (mjd < FIRST_DAY) | (mjd > LAST_DAY)
     for row in np.flatnonzero(far)[:1]:
         found = f"MJD {mjd[row]:g}, UT1 - UTC {ut1_utc[row]:g} s"
-        raise InputError(Issue("not Earth orientation", file, lines[row], (), found, "UT1 - UTC within 1 s, a pole "
-                               "within 2 arcsec, days of 1972 to 2099"))  # fmt: skip
+        raise InputError(Issue("implausible Earth orientation", file, lines[row], (), found, "UT1 - UTC within 1 s, a "
+                               "pole within 2 arcsec, days of 1972 to 2099"))  # fmt: skip
     ahead = np.array([tai_minus_utc(int(np.floor(day))) for day in mjd])
     return EarthOrientation(file, mjd, ut1_utc - ahead, pole, offsets)
 

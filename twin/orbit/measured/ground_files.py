@@ -89,7 +89,7 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
             rows, images, header = _gcp(path)
             system = _required(spec) if header is None else _of_header(spec, header)
             if header is not None and heights is None and "geocent" not in header.lower():
-                heights = "ellipsoid"  # that program counts heights from the datum
+                heights = "ellipsoid"  # the Ames Stereo Pipeline counts heights from the datum
         case _:
             rows, system = _csv(path, spec), _required(spec)
     file = str(path)
@@ -107,7 +107,7 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
     for row in np.flatnonzero(~((height > -1000.0) & (height < 10000.0)))[:1]:
         found = f"{height[row]:.6g} m above the ellipsoid"
         raise InputError(
-            Issue("no place on the ground", file, rows.lines[row], (), found, "-1000 m to 10 000 m; units?")
+            Issue("not a position on the ground", file, rows.lines[row], (), found, "-1000 m to 10 000 m; units?")
         )
     covariance = _covariance(spec, file, rows, itrs, path.suffix.lower() == ".gcp" and spec.sigma_axes == "xyz")
     points = GroundPoints.of(np.array(rows.ids, object), itrs, covariance, np.array(rows.roles, object))
@@ -117,7 +117,7 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
 def _required(spec: GroundFileSpec) -> str:
     """Return the coordinate system of the test's file, or raise InputError if it names none."""
     if spec.crs is None:
-        raise spec.error("the system of the coordinates is not said", ("crs",), allowed="EPSG:4979, EPSG:32650, ...")
+        raise spec.error("the coordinate system is not specified", ("crs",), allowed="EPSG:4979, EPSG:32650, ...")
     return spec.crs
 
 
@@ -143,14 +143,14 @@ def _unique(file: str, ids: Sequence[str], lines: Sequence[int | None]) -> None:
     seen: set[str] = set()
     for name, line in zip(ids, lines, strict=True):
         if name in seen:
-            raise InputError(Issue("a point that is there twice", file, line, (), shown(name), "each point once"))
+            raise InputError(Issue("a point that occurs twice", file, line, (), shown(name), "each point once"))
         seen.add(name)
 
 
 def _role(file: str, role: str, line: int | None, key: tuple[str | int, ...] = ("role",)) -> str:
     """Return the role, or raise InputError if it is neither control nor check."""
     if role not in ROLES[:2]:
-        raise InputError(Issue("no such role", file, line, key, shown(role), names_text(ROLES[:2])))
+        raise InputError(Issue("unknown role", file, line, key, shown(role), names_text(ROLES[:2])))
     return role
 
 
@@ -171,7 +171,7 @@ def _csv(path: Path, spec: GroundFileSpec) -> _Rows:
     lines = [int(v) for v in table.lines]
     have = [name for name in _SIGMAS if name in table]
     if have and len(have) < 3:
-        raise InputError(Issue("sigmas are not complete", file, None, (), names_text(have), names_text(_SIGMAS)))
+        raise InputError(Issue("incomplete sigmas", file, None, (), names_text(have), names_text(_SIGMAS)))
     if have and "sigma" in table:
         raise InputError(Issue("sigmas are given in two ways", file, None, (), names_text([*have, "sigma"])))
     sigmas = table.stacked(*_SIGMAS) if have else np.full((len(table), 3), np.nan)
@@ -190,7 +190,7 @@ def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
     try:
         crs = pyproj.CRS(_required(spec))
     except pyproj.exceptions.CRSError:
-        return  # told by whoever needs it
+        return  # Datum.of reports the error
     right = _PLACES[0] if crs.is_geographic else _PLACES[2] if crs.is_geocentric else _PLACES[1]
     if names != right:
         raise spec.error(
@@ -209,27 +209,27 @@ def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:
         problem = "a member `crs`, which GeoJSON no longer has"
         raise InputError(Issue(problem, file, None, ("crs",), shown(data["crs"]), "`crs:` in the test's file"))
     ids, places, sigmas, roles = [], [], [], []
-    for k, one in enumerate(features):
+    for k, feature in enumerate(features):
         key: tuple[str | int, ...] = ("features", k)
-        if not isinstance(one, dict):
-            raise InputError(Issue("not a feature", file, None, key, shown(one), "a Feature of a Point"))
-        geometry, properties = one.get("geometry"), one.get("properties") or {}
+        if not isinstance(feature, dict):
+            raise InputError(Issue("not a feature", file, None, key, shown(feature), "a Feature of a Point"))
+        geometry, properties = feature.get("geometry"), feature.get("properties") or {}
         kind = geometry.get("type") if isinstance(geometry, dict) else None
         if not isinstance(geometry, dict) or kind != "Point" or not isinstance(properties, dict):
             raise InputError(Issue("not a point", file, None, (*key, "geometry"), shown(kind), "a Point"))
-        place = geometry.get("coordinates")
-        if not isinstance(place, list) or len(place) != 3 or not all(map(_finite, place)):
+        position = geometry.get("coordinates")
+        if not isinstance(position, list) or len(position) != 3 or not all(map(_finite, position)):
             at = (*key, "geometry", "coordinates")
-            raise InputError(Issue("not a place", file, None, at, shown(place), "[longitude, latitude, height]"))
-        name = one.get("id", properties.get("point", properties.get("id", properties.get("name"))))
+            raise InputError(Issue("not a position", file, None, at, shown(position), "[longitude, latitude, height]"))
+        name = feature.get("id", properties.get("point", properties.get("id", properties.get("name"))))
         if not isinstance(name, str | int) or isinstance(name, bool) or not str(name).strip():
             raise InputError(Issue("a point without a name", file, None, (*key, "id"), shown(name), "an `id`"))
         spread = [properties.get(n) for n in _SIGMAS]
         if any(v is not None for v in spread) and not all(_finite(v) and 0.0 <= float(v) <= 1e4 for v in spread):  # type: ignore[arg-type]
             at = (*key, "properties")
-            raise InputError(Issue("not sigmas", file, None, at, shown(spread), f"{names_text(_SIGMAS)}, metres"))
+            raise InputError(Issue("invalid sigmas", file, None, at, shown(spread), f"{names_text(_SIGMAS)}, metres"))
         ids.append(str(name))
-        places.append([float(v) for v in place])
+        places.append([float(v) for v in position])
         sigmas.append([math.nan if v is None else float(v) for v in spread])
         role = properties.get("role", "control")
         roles.append(_role(file, role if isinstance(role, str) else shown(role), None, (*key, "properties", "role")))
@@ -268,16 +268,16 @@ def _of_header(spec: GroundFileSpec, header: str) -> str:
 
     try:
         crs = pyproj.CRS(header)
-        # ensembles, datums and their axes are spelt in many ways; places are what has to agree
+        # Ensembles, datums and their axes are spelt in many ways, so the coordinates are compared.
         same = spec.crs is None or _alike(pyproj.CRS(spec.crs), crs)
     except pyproj.exceptions.CRSError:
         raise spec.error("the header # WKT: of the file cannot be read", ("file",), found=shown(header)) from None
     if not crs.is_geographic:
-        problem, allowed = "a header with a projection", "a geographic system: latitude, longitude, height"
+        problem, allowed = "the header names a projected system", "a geographic system: latitude, longitude, height"
         raise spec.error(problem, ("file",), found=crs.name, allowed=allowed)
     if not same:
         allowed = f"{crs.name}, as the file's header says, or none"
-        raise spec.error("the system is said differently by the file", ("crs",), found=spec.crs, allowed=allowed)
+        raise spec.error("the file's header names another coordinate system", ("crs",), found=spec.crs, allowed=allowed)
     return spec.crs or header
 
 
@@ -298,10 +298,10 @@ def _gcp(path: Path) -> tuple[_Rows, dict[str, np.ndarray], str | None]:
         lines.append(k + 1)
     if not rows:
         raise InputError(Issue("no points", file, None, (), None, "one a line"))
-    found = numbers(file, [row[1:7] for row in rows], lines, _GCP)
-    for row, column in np.argwhere((found[:, 3:] <= 0.0) | (found[:, 3:] > 1e4))[:1].tolist():
+    numeric = numbers(file, [row[1:7] for row in rows], lines, _GCP)
+    for row, column in np.argwhere((numeric[:, 3:] <= 0.0) | (numeric[:, 3:] > 1e4))[:1].tolist():
         value = shown(rows[row][4 + column])
-        raise InputError(Issue("not a sigma", file, lines[row], (_GCP[3 + column],), value, "0 m to 10 km"))
+        raise InputError(Issue("invalid sigma", file, lines[row], (_GCP[3 + column],), value, "0 m to 10 km"))
     ids = [row[0] for row in rows]
     _unique(file, ids, lines)
     images: dict[str, list[np.ndarray]] = {}
@@ -310,7 +310,7 @@ def _gcp(path: Path) -> tuple[_Rows, dict[str, np.ndarray], str | None]:
             heads = ("column", "row", "sigma column", "sigma row")
             column, line, sigma_column, sigma_row = numbers(file, [cells[start + 1 : start + 5]], [lines[k]], heads)[0]
             if not (sigma_column > 0.0 and sigma_row > 0.0):
-                raise InputError(Issue("not a sigma", file, lines[k], ("image",), shown(cells[start]), "above zero"))
+                raise InputError(Issue("invalid sigma", file, lines[k], ("image",), shown(cells[start]), "above zero"))
             images.setdefault(cells[start], []).append(np.array([k, line, column, sigma_row, sigma_column]))
     measured = {name: np.array(values) for name, values in images.items()}
-    return _Rows(ids, found[:, [1, 0, 2]], found[:, 3:], ["control"] * len(ids), lines), measured, header
+    return _Rows(ids, numeric[:, [1, 0, 2]], numeric[:, 3:], ["control"] * len(ids), lines), measured, header

@@ -76,7 +76,7 @@ class GeoRaster:
         """Return row and column of coordinates, (...): the inverse of `coordinates_of`."""
         a, b, c, d, e, f = self.transform
         u, v, area = np.asarray(x) - c, np.asarray(y) - f, a * e - b * d
-        with np.errstate(invalid="ignore"):  # of places beyond the system, which are infinite
+        with np.errstate(invalid="ignore"):  # coordinates outside the system are infinite
             return (a * v - d * u) / area, (e * u - b * v) / area
 
     def read(self, rows: slice | None = None, columns: slice | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +99,7 @@ class GeoRaster:
         if size[0] * size[1] > LARGEST_PART:
             found = f"{size[0]} x {size[1]} pixels"
             allowed = f"at most {LARGEST_PART:.0e} pixels at once; a map that is cut to the images"
-            raise InputError(Issue("too large a part of a map", self.file, None, (), found, allowed))
+            raise InputError(Issue("the part of a map is too large", self.file, None, (), found, allowed))
         with opened(self.file) as source:
             from rasterio.windows import Window
 
@@ -138,20 +138,26 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
         raise InputError(Issue("no such band", file, None, ("band",), str(band), f"1 to {count}"))
     dtype = dtypes[band - 1]
     if np.dtype(dtype).kind not in "uif":
-        raise InputError(Issue("values that are no grey values or heights", file, None, (), str(dtype), "real numbers"))
+        raise InputError(
+            Issue("values that are not grey values or heights", file, None, (), str(dtype), "real numbers")
+        )
     if affine.is_identity or affine.determinant == 0.0:
         found = "ground control points only" if ground else "no georeference"
-        raise InputError(Issue("a raster without a place", file, None, (), found, "a GeoTIFF with a geotransform"))
+        raise InputError(Issue("a raster without georeference", file, None, (), found, "a GeoTIFF with a geotransform"))
     if text is None and crs is None:
         raise InputError(
-            Issue("a raster that does not say its system", file, None, ("crs",), None, "`crs:`, EPSG:32650")
+            Issue("a raster without a coordinate reference system", file, None, ("crs",), None, "`crs:`, EPSG:32650")
         )
     try:
         system = pyproj.CRS.from_wkt(text) if text is not None else pyproj.CRS(str(crs))
         if text is not None and crs is not None and not system.to_2d().equals(pyproj.CRS(crs).to_2d(), True):
-            raise InputError(Issue("the file says another system", file, None, ("crs",), str(crs), system.name))
+            raise InputError(
+                Issue("the file has another coordinate reference system", file, None, ("crs",), str(crs), system.name)
+            )
     except pyproj.exceptions.CRSError:
-        raise InputError(Issue("no system that PROJ knows", file, None, ("crs",), crs, "EPSG:32650, ...")) from None
+        raise InputError(
+            Issue("a coordinate reference system that PROJ does not know", file, None, ("crs",), crs, "EPSG:32650, ...")
+        ) from None
     a, b, c, d, e, f = affine[:6]
     middle = (a, b, c + 0.5 * (a + b), d, e, f + 0.5 * (d + e))
     return GeoRaster(file, system, middle, shape, band, str(dtype))
@@ -169,23 +175,23 @@ def opened(file: str) -> Iterator[Any]:
     import rasterio
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
-    # names that GDAL takes for addresses or archives are none of files
+    # Refuse names that GDAL takes for addresses or archives.
     wrong = no_file(Path(file))
     if wrong is not None:
         raise InputError(Issue(wrong, file, allowed="a GeoTIFF"))
     try:
-        # a file beside the raster is not the raster
+        # GDAL must not read files beside the raster.
         with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", NotGeoreferencedWarning)
                 source = rasterio.open(Path(file).resolve(), sharing=False)
         with source:
             if source.driver not in _DRIVERS:
-                raise InputError(Issue("a raster of another format", file, None, (), source.driver, "GeoTIFF or GTX"))
+                raise InputError(Issue("unsupported raster format", file, None, (), source.driver, "GeoTIFF or GTX"))
             yield source
     except RasterioError as error:
         reason = str(error).replace(str(Path(file).resolve()), "").strip(" :'") or "damaged"
-        raise InputError(Issue(f"not a raster that can be read: {reason}", file, allowed="a GeoTIFF")) from None
+        raise InputError(Issue(f"the raster cannot be read: {reason}", file, allowed="a GeoTIFF")) from None
 
 
 _ALLOWED = "a code or a text that PROJ knows, as EPSG:4979 (WGS 84 with ellipsoidal height), EPSG:32650, OGC:CRS84"
@@ -211,7 +217,9 @@ class Geoid:
         raster = open_raster(path)
         if not raster.crs.is_geographic:
             name = raster.crs.name
-            raise InputError(Issue("a geoid in another system", str(path), None, (), name, "longitude and latitude"))
+            raise InputError(
+                Issue("a geoid grid in another system", str(path), None, (), name, "longitude and latitude")
+            )
         return cls(raster)
 
     @cached_property
@@ -219,9 +227,11 @@ class Geoid:
         values, valid = self.raster.read()
         if np.any(np.abs(values[valid]) > 150.0):
             found = f"{np.max(np.abs(values[valid])):g}"
-            raise InputError(Issue("no heights of a geoid", self.raster.file, None, (), found, "metres, within 150 m"))
+            raise InputError(
+                Issue("values are not heights of a geoid", self.raster.file, None, (), found, "metres, within 150 m")
+            )
         known = np.where(valid, values, np.nan).astype(np.float64)
-        # beyond the last column the first one comes again, or that column itself, which then has no weight
+        # Append the first column to a whole circle, otherwise repeat the last one, which then has no weight.
         return np.pad(known, ((0, 0), (0, 1)), mode="wrap" if self._whole_turn else "edge")
 
     @property
@@ -248,19 +258,19 @@ class Geoid:
         lon, lat = np.broadcast_arrays(np.asarray(longitude, float), np.asarray(latitude, float))
         rows, columns = self.raster.shape
         first, around = self.raster.transform[2], self._whole_turn
-        turn = (lon - first) % 360.0
-        row, column = self.raster.row_column_of(first + turn, lat)
+        offset = (lon - first) % 360.0
+        row, column = self.raster.row_column_of(first + offset, lat)
         inside = (row >= -1e-6) & (row <= rows - 1.0 + 1e-6)
         if not around:
             inside &= (column >= -1e-6) & (column <= columns - 1.0 + 1e-6)
         if not np.all(inside):
             k = int(np.argmin(np.ravel(inside)))
             found = f"{np.ravel(lat)[k]:.6g} deg N, {np.ravel(lon)[k]:.6g} deg E"
-            raise Problem("a place beyond the grid of the geoid", found, self.raster.file)
+            raise Problem("a position outside the grid of the geoid", found, self.raster.file)
         at = np.clip(row, 0.0, rows - 1.0), column % columns if around else np.clip(column, 0.0, columns - 1.0)
         height = map_coordinates(self._values, at, order=1, mode="nearest")
         if not np.all(np.isfinite(height)):
-            raise Problem("a place where the grid of the geoid holds nothing", None, self.raster.file)
+            raise Problem("a position without a value in the grid of the geoid", None, self.raster.file)
         return np.asarray(height)
 
 
@@ -309,12 +319,12 @@ class Datum:
         except CRSError:
             raise Problem("no such coordinate reference system", shown(text), _ALLOWED) from None
         if not (crs.is_geographic or crs.is_projected or crs.is_geocentric or crs.is_compound):
-            raise Problem("a system without a place on the Earth", crs.name, _ALLOWED)
+            raise Problem("not a coordinate system of the Earth", crs.name, _ALLOWED)
         if len(crs.axis_info) == 3 and heights is not None:
             allowed = "a system of two coordinates, or no `heights:`"
-            raise Problem(f"{crs.name} says itself what its heights are", heights, allowed)
+            raise Problem(f"{crs.name} defines its heights itself", heights, allowed)
         if len(crs.axis_info) == 2 and heights is None:
-            problem = f"{crs.name} does not say what heights are counted from"
+            problem = f"{crs.name} does not define the reference surface of heights"
             raise Problem(problem, text, "heights: ellipsoid, heights: geoid with geoid: FILE, or EPSG:4979")
         whole = crs if len(crs.axis_info) == 3 else crs.to_3d()
         try:
@@ -328,7 +338,7 @@ class Datum:
         except ProjError as error:
             reason = str(error).rsplit("(", 1)[-1].rstrip(") ")
             allowed = "a system that needs no grid of PROJ's: EPSG:4979, EPSG:4326 with heights, a zone of UTM"
-            raise Problem(f"PROJ knows no exact way from {crs.name}: {reason}", text, allowed) from None
+            raise Problem(f"PROJ has no exact transformation from {crs.name}: {reason}", text, allowed) from None
         return cls(crs, geoid, forward, geographic)
 
     def itrs(self, x: Any, y: Any, z: Any) -> np.ndarray:
@@ -352,7 +362,7 @@ class Datum:
         if self.crs.is_geographic and (np.any(np.abs(y) > 90.0) or np.any(np.abs(x) > 540.0)):
             k = int(np.argmax((np.abs(y) > 90.0) | (np.abs(x) > 540.0)))
             found = f"longitude {np.ravel(x)[k]:g}, latitude {np.ravel(y)[k]:g}"
-            raise Problem("no longitude and latitude", found, "degrees, and longitude before latitude", within=(k,))
+            raise Problem("not a longitude and latitude", found, "degrees, and longitude before latitude", within=(k,))
         height = z
         if self.geoid is not None:
             height = z + self.geoid(*self.geographic.transform(x, y))
@@ -361,7 +371,7 @@ class Datum:
         if not np.all(good):
             k = int(np.argmin(np.ravel(good)))
             text = f"{np.ravel(x)[k]:g}, {np.ravel(y)[k]:g}"
-            raise Problem(f"no place in {self.crs.name}", text, "coordinates of that system", within=(k,))
+            raise Problem(f"not coordinates in {self.crs.name}", text, "coordinates of that system", within=(k,))
         return places
 
     @property
@@ -433,7 +443,7 @@ class MapPart:
         longitude, latitude = np.degrees(self.frame.geographic(east, north))
         x, y = self.way.transform(longitude, latitude, direction="INVERSE")
         if self.raster.crs.is_geographic:
-            # the turn of longitude that the map has
+            # Bring longitudes to the range of the map.
             middle = self.raster.coordinates_of(0.5 * self.raster.shape[0], 0.5 * self.raster.shape[1])[0]
             x = middle + (x - middle + 180.0) % 360.0 - 180.0
         row, column = self.raster.row_column_of(x, y)
@@ -481,7 +491,7 @@ class UserMap:
         flat = raster.crs.sub_crs_list[0] if raster.crs.is_compound else raster.crs
         itself = len(raster.crs.axis_info) == 3 and not raster.crs.is_compound
         if heights and spec.heights is None and not itself:
-            problem = "what the heights are counted from is not said"
+            problem = "the reference surface of the heights is not specified"
             allowed = "heights: ellipsoid, or heights: geoid with geoid: FILE"
             raise spec.error(problem, ("heights",), allowed=allowed)
         geoid = None if spec.geoid is None else Geoid.read(folder / spec.geoid)
@@ -489,12 +499,12 @@ class UserMap:
             geodetic, target = flat.geodetic_crs, pyproj.CRS(_WGS84)
             if geodetic is not None and geodetic.datum is not None and geodetic.datum.name == CGCS2000:
                 target = geodetic.to_2d()
-            way = pyproj.Transformer.from_crs(
+            transformer = pyproj.Transformer.from_crs(
                 flat.to_2d(), target, always_xy=True, allow_ballpark=False, only_best=True
             )
         except ProjError as error:
-            raise InputError(Issue(f"no exact way from {flat.name}: {error}", raster.file)) from None
-        return cls(raster, way, geoid)
+            raise InputError(Issue(f"no exact transformation from {flat.name}: {error}", raster.file)) from None
+        return cls(raster, transformer, geoid)
 
     def limits(self) -> tuple[float, float]:
         """Return the least and largest height, sampled over the whole elevation model.
@@ -506,16 +516,16 @@ class UserMap:
         """
         shape = tuple(min(n, _SAMPLED) for n in self.raster.shape)
         with opened(self.raster.file) as source:
-            some = source.read(self.raster.band, out_shape=shape, masked=True)
-        with np.errstate(invalid="ignore"):  # of a damaged file some are not even right NaN
-            values = np.asarray(some.compressed(), float)
+            sample = source.read(self.raster.band, out_shape=shape, masked=True)
+        with np.errstate(invalid="ignore"):  # a damaged file can hold malformed NaN
+            values = np.asarray(sample.compressed(), float)
         values = values[np.isfinite(values)]
         if not len(values):
             raise InputError(Issue("a map without values", self.raster.file))
         low, high = float(values.min()), float(values.max())
         if max(-low, high) > MOST_HEIGHT:
             found, allowed = f"{low:.6g} to {high:.6g} m", f"up to {MOST_HEIGHT:g} m; empty pixels as nodata"
-            raise InputError(Issue("no heights of ground", self.raster.file, found=found, allowed=allowed))
+            raise InputError(Issue("values are not ground heights", self.raster.file, found=found, allowed=allowed))
         return low, high
 
     def part(self, frame: GroundFrame, ends: tuple[float, float, float, float], heights: bool = False) -> MapPart:
@@ -542,17 +552,17 @@ class UserMap:
         row, column = whole.row_column(east, north)
         good = np.isfinite(row) & np.isfinite(column)
         if not good.any():
-            raise InputError(Issue("the images lie beyond the system of this map", self.raster.file))
+            raise InputError(Issue("the images lie outside the coordinate system of this map", self.raster.file))
         bounds = []
         for place, count in ((row[good], self.raster.shape[0]), (column[good], self.raster.shape[1])):
             low, high = int(max(np.floor(place.min()) - 2, 0)), int(min(np.ceil(place.max()) + 3, count))
             if high - low < 4:
                 lon, lat = np.degrees((frame.longitude, frame.latitude))
                 found = f"images near {lat:.4f} deg N, {lon:.4f} deg E"
-                allowed = "a map of the ground that the images show; its own longitude and latitude are "
+                allowed = "a map of the ground in the images; the centre of this one is at "
                 x, y = self.way.transform(*self.raster.coordinates_of(*(0.5 * n for n in self.raster.shape)))
                 raise InputError(
-                    Issue("the map does not show what the images show", self.raster.file, None, (), found,
+                    Issue("the map does not cover the images", self.raster.file, None, (), found,
                           f"{allowed}{float(x):.4f} deg E, {float(y):.4f} deg N")
                 )  # fmt: skip
             bounds.append(slice(low, high))
@@ -574,7 +584,7 @@ class UserMap:
         values = part.values.astype(np.float64)
         if self.geoid is not None:
             rows, columns = (np.arange(n, dtype=float) for n in values.shape)
-            for k in range(0, len(rows), 256):  # a part at a time: a geoid needs several numbers a post
+            for k in range(0, len(rows), 256):  # in parts, because a geoid needs several numbers per post
                 east, north = part.east_north(rows[k : k + 256, None], columns[None])
                 try:
                     values[k : k + 256] += self.geoid(*np.degrees(part.frame.geographic(east, north)))
@@ -583,6 +593,6 @@ class UserMap:
         known = values if part.valid is None else values[part.valid]
         if known.size and (known.min() < -1000.0 or known.max() > 10000.0):
             found = f"{known.min():g} to {known.max():g} m"
-            allowed = "heights within -1000 m to 10 000 m; a nodata value that the file does not say?"
-            raise InputError(Issue("no heights of ground", self.raster.file, None, (), found, allowed))
+            allowed = "heights within -1000 m to 10 000 m; is a nodata value missing in the file?"
+            raise InputError(Issue("values are not ground heights", self.raster.file, None, (), found, allowed))
         return values

@@ -108,7 +108,7 @@ def read_pass(
     """
     files = spec.files
     platform = _platform(spec, conventions)
-    # who needs no control is content with tie points
+    # Without a need for control, tie points are enough.
     least = 0 if "tie_points" in files and not needed else 1
     lines = read_table(files["lines"], COLUMNS["lines"])
     known, pixels = (read_table(files[key], COLUMNS[key], least) for key in ("ground", "image_points"))
@@ -148,7 +148,7 @@ def read_pass(
 def _platform(spec: PassFilesSpec, conventions: ConventionsSpec) -> PlatformTable:
     """Return orbit and attitude of a pass, from tables or from files of other formats."""
     if isinstance(spec.platform, PlatformFilesSpec):
-        # what reads them waits for libraries that tables do not need
+        # Import only here, because tables do not need these libraries.
         from twin.orbit.measured.platform_files import platform_table, read_platform
 
         return platform_table(*read_platform(spec.platform, Path()), spec.epoch)
@@ -178,11 +178,11 @@ def read_measurements(
     InputError
         A table cannot be read or holds impossible values; with file, line and column.
     """
-    found = []
+    passes = []
     for name, files in data.passes.items():
-        found.append(read_pass(name, files, data.conventions, camera, needed))
-        advance("read", len(found), len(data.passes))
-    return tuple(found)
+        passes.append(read_pass(name, files, data.conventions, camera, needed))
+        advance("read", len(passes), len(data.passes))
+    return tuple(passes)
 
 
 def _line_times_of(
@@ -208,18 +208,20 @@ def _line_times_of(
     """
     require_known(table, "camera", tuple(camera.lines))
     path = TabulatedTrajectory(platform)
-    found, origins = {}, {}
+    times_of, origins = {}, {}
     for name in dict.fromkeys(table["camera"].tolist()):
         rows = np.flatnonzero(table["camera"] == name)
         rows = rows[np.argsort(table["line"][rows], kind="stable")]
         line, time = table["line"][rows], table["time"][rows]
         if len(rows) < 2:
-            raise table.error(int(rows[0]), "line", f"one line of {name} tells no line time", allowed="two or more")
+            raise table.error(
+                int(rows[0]), "line", f"one line of {name} does not define a line time", allowed="two or more"
+            )
         for row in rows[1:][np.diff(line) == 0.0][:1]:
-            raise table.error(int(row), "line", f"this line of {name} stands twice", f"{table['line'][row]:g}")
+            raise table.error(int(row), "line", f"this line of {name} occurs twice", f"{table['line'][row]:g}")
         for row in rows[1:][np.diff(time) <= 0.0][:1]:
             allowed = "a later time than that of the line before; number the lines as they were exposed"
-            raise table.error(int(row), "time", "times do not rise with the lines", allowed=allowed)
+            raise table.error(int(row), "time", "times do not increase with the lines", allowed=allowed)
         step = np.gradient(time, line)
         time = time + {"start": 0.5, "middle": 0.0, "end": -0.5}[conventions.line_moment] * step
         at = LineTimes.of(line - line[0], time)
@@ -228,8 +230,8 @@ def _line_times_of(
             if not in_span(end, path.first, path.last):
                 allowed = f"within orbit and attitude, {path.first:.9g} s to {path.last:.9g} s; leave out other lines"
                 raise table.error(int(row), "time", "a line outside the readings", f"{end:.9g} s", allowed)
-        found[name], origins[name] = at, float(line[0])
-    return found, origins
+        times_of[name], origins[name] = at, float(line[0])
+    return times_of, origins
 
 
 def ground_of(table: Table) -> GroundPoints:
@@ -255,33 +257,33 @@ def ground_of(table: Table) -> GroundPoints:
     for row in np.flatnonzero(~(np.abs(height) < MOST_HEIGHT))[:1]:
         found = f"{height[row] / 1e3:.6g} km above the ellipsoid"
         allowed = "Earth-centred, Earth-fixed coordinates of the ground, not geodetic ones; and is the unit right?"
-        raise table.error(int(row), "x", "no place on the ground", found, allowed)
+        raise table.error(int(row), "x", "not a position on the ground", found, allowed)
     return GroundPoints.of(table["point"], place, _covariance(table, place), table["role"])
 
 
 def _covariance(table: Table, place: Array) -> Array:
     """Return covariances (n, 3, 3) in axes of the ITRS, in m^2."""
-    ways = [way for way in _SIGMAS if any(name in table for name in way)]
-    allowed = "or ".join(", ".join(f"{name} [m]" for name in way) + " " for way in _SIGMAS).strip()
-    if len(ways) != 1:
-        problem = "sigmas are given in two ways" if ways else "no sigmas of the coordinates"
+    sets = [names for names in _SIGMAS if any(name in table for name in names)]
+    allowed = "or ".join(", ".join(f"{name} [m]" for name in names) + " " for names in _SIGMAS).strip()
+    if len(sets) != 1:
+        problem = "sigmas are given in two ways" if sets else "no sigmas of the coordinates"
         raise InputError(Issue(problem, table.file, int(table.lines[0]) - 1, allowed=allowed))
-    missing = [name for name in ways[0] if name not in table]
+    missing = [name for name in sets[0] if name not in table]
     if missing:
         raise InputError(Issue(f"no column {missing[0]!r}", table.file, int(table.lines[0]) - 1, allowed=allowed))
     correlated = [name for name in _CORRELATIONS if name in table]
-    if correlated and ways[0] != _SIGMAS[2]:
+    if correlated and sets[0] != _SIGMAS[2]:
         text = "correlations go with x_sigma, y_sigma and z_sigma"
         raise InputError(Issue(text, table.file, int(table.lines[0]) - 1, (table.heads[correlated[0]],)))
-    for name in ways[0]:
+    for name in sets[0]:
         zero = (table[name] == 0.0) & (table["role"] == "control") & np.any(table[name] > 0.0)
         for row in np.flatnonzero(zero)[:1]:
             raise table.error(int(row), name, "some sigmas are zero", "0", "all positive, or all zero for exact")
-    if ways[0] == ("sigma",):
+    if sets[0] == ("sigma",):
         return np.asarray(table["sigma"][:, None, None] ** 2 * np.eye(3))
-    if ways[0] == _SIGMAS[1]:
-        return level_covariance(place, *(table[name] for name in ways[0]))
-    sigma = table.stacked(*ways[0])
+    if sets[0] == _SIGMAS[1]:
+        return level_covariance(place, *(table[name] for name in sets[0]))
+    sigma = table.stacked(*sets[0])
     like = np.broadcast_to(np.eye(3), (len(table), 3, 3)).copy()
     for name, (i, j) in zip(_CORRELATIONS, ((0, 1), (0, 2), (1, 2)), strict=True):
         if name in table:
@@ -332,14 +334,14 @@ def _image_points_of(
         name, problem = str(table["point"][row]), "this point has no coordinates"
         allowed = "a point of the ground table; points without coordinates belong into `tie_points`"
         raise table.error(int(row), "point", problem, shown(name), allowed, nearest(name, names))
-    found = {}
+    points = {}
     half = 0.5 if conventions.centre == "half" else 0.0
     for name in times:
         rows = np.flatnonzero(table["camera"] == name)
         order = rows[np.argsort(number[rows], kind="stable")]
         for row in order[1:][np.diff(number[order]) == 0][:1]:
             point = str(table["point"][row])
-            raise table.error(int(row), "point", f"this point stands twice in {name}", shown(point))
+            raise table.error(int(row), "point", f"this point occurs twice in {name}", shown(point))
         pixels, last = camera.pixels_of(name), times[name].line[-1]
         line = table["line"][order] - half - origins[name]
         pixel = table["pixel"][order] - half - conventions.first_pixel
@@ -356,10 +358,10 @@ def _image_points_of(
             raise table.error(int(row), "line", problem, allowed="points where readings are at most 5 intervals apart")
         spread = image_covariance(table, order)
         if conventions.first_pixel_sees == "left":
-            # a mirrored axis turns the sign of the correlation
+            # A mirrored axis changes the sign of the correlation.
             pixel, spread = pixels - 1.0 - pixel, spread * np.array([[1.0, -1.0], [-1.0, 1.0]])
-        found[name] = ImagePoints.of(number[order], line, pixel, spread)
-    return found
+        points[name] = ImagePoints.of(number[order], line, pixel, spread)
+    return points
 
 
 def image_covariance(table: Table, rows: NDArray[np.intp]) -> Array:
@@ -381,7 +383,7 @@ def _once(table: Table, column: str) -> None:
     seen: dict[str, int] = {}
     for row, name in enumerate(table[column].tolist()):
         if name in seen:
-            problem = f"stands twice, first on line {int(table.lines[seen[name]])}"
+            problem = f"occurs twice, first on line {int(table.lines[seen[name]])}"
             raise table.error(row, column, problem, shown(name), "each once")
         seen[name] = row
 
@@ -412,78 +414,81 @@ def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]
         Content of the payload's file, plain data.
     """
     files, listed = {CAMERA_FILE: dump_yaml(camera)}, {}
-    for one in passes:
-        tables = _pass_tables(one)
-        files |= {f"{one.name}/{key}.csv": text for key, text in tables.items()}
-        listed[one.name] = {"epoch": one.platform.epoch, **{key: f"{one.name}/{key}.csv" for key in tables}}
+    for measured in passes:
+        tables = _pass_tables(measured)
+        files |= {f"{measured.name}/{key}.csv": text for key, text in tables.items()}
+        listed[measured.name] = {
+            "epoch": measured.platform.epoch,
+            **{key: f"{measured.name}/{key}.csv" for key in tables},
+        }
     files[DATA_FILE] = dump_yaml({"conventions": dict(CONVENTIONS), "passes": listed})
     return files
 
 
-def _pass_tables(one: PassMeasurements) -> dict[str, str]:
+def _pass_tables(measured: PassMeasurements) -> dict[str, str]:
     """Return the text of each table of a pass by its key, with all digits."""
-    platform = one.platform
+    platform = measured.platform
     orbit = {"time [s]": platform.orbit_time, **_columns(("x [m]", "y [m]", "z [m]"), platform.position)}
     if platform.velocity is not None:
         orbit |= _columns(("vx [m/s]", "vy [m/s]", "vz [m/s]"), platform.velocity)
     attitude = {"time [s]": platform.attitude_time, **_columns(("q1", "q2", "q3", "q4"), platform.quaternion)}
     lines: dict[str, Any] = {"camera": [], "line": [], "time [s]": []}
-    for name, times in one.line_times.items():
+    for name, times in measured.line_times.items():
         lines["camera"] += [name] * len(times.line)
         lines["line"] += times.line.tolist()
         lines["time [s]"] += times.time.tolist()
-    given = one.ground.role != "tie"
+    known = measured.ground.role != "tie"
     tables = {
         "orbit": _csv(orbit),
         "attitude": _csv(attitude),
         "lines": _csv(lines),
-        "ground": _csv(_ground(one.ground.taken(given))),
-        "image_points": _csv(_images(one.images, one.ground, given)),
+        "ground": _csv(_ground(measured.ground.taken(known))),
+        "image_points": _csv(_images(measured.images, measured.ground, known)),
     }
-    if np.any(~given):
-        tables["tie_points"] = _csv(_images(one.images, one.ground, ~given))
+    if np.any(~known):
+        tables["tie_points"] = _csv(_images(measured.images, measured.ground, ~known))
     return tables
 
 
 def _ground(points: GroundPoints) -> dict[str, Any]:
     """Return the columns of the table of ground points."""
     sigma = np.sqrt(np.diagonal(points.covariance, axis1=1, axis2=2))
-    found: dict[str, Any] = {
+    columns: dict[str, Any] = {
         "point": points.ids,
         "role": points.role,
         **_columns(("x [m]", "y [m]", "z [m]"), points.itrs),
     }
     alike = np.array_equal(points.covariance, sigma[:, 0, None, None] ** 2 * np.eye(3))
     if alike:
-        return found | {"sigma [m]": sigma[:, 0]}
-    found |= _columns(("x_sigma [m]", "y_sigma [m]", "z_sigma [m]"), sigma)
+        return columns | {"sigma [m]": sigma[:, 0]}
+    columns |= _columns(("x_sigma [m]", "y_sigma [m]", "z_sigma [m]"), sigma)
     scale = np.where(sigma > 0.0, sigma, 1.0)
     like = points.covariance / scale[:, :, None] / scale[:, None, :]
     pairs = {"correlation_xy": (0, 1), "correlation_xz": (0, 2), "correlation_yz": (1, 2)}
-    return found | {name: like[:, i, j] for name, (i, j) in pairs.items()}
+    return columns | {name: like[:, i, j] for name, (i, j) in pairs.items()}
 
 
 def _images(images: Mapping[str, ImagePoints], ground: GroundPoints, chosen: np.ndarray) -> dict[str, Any]:
     """Return the columns of a table of image points, of the ground points that the mask `chosen` selects."""
     heads = ("point", "camera", "line", "pixel", "line_sigma", "pixel_sigma", "correlation")
-    found: dict[str, Any] = {head: [] for head in heads}
+    columns: dict[str, Any] = {head: [] for head in heads}
     for name, row in images.items():
-        some = row.taken(chosen[row.point])
-        a, b = np.sqrt(some.covariance[:, 0, 0]), np.sqrt(some.covariance[:, 1, 1])
+        selected = row.taken(chosen[row.point])
+        a, b = np.sqrt(selected.covariance[:, 0, 0]), np.sqrt(selected.covariance[:, 1, 1])
         values = (
-            ground.ids[some.point],
+            ground.ids[selected.point],
             [name] * len(a),
-            some.line,
-            some.pixel,
+            selected.line,
+            selected.pixel,
             a,
             b,
-            some.covariance[:, 0, 1] / a / b,
+            selected.covariance[:, 0, 1] / a / b,
         )
         for head, value in zip(heads, values, strict=True):
-            found[head] += np.asarray(value, dtype=object).tolist()
-    if not any(found["correlation"]):
-        del found["correlation"]
-    return found
+            columns[head] += np.asarray(value, dtype=object).tolist()
+    if not any(columns["correlation"]):
+        del columns["correlation"]
+    return columns
 
 
 def _columns(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
@@ -534,7 +539,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     for k in np.flatnonzero((radius < _LEAST_RADIUS) | (radius > _MOST_RADIUS))[:1]:
         found = f"{radius[k] / 1e3:.6g} km from the Earth's centre"
         allowed = f"{_LEAST_RADIUS / 1e3:g} to {_MOST_RADIUS / 1e3:g} km; is the unit in the head right?"
-        raise orbit.error(int(order[k]), "x", "no place of a satellite", found, allowed)
+        raise orbit.error(int(order[k]), "x", "not a position of a satellite", found, allowed)
     _check_jumps(orbit, order, time, place)
     speed = None
     given = [name for name in ("vx", "vy", "vz") if name in orbit]
@@ -550,7 +555,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     norm = np.linalg.norm(numbers, axis=1)
     for k in np.flatnonzero(np.abs(norm - 1.0) > _UNIT_TOLERANCE)[:1]:
         raise attitude.error(
-            int(looks[k]), "q1", "no unit quaternion", f"a norm of {norm[k]:.6g}", "four numbers of norm 1"
+            int(looks[k]), "q1", "not a unit quaternion", f"a norm of {norm[k]:.6g}", "four numbers of norm 1"
         )
     quaternion = _quaternions_of(numbers, conventions)
     _check_turns(attitude, looks, quaternion)
@@ -567,11 +572,11 @@ def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
     conventions : ConventionsSpec
         Conventions of the file.
     """
-    said = conventions.quaternion
-    assert said is not None
+    convention = conventions.quaternion
+    assert convention is not None
     assert conventions.body_axes is not None
-    xyzw = numbers if said.scalar == "last" else np.roll(numbers, -1, axis=1)
-    if said.turns == "frame_to_body":
+    xyzw = numbers if convention.scalar == "last" else np.roll(numbers, -1, axis=1)
+    if convention.turns == "frame_to_body":
         xyzw = xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
     axes = np.array(body_axes_matrix(conventions.body_axes), np.float64)
     if np.array_equal(axes, np.eye(3)):
@@ -586,14 +591,14 @@ def _rising(table: Table) -> NDArray[np.intp]:
     """Return the rows in the order of time; InputError if a time occurs twice."""
     order = np.argsort(table["time"], kind="stable")
     for row in order[1:][np.diff(table["time"][order]) == 0.0][:1]:
-        raise table.error(int(row), "time", "this time stands twice", f"{table['time'][row]:.9g} s", "each time once")
+        raise table.error(int(row), "time", "this time occurs twice", f"{table['time'][row]:.9g} s", "each time once")
     return np.asarray(order, np.intp)
 
 
 def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Array) -> None:
     """Raise InputError for a position that no orbit passes between its neighbours."""
     step = np.diff(time)
-    with np.errstate(over="ignore", invalid="ignore"):  # of times that all but coincide
+    with np.errstate(over="ignore", invalid="ignore"):  # times can almost coincide
         rate = np.diff(place, axis=0) / step[:, None]
         change = np.linalg.norm(np.diff(rate, axis=0), axis=1)
         speed = np.median(np.linalg.norm(rate, axis=1))
@@ -606,9 +611,9 @@ def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Arra
 def _check_turns(table: Table, order: NDArray[np.intp], quaternion: Array) -> None:
     """Raise InputError for a rotation between two readings that is too fast for a satellite."""
     step = np.diff(table["time"][order])
-    turn = 2.0 * np.arccos(np.clip(np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=1)), 0.0, 1.0))
-    for k in np.flatnonzero(turn > _LEAST_TURN + _FASTEST_TURN * step)[:1]:
-        found = f"{np.degrees(turn[k]):.4g} deg in {step[k]:.4g} s"
+    rotation = 2.0 * np.arccos(np.clip(np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=1)), 0.0, 1.0))
+    for k in np.flatnonzero(rotation > _LEAST_TURN + _FASTEST_TURN * step)[:1]:
+        found = f"{np.degrees(rotation[k]):.4g} deg in {step[k]:.4g} s"
         raise table.error(int(order[k + 1]), "q1", "a jump of the attitude", found, "leave out wrong readings")
 
 

@@ -81,8 +81,11 @@ class OrbitReadings:
     def taken(self, part: slice) -> OrbitReadings:
         """Return the readings of a slice, with the segments cut accordingly."""
         begin, end, _ = part.indices(len(self.clock))
-        here = (one for one in self.segments if one.first < end and one.last >= begin)
-        segments = (replace(one, first=max(one.first - begin, 0), last=min(one.last, end - 1) - begin) for one in here)
+        here = (segment for segment in self.segments if segment.first < end and segment.last >= begin)
+        segments = (
+            replace(segment, first=max(segment.first - begin, 0), last=min(segment.last, end - 1) - begin)
+            for segment in here
+        )
         velocity, clock = None if self.velocity is None else self.velocity[part], self.clock.taken(part)
         return replace(self, clock=clock, position=self.position[part], velocity=velocity, segments=tuple(segments))
 
@@ -138,14 +141,14 @@ def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_F
         The frame is not supported.
     """
     word = name.strip().upper().replace("-", "").replace("_", "")
-    # SP3 has five letters: ITR97, IER97 of the IERS, IGS14, IGb08, and ECF where a realisation is not said
+    # SP3 has five letters: ITR97, IER97 of the IERS, IGS14, IGb08, and ECF for an unspecified realisation.
     if word.startswith(("ITRF", "ITRS", "ITR", "IER", "IGS", "IGB", "IGC", "WGS84", "WGS", "SLR", "ECEF", "ECF")):
         return "ITRS"
-    found = {"GCRF": "GCRS", "ICRF": "GCRS", "GCRS": "GCRS", "J2000": "EME2000", "EME2000": "EME2000", "TEME": "TEME"}
-    if word not in found:
+    frames = {"GCRF": "GCRS", "ICRF": "GCRS", "GCRS": "GCRS", "J2000": "EME2000", "EME2000": "EME2000", "TEME": "TEME"}
+    if word not in frames:
         allowed = f"{names_text(FRAMES)}, or names of them as ITRF2014, ICRF, J2000"
-        raise InputError(Issue("a frame that cannot be read", file, line, (key,), shown(name), allowed))
-    return found[word]
+        raise InputError(Issue("unknown reference frame", file, line, (key,), shown(name), allowed))
+    return frames[word]
 
 
 def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
@@ -156,7 +159,9 @@ def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
     radius = np.linalg.norm(position, axis=1)
     for row in np.flatnonzero((radius < 6.3e6) | (radius > 1e8))[:1]:
         found = f"{radius[row] / 1e3:.6g} km from the Earth's centre"
-        raise InputError(Issue("no place of a satellite", file, lines[row], (), found, "6300 km to 100 000 km; units?"))
+        raise InputError(
+            Issue("not a position of a satellite", file, lines[row], (), found, "6300 km to 100 000 km; units?")
+        )
 
 
 def require_unit(file: str, quaternion: np.ndarray, lines: list[int]) -> None:
@@ -164,7 +169,7 @@ def require_unit(file: str, quaternion: np.ndarray, lines: list[int]) -> None:
     length = np.linalg.norm(quaternion, axis=1)
     for row in np.flatnonzero(np.abs(length - 1.0) > 1e-3)[:1]:
         found = f"length {length[row]:.6g}"
-        raise InputError(Issue("not a quaternion of a rotation", file, lines[row], (), found, "length 1"))
+        raise InputError(Issue("not a unit quaternion", file, lines[row], (), found, "length 1"))
 
 
 SPEED_TOLERANCE = 0.02
@@ -194,12 +199,12 @@ def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, boo
         Relative differences, and whether the velocities less omega x P fit while they themselves do not.
     """
     rate = np.diff(place, axis=0) / np.diff(time)[:, None]
-    # across a long step the chord is shorter than the arc, and lies to its side; that is no error of the velocity
-    own, turning = (
+    # Across a long step the chord is shorter than the arc and lies to its side, which is not an error of the velocity.
+    earth_fixed, inertial = (
         np.linalg.norm(rate - 0.5 * (v[1:] + v[:-1]), axis=1) / np.linalg.norm(rate, axis=1).clip(1.0)
         for v in (speed, speed - carried_with_earth(place))
     )
-    return own, bool(np.median(own) > SPEED_TOLERANCE >= np.median(turning))
+    return earth_fixed, bool(np.median(earth_fixed) > SPEED_TOLERANCE >= np.median(inertial))
 
 
 def require_own_velocity(orbit: OrbitReadings) -> None:
@@ -209,9 +214,9 @@ def require_own_velocity(orbit: OrbitReadings) -> None:
         raise InputError(Issue(INERTIAL, orbit.file, None, (), None, AGAINST_EARTH))
 
 
-INERTIAL = "the velocities are against the stars, larger than those of the Earth-fixed positions by omega x P"
+INERTIAL = "the velocities are inertial, larger than those of the Earth-fixed positions by omega x P"
 """Problem text of inertial velocities with Earth-fixed positions."""
-AGAINST_EARTH = "velocities against the same axes as the positions, or none"
+AGAINST_EARTH = "velocities relative to the same axes as the positions, or none"
 """Text of the allowed velocities."""
 
 
@@ -261,15 +266,15 @@ def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     rows, lines = [row for s in segments for row in s.rows], [line for s in segments for line in s.lines]
     widths = {len(row) for row in rows}
     cells = [row[1:7] for row in rows] if widths <= {7, 10} else [row[1:] for row in rows]
-    found = 1e3 * numbers(file, cells, lines, ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT"))
+    states = 1e3 * numbers(file, cells, lines, ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT"))
     clock = readings(file, [row[0] for row in rows], lines)
-    require_orbit(file, found[:, :3], lines)
+    require_orbit(file, states[:, :3], lines)
     parts = _parts(file, segments)
     for part, segment in zip(parts, segments, strict=True):
-        own = slice(part.first, part.last + 1)
-        require_rising(file, Readings(clock.day[own], clock.second[own]), segment.lines)
+        part_of = slice(part.first, part.last + 1)
+        require_rising(file, Readings(clock.day[part_of], clock.second[part_of]), segment.lines)
     scale = _scale(file, segments)
-    return OrbitReadings(file, clock, found[:, :3], found[:, 3:], known_frame(frame, file, line), scale, parts)
+    return OrbitReadings(file, clock, states[:, :3], states[:, 3:], known_frame(frame, file, line), scale, parts)
 
 
 def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings:
@@ -278,7 +283,7 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
     segments = _chosen(file, _segments(path, "AEM"), satellite)
     kind, line = _same(file, segments, "ATTITUDE_TYPE")
     if not kind.upper().startswith("QUATERNION"):
-        problem = "an attitude of another type"
+        problem = "unsupported attitude type"
         raise InputError(Issue(problem, file, line, ("ATTITUDE_TYPE",), shown(kind), "QUATERNION"))
     frames = {key: _same(file, segments, key) for key in ("REF_FRAME_A", "REF_FRAME_B")}
     body = [key for key, (name, _) in frames.items() if name.upper().startswith(("SC_", "SC", "SPACECRAFT"))]
@@ -290,12 +295,12 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
     reference, at = frames["REF_FRAME_A" if body[0] == "REF_FRAME_B" else "REF_FRAME_B"]
     direction, turn_line = _same(file, segments, "ATTITUDE_DIR", "A2B")
     if direction.upper() not in ("A2B", "B2A"):
-        raise InputError(Issue("no such direction", file, turn_line, ("ATTITUDE_DIR",), shown(direction), "A2B, B2A"))
+        raise InputError(Issue("unknown direction", file, turn_line, ("ATTITUDE_DIR",), shown(direction), "A2B, B2A"))
     to_body = (direction.upper() == "A2B") == (body[0] == "REF_FRAME_B")
     turns: Turns = "body_to_frame" if to_body else "frame_to_body"
     first, type_line = _same(file, segments, "QUATERNION_TYPE", "LAST")
     if first.upper() not in ("FIRST", "LAST"):
-        raise InputError(Issue("no such type", file, type_line, ("QUATERNION_TYPE",), shown(first), "FIRST, LAST"))
+        raise InputError(Issue("unknown type", file, type_line, ("QUATERNION_TYPE",), shown(first), "FIRST, LAST"))
     scalar: Scalar = "first" if first.upper() == "FIRST" else "last"
     rows, lines = _joined(segments)
     cells = [row[1:5] if len(row) >= 5 else row[1:] for row in rows]
@@ -363,14 +368,14 @@ _TURN = {"LAST": ("EPOCH", "Q1", "Q2", "Q3", "QC"), "FIRST": ("EPOCH", "QC", "Q1
 def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
     """Parse the segments of a message in XML."""
     root = parsed_xml(text, file)
-    for one in root.iter("segment"):
+    for element in root.iter("segment"):
         segment = _Segment()
-        for meta in one.iter("metadata"):
+        for meta in element.iter("metadata"):
             segment.keys |= {item.tag: (item.text, item.line) for item in meta.children}
         heads = (
             _STATE if kind == "OEM" else _TURN[segment.keys.get("QUATERNION_TYPE", ("LAST", 1))[0].upper() or "LAST"]
         )
-        for state in (*one.iter("stateVector"), *one.iter("attitudeState")):
+        for state in (*element.iter("stateVector"), *element.iter("attitudeState")):
             cells = {item.tag: item.text for item in state.below()}
             if missing := [head for head in heads if not cells.get(head)]:
                 number = len(segment.rows) + 1
@@ -387,30 +392,30 @@ def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[
     for segment in segments:
         known = {segment.keys[k][0]: None for k in ("OBJECT_ID", "OBJECT_NAME") if k in segment.keys}
         names[segment.keys.get("OBJECT_ID", segment.keys.get("OBJECT_NAME", ("", 0)))[0]] = known
-    every = [name for known in names.values() for name in known]
+    allowed = [name for known in names.values() for name in known]
     if satellite is None:
         if len(names) > 1:
             found = names_text(names)
-            raise InputError(Issue("which satellite is not said", file, None, ("satellite",), found, "one of them"))
+            raise InputError(Issue("the satellite is not specified", file, None, ("satellite",), found, "one of them"))
         return segments
     found_segments = [
         s for s in segments if satellite in (s.keys.get(k, ("",))[0] for k in ("OBJECT_ID", "OBJECT_NAME"))
     ]
     if not found_segments:
-        meant = nearest(satellite, every)
-        raise InputError(Issue("no such satellite", file, None, ("satellite",), satellite, names_text(every), meant))
+        meant = nearest(satellite, allowed)
+        raise InputError(Issue("no such satellite", file, None, ("satellite",), satellite, names_text(allowed), meant))
     return found_segments
 
 
 def _same(file: str, segments: list[_Segment], key: str, usual: str | None = None) -> tuple[str, int]:
     """Return the value of a key that all segments share, and its line in the file."""
-    said = [s.keys.get(key) for s in segments]
-    values = {None if one is None else one[0] for one in said}
+    entries = [s.keys.get(key) for s in segments]
+    values = {None if value is None else value[0] for value in entries}
     if values == {None} and usual is not None:
         return usual, 1
-    first = next((one for one in said if one is not None), None)
+    first = next((value for value in entries if value is not None), None)
     if first is None or None in values:
-        raise InputError(Issue(f"no {key}", file, None, (key,), None, "it in every segment's metadata"))
+        raise InputError(Issue(f"no {key}", file, None, (key,), None, "this key in the metadata of every segment"))
     if len(values) > 1:
         found = names_text(sorted(map(str, values)))
         raise InputError(Issue(f"segments with different {key}", file, first[1], (key,), found, "the same in all"))
@@ -438,8 +443,8 @@ def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
         ends = [segment.keys.get(f"USEABLE_{end}_TIME", segment.keys.get(f"{end}_TIME")) for end in ("START", "STOP")]
         usable = None
         if any(f"USEABLE_{end}_TIME" in segment.keys for end in ("START", "STOP")):
-            texts = [segment.rows[k][0] if one is None else one[0] for k, one in zip((0, -1), ends, strict=True)]
-            where = [segment.lines[k] if one is None else one[1] for k, one in zip((0, -1), ends, strict=True)]
+            texts = [segment.rows[k][0] if limit is None else limit[0] for k, limit in zip((0, -1), ends, strict=True)]
+            where = [segment.lines[k] if limit is None else limit[1] for k, limit in zip((0, -1), ends, strict=True)]
             usable = readings(file, texts, where)
         found.append(Segment(first, first + count - 1, usable))
         first += count
@@ -517,7 +522,7 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
         allowed = "EOF as the last line, or all epochs of the header"
         raise InputError(Issue("the file ends early", file, len(lines), (), found, allowed))
     if len(rows) < 2:
-        raise InputError(Issue(f"fewer than two places of {which}", file, None, (), str(len(rows)), "two or more"))
+        raise InputError(Issue(f"fewer than two positions of {which}", file, None, (), str(len(rows)), "two or more"))
     clock = readings(file, texts, rows)
     require_rising(file, clock, rows)
     position = 1e3 * numbers(file, places, rows, ("x", "y", "z"))
@@ -537,7 +542,7 @@ def _satellite(file: str, lines: list[str], wanted: str | None, old: bool) -> st
     key, found = ("satellite",), names_text(names[:20]) or "none"
     if wanted is None:
         if len(names) != 1:
-            raise InputError(Issue("which satellite is not said", file, None, key, found, "the name of one"))
+            raise InputError(Issue("the satellite is not specified", file, None, key, found, "the name of one"))
         return names[0]
     alike = [n for n in sorted(names) if n.lstrip("Gg").strip().lstrip("0") == wanted.lstrip("Gg").lstrip("0")]
     name = wanted if wanted in names or not (old and alike) else alike[0]

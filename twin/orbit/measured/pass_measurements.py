@@ -70,17 +70,17 @@ class GroundPoints:
         if names.ndim != 1 or places.shape != (n, 3):
             raise ValueError(f"ground points: {n} names and coordinates {places.shape}, not ({n}, 3)")
         if len(set(names.tolist())) != n:
-            raise ValueError("ground points: a name stands twice")
+            raise ValueError("ground points: a name occurs twice")
         spread = np.array(np.broadcast_to(np.asarray(covariance, np.float64), (n, 3, 3)))
         sorts = np.array(np.broadcast_to(np.asarray(role, dtype=object), (n,)))
         if not set(sorts.tolist()) <= set(ROLES):
             raise ValueError(f"ground points: roles are {', '.join(ROLES)}")
-        given = sorts != "tie"
-        if not (np.all(np.isfinite(places[given])) and np.all(np.isfinite(spread))):
+        known = sorts != "tie"
+        if not (np.all(np.isfinite(places[known])) and np.all(np.isfinite(spread))):
             raise ValueError("ground points: a coordinate or covariance is not finite")
         scale = np.trace(spread, axis1=1, axis2=2)[:, None]
         if np.any(np.linalg.eigvalsh(spread) < -1e-9 * scale) or not np.allclose(spread, spread.swapaxes(1, 2)):
-            raise ValueError("ground points: a covariance is not one")
+            raise ValueError("ground points: a covariance is not symmetric and positive semidefinite")
         return cls(names, places, spread, sorts)
 
     def __len__(self) -> int:
@@ -89,7 +89,9 @@ class GroundPoints:
     def with_ties(self, names: Sequence[str]) -> GroundPoints:
         """Return these points, followed by tie points of these names without coordinates."""
         ties = GroundPoints.of(names, np.full((len(names), 3), np.nan), np.zeros((3, 3)), "tie")
-        return GroundPoints(*(np.concatenate([getattr(one, k.name) for one in (self, ties)]) for k in fields(self)))
+        return GroundPoints(
+            *(np.concatenate([getattr(points, k.name) for points in (self, ties)]) for k in fields(self))
+        )
 
     def taken(self, keep: ArrayLike) -> GroundPoints:
         """Return the points that a mask or index selects."""
@@ -152,7 +154,7 @@ class ImagePoints:
     @classmethod
     def joined(cls, parts: Sequence[ImagePoints]) -> ImagePoints:
         """Concatenate one or more sets of image points."""
-        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
+        return cls(*(np.concatenate([getattr(part, attribute.name) for part in parts]) for attribute in fields(cls)))
 
     def numbered(self, first: int) -> ImagePoints:
         """Return these image points with their ground points counted from ``first``."""
@@ -184,7 +186,7 @@ def duplicates(ids: NDArray[np.object_], places: Array) -> str:
     if not pairs:
         return ""
     names = listed([f"{ids[known[a]]} = {ids[known[b]]}" for a, b in pairs])
-    return f"points at one place under two names: {names}; counted twice, they make sigmas too small"
+    return f"points with the same coordinates under two names: {names}; counted twice, they make sigmas too small"
 
 
 _NAMED = 8

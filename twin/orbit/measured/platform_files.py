@@ -128,28 +128,32 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         A file cannot be read, or a convention is specified neither by file nor spec, or differently.
     """
     orbit, attitude = _orbit(spec.orbit, folder), _attitude(spec.attitude, folder)
-    turned = attitude.quaternion is not None
+    quaternions = attitude.quaternion is not None
     spec_of = spec.attitude
-    frame = _stated(spec_of, "frame", spec_of.frame, attitude.frame, "the frame that the body is turned against")
+    frame = _stated(spec_of, "frame", spec_of.frame, attitude.frame, "the reference frame of the attitude")
     if frame == "orbital" and (spec_of.nadir is None or spec_of.steering is None):
-        problem = "which orbital frame is not said"
+        problem = "the orbital frame is not specified"
         raise spec_of.error(problem, (), allowed="nadir: geodetic or geocentric, and steering: none or yaw")
-    found = Conventions(
+    conventions = Conventions(
         _stated(spec.orbit, "frame", spec.orbit.frame, orbit.frame, "the frame of the positions"),
         _stated(spec.orbit, "time_scale", spec.orbit.time_scale, orbit.scale, "the time scale of the orbit"),
         frame,
         _stated(spec_of, "time_scale", spec_of.time_scale, attitude.scale, "the time scale of the attitude"),
         spec.orbit.offset,
         spec_of.offset,
-        _stated(spec_of, "scalar", spec_of.scalar, attitude.scalar, "where the scalar stands") if turned else "last",
-        _stated(spec_of, "turns", spec_of.turns, attitude.turns, "what is turned") if turned else "body_to_frame",
+        _stated(spec_of, "scalar", spec_of.scalar, attitude.scalar, "the position of the scalar")
+        if quaternions
+        else "last",
+        _stated(spec_of, "turns", spec_of.turns, attitude.turns, "the direction of the rotation")
+        if quaternions
+        else "body_to_frame",
         spec_of.body_axes,
-        "xyz" if turned else _stated(spec_of, "sequence", spec_of.sequence, None, "the sequence of the angles"),
+        "xyz" if quaternions else _stated(spec_of, "sequence", spec_of.sequence, None, "the sequence of the angles"),
         Attitude(spec_of.nadir != "geocentric", spec_of.steering == "yaw"),
     )
-    if found.orbit_frame == "ITRS":
+    if conventions.orbit_frame == "ITRS":
         require_own_velocity(orbit)
-    return PlatformReadings(orbit, attitude, _earth(spec, folder, orbit, found)), found
+    return PlatformReadings(orbit, attitude, _earth(spec, folder, orbit, conventions)), conventions
 
 
 def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | None = None) -> PlatformTable:
@@ -195,7 +199,7 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
         known = flown.known(turn_time)
         if np.sum(known) < 2:
             found = f"{turn_time[0]:.9g} s to {turn_time[-1]:.9g} s, and orbit from {flown.first:.9g} s"
-            allowed = "two readings or more within the orbit's, as the attitude is against it"
+            allowed = "two or more attitude readings within the time span of the orbit, which defines their frame"
             raise InputError(Issue("attitude at times without orbit", attitude.file, None, (), found, allowed))
         turn_time = turn_time[known]
         matrix = flown.orbital_to_itrs(turn_time) @ matrix[known]
@@ -211,7 +215,9 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
         step = float(np.median(np.diff(time)))
         found = f"{between:.2g} m with {step:g} s between readings"
         allowed = f"{_LARGEST_ERROR:g} m: readings closer together"
-        raise InputError(Issue("positions between the readings are not known", orbit.file, None, (), found, allowed))
+        raise InputError(
+            Issue("positions between the readings are too uncertain", orbit.file, None, (), found, allowed)
+        )
     if usable is None:
         return table
     first, last = usable.since(epoch)
@@ -226,14 +232,16 @@ def _one_segment(readings: PlatformReadings, meant: Conventions) -> tuple[OrbitR
     start = epoch_before(fixes)
     time, turn_time = fixes.since(start), looks.since(start)
     best, best_count, best_usable = orbit.segments[0], -1, None
-    for one in orbit.segments:
+    for segment in orbit.segments:
         usable = (
-            None if one.usable is None else _instants(orbit.file, one.usable, meant.orbit_scale, meant.orbit_offset)
+            None
+            if segment.usable is None
+            else _instants(orbit.file, segment.usable, meant.orbit_scale, meant.orbit_offset)
         )
-        first, last = (time[one.first], time[one.last]) if usable is None else usable.since(start)
+        first, last = (time[segment.first], time[segment.last]) if usable is None else usable.since(start)
         count = int(np.sum(in_span(turn_time, first, last)))
         if count > best_count:
-            best, best_count, best_usable = one, count, usable
+            best, best_count, best_usable = segment, count, usable
     return replace(orbit.taken(slice(best.first, best.last + 1)), segments=()), best_usable
 
 
@@ -243,12 +251,12 @@ def _in_itrs(
     """Return positions and velocities in the ITRS."""
     if frame == "ITRS" or rotation is None:
         return orbit.position, orbit.velocity
-    turn = to_itrs(frame, rotation)
-    matrix = turn(time)
+    to_earth = to_itrs(frame, rotation)
+    matrix = to_earth(time)
     position = np.einsum("nij,nj->ni", matrix, orbit.position)
     if orbit.velocity is None:
         return position, None
-    carried = np.cross(earth_orientation.rate_of(turn, time), position)
+    carried = np.cross(earth_orientation.rate_of(to_earth, time), position)
     return position, np.einsum("nij,nj->ni", matrix, orbit.velocity) - carried
 
 
@@ -283,15 +291,13 @@ def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants
         raise InputError(problem.at(file)) from None
 
 
-def _stated(spec: Any, key: str, said: str | None, found: str | None, what: str) -> str:
+def _stated(spec: Any, key: str, in_spec: str | None, in_file: str | None, what: str) -> str:
     """Return a convention that spec or file specifies; InputError if neither does or they differ."""
-    if said is None and found is None:
-        raise spec.error(f"{what} is not said, neither by the file nor here", (key,), allowed=f"`{key}:` here")
-    if said is not None and found is not None and said != found:
-        raise spec.error(
-            f"{what} is said differently by the file", (key,), found=said, allowed=f"{found}, as the file says"
-        )
-    return str(said or found)
+    if in_spec is None and in_file is None:
+        raise spec.error(f"{what} is not specified, neither by the file nor here", (key,), allowed=f"`{key}:` here")
+    if in_spec is not None and in_file is not None and in_spec != in_file:
+        raise spec.error(f"{what} differs from the file", (key,), found=in_spec, allowed=f"{in_file}, as the file says")
+    return str(in_spec or in_file)
 
 
 def _earth(spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, meant: Conventions) -> EarthOrientation | None:
@@ -320,9 +326,7 @@ def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
     clock, scale = _clock(table, spec)
     have = [name for name in ("vx", "vy", "vz") if name in table]
     if len(have) in (1, 2):
-        raise InputError(
-            Issue("velocities are not complete", str(path), None, (), ", ".join(have), "vx, vy, vz or none")
-        )
+        raise InputError(Issue("incomplete velocities", str(path), None, (), ", ".join(have), "vx, vy, vz or none"))
     position, lines = table.stacked("x", "y", "z"), [int(v) for v in table.lines]
     require_orbit(str(path), position, lines)
     velocity = table.stacked("vx", "vy", "vz") if have else None
@@ -363,7 +367,7 @@ def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFil
     """
     if ("time" in table) == ("date_time" in table):
         found, allowed = ", ".join(table.columns), "time [s] with `epoch:`, or date_time"
-        raise InputError(Issue("times are not said once", table.file, None, (), found, allowed))
+        raise InputError(Issue("times must be given exactly once", table.file, None, (), found, allowed))
     try:
         if "date_time" in table:
             return Readings.of_texts(table["date_time"].tolist())
@@ -382,7 +386,7 @@ def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readin
     clock = clock_of(table, spec)
     if "date_time" in table:
         if spec.epoch is not None:
-            raise spec.error("an epoch for times of the day", ("epoch",), allowed="no epoch, or a column time [s]")
+            raise spec.error("an epoch with dates and times", ("epoch",), allowed="no epoch, or a column time [s]")
         zoned = "UTC" if all(text.endswith("Z") for text in table["date_time"]) else None
     else:
         zoned = "UTC" if str(spec.epoch).endswith("Z") else None

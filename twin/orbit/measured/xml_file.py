@@ -59,7 +59,11 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
     uneven = next((k for k, row in enumerate(cells) if len(row) != width), None)
     if uneven is not None:
         found = f"{len(cells[uneven])} numbers"
-        raise InputError(Issue("a row of another length", file, lines[uneven], found=found, allowed=", ".join(heads)))
+        raise InputError(
+            Issue(
+                "a row with a different number of columns", file, lines[uneven], found=found, allowed=", ".join(heads)
+            )
+        )
     try:
         values = np.array([list(map(float, row)) for row in cells], dtype=np.float64).reshape(len(cells), width)
     except ValueError:
@@ -70,7 +74,7 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
                     raise InputError(
                         Issue("not a number", file, lines[k], (heads[j],), shown(text), "a number")
                     ) from None
-    wrong = {"not a finite number": ~np.isfinite(values), "larger than any quantity": np.abs(values) > LARGEST_NUMBER}
+    wrong = {"not a finite number": ~np.isfinite(values), "implausibly large": np.abs(values) > LARGEST_NUMBER}
     for problem, bad in wrong.items():
         for k, j in np.argwhere(bad)[:1].tolist():
             raise InputError(Issue(problem, file, lines[k], (heads[j],), shown(cells[k][j]), "a number"))
@@ -93,7 +97,7 @@ def require_rising(file: str, clock: Readings, lines: Sequence[int]) -> None:
     back = (np.diff(clock.day) * 86400.0 + np.diff(clock.second)) <= 0.0
     for row in np.flatnonzero(back)[:1]:
         problem = "a time that is not later than the one before it"
-        raise InputError(Issue(problem, file, lines[row + 1], allowed="times in rising order, each once"))
+        raise InputError(Issue(problem, file, lines[row + 1], allowed="times in increasing order, each once"))
 
 
 def _is_number(text: str) -> bool:
@@ -144,22 +148,22 @@ class Element:
 
     def iter(self, tag: str) -> Iterator[Element]:
         """Return the elements of this name among itself and all descendants, in the order of the file."""
-        return (one for one in self.below() if one.tag == tag)
+        return (element for element in self.below() if element.tag == tag)
 
     def below(self) -> Iterator[Element]:
         """Return itself and all descendants, in the order of the file."""
         waiting = [self]
         while waiting:
-            one = waiting.pop()
-            yield one
-            waiting += reversed(one.children)
+            element = waiting.pop()
+            yield element
+            waiting += reversed(element.children)
 
     def all(self, *tags: str) -> list[Element]:
         """Return the elements at a path below this one; an empty list where there are none."""
-        found = [self]
+        elements = [self]
         for tag in tags:
-            found = [child for one in found for child in one.children if child.tag == tag]
-        return found
+            elements = [child for element in elements for child in element.children if child.tag == tag]
+        return elements
 
     def maybe(self, *tags: str) -> Element | None:
         """Return the element at a path below this one; None where there is none.
@@ -169,10 +173,10 @@ class Element:
         InputError
             There are several.
         """
-        found = self.all(*tags)
-        if len(found) > 1:
-            self._wrong("stands more than once", tags, found[1].line, f"{len(found)} of them", "one")
-        return found[0] if found else None
+        elements = self.all(*tags)
+        if len(elements) > 1:
+            self._wrong("occurs more than once", tags, elements[1].line, f"{len(elements)} of them", "one")
+        return elements[0] if elements else None
 
     def one(self, *tags: str) -> Element:
         """Return the element at a path below this one.
@@ -182,9 +186,9 @@ class Element:
         InputError
             There is none, or there are several.
         """
-        found = self.maybe(*tags)
-        if found is not None:
-            return found
+        element = self.maybe(*tags)
+        if element is not None:
+            return element
         here, missing = self, 0
         while (deeper := here.all(tags[missing])) and missing < len(tags) - 1:
             here, missing = deeper[0], missing + 1
@@ -196,10 +200,10 @@ class Element:
 
     def words(self, *tags: str) -> str:
         """Return the text at a path below this one; InputError where there is none, or it is empty."""
-        found = self.one(*tags)
-        if not found.text:
-            found.wrong("nothing stands in it", None, "a value")
-        return found.text
+        element = self.one(*tags)
+        if not element.text:
+            element.wrong("the element is empty", None, "a value")
+        return element.text
 
     def floats(self, count: int | None = None) -> np.ndarray:
         """Return the numbers of its text, (count,), separated by spaces or commas; any number if count is None.
@@ -211,7 +215,7 @@ class Element:
         """
         cells = self.text.replace(",", " ").split()
         if not cells or (count is not None and len(cells) != count):
-            self.wrong("another number of numbers", shown(self.text), "one or more" if count is None else str(count))
+            self.wrong("wrong number of values", shown(self.text), "one or more" if count is None else str(count))
         try:
             return numbers(self.file, [cells], [self.line], [self.tag] * len(cells))[0]
         except InputError as error:
@@ -239,23 +243,23 @@ class Element:
         InputError
             The element is missing, is not a number, is out of bounds or has an unknown unit.
         """
-        found = self.one(*tags) if tags else self
-        value = float(found.floats(1)[0])
+        element = self.one(*tags) if tags else self
+        value = float(element.floats(1)[0])
         if unit is not None:
-            name = found.attributes.get("unit", next(iter(unit)))
+            name = element.attributes.get("unit", next(iter(unit)))
             if name not in unit:
-                found.wrong("another unit", shown(name), names_text(unit))
+                element.wrong("unknown unit", shown(name), names_text(unit))
             value *= unit[name]
         if not least <= value <= most:
-            found.wrong("out of bounds", f"{value:.9g}", f"{least:.9g} to {most:.9g}")
+            element.wrong("out of bounds", f"{value:.9g}", f"{least:.9g} to {most:.9g}")
         return value
 
     def whole(self, *tags: str, least: int = 1, most: int = 10_000_000) -> int:
         """Return the whole number at a path below this one; raises as `number`."""
-        found = self.one(*tags)
-        value = found.number(least=least, most=most)
+        element = self.one(*tags)
+        value = element.number(least=least, most=most)
         if value != round(value):
-            found.wrong("not a whole number", shown(found.text), f"{least} to {most}")
+            element.wrong("not a whole number", shown(element.text), f"{least} to {most}")
         return int(value)
 
     def wrong(self, problem: str, found: str | None = None, allowed: str | None = None) -> NoReturn:
