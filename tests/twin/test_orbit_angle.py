@@ -13,7 +13,7 @@ from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import AngleSetup
 from tests.tiers import quick
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, angle_camera, fly
-from twin.orbit.angle.angle_run import estimated, frame_rows, run_angle, tls_angles, values_of
+from twin.orbit.angle.angle_run import estimate_angles, frame_rows, run_angle, tls_angles, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import look_angle
 
@@ -79,7 +79,7 @@ def test_without_errors_the_angles_come_back(effects: LightEffects) -> None:
     errors = {"station": 0.0, "points": 0.0}
     flight = flown(errors=errors)
     look, dihedral = true_angles()
-    found = estimated(flight.measure(flight.ground(effects), None, effects))
+    found = estimate_angles(flight.measure(flight.ground(effects), None, effects))
     for method in ("tls", "corrected", "printed"):
         assert np.abs(found.angles[method].values - dihedral).max() < 1e-4 * ARCSEC
     assert np.abs(found.look - look).max() < 1e-4 * ARCSEC
@@ -117,9 +117,9 @@ def test_scatter_of_200_passes_matches_sigma(full) -> None:
     for scatter in (full.planes, full.along, full.resection):
         count = len(scatter.values)
         assert count == 200
-        assert np.all(scatter.tail > 1e-3)
+        assert np.all(scatter.p_value > 1e-3)
         for wrong in (0.7, 1.4):
-            assert np.all(replace(scatter, covariance=scatter.covariance * wrong**2).tail < 1e-3)
+            assert np.all(replace(scatter, covariance=scatter.covariance * wrong**2).p_value < 1e-3)
         off = scatter.values - scatter.values.mean(axis=0)
         square = np.einsum("ni,ij,nj->", off, np.linalg.inv(scatter.covariance), off)
         assert chi2.ppf(5e-4, 2 * count - 2) < square < chi2.ppf(1 - 5e-4, 2 * count - 2)
@@ -169,7 +169,7 @@ def without_errors(setup: AngleSetup) -> AngleSetup:
 
 
 def found(flight: AnglePass, effects: LightEffects):
-    return estimated(flight.measure(flight.ground(effects), None, effects))
+    return estimate_angles(flight.measure(flight.ground(effects), None, effects))
 
 
 # The stereo pair

@@ -1,1 +1,1 @@
-"""The intersection-angle test: what is flown and measured, the procedure, JSON, report (paper 000)."""
+"""Intersection angles of lines from planes through the station and ground points, or from resection (paper 000)."""

@@ -1,8 +1,8 @@
-"""The lines whose angles are tested, and one moment of a pass as it truly is and as it is measured.
+"""Truth and measurement of one moment of a pass, for tests of the angles between lines.
 
-The measurement has errors of the orbit at the station, and of the ground points from matching and aerial
-triangulation. Beside the coordinates the analysis gets what the laboratory measured of each line before launch, nothing
-else.
+The measurement has errors of the orbit at the station, and errors of the ground points from matching and aerial
+triangulation. Beside the coordinates, the analysis has the laboratory's measurement of each line before launch, and
+nothing else.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class AngleCamera:
-    """Lines on their common base.
+    """Lines on their common base, before launch and in orbit.
 
     Attributes
     ----------
     laboratory : Mapping[str, LineCamera]
-        Line -> what was measured before launch, which the analysis knows.
+        Line -> camera as the laboratory measured it before launch, which the analysis knows.
     cameras : Mapping[str, LineCamera]
-        Line -> what it is in orbit.
+        Line -> camera as it is in orbit.
     trace : Mapping[str, float]
-        Angle -> how it has changed by `twin.monitor.truth.trace_truth`, radians; only for the two cameras of a pair.
+        Angle -> its change by `twin.monitor.truth.trace_truth`, in radians; only for the two cameras of a pair.
     """
 
     laboratory: Mapping[str, LineCamera]
@@ -63,28 +63,30 @@ class AngleCamera:
 
 
 def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
-    """The lines of a payload turned as the test says, or those of an instrument traced without and with its changes.
+    """Return the lines before and after the changes: of a payload rotated, of an instrument traced.
 
     Parameters
     ----------
     setup : AngleSetup
-        The test with its camera.
-    backend : Backend | None
-        Where to trace an instrument; a payload needs none.
+        Resolved test file and camera.
+    backend : Backend or None
+        Backend on which an instrument is traced; a payload needs none.
 
     Raises
     ------
     InputError
-        a change of what the instrument does not have, or a temperature that cannot be.
+        A change is not possible for this instrument, or a temperature is not possible.
     BenchError
         The changes move the image off the mirrors.
     """
     spec = setup.test
     if setup.camera is not None:
         laboratory = line_cameras(setup.camera)
-        turns = {name: rotation_matrix(change.rotate).T for name, change in spec.perturb.items()}
-        turned = {name: camera.turned(turns[name]) if name in turns else camera for name, camera in laboratory.items()}
-        return AngleCamera(FrozenMap(laboratory), FrozenMap(turned), FrozenMap())
+        rotations = {name: rotation_matrix(change.rotate).T for name, change in spec.perturb.items()}
+        changed = {
+            name: camera.turned(rotations[name]) if name in rotations else camera for name, camera in laboratory.items()
+        }
+        return AngleCamera(FrozenMap(laboratory), FrozenMap(changed), FrozenMap())
     if setup.instrument is None or backend is None:
         raise ValueError("an instrument's lines need a backend to be traced")
     instrument = build_instrument(setup.instrument, setup.cameras, backend)
@@ -100,17 +102,17 @@ def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
 
 
 def _changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
-    """The state that a test's changes put an instrument into.
+    """Return the state of an instrument after the changes of a test.
 
     Raises
     ------
     InputError
-        a node that does not exist or does not allow what is done to it, or a temperature that cannot be.
+        A node does not exist or does not allow its change, or a temperature is not possible.
     """
     issues = [
         issue
-        for path, what in spec.perturb.items()
-        for issue in perturbation_issues(spec, instrument.nodes, path, what, ("perturb", path))
+        for path, change in spec.perturb.items()
+        for issue in perturbation_issues(spec, instrument.nodes, path, change, ("perturb", path))
     ]
     if issues:
         raise InputError(*issues)
@@ -124,37 +126,39 @@ def _changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
 
 
 _LINE_TIME = 1e-3
-"""Seconds; of an image of one line only its middle is used."""
+"""Time per image line, in seconds; only the middle of a single line is used."""
 LEAST_SIGMA = 1e-3
-"""Metres. Points without errors are given this sigma, for an adjustment needs weights."""
+"""Sigma of points without errors, in metres: an adjustment needs weights."""
 _LEAST_CONVERGENCE = np.radians(1.0)
-"""Rays that meet at a smaller angle give no heights: one arcsecond would be half a kilometre and more."""
+"""Least angle between lines, in radians, at which heights are intersected: below it one arcsecond is half a kilometre
+and more.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What the analysis gets. Coordinates in one Cartesian frame, metres.
+    """Measured station and ground points, with the laboratory's interior of each line; one Cartesian frame, in metres.
 
     Attributes
     ----------
     pairs : Mapping[str, tuple[str, str]]
-        Angle -> the two lines that it lies between.
+        Angle -> its two lines.
     station : Station
-        Measured, with its covariance.
+        Measured station, with its covariance.
     strips : Mapping[str, Strip]
-        Line -> measured ground points with their covariance.
-    tangent : Mapping[str, np.ndarray]
-        Line -> laboratory's tangents of the points' directions from the line's centre, across the line and along it,
-        (n, 2); X forward, Y to the right.
-    along : Mapping[str, np.ndarray]
-        Line -> tangent of the angle of each point from the line's centre along the line, (n,).
+        Line -> measured ground points, with their covariances.
+    tangent : Mapping[str, (n, 2) ndarray]
+        Line -> laboratory's tangents of the points' directions from the line's centre, across the line and along it; X
+        forward, Y to the right.
+    along : Mapping[str, (n,) ndarray]
+        Line -> tangent of the angle of each point from the line's centre along the line.
     look : Mapping[str, float]
-        Line -> laboratory's angle of the line's centre from the body's Z about its Y, radians.
-    offset : Mapping[str, np.ndarray]
-        Line -> laboratory's projection centre of each point, in the axes of its tangents, (n, 3), metres.
-    bow : Mapping[str, np.ndarray]
-        Line -> what a direction needs, in the axes of its tangents, to lie in one plane with the line's centre and its
-        middle direction, (n, 3): the image of a mirror camera's line is bent.
+        Line -> laboratory's angle of the line's centre from the body's Z about its Y, in radians.
+    offset : Mapping[str, (n, 3) ndarray]
+        Line -> laboratory's projection centre of each point, in the axes of its tangents, in metres.
+    bow : Mapping[str, (n, 3) ndarray]
+        Line -> correction of each direction, in the axes of its tangents, that brings it into one plane with the line's
+        centre and its middle direction: the image of a mirror camera's line is bent.
     """
 
     pairs: Mapping[str, tuple[str, str]]
@@ -168,36 +172,38 @@ class Measurement:
 
     @classmethod
     def of(cls, laboratory: LineAngles, station: Station, strips: Mapping[str, Strip]) -> Measurement:
-        """Measured station and points, with what the laboratory knows of the lines' pixels.
+        """Return the measurement of a station and points, with the laboratory's interior of the lines' pixels.
 
         Parameters
         ----------
         laboratory : LineAngles
-            The lines as the laboratory measured them, and the places of the points on them.
+            Lines as the laboratory measured them, and the pixels of the points.
         station : Station
-            measured.
+            Measured station.
         strips : Mapping[str, Strip]
-            Line -> measured ground points; angles are found between these lines.
+            Line -> measured ground points, for each line of the angles.
         """
-        inside = {name: _interior(laboratory.cameras[name], laboratory.pixel[name]) for name in strips}
-        known = {key: {name: one[key] for name, one in inside.items()} for key in next(iter(inside.values()))}
-        return cls(laboratory.pairs, station, strips, **known)
+        interiors = {name: _interior(laboratory.cameras[name], laboratory.pixel[name]) for name in strips}
+        fields = {
+            key: {name: interior[key] for name, interior in interiors.items()} for key in next(iter(interiors.values()))
+        }
+        return cls(laboratory.pairs, station, strips, **fields)
 
     @property
     def which(self) -> list[tuple[int, int]]:
-        """The pairs by the numbers of their lines among the strips."""
+        """Pairs of lines as pairs of indices into the strips."""
         lines = list(self.strips)
         return [(lines.index(a), lines.index(b)) for a, b in self.pairs.values()]
 
     def in_frame(self, axes: np.ndarray, origin: np.ndarray) -> Measurement:
-        """The measurement in another frame.
+        """Return the measurement in another frame.
 
         Parameters
         ----------
-        axes : np.ndarray
-            Of that frame as rows in the present one, (3, 3).
-        origin : np.ndarray
-            Of that frame in the present one, (3,), metres.
+        axes : (3, 3) ndarray
+            Axes of that frame as rows, in the present one.
+        origin : (3,) ndarray
+            Origin of that frame in the present one, in metres.
         """
         station = Station((self.station.position - origin) @ axes.T, axes @ self.station.covariance @ axes.T)
         strips = {
@@ -209,24 +215,25 @@ class Measurement:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AnglePass(LineAngles):
-    """The truth at the moment of exposure; made by `fly`. All coordinates in the ITRS, metres.
+    """Truth at the moment of exposure, as `fly` simulates it; all coordinates in the ITRS, in metres.
 
-    The cameras are those in orbit, and so the angles are the true ones.
+    The cameras are those in orbit, so that the angles are the true ones.
 
     Attributes
     ----------
     spec : OrbitAngleSpec
-        The test.
+        Content of the test file.
     earth : Earth
-        Its rotation and ellipsoid.
+        Rotation and ellipsoid of the Earth.
     trajectory : Trajectory
         True orbit and attitude.
     laboratory : Mapping[str, LineCamera]
         Line -> camera as it was measured before launch.
     trace : Mapping[str, float]
-        Angle -> its change by `twin.monitor.truth.trace_truth`, radians; empty where no trace of two cameras tells it.
-    height : Mapping[str, np.ndarray]
-        Line -> heights of its points above the ellipsoid, (n,).
+        Angle -> its change by `twin.monitor.truth.trace_truth`, in radians; empty where no trace of two cameras gives
+        it.
+    height : Mapping[str, (n,) ndarray]
+        Line -> heights of its points above the ellipsoid.
     """
 
     spec: OrbitAngleSpec
@@ -238,22 +245,22 @@ class AnglePass(LineAngles):
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Lines that angles are measured of, in the order of the camera's file."""
+        """Lines of the angles, in the order of the camera's file."""
         return tuple(self.pixel)
 
     @property
     def reference(self) -> str:
-        """The line whose look is zero in a resection: the second of the first angle."""
+        """Line whose look angle is zero in a resection: the second of the first angle."""
         return next(iter(self.pairs.values()))[1]
 
     @property
     def station(self) -> np.ndarray:
-        """True position of the satellite, (3,), metres."""
+        """True position of the satellite, (3,), in metres."""
         return self.trajectory.position(self.spec.time)
 
     @property
     def velocity(self) -> np.ndarray:
-        """True velocity against the stars, (3,), m/s."""
+        """True inertial velocity of the satellite, (3,), in m/s."""
         return self.trajectory.inertial_velocity(self.spec.time)
 
     @property
@@ -263,12 +270,12 @@ class AnglePass(LineAngles):
 
     @property
     def before_launch(self) -> LineAngles:
-        """The angles as the laboratory measured them."""
+        """Angles as the laboratory measured them."""
         return LineAngles(self.laboratory, self.pairs, self.pixel)
 
     @property
     def middle_point(self) -> np.ndarray:
-        """What the reference line's centre sees, (3,); origin of the local level frame."""
+        """Ground point that the reference line's centre sees, (3,); origin of the local level frame."""
         middle = np.array([0.5 * (self.cameras[self.reference].pixels - 1)])
         return self._sensor(self.reference, NO_EFFECTS).ground(np.zeros(1), middle, self.spec.terrain.height)[0]
 
@@ -285,7 +292,10 @@ class AnglePass(LineAngles):
 
     @property
     def line_axes(self) -> np.ndarray:
-        """Axes of the reference line as rows: normal of its plane, along the line, its middle's look, (3, 3)."""
+        """Axes of the reference line as rows, (3, 3).
+
+        They are the normal of its plane, the direction along the line, and the line of sight of its middle.
+        """
         camera = self.cameras[self.reference]
         x = line_normal(camera)
         z = camera.look(np.array([0.5 * (camera.pixels - 1)]))[0]
@@ -294,19 +304,21 @@ class AnglePass(LineAngles):
         return np.stack([x, np.cross(z, x), z]) @ self.trajectory.body_to_itrs(self.spec.time).T
 
     def ground(self, effects: LightEffects) -> dict[str, np.ndarray]:
-        """Line -> true ground points, (n, 3), when these effects act on the light.
+        """Return the true ground points (n, 3) of each line under these effects on the light.
 
         Raises
         ------
         BenchError
-            a look misses the Earth, or the time is too near the end of the orbit.
+            A line of sight misses the Earth, or the time is too near the end of the orbit.
         """
         points = {
             name: self._sensor(name, effects).ground(np.zeros(1), self.pixel[name], self.height[name])
             for name in self.lines
         }
         if not all(np.all(np.isfinite(p)) for p in points.values()):
-            raise BenchError("a look misses the Earth", ("attitude",), "an attitude in which all lines see the ground")
+            raise BenchError(
+                "a line of sight misses the Earth", ("attitude",), "an attitude in which all lines see the ground"
+            )
         return points
 
     def measure(
@@ -316,59 +328,62 @@ class AnglePass(LineAngles):
         corrected: LightEffects = NO_EFFECTS,
         datum: tuple[float, float, float] | None = None,
     ) -> Measurement:
-        """Station and points as they are measured.
+        """Simulate the measurement of the station and the points.
 
         Parameters
         ----------
-        points : Mapping[str, np.ndarray]
-            Line -> true points, (n, 3).
-        seed : np.random.SeedSequence | None
-            Of the errors; None for none but the datum's.
+        points : Mapping[str, (n, 3) ndarray]
+            Line -> true points.
+        seed : np.random.SeedSequence or None
+            Seed of the errors; None for no errors but the datum's.
         corrected : LightEffects
-            Effects that are taken out of the points.
-        datum : tuple[float, float, float] | None
-            Shift of all points, east, north, up, metres; None for the file's.
+            Effects that the analysis takes out of the points.
+        datum : tuple of float, optional
+            Shift of all points east, north and up, in metres; None for that of the file.
         """
         errors, lines = self.spec.errors, self.lines
         noise = np.zeros((1 + sum(len(points[name]) for name in lines), 3))
         if seed is not None:
             noise = np.random.default_rng(seed).standard_normal(noise.shape)
-        place = self.station + errors.station * noise[0]
+        position = self.station + errors.station * noise[0]
         shift = np.array(errors.datum if datum is None else datum) @ self.local
-        found = np.concatenate([points[name] for name in lines]) + shift + errors.points * noise[1:]
+        measured = np.concatenate([points[name] for name in lines]) + shift + errors.points * noise[1:]
         if corrected.names:
-            found = without_effects(found, place, self.velocity, self.earth, corrected)
+            measured = without_effects(measured, position, self.velocity, self.earth, corrected)
         sigma = max(errors.points, LEAST_SIGMA)
-        strips = {name: Strip.of(p, sigma) for name, p in zip(lines, np.split(found, len(lines)), strict=True)}
-        return Measurement.of(self.before_launch, Station.of(place, errors.station), strips)
+        strips = {name: Strip.of(p, sigma) for name, p in zip(lines, np.split(measured, len(lines)), strict=True)}
+        return Measurement.of(self.before_launch, Station.of(position, errors.station), strips)
 
     def height_per_arcsec(self) -> dict[str, float | None]:
-        """How far a wrong angle of one arcsecond moves heights that are intersected from its two lines, metres.
+        """Return, by angle, the error of intersected heights for an error of 1 arcsec in that angle, in metres.
 
-        The point that the reference line's centre sees (or that of the second line, where the reference is not one of
-        them) is looked up in the other line's image, that line is then turned by 1 arcsec about the body's Y, and the
-        two rays are intersected; None where the orbit is too short for the other line to see the point, and for lines
-        so nearly parallel that they make no heights. No effects on the light.
+        The point that the reference line's centre sees (or the second line's centre, where the reference is not one of
+        the two) is located in the other line's image, that line is then rotated by 1 arcsec about the body's Y, and the
+        two rays are intersected. There are no effects on the light. The value is None where the orbit is too short for
+        the other line to see the point, and for lines so nearly parallel that they give no heights.
         """
-        out: dict[str, float | None] = {}
+        heights_by_angle: dict[str, float | None] = {}
         look = self.look
         for angle, (a, b) in self.pairs.items():
-            out[angle] = None
+            heights_by_angle[angle] = None
             if look[angle] < _LEAST_CONVERGENCE:
                 continue
             base, other = (a, b) if a == self.reference else (b, a)
             middle = np.array([0.5 * (self.cameras[base].pixels - 1)])
             point = self._sensor(base, NO_EFFECTS).ground(np.zeros(1), middle, self.spec.terrain.height)[0]
             first = self._ray(base, point, 0.0)
-            rays = [self._ray(other, point, turn) for turn in (0.0, np.radians(1.0 / 3600.0))]
+            rays = [self._ray(other, point, rotation) for rotation in (0.0, np.radians(1.0 / 3600.0))]
             if first is None or any(ray is None for ray in rays):
                 continue
             heights = [self.earth.geodetic(_nearest(first, ray))[2] for ray in rays if ray is not None]
-            out[angle] = float(abs(heights[1] - heights[0]))
-        return out
+            heights_by_angle[angle] = float(abs(heights[1] - heights[0]))
+        return heights_by_angle
 
-    def _ray(self, name: str, point: np.ndarray, turn: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Projection centre and look of the pixel that sees a point, the line turned afterwards; None if none does."""
+    def _ray(self, name: str, point: np.ndarray, rotation: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the ray of the pixel that sees a point, after a rotation of the line; None if none sees it.
+
+        The ray is the projection centre and the direction.
+        """
         first, last = self.trajectory.first, self.trajectory.last
         lines = int((last - first) / _LINE_TIME) - 1
         sensor = Sensor(
@@ -378,7 +393,7 @@ class AnglePass(LineAngles):
         if not np.isfinite(line[0]):
             return None
         seconds = sensor.time(line)[0]
-        body = about_axis(1, turn) @ self.cameras[name].look(pixel)[0]
+        body = about_axis(1, rotation) @ self.cameras[name].look(pixel)[0]
         axes = self.trajectory.body_to_itrs(seconds)
         return self.trajectory.position(seconds) + axes @ self.cameras[name].origin(pixel)[0], axes @ body
 
@@ -390,21 +405,21 @@ class AnglePass(LineAngles):
 
 
 def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) -> AnglePass:
-    """Put the satellite into its orbit and draw the terrain.
+    """Simulate the pass: propagate the orbit and draw the terrain.
 
     Parameters
     ----------
     setup : AngleSetup
-        The test.
+        Resolved test file and camera.
     camera : AngleCamera
-        Its lines, by `angle_camera`.
+        Lines of the camera, from `angle_camera`.
     seed : np.random.SeedSequence
-        Of the terrain.
+        Seed of the terrain.
 
     Raises
     ------
     BenchError
-        There is no such orbit.
+        No such orbit exists.
     """
     spec = setup.test
     earth = Earth.from_spec(spec.earth)
@@ -434,58 +449,58 @@ def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) ->
 
 
 def _interior(camera: LineCamera, pixel: np.ndarray) -> dict[str, Any]:
-    """What the laboratory knows of a line's pixels (N,): fields of a `Measurement`.
+    """Return the laboratory's interior of a line's pixels (N,) as fields of a `Measurement`.
 
-    Tangents count across (forward) and along (to the right) in the body's axes pitched to the line's centre; the angle
-    within the line is positive to the right.
+    Tangents count across the line (forward) and along it (to the right) in the body's axes pitched to the line's
+    centre; the angle within the line is positive to the right.
     """
     centre = camera.look(np.array([0.5 * (camera.pixels - 1)]))[0]
-    seen = camera.look(pixel)
+    looks = camera.look(pixel)
     look = float(np.arctan2(centre[0], centre[2]))
     pitch = about_axis(1, look)
-    pitched = seen @ pitch
-    turn = np.linalg.norm(np.cross(centre, seen), axis=-1) / (seen @ centre)
+    pitched = looks @ pitch
+    tangent = np.linalg.norm(np.cross(centre, looks), axis=-1) / (looks @ centre)
     normal = line_normal(camera, pixel)
     normal = normal - (normal @ centre) * centre
     normal = normal / np.linalg.norm(normal)
     return {
         "tangent": pitched[:, :2] / pitched[:, 2:],
-        "along": np.copysign(turn, seen[:, 1] - centre[1]),
+        "along": np.copysign(tangent, looks[:, 1] - centre[1]),
         "look": look,
         "offset": camera.origin(pixel) @ pitch,
-        "bow": -np.outer(seen @ normal, normal @ pitch),
+        "bow": -np.outer(looks @ normal, normal @ pitch),
     }
 
 
 def without_effects(
     points: np.ndarray, station: np.ndarray, velocity: np.ndarray, earth: Earth, effects: LightEffects
 ) -> np.ndarray:
-    """Where ground points (N, 3) would lie on the lines of sight that see them, if nothing happened to the light.
+    """Return ground points (N, 3) moved to the lines of sight that would see them without effects on the light.
 
     Parameters
     ----------
-    points : np.ndarray
-        ITRS, metres.
-    station : np.ndarray
-        (3,), metres.
-    velocity : np.ndarray
-        Of the satellite against the stars in axes of the ITRS, (3,), m/s.
+    points : (N, 3) ndarray
+        Ground points in the ITRS, in metres.
+    station : (3,) ndarray
+        Position of the satellite, in metres.
+    velocity : (3,) ndarray
+        Inertial velocity of the satellite in axes of the ITRS, in m/s.
     earth : Earth
-        The ellipsoid.
+        Ellipsoid.
     effects : LightEffects
-        To take out.
+        Effects to take out.
 
     Returns
     -------
-    np.ndarray
-        (N, 3), at the distances of the points.
+    (N, 3) ndarray
+        Moved points, at the distances of the given ones.
     """
     source = points
-    way = np.linalg.norm(source - station, axis=-1) / light_effects.SPEED_OF_LIGHT * effects.light_time
-    place = light_effects.turned_with_earth(np.broadcast_to(station, source.shape), way)
+    delay = np.linalg.norm(source - station, axis=-1) / light_effects.SPEED_OF_LIGHT * effects.light_time
+    position = light_effects.rotated_with_earth(np.broadcast_to(station, source.shape), delay)
     if effects.refraction:
-        source = light_effects.unrefracted(source, place, earth, effects.wavelength)
-    arm = light_effects.turned_with_earth(source - place, -way)
+        source = light_effects.unrefracted(source, position, earth, effects.wavelength)
+    arm = light_effects.rotated_with_earth(source - position, -delay)
     if effects.aberration:
         arm = light_effects.aberrated(arm / np.linalg.norm(arm, axis=-1, keepdims=True), velocity)
         arm = arm * np.linalg.norm(points - station, axis=-1, keepdims=True)
@@ -493,19 +508,19 @@ def without_effects(
 
 
 def _spread(camera: LineCamera, pixel: np.ndarray) -> np.ndarray:
-    """Places on flat ground along the strip, (N,), in heights of the satellite."""
+    """Return positions (N,) on flat ground along the strip, in units of the satellite's height."""
     look = camera.look(pixel)
     return np.asarray(look[:, 1] / look[:, 2])
 
 
-def _terrain(spec: OrbitAngleSpec, place: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Heights (N,) at places along a strip, metres: a normal process with a Gaussian correlation."""
-    away = (place[:, None] - place) / spec.terrain.length
-    unit = covariance_root(np.exp(-0.5 * away**2)) @ random.standard_normal(len(place))
+def _terrain(spec: OrbitAngleSpec, position: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Draw heights (N,) at positions along a strip, in metres: a normal process with a Gaussian correlation."""
+    distance = (position[:, None] - position) / spec.terrain.length
+    unit = covariance_root(np.exp(-0.5 * distance**2)) @ random.standard_normal(len(position))
     return np.asarray(spec.terrain.height + spec.terrain.relief * unit)
 
 
 def _nearest(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """The point nearest to two rays, (3,)."""
+    """Return the (3,) point nearest to two rays."""
     weights = [np.eye(3) - np.outer(d, d) for _, d in (a, b)]
     return np.linalg.solve(weights[0] + weights[1], weights[0] @ a[0] + weights[1] @ b[0])

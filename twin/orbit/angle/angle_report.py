@@ -1,6 +1,6 @@
-"""Report of an intersection-angle test: against the laboratory, and of a simulated one also against the truth.
+"""Report of a test of intersection angles, against the laboratory and, for a simulation, against the truth.
 
-What the methods are, and why they differ, is in docs/orbit.md and docs/measured_orbit.md.
+docs/orbit.md and docs/measured_orbit.md explain the methods and their differences.
 """
 
 from __future__ import annotations
@@ -29,46 +29,46 @@ METHOD_NAMES = {
     "corrected": "planes, eq. 5 with the right sign",
     "tls": "planes, total least squares",
 }
-"""Reports' name for each way to fit planes."""
+"""Name in reports of each method of fitting planes."""
 EFFECT_NAMES = {"light_time": "light time", "all": "all three", "datum": "shift of all points"}
-"""Reports' name for effects that are not called so."""
+"""Name in reports of effects whose key is not their name."""
 _FALSE_ALARM = 1e-4
-"""Chance that a good set of points warns, for each plane."""
+"""Probability that a plane of good points raises a warning."""
 _GREEK = {"alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ"}
 COLOURS = (svg.BLUE, svg.GREEN, svg.VERMILION, svg.ORANGE, svg.PURPLE, svg.SKY)
-"""Lines in their order."""
+"""Colours of the lines, in their order."""
 _LEAST_ARC = np.radians(5.0)
-"""Smallest angle whose arc is drawn in the geometry."""
+"""Smallest angle whose arc is drawn in the figure of the geometry, in radians."""
 
 
-def signs(names: Iterable[str]) -> list[str]:
-    """Angles' names as a report writes them."""
+def greek_names(names: Iterable[str]) -> list[str]:
+    """Return the names of angles as reports write them."""
     return [_GREEK.get(name, name.replace("_", " ")) for name in names]
 
 
 def listed(words: Sequence[str]) -> str:
-    """`a, b and c`."""
+    """Return words as a list in prose: `a, b and c`."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def angle_report(run: AngleRun) -> Report:
-    """Report of a simulated or a measured test."""
+    """Return the report of a simulated or a measured test."""
     first = run.passes[0]
     lead: tuple[str, ...] = ()
     along = first.estimate.along
     change = first.change / ARCSEC
     changed = [
         f"{name} has changed by {fixed(change[k], 2)} ± {along.sigma[k] / ARCSEC:.2f} arcsec"
-        for k, name in enumerate(signs(first.pairs))
+        for k, name in enumerate(greek_names(first.pairs))
     ]
-    found = ["the sigmas are those of points, image points and readings"]
+    parts = ["the sigmas include the errors of ground points, image points and readings"]
     sections: tuple[Section, ...] = (_planes(run),)
     if isinstance(run, SimulatedAngleRun):
-        found, lead = _found(run)
+        parts, lead = _simulated_verdict(run)
         sections += (_geometry(run), _change(run), _scatter(run), _frames(run), _effects(run), _sensitivity(run))
     verdict, more = answer(
-        f"Since the laboratory {listed(changed)} along the track, measured from the ground points of {first.name}",
-        *found,
+        f"Since the laboratory calibration {listed(changed)} along the track, from the ground points of {first.name}",
+        *parts,
     )
     return Report(
         "Intersection angles from ground points",
@@ -81,50 +81,53 @@ def angle_report(run: AngleRun) -> Report:
     )
 
 
-def _found(run: SimulatedAngleRun) -> tuple[list[str], tuple[str, ...]]:
-    """Angles against their truth, and planes against resection."""
-    names, flight, few = signs(run.names), run.flight, run.narrow
+def _simulated_verdict(run: SimulatedAngleRun) -> tuple[list[str], tuple[str, ...]]:
+    """Return the sentences of a simulated test: angles against their truth, and planes against resection."""
+    names, flight, narrow = greek_names(run.names), run.flight, run.narrow
     tls, along = run.estimate.angles["tls"], run.estimate.along
-    truth = np.where(few, values_of(flight.along_track), values_of(flight.dihedral))
-    found, sigma = np.where(few, along.values, tls.values), np.where(few, along.sigma, tls.sigma) / ARCSEC
-    off, difference = (found - truth) / ARCSEC, run.difference / ARCSEC
-    said, lead = [], []
-    for which, by in ((np.flatnonzero(~few), "by planes"), (np.flatnonzero(few), "along the track, by planes")):
+    truth = np.where(narrow, values_of(flight.along_track), values_of(flight.dihedral))
+    angles, sigma = np.where(narrow, along.values, tls.values), np.where(narrow, along.sigma, tls.sigma) / ARCSEC
+    error, difference = (angles - truth) / ARCSEC, run.difference / ARCSEC
+    sentences, lead = [], []
+    for which, by in ((np.flatnonzero(~narrow), "by planes"), (np.flatnonzero(narrow), "along the track, by planes")):
         if not len(which):
             continue
-        said.append(
-            f"{listed([f'{names[k]} = {np.degrees(found[k]):.6f}°' for k in which])} with "
+        sentences.append(
+            f"{listed([f'{names[k]} = {np.degrees(angles[k]):.6f}°' for k in which])} with "
             f"{'a sigma' if len(which) == 1 else 'sigmas'} of {listed([f'{sigma[k]:.2f} arcsec' for k in which])} "
-            f"{by}, {listed([f'{fixed(off[k], 2)} arcsec' for k in which])} from the truth"
+            f"{by}, {listed([f'{fixed(error[k], 2)} arcsec' for k in which])} from the truth"
         )
         lead.append(f"Planes minus resection: {listed([f'{fixed(difference[k], 3)} arcsec' for k in which])}.")
     if flight.trace:
         (name, true), change = next(iter(flight.trace.items())), run.change / ARCSEC
         at = run.names.index(name)
         lead.append(
-            f"Since the laboratory {names[at]} has changed by {fixed(change[at], 2)} ± "
-            f"{along.sigma[at] / ARCSEC:.2f} arcsec as seen from the ground; the trace of the instrument gives "
+            f"By the ground points, {names[at]} has changed by {fixed(change[at], 2)} ± "
+            f"{along.sigma[at] / ARCSEC:.2f} arcsec since the laboratory; the ray trace of the instrument gives "
             f"{fixed(true / ARCSEC, 3)} arcsec."
         )
     with np.errstate(divide="ignore", invalid="ignore"):
-        worst = float(np.nanmax(np.abs(off) / sigma)) if np.any(sigma > 0.0) else None
+        worst = float(np.nanmax(np.abs(error) / sigma)) if np.any(sigma > 0.0) else None
     if worst is not None:
-        held = "all angles are within" if worst <= FAR else "not all angles are within"
-        said.insert(0, f"{held} {FAR:g} σ of the truth, with a largest error of {worst:.1f} σ: see the methods")
-    return said, tuple(lead)
+        verdict = "all angles are within" if worst <= FAR else "not all angles are within"
+        sentences.insert(0, f"{verdict} {FAR:g} σ of the truth (largest error {worst:.1f} σ): see the methods")
+    return sentences, tuple(lead)
 
 
 def _facts(run: AngleRun) -> tuple[tuple[str, str], ...]:
     setup, test = run.setup, run.setup.test
     on = ", ".join(LightEffects.of(test.effects).names)
-    state = f"{'' if test.effects.corrected else 'not '}corrected in the analysis"
+    state = f"{'' if test.effects.corrected else 'not '}corrected by the analysis"
     between = [f"{sign} between {a} and {b}" for sign, (a, b) in _named_pairs(run.passes[0])]
     if isinstance(setup, MeasuredAngleSetup):
         camera, tracker, gps = setup.camera, setup.test.errors.star_tracker, setup.test.errors.gps
         name, described = camera.name, camera.description
-        own: tuple[tuple[str, str], ...] = (
-            ("Passes", ", ".join(one.name for one in run.passes)),
-            ("Moment, from the epoch", ", ".join(f"{one.name} {one.time:.4g} s" for one in run.passes)),
+        particular: tuple[tuple[str, str], ...] = (
+            ("Passes", ", ".join(pass_angles.name for pass_angles in run.passes)),
+            (
+                "Moment, from the epoch",
+                ", ".join(f"{pass_angles.name} {pass_angles.time:.4g} s" for pass_angles in run.passes),
+            ),
             ("Noise of the attitude, 1σ", ", ".join(format_quantity(v, ANGLE) for v in tracker.noise)),
             ("Noise of the orbit, 1σ", ", ".join(format_quantity(v, LENGTH) for v in gps.noise)),
         )
@@ -145,7 +148,7 @@ def _facts(run: AngleRun) -> tuple[tuple[str, str], ...]:
                 f"{passing.direction} pass {passing.altitude / 1e3:g} km above "
                 f"{np.degrees(passing.latitude):.4g}° N {np.degrees(passing.longitude):.4g}° E, {orbit}"
             )
-        own = (
+        particular = (
             ("Changed since the laboratory", in_words(simulated.perturb) or "nothing"),
             ("Orbit", orbit),
             ("Exposure", f"{simulated.time:g} s from the epoch"),
@@ -157,26 +160,31 @@ def _facts(run: AngleRun) -> tuple[tuple[str, str], ...]:
     return (
         ("Camera", f"{name}, {described}"),
         ("Angles", "; ".join(between)),
-        *own,
+        *particular,
         ("Effects on the light", f"{on} {state}" if on else "none"),
         ("Description", test.description),
     )
 
 
-def _named_pairs(one: PassAngles) -> Iterable[tuple[str, tuple[str, str]]]:
-    return zip(signs(one.pairs), one.pairs.values(), strict=True)
+def _named_pairs(pass_angles: PassAngles) -> Iterable[tuple[str, tuple[str, str]]]:
+    return zip(greek_names(pass_angles.pairs), pass_angles.pairs.values(), strict=True)
 
 
 def _methods(run: AngleRun) -> Table:
     flight = run.flight if isinstance(run, SimulatedAngleRun) else None
     truth = () if flight is None else tuple(values_of(a) for a in (flight.dihedral, flight.look, flight.along_track))
     rows: list[tuple[Cell, ...]] = []
-    for one in run.passes:
-        estimate, along, resected, lab = one.estimate, one.estimate.along, one.estimate.resected, one.laboratory
-        known = tuple(values_of(angles) for angles in (lab.dihedral, lab.look, lab.along_track))
-        for k, name in enumerate(signs(one.pairs)):
-            # across the track the sigma of the look is another one
-            mostly = abs(known[2][k]) > 0.99 * known[1][k]
+    for pass_angles in run.passes:
+        estimate, along, resection, lab = (
+            pass_angles.estimate,
+            pass_angles.estimate.along,
+            pass_angles.estimate.resection_angles,
+            pass_angles.laboratory,
+        )
+        laboratory = tuple(values_of(angles) for angles in (lab.dihedral, lab.look, lab.along_track))
+        for k, name in enumerate(greek_names(pass_angles.pairs)):
+            # the sigma along the track holds only for looks mostly along the track
+            mostly = abs(laboratory[2][k]) > 0.99 * laboratory[1][k]
             sighted = "lines of sight in the tls planes"
             kinds: list[tuple[str, str, np.ndarray, np.ndarray | None, int]] = [
                 *(
@@ -185,12 +193,12 @@ def _methods(run: AngleRun) -> Table:
                 ),
                 (sighted, "look", estimate.look, along.sigma if mostly else None, 1),
                 (sighted, "along track", along.values, along.sigma, 2),
-                ("resection", "along track", resected.values, resected.sigma, 2),
+                ("resection", "along track", resection.values, resection.sigma, 2),
             ]
             for method, kind, value, sigma, which in kinds:
-                off = (float((value[k] - side[which][k]) / ARCSEC) for side in (known, truth) if side)
+                differences = (float((value[k] - side[which][k]) / ARCSEC) for side in (laboratory, truth) if side)
                 spread = None if sigma is None else float(sigma[k] / ARCSEC)
-                rows.append((one.name, name, method, kind, float(np.degrees(value[k])), spread, *off))
+                rows.append((pass_angles.name, name, method, kind, float(np.degrees(value[k])), spread, *differences))
     heads = ("pass", "", "method", "angle", "deg", "σ [arcsec]", "− laboratory [arcsec]", "− truth [arcsec]")
     width = len(heads) - (not truth)
     return Table(
@@ -198,7 +206,7 @@ def _methods(run: AngleRun) -> Table:
         "Angles by each method",
         "Dihedral: between the planes of the lines, fitted in the Earth-fixed frame. Look: between the lines of sight "
         "of the lines' centres. Along track: the look's signed part along the track, positive where the first line "
-        "looks ahead of the second. Folded: below three sigmas, where noise pushes an unsigned angle up.",
+        "looks ahead of the second. Folded: below three sigmas, where noise biases an unsigned angle upward.",
         heads[:width],
         rows,
         (None, None, None, None, 7, 3, 3, 3)[:width],
@@ -207,18 +215,18 @@ def _methods(run: AngleRun) -> Table:
 
 def _planes(run: AngleRun) -> Section:
     rows: list[tuple[Cell, ...]] = []
-    for one in run.passes:
-        for line, fit in zip(one.measurement.strips, one.estimate.planes["tls"], strict=True):
-            freedom, away = len(fit.residual) - 2, float(np.sqrt(np.mean(fit.residual**2)))
-            chance = float(chi2.sf(fit.chi_square, freedom)) if freedom > 0 else None
+    for pass_angles in run.passes:
+        for line, fit in zip(pass_angles.measurement.strips, pass_angles.estimate.planes["tls"], strict=True):
+            freedom, rms = len(fit.residual) - 2, float(np.sqrt(np.mean(fit.residual**2)))
+            p_value = float(chi2.sf(fit.chi_square, freedom)) if freedom > 0 else None
             ratio = fit.chi_square / max(freedom, 1)
-            rows.append((one.name, line, len(fit.residual), *one.span[line], away, ratio, chance))
+            rows.append((pass_angles.name, line, len(fit.residual), *pass_angles.span[line], rms, ratio, p_value))
     table = Table(
         "planes",
         "Planes of the lines",
-        "Through the station and the points of each line; when its points were seen, from the moment; RMS distance of "
-        "the points from the plane; chi-square over its degrees of freedom and its chance.",
-        ("pass", "line", "points", "from [s]", "to [s]", "RMS [m]", "χ²/dof", "chance"),
+        "Planes through the station and the points of each line: times of the points from the moment; RMS distance of "
+        "the points from the plane; chi-square over its degrees of freedom and its p-value.",
+        ("pass", "line", "points", "from [s]", "to [s]", "RMS [m]", "χ²/dof", "p"),
         rows,
         (None, None, None, 2, 2, 3, 2, 3),
     )
@@ -235,12 +243,12 @@ def _geometry(run: SimulatedAngleRun) -> Section:
     if any(np.any(v) for v in offsets):
         bow = max(float(np.max(np.linalg.norm(bow, axis=1))) for bow in run.measurement.bow.values()) / ARCSEC
         text.append(
-            "The cameras' projection centres stand metres apart on the satellite and their lines are seen bent, by "
-            f"{bow:.1f} arcsec at the ends. The analysis takes both from the laboratory."
+            "The cameras' projection centres lie metres apart on the satellite, and their lines are imaged bent by "
+            f"{bow:.1f} arcsec at the ends. The analysis uses both as the laboratory measured them."
         )
-    heights = [f"{v:.2f} m for {signs([n])[0]}" for n, v in run.height.items() if v is not None]
+    heights = [f"{v:.2f} m for {greek_names([n])[0]}" for n, v in run.height.items() if v is not None]
     if heights:
-        text.append(f"An angle that is wrong by 1 arcsec moves intersected heights by {listed(heights)}.")
+        text.append(f"An error of 1 arcsec in an angle changes intersected heights by {listed(heights)}.")
     drawing = svg.drawn("angle-geometry", _geometry_figure, run)
     figure = SvgFigure("geometry", "Planes and strips", "In the orbital frame at the station.", drawing)
     return Section("Geometry", tuple(text), (figure,))
@@ -253,44 +261,48 @@ def _change(run: SimulatedAngleRun) -> Section:
     table = Table(
         "change",
         "Change of the angles between the lines of sight",
-        "Ground: found from the ground points, minus the laboratory's angle. True: of the lines that the points were "
-        "made with. Trace: by chief rays of the instrument, only for the two cameras of a pair.",
+        "Ground: from the ground points, minus the laboratory's angle. True: change of the simulated lines. Trace: by "
+        "chief rays of the instrument, only for the two cameras of a pair.",
         ("angle", "ground [arcsec]", "σ [arcsec]", "true [arcsec]", "trace [arcsec]"),
-        list(zip(signs(run.names), *((v / ARCSEC).tolist() for v in arcsec), trace, strict=True)),
+        list(zip(greek_names(run.names), *((v / ARCSEC).tolist() for v in arcsec), trace, strict=True)),
         (None, 3, 3, 4, 4),
     )
     return Section("Since the laboratory", (), (table,))
 
 
 def _scatter(run: SimulatedAngleRun) -> Section:
-    names = signs(run.names)
+    names = greek_names(run.names)
     cases = (("planes, tls", run.planes), ("planes, along track", run.along), ("resection", run.resection))
     rows: list[list[Cell]] = []
-    for method, one in cases:
-        of_mean = one.spread / np.sqrt(len(one.values))
-        numbers = np.stack([v / ARCSEC for v in (one.bias, of_mean, one.spread, one.sigma)] + [one.tail], axis=-1)
+    for method, scatter in cases:
+        of_mean = scatter.spread / np.sqrt(len(scatter.values))
+        numbers = np.stack(
+            [v / ARCSEC for v in (scatter.bias, of_mean, scatter.spread, scatter.sigma)] + [scatter.p_value], axis=-1
+        )
         rows += [[method, sign, *row] for sign, row in zip(names, numbers.tolist(), strict=True)]
     table = Table(
         "scatter",
         f"{len(run.planes.values)} passes with errors drawn anew",
-        "Mean minus truth with the sigma of a mean; spread of the passes beside the sigma that the estimator claims, "
-        "and the chance of a spread as far off if that sigma is right.",
-        ("method", "angle", "mean − truth", "σ of the mean", "spread", "claimed σ", "chance"),
+        "Mean minus truth with the sigma of the mean, in arcseconds; spread over the passes, the sigma predicted by "
+        "the estimator, and the two-sided p-value of the spread under that sigma.",
+        ("method", "angle", "mean − truth", "σ of the mean", "spread", "predicted σ", "p"),
         rows,
         (None, None, 4, 4, 4, 4, 3),
     )
     both = Table(
         "difference",
         "Planes minus resection",
-        "Dihedral angle of tls planes minus the size of the resection's angle; below 5° the signed angles along the "
-        "track. The spread is that of the difference over the passes.",
+        "Dihedral angle of tls planes minus the absolute angle of the resection; below 5°, the signed angles along the "
+        "track. Spread: standard deviation of the difference over the passes.",
         ("angle", "difference [arcsec]", "spread [arcsec]"),
         list(zip(names, *((v / ARCSEC).tolist() for v in (run.difference, run.difference_sigma)), strict=True)),
         (None, 3, 3),
     )
-    caption = "Beside the normal distribution of the claimed sigma."
+    caption = "Histogram, with the normal distribution of the predicted sigma."
     if len(names) > 1:
-        caption = f"{names[0]} and {names[1]}; the table has all. Angles share the station and common lines' planes."
+        caption = (
+            f"{names[0]} and {names[1]}; the table has all. Angles share the station and the planes of common lines."
+        )
     drawing = svg.drawn("angle-scatter", _scatter_figure, run)
     figure = SvgFigure("scatter-passes", "Angles of all passes", caption, drawing)
     return Section("Planes and resection", (), (both, table, figure))
@@ -301,24 +313,24 @@ def _frames(run: SimulatedAngleRun) -> Section:
     rows: list[tuple[Cell, ...]] = []
     worst = spread = 0.0
     for row in run.frames:
-        off = (row.values - reference) / ARCSEC
-        seen = bool(np.all(np.isfinite(off)))
-        largest = float(np.max(np.abs(off)))
-        worst = max(worst, largest if row.warned and seen else 0.0)
+        difference = (row.values - reference) / ARCSEC
+        finite = bool(np.all(np.isfinite(difference)))
+        largest = float(np.max(np.abs(difference)))
+        worst = max(worst, largest if row.warned and finite else 0.0)
         spread = max(spread, largest if row.method == "tls" else 0.0)
-        remark = "biased, and says so" if row.warned else ""
-        rows.append((row.frame, row.method, *_cells(off), row.steepest, remark if seen else "singular"))
-    failure = f"misses by up to {f'{worst / 3600.0:.3g}°' if worst > 360.0 else f'{worst:.3g} arcsec'}"
+        remark = "fit warns of its bias" if row.warned else ""
+        rows.append((row.frame, row.method, *_cells(difference), row.least_normal_z, remark if finite else "singular"))
+    failure = f"has errors up to {f'{worst / 3600.0:.3g}°' if worst > 360.0 else f'{worst:.3g} arcsec'}"
     text = (
-        "In the frame of a line that looks down its plane is vertical, and the printed form "
-        f"{failure if worst else 'finds no plane at all'}. Total least squares does not depend on the frame: its "
+        "In the frame of a line that looks down, its plane is vertical and the printed form "
+        f"{failure if worst else 'is singular'}. Total least squares does not depend on the frame: its "
         f"angles agree to {spread:.1g} arcsec.",
     )
     table = Table(
         "frames",
         "The three forms in four frames",
-        "Angles minus those of total least squares in the Earth-fixed frame; the smallest z component of the three "
-        "unit normals, 0 for a vertical plane.",
+        "Angles minus those of total least squares in the Earth-fixed frame; smallest absolute z component of the unit "
+        "normals, 0 for a vertical plane.",
         ("frame", "form", *_heads(run), "least |normal z|", "warning"),
         rows,
         (None, None, *[6] * len(run.names), 6, None),
@@ -327,7 +339,7 @@ def _frames(run: SimulatedAngleRun) -> Section:
 
 
 def _heads(run: SimulatedAngleRun) -> list[str]:
-    return [f"{name} [arcsec]" for name in signs(run.names)]
+    return [f"{name} [arcsec]" for name in greek_names(run.names)]
 
 
 def _cells(values: np.ndarray) -> list[float | None]:
@@ -337,13 +349,13 @@ def _cells(values: np.ndarray) -> list[float | None]:
 def _effects(run: SimulatedAngleRun) -> Section:
     count, rows = len(run.names), []
     for row in run.effects:
-        rows.append((EFFECT_NAMES.get(row.what, row.what), *_cells(row.bias / ARCSEC), *_cells(row.left / ARCSEC)))
+        rows.append((EFFECT_NAMES.get(row.what, row.what), *_cells(row.bias / ARCSEC), *_cells(row.remaining / ARCSEC)))
     table = Table(
         "effects",
         "Bias of the planes, without noise",
         "Total least squares minus the true dihedral angle: with the effect left in the points, and after the analysis "
-        "has moved the points to where the lines of sight lead without it.",
-        ("effect", *_heads(run), *(f"{name} corrected" for name in signs(run.names))),
+        "has corrected the points for it.",
+        ("effect", *_heads(run), *(f"{name} corrected" for name in greek_names(run.names))),
         rows,
         (None, *[4] * count, *[6] * count),
     )
@@ -355,9 +367,9 @@ def _effects(run: SimulatedAngleRun) -> Section:
 def _sensitivity(run: SimulatedAngleRun) -> Section:
     figures = []
     for name, shows in _panels(run).items():
-        moved = "The station" if name == "station" else f"Points, {signs([name.removesuffix('-points')])[0]}"
+        moved = "The station" if name == "station" else f"Points, {greek_names([name.removesuffix('-points')])[0]}"
         drawing = svg.drawn(f"angle-{name}", _sensitivity_figure, run, shows)
-        caption = "Resection, which stays, minus planes."
+        caption = "Resection, which does not change, minus planes."
         figures.append(SvgFigure(f"sensitivity-{name}", moved, caption, drawing))
     rows: list[tuple[Cell, ...]] = []
     for entry in (row.to_dict() for row in run.table):
@@ -366,7 +378,8 @@ def _sensitivity(run: SimulatedAngleRun) -> Section:
     table = Table(
         "sensitivity",
         "Change of the angles for 10 m",
-        "The station, or all points of one strip, moved by 10 m along an Earth-fixed axis: dihedral angles.",
+        "Change of the dihedral angles when the station, or all points of one strip, move by 10 m along an Earth-fixed "
+        "axis.",
         ("moved", "axis", *_heads(run)),
         rows,
         (None, None, *[4] * len(run.names)),
@@ -379,14 +392,14 @@ def _moved(what: str) -> str:
 
 
 def _panels(run: SimulatedAngleRun) -> dict[str, list[tuple[str, str]]]:
-    """Figure -> panels, (what is moved, angle), in the paper's order: Fig. 3, Figs. 4 and 5."""
+    """Return the panels of each figure, (moved quantity, angle), in the paper's order: Fig. 3, Figs. 4 and 5."""
     pairs = run.flight.pairs
     out = {"station": [("station", name) for name in pairs]}
     return out | {f"{name}-points": [(line, name) for line in pair] for name, pair in pairs.items()}
 
 
 def _geometry_figure(run: SimulatedAngleRun) -> Figure:
-    """The planes from the side, where each is seen on edge, and the strips from above."""
+    """Draw the planes from the side, where each is seen edge-on, and the strips from above."""
     flight = run.flight
     figure = svg.new_figure(4.6)
     side, above = figure.subplots(1, 2)
@@ -406,11 +419,11 @@ def _geometry_figure(run: SimulatedAngleRun) -> Figure:
         cameras = [flight.cameras[name] for name in reversed(pair)]
         looks = [camera.look(np.array([0.5 * (camera.pixels - 1)]))[0] for camera in cameras]
         begin, end = (float(np.arctan2(look[0], look[2])) for look in looks)
-        turn = np.linspace(begin, end, 40)
+        angle = np.linspace(begin, end, 40)
         if abs(end - begin) < _LEAST_ARC:
             continue
-        side.plot(150.0 * np.sin(turn), 150.0 * np.cos(turn), color=svg.GREY, lw=0.8)
-        side.text(185.0 * np.sin(turn[20]), 185.0 * np.cos(turn[20]), sign, ha="center", va="center")
+        side.plot(150.0 * np.sin(angle), 150.0 * np.cos(angle), color=svg.GREY, lw=0.8)
+        side.text(185.0 * np.sin(angle[20]), 185.0 * np.cos(angle[20]), sign, ha="center", va="center")
     side.invert_yaxis()
     side.set_aspect("equal")
     points = len(run.measurement.strips[flight.lines[0]].points)
@@ -422,7 +435,7 @@ def _geometry_figure(run: SimulatedAngleRun) -> Figure:
 
 
 def _sensitivity_figure(run: SimulatedAngleRun, shows: list[tuple[str, str]]) -> Figure:
-    """Changes of the differences between resection and planes with errors of 0 to 10 m."""
+    """Draw the difference between resection and planes against errors of 0 to 10 m."""
     rows = {(row.what, row.axis): row for row in run.table}
     figure = svg.new_figure(3.2 * ((len(shows) + 1) // 2))
     grid = figure.subplots((len(shows) + 1) // 2, min(len(shows), 2), sharey=True, squeeze=False)
@@ -434,7 +447,7 @@ def _sensitivity_figure(run: SimulatedAngleRun, shows: list[tuple[str, str]]) ->
             row = rows[what, axis]
             shown = (-run.difference[k] - row.change[k]) / ARCSEC
             axes.plot(row.amount, shown, "o-", color=colour, ms=3, lw=1.2, label=axis)
-        axes.set(title=f"{signs([angle])[0]} over the error of the {_moved(what)}", xlabel="m")
+        axes.set(title=f"{greek_names([angle])[0]} over the error of the {_moved(what)}", xlabel="m")
         axes.legend(loc="best", ncols=3)
         svg.gridded(axes)
     for axes in grid[:, 0]:
@@ -443,15 +456,15 @@ def _sensitivity_figure(run: SimulatedAngleRun, shows: list[tuple[str, str]]) ->
 
 
 def _scatter_figure(run: SimulatedAngleRun) -> Figure:
-    """Angles of all passes: two beside the ellipse of the claimed covariance, one beside its normal distribution."""
-    names = signs(run.names)
+    """Draw the angles of all passes: two with their predicted ellipse, or one with its predicted distribution."""
+    names = greek_names(run.names)
     several = len(names) > 1
     figure = svg.new_figure(4.4 if several else 3.2)
     grid = figure.subplots(1, 2, sharex=True, sharey=True)
     cases = (("Planes, total least squares", run.planes), ("Resection", run.resection))
     for axes, (title, scatter) in zip(grid, cases, strict=True):
         axes.set(title=title, xlabel=f"{names[0]} − truth [arcsec]")
-        (_ellipse_of_passes if several else _bell_of_passes)(axes, scatter)
+        (_ellipse_of_passes if several else _histogram_of_passes)(axes, scatter)
         axes.legend(loc="upper right")
         svg.gridded(axes)
     grid[0].set_ylabel(f"{names[1]} − truth [arcsec]" if several else "share of passes per arcsec")
@@ -460,68 +473,73 @@ def _scatter_figure(run: SimulatedAngleRun) -> Figure:
 
 
 def _ellipse_of_passes(axes: Axes, scatter: Scatter) -> None:
-    """Two angles, and where 95% of the passes should lie."""
-    off, turn = (scatter.values - scatter.truth) / ARCSEC, np.linspace(0.0, 2.0 * np.pi, 181)
+    """Draw two angles and the ellipse that should hold 95% of the passes."""
+    error, phase = (scatter.values - scatter.truth) / ARCSEC, np.linspace(0.0, 2.0 * np.pi, 181)
     root = np.linalg.cholesky(scatter.covariance[:2, :2]) / ARCSEC
-    ellipse = np.sqrt(5.991) * root @ np.stack([np.cos(turn), np.sin(turn)])
-    axes.plot(off[:, 0], off[:, 1], ".", color=svg.BLUE, ms=4, label=f"{len(off)} passes")
+    ellipse = np.sqrt(5.991) * root @ np.stack([np.cos(phase), np.sin(phase)])
+    axes.plot(error[:, 0], error[:, 1], ".", color=svg.BLUE, ms=4, label=f"{len(error)} passes")
     axes.plot(*ellipse, color=svg.VERMILION, lw=1.2, label="95% by propagation")
     axes.plot(0.0, 0.0, "+", color=svg.INK, ms=9)
     axes.set_aspect("equal")
 
 
-def _bell_of_passes(axes: Axes, scatter: Scatter) -> None:
-    """One angle's histogram."""
-    off, sigma = (scatter.values - scatter.truth)[:, 0] / ARCSEC, float(scatter.sigma[0] / ARCSEC)
-    place = np.linspace(-4.0, 4.0, 161) * sigma
-    bell = np.exp(-0.5 * (place / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
+def _histogram_of_passes(axes: Axes, scatter: Scatter) -> None:
+    """Draw the histogram of one angle with its predicted normal distribution."""
+    error, sigma = (scatter.values - scatter.truth)[:, 0] / ARCSEC, float(scatter.sigma[0] / ARCSEC)
+    position = np.linspace(-4.0, 4.0, 161) * sigma
+    bell = np.exp(-0.5 * (position / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma)
     bins: Any = np.linspace(-4.0, 4.0, 25) * sigma
-    axes.hist(off, bins=bins, density=True, color=svg.SKY, label=f"{len(off)} passes")
-    axes.plot(place, bell, color=svg.VERMILION, lw=1.2, label="by propagation")
+    axes.hist(error, bins=bins, density=True, color=svg.SKY, label=f"{len(error)} passes")
+    axes.plot(position, bell, color=svg.VERMILION, lw=1.2, label="by propagation")
 
 
-def _far_points(one: PassAngles) -> list[tuple[str, int, float]]:
-    """Points that lie farther from their plane than chance allows: line, number in it, sigmas."""
-    found = []
-    for line, fit in zip(one.measurement.strips, one.estimate.planes["tls"], strict=True):
+def _far_points(pass_angles: PassAngles) -> list[tuple[str, int, float]]:
+    """Return points that lie improbably far from their plane: line, index in it, distance in sigmas."""
+    points = []
+    for line, fit in zip(pass_angles.measurement.strips, pass_angles.estimate.planes["tls"], strict=True):
         sigma = np.sqrt(np.einsum("i,nij,j->n", fit.normal, fit.strip.covariance, fit.normal))
-        away = np.abs(fit.residual) / sigma
-        limit = np.sqrt(chi2.isf(_FALSE_ALARM / len(away), 1))
-        found += [(line, int(k), float(away[k])) for k in np.flatnonzero(away > limit)]
-    return found
+        distance = np.abs(fit.residual) / sigma
+        limit = np.sqrt(chi2.isf(_FALSE_ALARM / len(distance), 1))
+        points += [(line, int(k), float(distance[k])) for k in np.flatnonzero(distance > limit)]
+    return points
 
 
 def _warnings(run: AngleRun) -> tuple[str, ...]:
-    found = []
+    warnings = []
     if isinstance(run, SimulatedAngleRun):
-        spec, left = run.flight.spec, run.flight.effects.names
-        if left and not spec.effects.corrected:
-            found.append(
-                f"the analysis leaves {', '.join(left)} in the points; the angles are biased as the table of effects "
-                "says"
+        spec, effects = run.flight.spec, run.flight.effects.names
+        if effects and not spec.effects.corrected:
+            warnings.append(
+                f"the analysis does not correct {', '.join(effects)} in the points; the table of effects gives the "
+                "bias of the angles"
             )
         if any(spec.errors.datum):
-            found.append(
-                "the points share a shift that no sigma contains and no residual shows; see the table of effects"
+            warnings.append(
+                "the points share a shift that is neither in the sigmas nor visible in the residuals; see the table of "
+                "effects"
             )
-    for one in run.passes:
-        folded = [n for n, f in zip(signs(one.pairs), one.estimate.angles["tls"].folded, strict=True) if f]
+    for pass_angles in run.passes:
+        folded = [
+            n
+            for n, f in zip(greek_names(pass_angles.pairs), pass_angles.estimate.angles["tls"].folded, strict=True)
+            if f
+        ]
         if folded:
-            found.append(
-                f"{one.name}: the planes of {listed(folded)} are parallel within their noise: the unsigned dihedral "
-                "angle folds at zero; use the angle along the track, which has a sign"
+            warnings.append(
+                f"{pass_angles.name}: the planes of {listed(folded)} are parallel within their noise, where the "
+                "unsigned dihedral angle is biased; use the signed angle along the track"
             )
-        far = _far_points(one)
+        far = _far_points(pass_angles)
         if far:
-            line, number, away = max(far, key=lambda point: point[2])
-            found.append(
-                f"{one.name}: {len(far)} points lie farther from their planes than chance allows, the farthest "
-                f"{one.ids[line][number]} of {line}, {away:.0f} σ; `angle` leaves none out: look at them, or let "
-                "`calibrate` find them"
+            line, number, distance = max(far, key=lambda point: point[2])
+            warnings.append(
+                f"{pass_angles.name}: {len(far)} points lie improbably far from their planes, the farthest "
+                f"{pass_angles.ids[line][number]} of {line}, {distance:.0f} σ; `angle` rejects none: check them, or "
+                "use the screening of `calibrate`"
             )
-        if one.estimate.resection.p_value < UNLIKELY:
-            found.append(
-                f"{one.name}: the resection does not fit (chance {one.estimate.resection.p_value:.1g}); principal "
-                "distances may have changed, or lines turned about the flight direction or the vertical"
+        if pass_angles.estimate.resection.p_value < UNLIKELY:
+            warnings.append(
+                f"{pass_angles.name}: the resection does not fit (p = {pass_angles.estimate.resection.p_value:.1g}); "
+                "principal distances may have changed, or lines rotated about the flight direction or the vertical"
             )
-    return tuple(found)
+    return tuple(warnings)

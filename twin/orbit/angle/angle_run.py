@@ -1,14 +1,12 @@
-"""The intersection angle test's procedure: estimates by planes and by resection, in other frames, over many passes,
-with each effect on the light. Truth enters only where an estimate is compared with it.
+"""Test of intersection angles by planes and by resection, in several frames and over many passes.
 
-Planes go through one station. The lines of a satellite have projection centres of their own, metres apart, and a mirror
-camera's line is bent. The resection takes both as the laboratory knows them; its attitude, good to an arcsecond, then
-moves the points to where they would lie for one common centre (nanoradians of the angles), and for the angles between
-lines of sight onto straight lines.
+The truth enters only where an estimate is compared with it. Planes pass through one station, but the lines of a
+satellite have projection centres metres apart, and a mirror camera's line is bent. The resection uses both as the
+laboratory measured them; its attitude, accurate to an arcsecond, then moves the points to where they would lie for
+one common centre (nanoradians of the angles) and, for the angles between lines of sight, onto straight lines.
 
-The quantities of an intersection-angle test, as angle.json has them.
-
-Keys below those that name a result begin with the name of an angle, such as alpha_deg and alpha_arcsec_sigma.
+The records below define the keys of angle.json; keys within a result begin with the name of an angle, such as
+alpha_deg and alpha_arcsec_sigma.
 """
 
 from __future__ import annotations
@@ -50,9 +48,12 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import AngleSetup, AnyAngle
 
 EFFECTS = ("light_time", "aberration", "refraction")
+"""Names of the effects on the light, as attributes of `LightEffects`."""
 BEND = 0.01 * ARCSEC
-"""How far the ends of a line may have bent since the laboratory, one sigma. A micrometre's shift of a mirror bends the
-line of `gf7` by 1e-5 arcsec, and a turn of its focal plane by 2 arcsec about the rear node by 1e-3 arcsec."""
+"""Standard deviation of the bending of a line's ends since the laboratory, in radians. A micrometre's shift of a mirror
+bends the line of `gf7` by 1e-5 arcsec, and a rotation of its focal plane by 2 arcsec about the rear node by 1e-3
+arcsec.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,15 +65,15 @@ class Estimate:
     planes : Mapping[Method, tuple[PlaneFit, ...]]
         Method -> planes of the lines.
     angles : Mapping[Method, PlaneAngles]
-        Method -> their dihedral angles.
-    look : np.ndarray
-        Angles between the lines of sight of the lines' centres, from tls planes and places on the line, radians.
+        Method -> dihedral angles between these planes.
+    look : (m,) ndarray
+        Angles between the lines of sight of the lines' centres, from tls planes and positions on the line, in radians.
     along : AlongTrackAngles
-        Their signed part along the track.
+        Signed parts of these angles along the track.
     resection : Resection
-        The second method.
-    resected : AlongTrackAngles
-        Its angles, signed like those along the track.
+        Space resection, the second method.
+    resection_angles : AlongTrackAngles
+        Angles of the resection, signed like those along the track.
     """
 
     planes: Mapping[Method, tuple[PlaneFit, ...]]
@@ -80,73 +81,73 @@ class Estimate:
     look: np.ndarray
     along: AlongTrackAngles
     resection: Resection
-    resected: AlongTrackAngles
+    resection_angles: AlongTrackAngles
 
 
 @dataclass(frozen=True, eq=False)
 class FrameRow:
-    """One method in one frame.
+    """Angles by one method in one frame.
 
     Attributes
     ----------
     frame : str
-        Its name.
+        Name of the frame.
     method : Method
-        Of the planes.
-    values : np.ndarray
-        The angles, radians; NaN where the method found a plane singular.
-    sigma : np.ndarray
-        That it claims, radians.
-    steepest : float
-        Smallest size of the z component of the three unit normals; 0 for a vertical plane.
+        Method of fitting the planes.
+    values : (m,) ndarray
+        Angles, in radians; NaN where a plane is singular for the method.
+    sigma : (m,) ndarray
+        Standard deviations predicted by the method, in radians.
+    least_normal_z : float
+        Smallest absolute z component of the unit normals; 0 for a vertical plane.
     warned : bool
-        The fit itself says that it is biased.
+        True where the fit itself warns of its bias.
     """
 
     frame: str
     method: Method
     values: np.ndarray
     sigma: np.ndarray
-    steepest: float
+    least_normal_z: float
     warned: bool
 
 
 @dataclass(frozen=True, eq=False)
 class EffectRow:
-    """What an effect on the light, or a common shift of the points, does to the angles of tls planes, radians.
+    """Error of the angles of tls planes by an effect on the light or a common shift of the points, in radians.
 
     Attributes
     ----------
-    names : tuple[str, ...]
-        Of the angles.
+    names : tuple of str
+        Names of the angles.
     what : str
         Name of the effect.
-    bias : np.ndarray
-        Angles minus the truth without correction.
-    left : np.ndarray
-        The same after the analysis has taken it out; NaN where it cannot.
+    bias : (m,) ndarray
+        Angles minus truth without correction.
+    remaining : (m,) ndarray
+        Angles minus truth after the correction; NaN where there is none.
     """
 
     names: tuple[str, ...]
     what: str
     bias: np.ndarray
-    left: np.ndarray
+    remaining: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Repeated passes with errors drawn anew, of one estimator of m angles.
+    """Estimates of m angles by one method, over passes with errors drawn anew.
 
     Attributes
     ----------
-    names : tuple[str, ...]
-        Of the angles.
-    values : np.ndarray
-        (passes, m), radians.
-    covariance : np.ndarray
-        That the estimator claims, mean over the passes, (m, m), rad^2.
-    truth : np.ndarray
-        What it estimates, (m,), radians.
+    names : tuple of str
+        Names of the angles.
+    values : (passes, m) ndarray
+        Estimated angles, in radians.
+    covariance : (m, m) ndarray
+        Predicted covariance, mean over the passes, in rad^2.
+    truth : (m,) ndarray
+        True angles, in radians.
     """
 
     names: tuple[str, ...]
@@ -156,28 +157,28 @@ class Scatter:
 
     @classmethod
     def of(cls, passes: Sequence[PlaneAngles] | Sequence[AlongTrackAngles], truth: Mapping[str, float]) -> Scatter:
-        """The scatter of what one estimator found in each of the passes about the truth, radians."""
-        covariance = np.mean([one.covariance for one in passes], axis=0)
-        return cls(tuple(truth), np.array([one.values for one in passes]), covariance, values_of(truth))
+        """Return the scatter of one method's estimates about the truth, in radians."""
+        covariance = np.mean([estimate.covariance for estimate in passes], axis=0)
+        return cls(tuple(truth), np.array([estimate.values for estimate in passes]), covariance, values_of(truth))
 
     @property
     def sigma(self) -> np.ndarray:
-        """Claimed, (m,)."""
+        """Predicted standard deviations, (m,), in radians."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def spread(self) -> np.ndarray:
-        """Standard deviation of the values, (m,)."""
+        """Standard deviation of the values, (m,), in radians."""
         return np.asarray(np.std(self.values, axis=0, ddof=1))
 
     @property
     def bias(self) -> np.ndarray:
-        """Mean minus truth, (m,)."""
+        """Mean minus truth, (m,), in radians."""
         return np.asarray(np.mean(self.values, axis=0) - self.truth)
 
     @property
-    def tail(self) -> np.ndarray:
-        """Chance that a right sigma shows a spread as far off as this one, to either side, (m,)."""
+    def p_value(self) -> np.ndarray:
+        """Two-sided p-value of the spread under the predicted sigma, (m,)."""
         free = len(self.values) - 1
         below = chi2.cdf(free * (self.spread / self.sigma) ** 2, free)
         return np.asarray(2.0 * np.minimum(below, 1.0 - below))
@@ -190,19 +191,19 @@ class PassAngles:
     Attributes
     ----------
     name : str
-        Of the pass.
+        Name of the pass.
     time : float
-        Of the moment, seconds from the epoch.
+        Moment of the angles, in seconds from the epoch.
     laboratory : LineAngles
-        Angles between the lines as the laboratory knows them.
-    ids : Mapping[str, np.ndarray]
-        Line -> names of its points, (n,).
+        Angles between the lines as the laboratory measured them.
+    ids : Mapping[str, (n,) ndarray]
+        Line -> names of its points.
     span : Mapping[str, tuple[float, float]]
-        Line -> first and last time of its points from the moment, seconds.
+        Line -> first and last time of its points from the moment, in seconds.
     measurement : Measurement
         Points as the lines would see them at the moment.
     estimate : Estimate
-        From it.
+        Angles by all methods.
     """
 
     name: str
@@ -215,27 +216,27 @@ class PassAngles:
 
     @property
     def change(self) -> np.ndarray:
-        """Changes of the angles along the track since the laboratory, radians."""
+        """Changes of the angles along the track since the laboratory, (m,), in radians."""
         return np.asarray(self.estimate.along.values - values_of(self.laboratory.along_track))
 
     @property
     def pairs(self) -> Mapping[str, tuple[str, str]]:
-        """Angle -> the two lines that it lies between."""
+        """Two lines of each angle."""
         return self.laboratory.pairs
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AngleRun:
-    """A finished test, simulated or on measurements.
+    """Results of a test of intersection angles, simulated or on measurements.
 
     Attributes
     ----------
     setup : AnyAngle
-        What its file says.
+        Resolved test file and camera.
     seed : int
-        Of all random numbers.
-    passes : tuple[PassAngles, ...]
-        Measured, one by one; of a simulation the one that is shown.
+        Seed of all random numbers.
+    passes : tuple of PassAngles
+        Measured passes; for a simulation, the single pass that is shown.
     """
 
     setup: AnyAngle
@@ -245,24 +246,24 @@ class AngleRun:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedAngleRun(AngleRun):
-    """A simulated test, which also knows the truth.
+    """Results of a simulated test, with the truth.
 
     Attributes
     ----------
     flight : AnglePass
-        The truth.
-    frames : tuple[FrameRow, ...]
+        Truth.
+    frames : tuple of FrameRow
         All methods in all frames.
-    effects : tuple[EffectRow, ...]
-        Each alone and all together, without errors.
+    effects : tuple of EffectRow
+        Each effect alone and all together, without errors.
     planes, resection, along : Scatter
-        Scatter of the dihedral angles (tls), of the resection's, and of the planes' angles along the track.
-    difference_sigma : np.ndarray
-        Standard deviation of planes minus resection over the passes, (m,), radians.
-    table : tuple[Sensitivity, ...]
+        Scatter of the dihedral angles (tls), of the resection's angles, and of the planes' angles along the track.
+    difference_sigma : (m,) ndarray
+        Standard deviation of planes minus resection over the passes, in radians.
+    table : tuple of Sensitivity
         Sensitivity of tls planes in the Earth-fixed frame.
-    height : Mapping[str, float | None]
-        Angle -> height error of one arcsecond, metres; None where the orbit is too short.
+    height : Mapping[str, float or None]
+        Angle -> height error for an error of one arcsecond, in metres; None where the orbit is too short.
     """
 
     setup: AngleSetup
@@ -298,53 +299,56 @@ class SimulatedAngleRun(AngleRun):
 
     @property
     def narrow(self) -> np.ndarray:
-        """Where lines are so nearly parallel that a turn about their looks counts in the dihedral angle, (m,)."""
+        """Mask of angles so small that a rotation about the lines of sight changes the dihedral angle, (m,)."""
         return narrow(self.flight)
 
     @property
     def difference(self) -> np.ndarray:
-        """Planes (tls) minus resection, (m,), radians: dihedral angles, but along the track where they are `narrow`."""
+        """Planes (tls) minus resection, (m,), in radians.
+
+        Dihedral angles are compared, but angles along the track where they are `narrow`.
+        """
         estimate = self.estimate
-        dihedral = estimate.angles["tls"].values - np.abs(estimate.resected.values)
-        return np.where(self.narrow, estimate.along.values - estimate.resected.values, dihedral)
+        dihedral = estimate.angles["tls"].values - np.abs(estimate.resection_angles.values)
+        return np.where(self.narrow, estimate.along.values - estimate.resection_angles.values, dihedral)
 
     @property
     def change(self) -> np.ndarray:
-        """Look angles from the planes minus the laboratory's, (m,), radians."""
+        """Look angles from the planes minus the laboratory's, (m,), in radians."""
         return self.estimate.look - values_of(self.flight.before_launch.look)
 
 
 def narrow(flight: AnglePass) -> np.ndarray:
-    """Angles below 5 deg in the laboratory, (m,)."""
+    """Return the mask of angles below 5 deg in the laboratory, (m,)."""
     return values_of(flight.before_launch.look) < np.radians(5.0)
 
 
 def values_of(angles: Mapping[str, float]) -> np.ndarray:
-    """The numbers of a mapping by angle, (m,)."""
+    """Return the values of a mapping by angle as an array (m,)."""
     return np.array(list(angles.values()))
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
 def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> SimulatedAngleRun:
-    """Fly, measure and estimate: ``python -m twin.orbit angle``.
+    """Simulate a pass, measure, and estimate the angles: ``python -m twin.orbit angle``.
 
     Parameters
     ----------
     setup : AngleSetup
-        The test and its camera.
-    backend : Backend | None
-        Where to trace an instrument; a payload needs none.
+        Resolved test file and camera.
+    backend : Backend or None
+        Backend on which an instrument is traced; a payload needs none.
     seed : int
-        Of all random numbers.
+        Seed of all random numbers.
     advance : Advance
-        Told of the progress.
+        Callback that reports the progress.
 
     Raises
     ------
     InputError
-        An instrument's changes are not possible.
+        The changes of an instrument are not possible.
     BenchError
-        The test cannot be carried out as its file says.
+        The test cannot be carried out as its file describes it.
     """
     terrain, shown, repeats = _streams(seed)
     flight = fly(setup, angle_camera(setup, backend), terrain)
@@ -353,19 +357,19 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
         ground = flight.ground(flight.effects)
         removed = flight.effects if setup.test.effects.corrected else NO_EFFECTS
         measurement = flight.measure(ground, shown, removed)
-        estimate = estimated(measurement)
+        estimate = estimate_angles(measurement)
         planes, alongs, resections = [], [], []
         for k, stream in enumerate(repeats.spawn(count)):
-            once = flight.measure(ground, stream, removed)
-            section = resected(once)
-            planes.append(tls_angles(centred(once, section)))
-            alongs.append(sighted(once, section)[1])
-            resections.append(_resected_angles(once, section))
+            repeat = flight.measure(ground, stream, removed)
+            section = resect_measurement(repeat)
+            planes.append(tls_angles(reduce_to_station(repeat, section)))
+            alongs.append(line_of_sight_angles(repeat, section)[1])
+            resections.append(_resected_angles(repeat, section))
             advance("passes", k + 1, count)
         first, third = Scatter.of(planes, flight.dihedral), Scatter.of(alongs, flight.along_track)
         second = Scatter.of(resections, flight.along_track)
-        common = centred(measurement, estimate.resection)
-        one = PassAngles(
+        common = reduce_to_station(measurement, estimate.resection)
+        pass_angles = PassAngles(
             "pass 1",
             flight.spec.time,
             flight.before_launch,
@@ -374,18 +378,18 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
             measurement,
             estimate,
         )
-        off = np.where(narrow(flight), third.values - second.values, first.values - np.abs(second.values))
+        difference = np.where(narrow(flight), third.values - second.values, first.values - np.abs(second.values))
         return SimulatedAngleRun(
             setup=setup,
             seed=seed,
-            passes=(one,),
+            passes=(pass_angles,),
             flight=flight,
             frames=frame_rows(flight, common),
             effects=effect_rows(flight),
             planes=first,
             resection=second,
             along=third,
-            difference_sigma=np.std(off, 0, ddof=1),
+            difference_sigma=np.std(difference, 0, ddof=1),
             table=plane_angles.sensitivity(measurement.station, common.strips, flight.pairs),
             height=flight.height_per_arcsec(),
         )
@@ -394,13 +398,19 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _streams(seed: int) -> tuple[np.random.SeedSequence, np.random.SeedSequence, np.random.SeedSequence]:
-    """Random streams of the terrain, of the errors of the pass that is shown, and of those of its repeats."""
+    """Return the random streams of the terrain, of the errors of the pass that is shown, and of its repeats."""
     terrain, shown, repeats = np.random.SeedSequence(seed).spawn(3)
     return terrain, shown, repeats
 
 
-def resected(measurement: Measurement) -> Resection:
-    """Space resection, in which the look of the second line of the first angle is zero. Raises ResectionError."""
+def resect_measurement(measurement: Measurement) -> Resection:
+    """Compute the space resection in which the second line of the first angle has zero look angle.
+
+    Raises
+    ------
+    ResectionError
+        The points do not determine the resection.
+    """
     m = measurement
     lines = {
         name: ObservedLine.of(strip, m.tangent[name], look=m.look[name], offset=m.offset[name])
@@ -410,13 +420,13 @@ def resected(measurement: Measurement) -> Resection:
 
 
 def _resected_angles(measurement: Measurement, section: Resection) -> AlongTrackAngles:
-    """The angles of a resection, signed like those along the track."""
+    """Return the angles of a resection, signed like those along the track."""
     pairs = tuple(measurement.pairs.values())
     return AlongTrackAngles(section.angles(pairs), section.angle_covariance(pairs))
 
 
-def centred(measurement: Measurement, section: Resection) -> Measurement:
-    """The measurement as it would be with all projection centres at the station."""
+def reduce_to_station(measurement: Measurement, section: Resection) -> Measurement:
+    """Return the measurement as it would be with all projection centres at the station."""
     strips = dict(measurement.strips)
     for name, offset in measurement.offset.items():
         if np.any(offset):
@@ -427,13 +437,13 @@ def centred(measurement: Measurement, section: Resection) -> Measurement:
 
 
 def tls_angles(common: Measurement) -> PlaneAngles:
-    """Angles between the planes by total least squares, from a measurement that is `centred`."""
+    """Return the angles between planes by total least squares, for a measurement from `reduce_to_station`."""
     return angles_between([fit_plane(common.station, strip) for strip in common.strips.values()], common.which)
 
 
-def sighted(measurement: Measurement, section: Resection) -> tuple[np.ndarray, AlongTrackAngles]:
-    """Angles between the lines of sight of the lines' centres, (m,), radians, and their part along the track."""
-    common, frames = centred(measurement, section), []
+def line_of_sight_angles(measurement: Measurement, section: Resection) -> tuple[np.ndarray, AlongTrackAngles]:
+    """Return the angles (m,) between the lines' central lines of sight, in radians, and their along-track parts."""
+    common, frames = reduce_to_station(measurement, section), []
     for name, strip in common.strips.items():
         distance = np.linalg.norm(strip.points - common.station.position, axis=1)[:, None]
         straight = Strip(strip.points + distance * measurement.bow[name] @ section.axes(name).T, strip.covariance)
@@ -443,22 +453,24 @@ def sighted(measurement: Measurement, section: Resection) -> tuple[np.ndarray, A
     return np.array(looks, np.float64), plane_angles.along_track_angles(frames, common.which)
 
 
-def estimated(measurement: Measurement) -> Estimate:
-    """The angles by all methods. Raises PlaneError, AngleError, ResectionError."""
-    section = resected(measurement)
-    common = centred(measurement, section)
+def estimate_angles(measurement: Measurement) -> Estimate:
+    """Estimate the angles by all methods; may raise PlaneError, AngleError or ResectionError."""
+    section = resect_measurement(measurement)
+    common = reduce_to_station(measurement, section)
     planes: dict[Method, tuple[PlaneFit, ...]] = {}
     with warnings.catch_warnings():
-        # the report says it, for each frame
+        # the table of frames in the report has these warnings
         warnings.simplefilter("ignore", NearVerticalWarning)
         for method in METHODS:
             planes[method] = tuple(fit_plane(common.station, strip, method) for strip in common.strips.values())
     angles = {method: angles_between(fits, measurement.which) for method, fits in planes.items()}
-    return Estimate(planes, angles, *sighted(measurement, section), section, _resected_angles(measurement, section))
+    return Estimate(
+        planes, angles, *line_of_sight_angles(measurement, section), section, _resected_angles(measurement, section)
+    )
 
 
 def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
-    """Every method in every frame; of a measurement that is `centred`."""
+    """Estimate the angles by every method in every frame, from a measurement of `reduce_to_station`."""
     places = {
         "Earth-fixed": (np.eye(3), np.zeros(3)),
         "local level": (flight.local, flight.middle_point),
@@ -476,38 +488,44 @@ def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
                     fits = [fit_plane(moved.station, strip, method) for strip in moved.strips.values()]
                     angles = angles_between(fits, moved.which)
                     values, sigma = angles.values, angles.sigma
-                    steepest = min(abs(float(fit.normal[2])) for fit in fits)
+                    least_normal_z = min(abs(float(fit.normal[2])) for fit in fits)
                 except PlaneError:
-                    values, sigma, steepest = np.full(count, np.nan), np.full(count, np.nan), 0.0
+                    values, sigma, least_normal_z = np.full(count, np.nan), np.full(count, np.nan), 0.0
             warned = any(issubclass(w.category, NearVerticalWarning) for w in caught)
-            rows.append(FrameRow(frame, method, values, sigma, steepest, warned))
+            rows.append(FrameRow(frame, method, values, sigma, least_normal_z, warned))
     return tuple(rows)
 
 
 def effect_rows(flight: AnglePass) -> tuple[EffectRow, ...]:
-    """Each effect alone and all three, on the true points; and the datum's shift, if there is one."""
+    """Compute the errors of the angles by each effect on the light alone and by all three, on the true points.
+
+    Where the file has a shift of the datum, its error follows.
+    """
     truth, names = values_of(flight.dihedral), tuple(flight.pairs)
     none = (0.0, 0.0, 0.0)
 
-    def off(effects: LightEffects, removed: LightEffects) -> np.ndarray:
-        return _off_truth(flight, flight.measure(flight.ground(effects), None, removed, none), truth)
+    def errors_of(effects: LightEffects, removed: LightEffects) -> np.ndarray:
+        return _error_of(flight, flight.measure(flight.ground(effects), None, removed, none), truth)
 
     wavelength = flight.spec.effects.wavelength
     cases = {name: replace(NO_EFFECTS, wavelength=wavelength, **{name: True}) for name in EFFECTS}
     cases["all"] = LightEffects(wavelength=wavelength)
-    rows = [EffectRow(names, name, off(effects, NO_EFFECTS), off(effects, effects)) for name, effects in cases.items()]
+    rows = [
+        EffectRow(names, name, errors_of(effects, NO_EFFECTS), errors_of(effects, effects))
+        for name, effects in cases.items()
+    ]
     if any(flight.spec.errors.datum):
-        shifted = _off_truth(flight, flight.measure(flight.ground(NO_EFFECTS), None), truth)
+        shifted = _error_of(flight, flight.measure(flight.ground(NO_EFFECTS), None), truth)
         rows.append(EffectRow(names, "datum", shifted, np.full(len(truth), np.nan)))
     return tuple(rows)
 
 
-def _off_truth(flight: AnglePass, measured: Measurement, truth: np.ndarray) -> np.ndarray:
-    return np.asarray(tls_angles(centred(measured, resected(measured))).values - truth)
+def _error_of(flight: AnglePass, measured: Measurement, truth: np.ndarray) -> np.ndarray:
+    return np.asarray(tls_angles(reduce_to_station(measured, resect_measurement(measured))).values - truth)
 
 
 ByAngle = dict[str, float | None]
-"""A number for each angle of the test's file; None for what could not be computed."""
+"""Number for each angle of the test's file; None where it could not be computed."""
 
 
 def _by_angle(names: Iterable[str], values: Iterable[float]) -> ByAngle:
@@ -515,39 +533,41 @@ def _by_angle(names: Iterable[str], values: Iterable[float]) -> ByAngle:
 
 
 def _degrees(names: Iterable[str], values: Iterable[float]) -> ByAngle:
-    """Radians as degrees; the keys say so, since they stand beside those of sigmas."""
+    """Convert radians to degrees, with the unit in the keys, since they stand beside sigmas in arcseconds."""
     return _by_angle([f"{name}_deg" for name in names], np.degrees(list(values)))
 
 
 def _with_sigmas(names: Iterable[str], angles: PlaneAngles | AlongTrackAngles | FrameRow) -> ByAngle:
-    """Angles in degrees, then their sigmas in arcseconds."""
+    """Return angles in degrees, then their sigmas in arcseconds."""
     names = tuple(names)
     return _degrees(names, angles.values) | _by_angle([f"{n}_arcsec_sigma" for n in names], angles.sigma / ARCSEC)
 
 
-def _plane_chances(one: PassAngles) -> dict[str, float]:
-    fits = zip(one.measurement.strips, one.estimate.planes["tls"], strict=True)
+def _plane_p_values(pass_angles: PassAngles) -> dict[str, float]:
+    fits = zip(pass_angles.measurement.strips, pass_angles.estimate.planes["tls"], strict=True)
     return {line: float(chi2.sf(fit.chi_square, len(fit.residual) - 2)) for line, fit in fits}
 
 
 PASS: Record[PassAngles] = Record(
-    "The angles of one pass, and those of the laboratory's camera.",
-    Quantity("time_s", lambda one: one.time, "moment to which the points are brought, from the epoch"),
-    Quantity("points", lambda one: {k: len(ids) for k, ids in one.ids.items()}, "line -> number of its points"),
-    Quantity("dihedral", lambda one: _with_sigmas(one.pairs, one.estimate.angles["tls"]), "between the tls planes"),
-    Quantity("along_track", lambda one: _with_sigmas(one.pairs, one.estimate.along), "of the centres' lines of sight"),
-    Quantity("resection", lambda one: _with_sigmas(one.pairs, one.estimate.resected), "by space resection, signed"),
-    Quantity("laboratory_dihedral", lambda one: _degrees(one.pairs, one.laboratory.dihedral.values()), "before launch"),
-    Quantity("laboratory_along_track", lambda one: _degrees(one.pairs, one.laboratory.along_track.values()), "too"),
-    Quantity("change_arcsec", lambda one: _by_angle(one.pairs, one.change), "of the angles along the track since then"),
-    Quantity("plane_p_value", _plane_chances, "line -> chance of a chi-square of its plane as large or larger"),
-    Quantity("resection_p_value", lambda one: one.estimate.resection.p_value, "the same for the resection"),
-    Quantity("resection_agrees", lambda one: one.estimate.resection.p_value >= UNLIKELY, "whether that is likely"),
+    "Angles of one pass, and those of the laboratory's camera.",
+    Quantity("time_s", lambda p: p.time, "moment to which the points are transferred, from the epoch"),
+    Quantity("points", lambda p: {k: len(ids) for k, ids in p.ids.items()}, "line -> number of its points"),
+    Quantity("dihedral", lambda p: _with_sigmas(p.pairs, p.estimate.angles["tls"]), "angles between the tls planes"),
+    Quantity("along_track", lambda p: _with_sigmas(p.pairs, p.estimate.along), "between the centres' lines of sight"),
+    Quantity("resection", lambda p: _with_sigmas(p.pairs, p.estimate.resection_angles), "by space resection, signed"),
+    Quantity("laboratory_dihedral", lambda p: _degrees(p.pairs, p.laboratory.dihedral.values()), "before launch"),
+    Quantity("laboratory_along_track", lambda p: _degrees(p.pairs, p.laboratory.along_track.values()), "before launch"),
+    Quantity(
+        "change_arcsec", lambda p: _by_angle(p.pairs, p.change), "change of the angles along the track since then"
+    ),
+    Quantity("plane_p_value", _plane_p_values, "line -> p-value of the chi-square of its plane"),
+    Quantity("resection_p_value", lambda p: p.estimate.resection.p_value, "p-value of the resection's chi-square"),
+    Quantity("resection_agrees", lambda p: p.estimate.resection.p_value >= UNLIKELY, "true if the resection fits"),
 )
 UNLIKELY = 1e-3
-"""Chance of a chi-square as large below which a resection does not fit."""
+"""p-value of chi-square below which a resection is reported not to fit."""
 TRUTH: Record[SimulatedAngleRun] = Record(
-    "The angles of the true camera, by each definition.",
+    "Angles of the true camera, by each definition.",
     Quantity("look", lambda run: _degrees(run.names, run.flight.look.values()), "between the lines of sight"),
     Quantity("dihedral", lambda run: _degrees(run.names, run.flight.dihedral.values()), "between the planes"),
     Quantity("along_track", lambda run: _degrees(run.names, run.flight.along_track.values()), "along the track"),
@@ -564,21 +584,21 @@ def _changes(run: SimulatedAngleRun) -> dict[str, ByAngle]:
 
 
 SCATTER: Record[Scatter] = Record(
-    "One estimator over passes with errors drawn anew.",
-    Quantity("bias_arcsec", lambda one: _by_angle(one.names, one.bias), "mean over the passes minus truth"),
-    Quantity("spread_arcsec", lambda one: _by_angle(one.names, one.spread), "standard deviation over the passes"),
-    Quantity("sigma_arcsec", lambda one: _by_angle(one.names, one.sigma), "standard deviation that it claims"),
-    Quantity("p_value", lambda one: _by_angle(one.names, one.tail), "chance of such a spread if the sigma is right"),
+    "Estimates of one method over passes with errors drawn anew.",
+    Quantity("bias_arcsec", lambda s: _by_angle(s.names, s.bias), "mean over the passes minus truth"),
+    Quantity("spread_arcsec", lambda s: _by_angle(s.names, s.spread), "standard deviation over the passes"),
+    Quantity("sigma_arcsec", lambda s: _by_angle(s.names, s.sigma), "standard deviation predicted by the method"),
+    Quantity("p_value", lambda s: _by_angle(s.names, s.p_value), "two-sided p-value of the spread under this sigma"),
 )
 EFFECT: Record[EffectRow] = Record(
-    "What an effect on the light, or a shift of all points, does to the angles between tls planes.",
+    "Error of the angles between tls planes by an effect on the light, or by a shift of all points.",
     Quantity("what", lambda row: row.what, "name of the effect"),
     Quantity("bias_arcsec", lambda row: _by_angle(row.names, row.bias), "angles minus truth without correction"),
-    Quantity("corrected_arcsec", lambda row: _by_angle(row.names, row.left), "what the correction leaves of it"),
+    Quantity("corrected_arcsec", lambda row: _by_angle(row.names, row.remaining), "angles minus truth after it"),
 )
 PASSES: Record[SimulatedAngleRun] = Record(
     "Passes with errors drawn anew.",
-    Quantity("passes", lambda run: len(run.planes.values), "how many"),
+    Quantity("passes", lambda run: len(run.planes.values), "number of passes"),
     Quantity("planes", lambda run: run.planes, "dihedral angles of tls planes", record=SCATTER),
     Quantity("along_track", lambda run: run.along, "angles along the track from these planes", record=SCATTER),
     Quantity("resection", lambda run: run.resection, "angles by resection", record=SCATTER),
@@ -586,12 +606,12 @@ PASSES: Record[SimulatedAngleRun] = Record(
 
 
 def _frame(names: Iterable[str], row: FrameRow) -> dict[str, Any]:
-    normal = {"least_normal_z": row.steepest, "near_vertical": row.warned}
+    normal = {"least_normal_z": row.least_normal_z, "near_vertical": row.warned}
     return {"frame": row.frame, "method": row.method, **_with_sigmas(names, row), **normal}
 
 
 def _by_planes(run: SimulatedAngleRun) -> dict[str, ByAngle]:
-    return {name: _with_sigmas(run.names, one) for name, one in run.estimate.angles.items()}
+    return {name: _with_sigmas(run.names, angles) for name, angles in run.estimate.angles.items()}
 
 
 def _folded(run: SimulatedAngleRun) -> dict[str, bool]:
@@ -599,33 +619,37 @@ def _folded(run: SimulatedAngleRun) -> dict[str, bool]:
 
 
 def _by_resection(run: SimulatedAngleRun) -> ByAngle:
-    return _with_sigmas(run.names, run.estimate.resected) | {"p_value": run.estimate.resection.p_value}
+    return _with_sigmas(run.names, run.estimate.resection_angles) | {"p_value": run.estimate.resection.p_value}
 
 
 ANGLE: Record[Any] = Record(
-    "angle.json. Measurements have no truth: of them there is the key `measured` alone.",
-    Quantity("seed", lambda run: run.seed, "of all random numbers"),
+    "Content of angle.json. A test on measurements has the key `measured` alone, since it has no truth.",
+    Quantity("seed", lambda run: run.seed, "seed of all random numbers"),
     Quantity("time_s", lambda run: run.flight.spec.time, "moment of exposure, from the epoch"),
-    Quantity("angles", lambda run: run.flight.pairs, "the two lines that each angle lies between"),
+    Quantity("angles", lambda run: run.flight.pairs, "the two lines of each angle"),
     Quantity("planes", _by_planes, "dihedral angles by each form of the planes, in the Earth-fixed frame"),
-    Quantity("folded", _folded, "whether an angle is below three sigmas, where its noise pushes it up"),
+    Quantity("folded", _folded, "true for an angle below three sigmas, where noise biases it upward"),
     Quantity("look", lambda run: _degrees(run.names, run.estimate.look), "between the lines of sight of the centres"),
     Quantity("along_track", lambda run: _with_sigmas(run.names, run.estimate.along), "their part along the track"),
-    Quantity("resection", _by_resection, "angles by space resection, and the chance of its chi-square"),
-    Quantity("truth", lambda run: run, "the angles of the true camera", record=TRUTH),
-    Quantity("change_arcsec", _changes, "change of the look angles since launch: found, true, and by the trace"),
+    Quantity("resection", _by_resection, "angles by space resection, and the p-value of its chi-square"),
+    Quantity("truth", lambda run: run, "angles of the true camera", record=TRUTH),
+    Quantity("change_arcsec", _changes, "change of the look angles since launch: estimated, true, by ray trace"),
     Quantity("difference_arcsec", lambda run: _by_angle(run.names, run.difference), "planes minus resection"),
-    Quantity("difference_arcsec_sigma", lambda run: _by_angle(run.names, run.difference_sigma), "over the passes"),
-    Quantity("sensitivity", lambda run: [row.to_dict() for row in run.table], "answers of the angles to errors"),
+    Quantity(
+        "difference_arcsec_sigma",
+        lambda run: _by_angle(run.names, run.difference_sigma),
+        "standard deviation over passes",
+    ),
+    Quantity("sensitivity", lambda run: [row.to_dict() for row in run.table], "changes of the angles by errors"),
     Quantity("effects", lambda run: run.effects, "each effect alone and all together", record=EFFECT),
     Quantity("frames", lambda run: [_frame(run.names, row) for row in run.frames], "every form in every frame"),
     Quantity("scatter", lambda run: run, "passes with errors drawn anew", record=PASSES),
-    Quantity("height_m_per_arcsec", lambda run: run.height, "error of intersected heights", converted=False),
-    Quantity("measured", lambda run: {one.name: one for one in run.passes}, "pass -> its angles", record=PASS),
+    Quantity("height_m_per_arcsec", lambda run: run.height, "height error by 1 arcsec", converted=False),
+    Quantity("measured", lambda run: {p.name: p for p in run.passes}, "pass -> its angles", record=PASS),
 )
 _MEASURED: Record[AngleRun] = Record(ANGLE.meaning, ANGLE["measured"])
 
 
 def angle_numbers(run: AngleRun) -> dict[str, Any]:
-    """Contents of angle.json without its frames."""
+    """Return the content of angle.json without its reference frames."""
     return ANGLE(run) if isinstance(run, SimulatedAngleRun) else _MEASURED(run)

@@ -1,12 +1,11 @@
-"""Intersection angles from a measured pass: its image points, the ground points that they show, orbit and attitude.
+"""Intersection angles from a measured pass: image points, their ground points, orbit and attitude.
 
-Lines see ground points at many moments, but a plane goes through one station. So each arm from the station of its own
-moment to its ground point, freed of the effects on the light, is carried along in the body: from body axes then into
-those of one moment, S + R R_i' (G_i - S_i). Biases of the attitude turn all arms alike and leave the angles as they
-are; what differs from moment to moment is in the sigmas of the points.
+Lines see ground points at many moments, but a plane passes through one station. Each arm from the station of its own
+moment to its ground point, corrected for the effects on the light, is therefore transferred in the body frame to one
+moment: S + R R_i' (G_i - S_i). Biases of the attitude rotate all arms alike and do not change the angles; errors that
+differ from moment to moment are included in the sigmas of the points.
 
-What a simulated test was made from can be written as such measurements, a folder of tables with a test file that reads
-them back.
+A simulated test can be written as such measurements, a folder of tables with a test file that reads them back.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from scenes.yaml.units import MOMENT, format_quantity
 from scenes.yaml.yaml_file import dump_yaml
 from twin.framework.procedure import Advance, BenchError, silent
 from twin.orbit.angle.angle_flight import LEAST_SIGMA, Measurement, without_effects
-from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, estimated, run_angle
+from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, estimate_angles, run_angle
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import EARTH_RATE, NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineAngles, LineCamera, LineTimes, line_cameras
@@ -44,12 +43,12 @@ if TYPE_CHECKING:
 
 
 def run_angle_test(setup: AnyAngle, backend: Backend | None, seed: int, advance: Advance = silent) -> AngleRun:
-    """On measurements, or on a simulation: ``python -m twin.orbit angle``.
+    """Run a test on measurements or on a simulation: ``python -m twin.orbit angle``.
 
     Raises
     ------
     InputError, BenchError
-        As `run_angle` and `run_measured_angle`.
+        See `run_angle` and `run_measured_angle`.
     """
     if isinstance(setup, MeasuredAngleSetup):
         return run_measured_angle(setup, seed, advance)
@@ -58,116 +57,120 @@ def run_angle_test(setup: AnyAngle, backend: Backend | None, seed: int, advance:
 
 @one_blas_thread()
 def run_measured_angle(setup: MeasuredAngleSetup, seed: int = 0, advance: Advance = silent) -> AngleRun:
-    """Read and estimate; nothing is drawn, so that the seed is not used.
+    """Read the measurements and estimate the angles. Nothing is drawn: the seed is not used.
 
     Raises
     ------
     InputError
-        Files that cannot be used, or angles of lines that have no points.
+        Files cannot be used, or a line of an angle has no points.
     BenchError
         The points do not determine the angles.
     """
     passes = []
-    for one in read_measurements(setup.data, setup.camera, advance, needed={}):
+    for measured in read_measurements(setup.data, setup.camera, advance, needed={}):
         try:
-            passes.append(_measured_angles(setup, one))
+            passes.append(_measured_angles(setup, measured))
         except (PlaneError, AngleError, ResectionError, ValueError) as error:
             remedy = "more points on each line, spread over its length, and the right conventions"
-            raise BenchError(f"{one.name}: {error}", ("data",), remedy) from error
+            raise BenchError(f"{measured.name}: {error}", ("data",), remedy) from error
     return AngleRun(setup=setup, seed=seed, passes=tuple(passes))
 
 
-def _measured_angles(setup: MeasuredAngleSetup, one: PassMeasurements) -> PassAngles:
-    """Angles of one pass.
+def _measured_angles(setup: MeasuredAngleSetup, measured: PassMeasurements) -> PassAngles:
+    """Estimate the angles of one pass.
 
     Parameters
     ----------
     setup : MeasuredAngleSetup
-        The test.
-    one : PassMeasurements
-        The pass.
+        Resolved test file and camera.
+    measured : PassMeasurements
+        Measurements of the pass.
 
     Raises
     ------
     InputError
-        Angles of lines that have no points.
+        A line of an angle has no points.
     PlaneError, AngleError, ResectionError
-        The points do not determine them.
+        The points do not determine the angles.
     ValueError
-        a moment at which orbit or attitude are not known.
+        Orbit or attitude are not known at a moment.
     """
     test = setup.test
-    given = one.ground.role != "tie"
-    points = {name: row.taken(given[row.point]) for name, row in one.images.items()}
+    has_coordinates = measured.ground.role != "tie"
+    points = {name: row.taken(has_coordinates[row.point]) for name, row in measured.images.items()}
     enough = tuple(name for name in setup.camera.lines if name in points and len(points[name].point) >= LEAST_POINTS)
-    pairs = _pairs(setup, one, enough)
+    pairs = _pairs(setup, measured, enough)
     used = [name for name in enough if any(name in pair for pair in pairs.values())]
-    path = TabulatedTrajectory(one.platform)
-    seconds = {name: one.line_times[name].at(points[name].line) for name in used}
+    path = TabulatedTrajectory(measured.platform)
+    seconds = {name: measured.line_times[name].at(points[name].line) for name in used}
     moment = float(np.mean(seconds[next(iter(pairs.values()))[1]])) if test.time is None else test.time
     if not path.known(moment):
-        allowed = f"a moment within the readings of {one.name}, {path.first:.9g} s to {path.last:.9g} s, and in no gap"
-        raise test.error("orbit or attitude are not known then", ("time",), found=f"{moment:g} s", allowed=allowed)
+        allowed = (
+            f"a moment within the readings of {measured.name}, {path.first:.9g} s to {path.last:.9g} s, and in no gap"
+        )
+        raise test.error("no orbit or attitude at this time", ("time",), found=f"{moment:g} s", allowed=allowed)
     removed = LightEffects.of(test.effects) if test.effects.corrected else NO_EFFECTS
     pixel = FrozenMap({name: points[name].pixel for name in used})
     laboratory = LineAngles(FrozenMap(line_cameras(setup.camera)), FrozenMap(pairs), pixel)
     strips = {
-        name: _strip(one, points[name], laboratory.cameras[name], path, (name, moment), removed, test.errors)
+        name: _strip(measured, points[name], laboratory.cameras[name], path, (name, moment), removed, test.errors)
         for name in used
     }
     noise = test.errors.gps
     sigma = float(np.sqrt(np.mean(np.square(noise.noise)) + np.mean(np.square(noise.drift))))
     measurement = Measurement.of(laboratory, Station.of(path.position(moment), sigma), strips)
     return PassAngles(
-        one.name,
+        measured.name,
         moment,
         laboratory,
-        FrozenMap({name: one.ground.ids[points[name].point] for name in used}),
+        FrozenMap({name: measured.ground.ids[points[name].point] for name in used}),
         FrozenMap({k: (float(np.min(t) - moment), float(np.max(t) - moment)) for k, t in seconds.items()}),
         measurement,
-        estimated(measurement),
+        estimate_angles(measurement),
     )
 
 
-def _pairs(setup: MeasuredAngleSetup, one: PassMeasurements, enough: tuple[str, ...]) -> Mapping[str, tuple[str, str]]:
-    """Angle -> its two lines, which have enough points. InputError otherwise."""
+def _pairs(
+    setup: MeasuredAngleSetup, measured: PassMeasurements, enough: tuple[str, ...]
+) -> Mapping[str, tuple[str, str]]:
+    """Return the two lines of each angle; raise InputError if one of them has too few points."""
     test = setup.test
     pairs = test.angles or usual_angles(enough)
     seen = f"{names_text(enough) or 'no line'} of {setup.camera.name} {'has' if len(enough) == 1 else 'have'}"
-    has = f"{seen} {LEAST_POINTS} points or more in {one.name}"
+    has = f"{seen} {LEAST_POINTS} points or more in {measured.name}"
     if pairs is None:
         allowed = "`angles:` with a name and two lines for each, as alpha: [forward, nadir]"
-        raise test.error("which lines the angles lie between is not said", ("angles",), found=has, allowed=allowed)
+        raise test.error("the lines of the angles are not stated", ("angles",), found=has, allowed=allowed)
     for angle, pair in pairs.items():
         for k, line in enumerate(pair):
             if line not in enough:
                 key, meant = ("angles", angle, k), nearest(line, enough)
-                raise test.error("a line without points", key, found=line, allowed=has, suggestion=meant)
+                raise test.error("this line has no points", key, found=line, allowed=has, suggestion=meant)
     return pairs
 
 
 def _strip(
-    one: PassMeasurements,
+    measured: PassMeasurements,
     points: ImagePoints,
     camera: LineCamera,
     path: TabulatedTrajectory,
-    place: tuple[str, float],
+    line_and_moment: tuple[str, float],
     removed: LightEffects,
     errors: ReadingErrorsSpec,
 ) -> Strip:
-    """Ground points of a line as it would see them at the moment, with what is uncertain in that."""
-    name, moment = place
+    """Return the ground points of a line as it would see them at the moment, with the covariances of all errors."""
+    name, moment = line_and_moment
     earth = Earth()
-    times = one.line_times[name]
+    times = measured.line_times[name]
     seconds = times.at(points.line)
-    ground, spread = one.ground.itrs[points.point], one.ground.covariance[points.point]
+    ground, spread = measured.ground.itrs[points.point], measured.ground.covariance[points.point]
     station, axes = path.position(seconds), path.body_to_itrs(seconds)
-    seen = ground
+    corrected = ground
     if removed != NO_EFFECTS:
-        seen = without_effects(ground, station, path.inertial_velocity(seconds), earth, removed)
-    arm = seen - station
+        corrected = without_effects(ground, station, path.inertial_velocity(seconds), earth, removed)
+    arm = corrected - station
     carried = path.body_to_itrs(moment) @ np.swapaxes(axes, 1, 2)
-    # image: what a line and a pixel are on the ground
+    # errors of the image points on the ground, by the ground size of a line and a pixel
     sensor = Sensor.of_lines(camera, path, earth, times, NO_EFFECTS)
     height = earth.geodetic(ground)[2]
     last = (sensor.lines - 1.0, sensor.camera.pixels - 1.0)
@@ -191,63 +194,67 @@ def _strip(
     )
 
 
-def _shared(away: np.ndarray, path: TabulatedTrajectory, errors: ReadingErrorsSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Variances (n,) of attitude, rad^2, and of the station, m^2, against those of the moment.
+def _shared(offset: np.ndarray, path: TabulatedTrajectory, errors: ReadingErrorsSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Return variances (n,) of attitude, in rad^2, and station, in m^2, of points relative to the moment.
 
-    Points of one reading err alike: each of n is given n times the variance, so that their mean has the right one. A
-    point of the moment's own reading errs like the moment, which leaves the angles as they are.
+    Points of one reading have the same error: each of n points is given n times the variance, so that their mean has
+    the right one. A point of the moment's own reading shares the error of the moment, which does not change the angles.
 
     Parameters
     ----------
-    away : np.ndarray
-        Times of the points from the moment, (n,), seconds.
+    offset : (n,) ndarray
+        Times of the points from the moment, in seconds.
     path : TabulatedTrajectory
-        For the intervals of the readings.
+        Trajectory that gives the intervals of the readings.
     errors : ReadingErrorsSpec
-        Of the readings.
+        Errors of the readings.
     """
     tracker, gps = errors.star_tracker, errors.gps
-    turn = _of_readings(away, tracker.interval or path.attitude_interval, tracker.noise)
-    turn = turn + _of_readings(away, tracker.slow.interval, tracker.slow.noise)
-    return turn, _of_readings(away, gps.interval or path.orbit_interval, gps.noise)
+    attitude = _of_readings(offset, tracker.interval or path.attitude_interval, tracker.noise)
+    attitude = attitude + _of_readings(offset, tracker.slow.interval, tracker.slow.noise)
+    return attitude, _of_readings(offset, gps.interval or path.orbit_interval, gps.noise)
 
 
-def _of_readings(away: np.ndarray, interval: float, sigma: tuple[float, float, float]) -> np.ndarray:
-    number = np.round(away / interval).astype(int)
+def _of_readings(offset: np.ndarray, interval: float, sigma: tuple[float, float, float]) -> np.ndarray:
+    number = np.round(offset / interval).astype(int)
     _, which, count = np.unique(number, return_inverse=True, return_counts=True)
-    return float(np.mean(np.square(sigma))) * count[which] * np.minimum(np.abs(away) / interval, 1.0)
+    return float(np.mean(np.square(sigma))) * count[which] * np.minimum(np.abs(offset) / interval, 1.0)
 
 
 TEST_FILE = "angle.yaml"
 _LINE_TIME = 1e-3
-"""Seconds. All points are seen in the one line of the moment, which one on either side gives a time."""
+"""Time per line, in seconds. All points are seen in one line at the moment; a line on either side of it gives the
+times.
+"""
 _SPAN, _READINGS = 20.0, 41
-"""Seconds before and after the moment, as far as the orbit goes, and readings in them; one is at the moment."""
+"""Time exported before and after the moment, in seconds, and number of readings in it; one reading is at the moment."""
 _IMAGE_SIGMA = 1e-6
-"""Pixels: the errors of the points are those on the ground, and a table's sigmas must be positive."""
+"""Sigma of exported image points, in pixels: the errors are those of the ground points, and a table's sigmas must be
+positive.
+"""
 
 
 def angle_exported(run: AngleRun) -> dict[str, str]:
-    """Path -> text of the files: the pass that is shown, with the errors that were drawn for it.
+    """Return the files of the pass that is shown, path -> text, with the errors that were drawn for it.
 
     Raises
     ------
     InputError
-        The measurements are files already, or the lines are an instrument's, which no payload's file says.
+        The measurements are files already, or the lines are those of an instrument, which no payload file describes.
     """
     test = run.setup.test
     if not isinstance(run, SimulatedAngleRun):
         text = "measurements are files already; --export writes those of a simulation"
         raise test.error(text, ("data",), allowed="the file of a simulated test")
     if run.setup.camera is None:
-        text = "the lines of an instrument are traced, and no payload's file says where their pixels look"
+        text = "the lines of an instrument are traced; no payload file has the directions of their pixels"
         raise test.error(text, ("camera",), found=str(test.camera), allowed="a payload to export measurements of")
     files = campaign_files([_measurements(run)], run.setup.camera.plain())
     return files | {TEST_FILE: dump_yaml(_test(run))}
 
 
 def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
-    """The shown pass before anything was taken out of its points."""
+    """Return the measurements of the pass that is shown, with the effects on the light left in."""
     flight, spec = run.flight, run.flight.spec
     raw = flight.measure(flight.ground(flight.effects), run.shown, NO_EFFECTS)
     station = raw.station.position
@@ -258,11 +265,11 @@ def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
     if len(times) < 5:
         end = 0.9 * min(moment - path.first, path.last - moment)
         times = moment + end * np.linspace(-1.0, 1.0, 5)
-    moved = station - path.position(moment)
-    # aberration goes by the velocity against the stars, which an error of the place does not change
-    velocity = path.velocity(times) - np.cross([0.0, 0.0, EARTH_RATE], moved)
-    turn = Rotation.from_matrix(path.body_to_itrs(times)).as_quat(canonical=False)
-    platform = PlatformTable.of(str(path.orbit.epoch), times, path.position(times) + moved, velocity, times, turn)
+    shift = station - path.position(moment)
+    # aberration depends on the inertial velocity, which an error of the position does not change
+    velocity = path.velocity(times) - np.cross([0.0, 0.0, EARTH_RATE], shift)
+    quaternion = Rotation.from_matrix(path.body_to_itrs(times)).as_quat(canonical=False)
+    platform = PlatformTable.of(str(path.orbit.epoch), times, path.position(times) + shift, velocity, times, quaternion)
     line_times = LineTimes.of([0.0, 1.0, 2.0], moment + _LINE_TIME * np.array([-1.0, 0.0, 1.0]))
     ids = [f"{name}_{k}" for name in flight.lines for k in range(len(flight.pixel[name]))]
     ground = GroundPoints.of(
@@ -283,7 +290,7 @@ def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
 
 
 def _test(run: SimulatedAngleRun) -> dict[str, Any]:
-    """The test file: the same angles, moment, effects and sigmas."""
+    """Return the content of the test file, with the same angles, moment, effects and sigmas."""
     spec = run.flight.spec
     plain = spec.plain()
     return {

@@ -31,7 +31,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import AngleSetup
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, Measurement, angle_camera, fly
-from twin.orbit.angle.angle_run import centred, effect_rows, resected, sighted, values_of
+from twin.orbit.angle.angle_run import reduce_to_station, effect_rows, resect_measurement, line_of_sight_angles, values_of
 from twin.orbit.flight.light_effects import NO_EFFECTS, SPEED_OF_LIGHT, standard_refractivity
 from twin.orbit.flight.line_camera import dihedral_angle
 from twin.validation.check import CheckResult, mean_of
@@ -67,7 +67,7 @@ class Passes:
     @cached_property
     def sections(self) -> tuple[Resection, ...]:
         """Space resection of every measurement."""
-        return tuple(resected(m) for m in self.measured)
+        return tuple(resect_measurement(m) for m in self.measured)
 
     def normal(self, line: str) -> np.ndarray:
         """True unit normal of a line's plane, (3,), ITRS, its z component negative like the paper's (a0, a1, -1).
@@ -467,7 +467,7 @@ def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
         alpha = np.array([angles_between(fits, [(0, 1)]).printed[0] for fits in planes])
         return mean_of((alpha - lab - trace) / ARCSEC)
 
-    common = [centred(m, section) for m, section in zip(passes.measured, passes.sections, strict=True)]
+    common = [reduce_to_station(m, section) for m, section in zip(passes.measured, passes.sections, strict=True)]
     value, sigma = off(common)
     facts: dict[str, Any] = {"passes": passes, "trace": trace, "by_planes": trace / ARCSEC + value}
     yield context.row("000.traced", value, sigma, 0.0, **facts)
@@ -527,7 +527,7 @@ def _height(context: Context, flight: AnglePass) -> Iterator[CheckResult]:
 
 def _outlook(context: Context, passes: Passes) -> Iterator[CheckResult]:
     flight = passes.flight
-    along = np.array([sighted(m, s)[1].values for m, s in zip(passes.measured, passes.sections, strict=True)])
+    along = np.array([line_of_sight_angles(m, s)[1].values for m, s in zip(passes.measured, passes.sections, strict=True)])
     names = list(flight.pairs)
     for name in ("high_resolution", "multispectral"):
         true = flight.along_track[name]
