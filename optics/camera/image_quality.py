@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from optics.camera.prescription import Camera
 from optics.camera.ray_bundle import Field, chief_point, direction_of, launch_rays, light_nodes, shadow_pieces, trace
 from optics.geometry import zernike
-from optics.geometry.aperture import Circle
 from optics.geometry.polygon import covered
+from optics.numerics.array_math import UnphysicalError
 from optics.numerics.quadrature import PupilNodes, disk
 from optics.raytrace.first_order import first_order
 from optics.waves.diffraction import Grid, PupilField, image
@@ -67,6 +67,8 @@ class Wavefront:
 
 def _chief(camera: Camera, field: Field) -> tuple[np.ndarray, float]:
     """Return where the chief ray meets the image plane, metres, and how far upstream the exit pupil lies, metres."""
+    if camera.is_afocal:
+        raise UnphysicalError("the camera is afocal: parallel light leaves it parallel, so that it makes no image")
     launch, direction = (array[0] for array in launch_rays(camera, field, np.zeros((1, 2))))
     distance = first_order(camera.matrix(launch, direction)).exit_pupil_distance
     return chief_point(camera, field), float(distance[0])
@@ -156,10 +158,9 @@ def _colours(
 
 def _field_at(camera: Camera, field: Field, nodes: PupilNodes, origin: np.ndarray) -> PupilField:
     """Return the plane waves about a point of the image plane (3,) from nodes of the stop, of unit power."""
-    stop = Circle(0.5 * camera.surfaces[camera.stop].diameter)
     imaging, to_stop = camera.systems
-    rays = imaging_rays(camera.backend, imaging, to_stop, direction_of(field), camera.launch, stop, nodes)
-    return pupil_field(rays, camera.wavelength, origin - [0.0, 0.0, camera.vertices[-1]])
+    rays = imaging_rays(camera.backend, imaging, to_stop, direction_of(field), camera.launch, camera.aperture, nodes)
+    return pupil_field(rays, camera.wavelength, camera.image_pose.inverse().apply(origin))
 
 
 def psf(

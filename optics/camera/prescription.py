@@ -31,6 +31,9 @@ MIRROR = "mirror"
 
 _IMAGE = "image"
 
+_AFOCAL = 1000.0
+"""Focal length over the length of the camera from which on it has no focus."""
+
 
 @dataclass(frozen=True, eq=False)
 class OpticalSurface:
@@ -52,7 +55,9 @@ class OpticalSurface:
     inner_diameter : float
         Diameter of a central hole or obscuration, metres; light is stopped inside.
     vanes : sequence of (float, float)
-        Width in metres and direction from x in radians of each vane of a spider, from the axis outward.
+        Width in metres and direction from x in radians of each vane of a spider, from the middle outward.
+    offset : (float, float)
+        Middle of the clear aperture, x and y from the vertex, metres: the part of a parent surface that is used.
     asphere : sequence of float
         Coefficients A4, A6, ... of r^4, r^6, ..., in m^-3, m^-5, ...
     figure : mapping of int to float
@@ -86,6 +91,7 @@ class OpticalSurface:
     diameter: float = inf
     inner_diameter: float = 0.0
     vanes: Sequence[tuple[float, float]] = ()
+    offset: tuple[float, float] = (0.0, 0.0)
     asphere: Sequence[float] = ()
     figure: Mapping[int, float] = field(default_factory=dict)
     decenter: tuple[float, float] = (0.0, 0.0)
@@ -114,14 +120,14 @@ class OpticalSurface:
     @property
     def shape(self) -> Surface:
         """Shape of the surface in its own frame."""
-        figure = ZernikeFigure(0.5 * self.diameter, terms=self.figure) if self.figure else None
+        figure = ZernikeFigure(0.5 * self.diameter, self.offset, self.figure) if self.figure else None
         return Surface(1.0 / self.radius, self.conic, tuple(self.asphere), figure)
 
     def edges(self, outer: bool = True) -> tuple[Edge, ...]:
         """Return what stops light at the surface, with the outer edge or without it."""
-        rim = [Edge(Circle(0.5 * self.diameter))] if outer and isfinite(self.diameter) else []
-        hole = [Edge(Circle(0.5 * self.inner_diameter), blocks=True)] if self.inner_diameter else []
-        return (*rim, *hole, *(Edge(Ray(width), blocks=True, rotation=angle) for width, angle in self.vanes))
+        rim = [Edge(Circle(0.5 * self.diameter, self.offset))] if outer and isfinite(self.diameter) else []
+        hole = [Edge(Circle(0.5 * self.inner_diameter, self.offset), blocks=True)] if self.inner_diameter else []
+        return (*rim, *hole, *(Edge(Ray(w, self.offset), blocks=True, rotation=angle) for w, angle in self.vanes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,13 +142,16 @@ class Camera:
         Wavelength of the light, metres.
     stop : int
         Index of the surface that is the aperture stop; its ``diameter`` sets the beam.
+    image_tilt : (float, float, float)
+        Rotation vector of the image plane about the point where the axis meets it, radians.
     medium : {"vacuum", "air"}
         What the camera stands in: catalogues of glasses state indices against air, which light in vacuum does not have.
 
     Raises
     ------
     ValueError
-        There is no surface, the stop is none of them or has no diameter, or a glass or its wavelength is not known.
+        There is no surface, the stop is none of them or has no diameter, a thickness leads against the light, or a
+        glass or its wavelength is not known.
 
     Examples
     --------
@@ -158,11 +167,16 @@ class Camera:
     Traceback (most recent call last):
     ...
     ValueError: the stop, surface 1, needs a finite diameter
+    >>> Camera([m2, m1], wavelength=550e-9, stop=1)
+    Traceback (most recent call last):
+    ...
+    ValueError: the thickness of surface 0 must not be positive: light travels toward -z there, got 0.96
     """
 
     surfaces: Sequence[OpticalSurface]
     wavelength: float
     stop: int = 0
+    image_tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
     medium: Literal["vacuum", "air"] = "vacuum"
 
     def __post_init__(self) -> None:
@@ -176,6 +190,15 @@ class Camera:
             raise ValueError(f"wavelength must be positive, in metres, got {self.wavelength}")
         if self.medium not in ("vacuum", "air"):
             raise ValueError(f"medium must be 'vacuum' or 'air', got {self.medium!r}")
+        ahead = 1.0
+        for k, surface in enumerate(self.surfaces):
+            ahead = -ahead if surface.material == MIRROR else ahead
+            if surface.thickness * ahead < 0.0:
+                wrong, way = ("negative", "+z") if ahead > 0.0 else ("positive", "-z")
+                raise ValueError(
+                    f"the thickness of surface {k} must not be {wrong}: light travels toward {way} there, got "
+                    f"{surface.thickness}"
+                )
         self.indices  # noqa: B018
 
     @cached_property
@@ -194,6 +217,11 @@ class Camera:
         """Places of the surfaces' vertices and, last, of the image plane along z, metres, (K + 1,)."""
         return np.cumsum([0.0, *(surface.thickness for surface in self.surfaces)])
 
+    @property
+    def image_pose(self) -> Pose:
+        """Frame of the image plane in that of the camera."""
+        return Pose(rotation_matrix(self.image_tilt), np.array([0.0, 0.0, self.vertices[-1]]))
+
     @cached_property
     def assembly(self) -> Assembly:
         """Camera as the ray trace takes it."""
@@ -207,7 +235,7 @@ class Camera:
                 f"s{k}", f"s{k}", surface.shape, light, index_after=index, edges=surface.edges()
             )
             before = index
-        bodies.append(Body(_IMAGE, Pose(translation=np.array([0.0, 0.0, self.vertices[-1]]))))
+        bodies.append(Body(_IMAGE, self.image_pose))
         elements[_IMAGE] = Element(_IMAGE, _IMAGE, plane(), Interaction.PASS, index_after=before)
         return Assembly(RigidTree(tuple(bodies)), elements, {_IMAGE: tuple(elements)})
 
@@ -216,6 +244,12 @@ class Camera:
         """Camera to the image plane, and as far as the stop."""
         names = self.assembly.sequences[_IMAGE]
         return assemble(self.assembly, [names]), assemble(self.assembly, [names[: self.stop + 1]])
+
+    @property
+    def aperture(self) -> Circle:
+        """Rim of the aperture stop, in the frame of its surface."""
+        stop = self.surfaces[self.stop]
+        return Circle(0.5 * stop.diameter, stop.offset)
 
     @property
     def backend(self) -> Backend:
@@ -242,6 +276,11 @@ class Camera:
     def paraxial(self) -> Paraxial:
         """Paraxial data about the axis: focal lengths and pupils, in metres."""
         return paraxial(self._axial, -float(self.launch[2]), abs(self.surfaces[-1].thickness))
+
+    @property
+    def is_afocal(self) -> bool:
+        """Whether parallel light leaves the camera parallel, so that it has no image."""
+        return not self.focal_length < _AFOCAL * (float(np.sum(np.abs(np.diff(self.vertices)))) or 1.0)
 
     @property
     def focal_length(self) -> float:
@@ -286,9 +325,10 @@ class Camera:
         >>> Camera([mirror], wavelength=550e-9).refocused().surfaces[0].thickness
         -2.0
         """
-        distance = self.paraxial.back_focal_length
-        if not isfinite(distance):
+        if self.is_afocal:
             raise UnphysicalError("the camera is afocal: parallel light leaves it parallel, so that it has no focus")
         *before, last = self.surfaces
         toward = -1.0 if self._axial.direction[0, 2] < 0.0 else 1.0
-        return replace(self, surfaces=(*before, replace(last, thickness=round(toward * distance, 15))))
+        return replace(
+            self, surfaces=(*before, replace(last, thickness=round(toward * self.paraxial.back_focal_length, 15)))
+        )

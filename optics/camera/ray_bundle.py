@@ -119,7 +119,8 @@ def launch_rays(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | No
     points = np.stack([nodes.x, nodes.y], axis=-1) if pupil is None else np.asarray(pupil, float)
     if points.ndim != 2 or points.shape[1] != 2 or not np.all(np.isfinite(points)):
         raise ValueError(f"pupil must be finite points of shape (N, 2), got shape {points.shape}")
-    light, target = direction_of(field), 0.5 * camera.surfaces[camera.stop].diameter * points
+    rim = camera.aperture
+    light, target = direction_of(field), rim.radius * points + np.array(rim.centre)
     try:
         position, _ = aim_collimated(camera.backend, camera.systems[1], light, camera.launch, target)
     except AimError as error:
@@ -327,7 +328,7 @@ def distortion(camera: Camera, fields: ArrayLike) -> np.ndarray:
     angles = np.asarray(fields, float)
     if angles.ndim != 2 or angles.shape[1] != 2 or not np.all(np.any(angles != 0.0, axis=-1)):
         raise ValueError(f"fields must be (F, 2) angles off the axis, got {np.asarray(fields).tolist()}")
-    if not np.isfinite(camera.focal_length):
+    if camera.is_afocal:
         raise ValueError("the camera is afocal: distortion needs a focal length")
     middle = chief_point(camera, (0.0, 0.0))
     radius = np.array([np.linalg.norm(chief_point(camera, (x, y)) - middle) for x, y in angles])

@@ -1,4 +1,4 @@
-"""The glass of a lens: a name of the catalogue, or a maker's dispersion formula."""
+"""Glass of a lens: a name of the catalogue, or a manufacturer's dispersion formula."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from optics.materials.glass import (
     GLASSES,
     SCHOTT_RANGE,
     CatalogueGlass,
+    Glass,
     ThermalDispersion,
     WarmGlass,
-    air_index,
     common_glasses,
     glass,
 )
@@ -27,11 +27,11 @@ from scenes.yaml.units import EXPANSION, LENGTH, format_quantity
 
 Medium = Literal["vacuum", "air"]
 CATALOGUE_RANGE = TemperatureRange.celsius(-30.0, 70.0, "AGF catalogues state the mean expansion of that range")
-"""Where an expansion of a camera's file may be used."""
+"""Temperature range in which the expansion of a glass in a camera's file holds."""
 
 
 def glass_entry(glass: CatalogueGlass) -> dict[str, Any]:
-    """Return a catalogue's glass as a camera's file has it."""
+    """Return a catalogue glass in the form of a camera's file."""
     ends = [format_quantity(w, LENGTH) for w in (glass.shortest, glass.longest)]
     out = {"name": glass.name, "formula": glass.formula, "coefficients": list(glass.coefficients), "range": ends}
     if glass.expansion is not None:
@@ -40,24 +40,27 @@ def glass_entry(glass: CatalogueGlass) -> dict[str, Any]:
 
 
 class LensGlassSpec(Spec):
-    """A glass whose index is known by wavelength, at 20 C.
+    """Glass of a lens with its dispersion at 20 C.
 
     Attributes
     ----------
     name : Text
-        Of the catalogue (`N-BK7`, `N-SF11`, `S-FPL53`, `FCD1`, `H-K9L`, ...), or any name beside a formula.
+        Name of a glass in the catalogue (`N-BK7`, `N-SF11`, `S-FPL53`, `FCD1`, `H-K9L`, ...), or any name beside a
+        formula.
     formula : Whole | None
-        Number of the dispersion formula as AGF catalogues have it (1 Schott, 2 Sellmeier 1, ...).
+        Number of the dispersion formula in AGF catalogues (1 Schott, 2 Sellmeier 1, ...); by default the catalogue's
+        glass.
     coefficients : tuple[Number, ...] | None
-        Of it, for micrometres, in the catalogue's order; for Sellmeier's B1, C1, B2, C2, B3, C3.
+        Coefficients of the formula for wavelengths in micrometres, in the order of the AGF catalogue; for Sellmeier B1,
+        C1, B2, C2, B3, C3.
     range : WavelengthRange | None
-        Wavelengths between which it holds, metres.
+        Shortest and longest wavelength at which the formula holds, in metres.
     expansion : float | None
-        Linear, 1/K, mean of -30..70 C as the ED line of AGF catalogues has it; that of the twin's material of the same
-        name when left out, else unknown, and the lens is not warmed.
+        Linear thermal expansion, mean of -30 to 70 C, as in the ED line of AGF catalogues, in 1/K. By default that of
+        the twin's material of the same name; if there is none, the lens cannot be heated.
     thermal : tuple[Number, ...] | None
-        Schott's constants D0, D1, D2, E0, E1 and Lambda_TK of dn/dT, in the units of data sheets, as the TD line of AGF
-        catalogues has them; those of the catalogue when left out, else unknown.
+        Schott's constants D0, D1, D2, E0, E1 and Lambda_TK of dn/dT in the units of data sheets, as in the TD line of
+        AGF catalogues. By default those of the catalogue; if there are none, the lens cannot be heated.
     """
 
     name: Text
@@ -70,7 +73,7 @@ class LensGlassSpec(Spec):
     @model_validator(mode="before")
     @classmethod
     def _with_formula(cls, data: Any) -> Any:
-        """Return what a file says with the formula of a common glass, where it has none."""
+        """Return the file's data, with the formula of a common glass where they have none."""
         known = common_glasses().get(data["name"]) if isinstance(data, dict) and "name" in data else None
         return data if known is None or "formula" in data else {**glass_entry(known), **data}
 
@@ -88,46 +91,47 @@ class LensGlassSpec(Spec):
 
     @model_serializer(mode="wrap")
     def _short(self, handler: SerializerFunctionWrapHandler) -> Any:
-        """A glass of the catalogue is written as its name."""
+        """Return a catalogue glass as its name alone, another glass in full."""
         full = handler(self)
         plain = all(getattr(self, key) is None for key in type(self).model_fields if key != "name")
         return self.name if plain else full
 
     def index(self, wavelength: float, medium: Medium) -> float:
-        """Refractive index at 20 C.
+        """Return the refractive index at 20 C.
 
         Parameters
         ----------
         wavelength : float
-            metres.
+            Wavelength, in metres.
         medium : Medium
-            What the index is against: ``air`` of 20 C and 1013 hPa, as makers state it, or ``vacuum``.
+            Medium to which the index refers: ``air`` of 20 C and 1013 hPa, as manufacturers state it, or ``vacuum``.
 
         Raises
         ------
         ValueError
-            The formula does not hold at that wavelength.
+            The formula does not hold at this wavelength.
         """
+        known: Glass | CatalogueGlass
         if self.formula is None or self.coefficients is None or self.range is None:
-            own = glass(self.name)
-            return own.index(wavelength) if medium == "air" else own.vacuum_index(wavelength)
-        n = CatalogueGlass(self.name, self.formula, self._filled(self.coefficients), *self.range)(wavelength)
-        return n if medium == "air" else n * air_index(wavelength)
+            known = glass(self.name)
+        else:
+            known = CatalogueGlass(self.name, self.formula, self._filled(self.coefficients), *self.range)
+        return known.index(wavelength) if medium == "air" else known.vacuum_index(wavelength)
 
     def warm(self, wavelength: float, medium: Medium) -> WarmGlass:
-        """What heat does to the glass in light of a wavelength, metres.
+        """Return the thermal properties of the glass at a wavelength.
 
         Parameters
         ----------
         wavelength : float
-            metres.
+            Wavelength, in metres.
         medium : Medium
-            As of ``index``. What the lens stands in is not warmed.
+            Medium to which the index refers, as in ``index``. The medium itself is not heated.
 
         Raises
         ------
         ValueError
-            Neither the catalogue nor the file says how it expands, or how its index changes.
+            Neither the catalogue nor the file has its expansion or the change of its index.
         """
         own = None if self.formula is not None else glass(self.name)
         stuff = None if own is None else MATERIALS.get(own.name)
@@ -161,4 +165,4 @@ class LensGlassSpec(Spec):
 
 
 LensGlass = Annotated[LensGlassSpec, short_for("name", str)]
-"""With its keys, or the name of the catalogue alone."""
+"""Glass as a mapping with its keys, or the name of a catalogue glass alone."""
