@@ -74,7 +74,7 @@ def _cut(model: CameraModel, name: str) -> tuple[Any, ...]:
     if name == model.spec.stop or not edges:
         return model.apertures[name], 0, "", edges
     first = edges[0].shape
-    if not edges[0].blocks and not edges[0].turn and isinstance(first, Aperture):
+    if not edges[0].blocks and not edges[0].rotation and isinstance(first, Aperture):
         return first, 0, "", edges[1:]
     # what stands in the file, and not the box about the beams
     return None, 0, "", edges
@@ -120,8 +120,8 @@ def perturbed_prescription(instrument: Instrument, camera: str, state: State) ->
         pose = design @ Pose(placed.rotation[0, k], placed.translation[0, k])
         element = assembly.elements[f"{camera}/{name}"]
         size = float(placed.scale[0, k])
-        shape = joined(element.figured(state.get(body, AT_REST)).grown(size))
-        aperture = None if element.aperture is None else element.aperture.grown(size)
+        shape = joined(element.figured(state.get(body, AT_REST)).scaled(size))
+        aperture = None if element.aperture is None else element.aperture.scaled(size)
         surfaces.append(LensSurface(name, pose, shape, element.interaction, 1.0, aperture))
     k = placed.index[line_body(root)]
     line = design @ Pose(placed.rotation[0, k], placed.translation[0, k])
@@ -138,8 +138,8 @@ def _left_out(state: Mapping[str, object], root: str) -> list[Note]:
     carried = [
         p for p in state if p in ours or (p.startswith(f"{root}/") and "/monitor" not in p and "area_ccd" not in p)
     ]
-    strangers = [p for p in state if p not in carried]
-    return [Note(0, path, "is no part of this camera: not carried") for path in strangers]
+    count_unknown = [p for p in state if p not in carried]
+    return [Note(0, path, "is no part of this camera: not carried") for path in count_unknown]
 
 
 def rounded(pose: Pose) -> Pose:
@@ -245,7 +245,7 @@ def _edges(lens: Prescription, given: LensSurface) -> list[str]:
         if isinstance(hole, Circle) and not hole.inner and hole.centre == aperture.centre:
             aperture, further = Circle(aperture.radius, aperture.centre, hole.radius), ()
     blocked = further[0].shape if len(further) == 1 and aperture is None and further[0].blocks else None
-    if further and (not isinstance(blocked, Aperture) or further[0].turn):
+    if further and (not isinstance(blocked, Aperture) or further[0].rotation):
         what = "edges beyond a clear aperture or an obscuration of its own"
         raise _cannot(lens, given, what, "one circle, rectangle or ellipse, or a batoid YAML")
     if isinstance(blocked, Circle) and blocked.inner:
@@ -422,7 +422,7 @@ def _obscuration(edge: Edge) -> dict[str, Any] | None:
     """What cuts the light; None for what batoid does not know."""
     way, shape = "Obsc" if edge.blocks else "Clear", edge.shape
     x, y = shape.centre
-    turn = {"theta": edge.turn} if edge.turn else {}
+    turn = {"theta": edge.rotation} if edge.rotation else {}
     match shape:
         case Circle(radius, _, inner):
             if inner:

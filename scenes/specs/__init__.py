@@ -1,1 +1,1 @@
-"""What each kind of file may say, checked and in SI units."""
+"""Contents of each kind of input file, checked and in SI units."""

@@ -1,4 +1,4 @@
-"""An instrument as it was built: what was measured on it, what may be moved, and what is asked of it."""
+"""Estimation of an instrument's state as built: its measurements, its actuators and its merits."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from scenes.yaml.spec import (
     Spec,
     Text,
     Whole,
-    one_given,
+    require_one,
 )
 from scenes.yaml.unit_fields import Quantity, Vector
 from scenes.yaml.units import ANGLE, LENGTH, TEMPERATURE_DIFFERENCE
@@ -45,56 +45,55 @@ Place3 = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="
 Modulation = Annotated[Number, Field(ge=0.0, le=1.0)]
 FREE = "free"
 Focus = Literal["free"] | Annotated[float, Quantity(LENGTH, smallest="0 m", largest="1 m")]
-"""`free`, or the standard deviation of where the focus of an interferometer stands along the light, metres."""
+"""`free`, or the standard deviation of the position of an interferometer's focus along the light, in metres."""
 
 
 class ReadingsSpec(Spec):
-    """Base of what every kind of measurement says.
+    """Base of all kinds of measurement.
 
     Attributes
     ----------
     after : Name | None
-        The last of `moves` that had been made when it was taken; none by default.
+        Last one of `moves` that had been made before this measurement; by default no move.
     """
 
     after: Name | None = None
 
     @property
     def given(self) -> bool:
-        """Whether its data are in the file or named there."""
+        """True if the file holds the data or refers to a file of data."""
         raise NotImplementedError
 
 
 class WavefrontReadingsSpec(ReadingsSpec):
-    """Wavefronts at fields, by an interferometer in single or double pass. Piston and tilt never count.
+    """Wavefronts at several fields, by an interferometer in single or double pass. Piston and tilt are not used.
 
     Attributes
     ----------
-    after
-        The last of `moves` that had been made when it was taken; none by default.
     fields : Fields
-        Shares of the half field, along the line and along the track.
+        Fields as shares of the half field, [along the line, along the track].
     terms : tuple[Text, Text]
-        First and last Zernike term (Noll) that count, `[Z4, Z11]`.
+        First and last Zernike term (Noll) that are used, `[Z4, Z11]`.
     sigma : Sigma
-        Standard deviation of each coefficient's noise, rms, metres.
+        Standard deviation of the noise of each coefficient, rms, in metres.
     common : Common
-        Standard deviation of an error of each term that is the same at all fields, as of a reference surface, metres.
+        Standard deviation of an error of each term that is the same at all fields, such as that of a reference surface,
+        in metres.
     focus : Focus
-        `free`, by default: where the interferometer's focus stood along the light at each field is not known; or its
-        standard deviation along the light.
+        Standard deviation of the position of the interferometer's focus along the light at each field, in metres;
+        `free`, the default, if it is unknown.
     zernikes : Reference | None
         CSV file with the coefficients of every field.
     maps : tuple[Reference, ...] | None
         Files of wavefront maps, one for each field: Zygo .dat or .datx, CODE V INT, Zemax grid sag, FITS.
     double_pass : Flag
-        Whether the light went through the camera twice, so that the maps or coefficients show twice the error.
+        True if the light passed the camera twice, so that maps or coefficients show twice the error.
     reference : Reference | None
-        Map or CSV file of the reference surface's error, which is taken off.
+        Map or CSV file of the reference surface's error, which is subtracted; none by default.
     orientation : Text
-        How maps and coefficients have to be turned to the stop's axes, as `check` names it.
+        Rotation or reflection that brings maps and coefficients to the stop's axes, in the words of `check`.
     sign : Literal[1, -1]
-        -1 where the file counts a wavefront that is ahead as negative.
+        Sign convention of the file; -1 if an advanced wavefront is counted as negative.
     """
 
     fields: Fields
@@ -124,32 +123,32 @@ class WavefrontReadingsSpec(ReadingsSpec):
 
     @property
     def numbers(self) -> range:
-        """Noll indices of the terms."""
+        """Noll indices of the terms that are used."""
         return range(noll(self.terms[0]), noll(self.terms[1]) + 1)
 
     @property
     def given(self) -> bool:
-        """Whether files are named."""
+        """True if the measurement refers to files."""
         return self.zernikes is not None or self.maps is not None
 
 
 class FocusReadingsSpec(ReadingsSpec):
-    """Best focus at fields, along the light of the designed camera, from the line CCD on downstream.
+    """Position of best focus at several fields, along the designed camera's light.
+
+    Positions are counted downstream from the line CCD.
 
     Attributes
     ----------
-    after
-        The last of `moves` that had been made when it was taken; none by default.
     fields : Fields | None
-        As of wavefronts.
+        Fields as shares of the half field, [along the line, along the track].
     values : Places | None
-        Of each field, metres.
+        Position of best focus at each field, downstream of the line CCD, in metres.
     sigma : Sigma
-        Standard deviation of each, metres.
+        Standard deviation of each position, in metres.
     common : Common
-        Standard deviation of an error that all have in common, metres.
+        Standard deviation of an error that all positions have in common, in metres.
     file : Reference | None
-        In place of fields and values, the `focus.json` of a run of `twin.lab focus`.
+        Result `focus.json` of a run of `twin.lab focus`, in place of fields and values.
     """
 
     fields: Fields | None = None
@@ -160,33 +159,31 @@ class FocusReadingsSpec(ReadingsSpec):
 
     @model_validator(mode="after")
     def _as_many(self) -> FocusReadingsSpec:
-        one_given(self, ("fields", "file"), "where was it measured?", "fields with values, or a focus.json")
+        require_one(self, ("fields", "file"), "where was it measured?", "fields with values, or a focus.json")
         _one_for_each(self.fields, self.values, "values")
         return self
 
     @property
     def given(self) -> bool:
-        """Whether there are values."""
+        """True if there are values."""
         return self.values is not None or self.file is not None
 
 
 class MtfReadingsSpec(ReadingsSpec):
-    """MTF of the optics at fields, at one frequency.
+    """MTF of the optics at several fields and one spatial frequency.
 
     Attributes
     ----------
-    after
-        The last of `moves` that had been made when it was taken; none by default.
     fields : Fields
-        As of wavefronts.
+        Fields as shares of the half field, [along the line, along the track].
     frequency : Number | None
-        Cycles per mm; that of the pixels (Nyquist) if not given.
+        Spatial frequency, in cycles per mm; by default the Nyquist frequency of the pixels.
     along_line : tuple[Modulation, ...] | None
-        MTF for lines across the line CCD, of each field.
+        MTF at each field for a pattern of lines perpendicular to the line CCD.
     along_track : tuple[Modulation, ...] | None
-        MTF for lines along the line CCD, of each field.
+        MTF at each field for a pattern of lines parallel to the line CCD.
     sigma : Number
-        Standard deviation of each.
+        Standard deviation of each MTF value.
     """
 
     fields: Fields
@@ -205,24 +202,23 @@ class MtfReadingsSpec(ReadingsSpec):
 
     @property
     def given(self) -> bool:
-        """Whether there are values."""
+        """True if there are values."""
         return self.along_line is not None
 
 
 class DistortionReadingsSpec(ReadingsSpec):
-    """Places of images along the line CCD at known angles, which tell principal distance and distortion. The zero of
-    the angles is free.
+    """Positions of images along the line CCD at known angles, which determine principal distance and distortion.
+
+    The zero of the angles is a free parameter.
 
     Attributes
     ----------
-    after
-        The last of `moves` that had been made when it was taken; none by default.
     fields : tuple[FieldShare, ...] | None
-        Shares of half the line at which images were taken, where the data are simulated.
+        Fields of the images as shares of half the line, for simulated data.
     sigma : Sigma | None
-        Standard deviation of a place, metres; of a file its own if not given.
+        Standard deviation of a position, in metres; by default that of the file.
     file : Reference | None
-        The `distortion.json` of a run of `twin.lab distortion`.
+        Result `distortion.json` of a run of `twin.lab distortion`.
     """
 
     fields: Annotated[tuple[FieldShare, ...], Field(min_length=3, max_length=200)] | None = None
@@ -231,31 +227,29 @@ class DistortionReadingsSpec(ReadingsSpec):
 
     @model_validator(mode="after")
     def _one_source(self) -> DistortionReadingsSpec:
-        one_given(self, ("fields", "file"), "where was it measured?", "a distortion.json, or fields to simulate")
+        require_one(self, ("fields", "file"), "where was it measured?", "a distortion.json, or fields to simulate")
         if self.file is None and self.sigma is None:
             raise Problem("'sigma' is missing", None, "sigma: 0.5 um", within=("sigma",))
         return self
 
     @property
     def given(self) -> bool:
-        """Whether a file is named."""
+        """True if the measurement refers to a file."""
         return self.file is not None
 
 
 class SpotReadingsSpec(ReadingsSpec):
-    """Spots of the instrument's monitor, against where the design has them.
+    """Spot positions of the instrument's monitor, relative to those of the design.
 
     Attributes
     ----------
-    after
-        The last of `moves` that had been made when it was taken; none by default.
     sigma : Number
-        Standard deviation of each coordinate, pixels.
+        Standard deviation of each coordinate, in pixels.
     file : Reference | None
-        The `recovered.json` of a run of `twin.recover`, or a CSV file with the places: columns camera, channel, row_px,
-        column_px.
+        Result `recovered.json` of a run of `twin.recover`, or a CSV file of the positions with the columns camera,
+        channel, row_px, column_px.
     state : Literal['before', 'after']
-        Whether the spots of `recovered.json` count that were recorded before or after.
+        Set of spots in `recovered.json` that is used: those recorded before or after the change.
     """
 
     sigma: Annotated[Number, Field(gt=0.0, le=100.0)]
@@ -264,29 +258,27 @@ class SpotReadingsSpec(ReadingsSpec):
 
     @property
     def given(self) -> bool:
-        """Whether a file is named."""
+        """True if the measurement refers to a file."""
         return self.file is not None
 
 
 class SightReadingsSpec(ReadingsSpec):
-    """Line of sight, roll and principal distance against the design, as of a theodolite or of a calibration in orbit.
+    """Line of sight, roll and principal distance relative to the design, from a theodolite or a calibration in orbit.
 
     Attributes
     ----------
-    after
-        The last of `moves` that had been made when it was taken; none by default.
     alpha, beta : Turn | None
-        Turns of the line of sight about the camera's Y and X, radians.
+        Rotation of the line of sight about the camera's Y (alpha) or X (beta), in radians.
     gamma : Turn | None
-        Roll of the line about it, radians.
+        Roll of the line about the line of sight, in radians.
     principal_distance : Place | None
-        Its change, metres.
+        Change of the principal distance, in metres.
     sigma_alpha, sigma_beta, sigma_gamma : AngleSigma | None
-        Standard deviations, radians; of what is not measured they are left out.
+        Standard deviation of this angle, in radians; omitted for an angle that is not measured.
     sigma_principal_distance : Sigma | None
-        Likewise, metres.
+        Standard deviation of the principal distance, in metres; omitted if it is not measured.
     correlation : tuple[tuple[Number, ...], ...] | None
-        Matrix of those that are measured, in this order; the unit matrix by default.
+        Correlation matrix of the measured quantities in this order; by default they are uncorrelated.
     """
 
     alpha: Turn | None = None
@@ -315,31 +307,29 @@ class SightReadingsSpec(ReadingsSpec):
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Which of the four were measured."""
+        """Names of the measured quantities among the four."""
         names = ("alpha", "beta", "gamma", "principal_distance")
         return tuple(name for name in names if getattr(self, f"sigma_{name}") is not None)
 
     @property
     def given(self) -> bool:
-        """Whether there are values."""
+        """True if there are values."""
         return getattr(self, self.measured[0]) is not None
 
 
 class TemperatureReadingsSpec(ReadingsSpec):
-    """Temperatures of bodies against that at which the instrument is as drawn.
+    """Temperatures of bodies relative to the temperature at which the instrument has the shape of the design.
 
     Attributes
     ----------
-    after
-        The last of `moves` that had been made when it was taken; none by default.
     bodies : tuple[Text, ...]
-        Paths or short names.
+        Paths or short names of the bodies.
     values : tuple[Warmth, ...] | None
-        Of each body, kelvin.
+        Temperature difference of each body, in kelvin.
     sigma : WarmthSigma
-        Standard deviation of each, kelvin.
+        Standard deviation of each temperature, in kelvin.
     common : float
-        Standard deviation of an error that all have in common, kelvin.
+        Standard deviation of an error that all temperatures have in common, in kelvin.
     """
 
     bodies: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
@@ -354,26 +344,24 @@ class TemperatureReadingsSpec(ReadingsSpec):
 
     @property
     def given(self) -> bool:
-        """Whether there are values."""
+        """True if there are values."""
         return self.values is not None
 
 
 class PositionReadingsSpec(ReadingsSpec):
-    """Places of bodies' origins against the drawing, by a laser tracker or a coordinate-measuring machine.
+    """Positions of bodies' origins relative to the design, by a laser tracker or a coordinate-measuring machine.
 
     Attributes
     ----------
-    after
-        The last of `moves` that had been made when it was taken; none by default.
     bodies : tuple[Text, ...]
-        Paths or short names.
+        Paths or short names of the bodies.
     values : tuple[Place3, ...] | None
-        Displacement of each in the axes of the instrument's base, metres.
+        Displacement of each body in the axes of the instrument's base, in metres.
     sigma : Sigma
-        Standard deviation of each coordinate, metres.
+        Standard deviation of each coordinate, in metres.
     frame : Literal['free', 'base']
-        `free`, by default with three bodies or more: the frame of the measuring machine may be shifted and turned;
-        `base` where it is the instrument's.
+        Reference frame of the measuring machine: `base` for the instrument's base, or `free` for one with an unknown
+        shift and rotation, which needs three bodies or more.
     """
 
     bodies: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
@@ -391,7 +379,7 @@ class PositionReadingsSpec(ReadingsSpec):
 
     @property
     def given(self) -> bool:
-        """Whether there are values."""
+        """True if there are values."""
         return self.values is not None
 
 
@@ -401,26 +389,26 @@ def _one_for_each(places: Any, values: Any, key: str) -> None:
 
 
 class MeasurementsSpec(Spec):
-    """What was measured, kind by kind; each measurement has a name of its own.
+    """Measurements by kind; each has a name of your choice.
 
     Attributes
     ----------
     wavefronts : Named[WavefrontReadingsSpec]
-        By interferometers.
+        Name -> wavefronts by an interferometer.
     focus : Named[FocusReadingsSpec]
-        Best focus by field.
+        Name -> positions of best focus by field.
     mtf : Named[MtfReadingsSpec]
-        At fields.
+        Name -> MTF at fields.
     distortion : Named[DistortionReadingsSpec]
-        Places along the line at known angles.
+        Name -> image positions along the line at known angles.
     spots : Named[SpotReadingsSpec]
-        Of the monitor.
+        Name -> spots of the monitor.
     sight : Named[SightReadingsSpec]
-        Lines of sight and principal distances.
+        Name -> line of sight and principal distance.
     temperatures : Named[TemperatureReadingsSpec]
-        Of bodies.
+        Name -> temperatures of bodies.
     positions : Named[PositionReadingsSpec]
-        Of bodies.
+        Name -> positions of bodies.
     """
 
     wavefronts: Annotated[Named[WavefrontReadingsSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
@@ -442,31 +430,31 @@ class MeasurementsSpec(Spec):
         return self
 
     def every(self) -> Iterator[tuple[str, str, ReadingsSpec]]:
-        """Kind, name and content of each measurement."""
+        """Iterate over kind, name and content of each measurement."""
         for kind in type(self).model_fields:
             for name, one in getattr(self, kind).items():
                 yield kind, name, one
 
 
 class ActuatorSpec(CompensatorSpec):
-    """One thing that can be moved.
+    """Actuator: a motion that can be made to align the instrument.
 
     Attributes
     ----------
     motion
-        What is moved: `M2 shift z`.
+        Motion of the actuator: `M2 shift z`.
     carrying
         Further bodies that move rigidly with it.
     range
-        Largest amount either way, all moves together.
+        Largest amount in either direction, for all moves together.
     step
-        Of which it is moved by a whole number, as of shims; None for any amount.
+        Step of which the amount is a multiple, as with shims; by default any amount is possible.
     accuracy
-        Standard deviation of a move, whatever its size.
+        Standard deviation of a move that does not depend on its size.
     move_error : Number
-        Standard deviation of a move as a share of it.
+        Standard deviation of a move as a share of its amount.
     response : Number
-        Standard deviation of what the traced response of the instrument to it may be wrong by, as a share.
+        Standard deviation of the error of the traced response to this actuator, as a share of the response.
     """
 
     move_error: Annotated[Number, Field(ge=0.0, le=1.0)] = 0.02
@@ -480,28 +468,28 @@ def _some_amounts(value: Mapping[str, Amount]) -> Mapping[str, Amount]:
 
 
 class MoveSpec(Spec):
-    """A move that was made.
+    """Alignment move that was made.
 
     Attributes
     ----------
     by : dict[Name, Amount]
-        Actuator -> by how much.
+        Actuator -> amount of its move.
     """
 
     by: Annotated[dict[Name, Amount], AfterValidator(_some_amounts)]
 
 
 class SimulatedInstrumentSpec(Spec):
-    """An instrument that is drawn, measured and moved by the program, in place of a real one.
+    """Simulated instrument, which the program draws at random, measures and moves in place of a real one.
 
     Attributes
     ----------
     law : Literal['normal', 'uniform']
-        How its motions are distributed, with the prior's covariance.
+        Probability distribution of its motions, with the covariance of the prior.
     prior : Ref | None
-        Disturbances file it is drawn from; that of the estimate by default.
+        Disturbances file from which the instrument is drawn; by default that of the estimate.
     seed : Seed
-        Of the instrument and of all errors of measurement.
+        Seed of the instrument and of all measurement errors.
     """
 
     law: Literal["normal", "uniform"] = "normal"
@@ -510,32 +498,32 @@ class SimulatedInstrumentSpec(Spec):
 
 
 class AsBuiltSpec(Spec):
-    """The state of one instrument from everything that was measured on it.
+    """Estimate of the state of one built instrument from all of its measurements.
 
     Attributes
     ----------
     instrument : Ref
-        a camera or an instrument, by name or path, as in a job.
+        Camera or instrument, by name or path, as in a job.
     camera : Name | None
-        Which camera of an instrument is meant; may be left out where there is one.
+        Name of the camera to which the estimate applies; may be omitted if the instrument has one camera.
     prior : Ref
-        Disturbances file: what is known of the state before anything is measured.
+        Disturbances file with the prior: the uncertainty of the state before any measurement.
     measurements : MeasurementsSpec
-        By kind and name.
+        Measurements by kind and name.
     merits : Named[MeritSpec]
-        By name, what is asked of the camera, as in a tolerance budget.
+        Name -> requirement on the camera, as in a tolerance budget.
     actuators : Named[ActuatorSpec]
-        By name, what can be moved.
+        Name -> actuator for the alignment.
     moves : Named[MoveSpec]
-        By name, in their order, what was moved.
+        Name -> alignment move that was made, in the order of time.
     candidates : MeasurementsSpec
-        Measurements that could be made next; their worth is told.
+        Measurements that could be made next; the report compares their benefit.
     draws : Whole
-        States of the posterior that are traced for the merits.
+        Number of states drawn from the posterior and traced for the merits.
     seed : Seed
-        Of these draws.
+        Seed of these draws.
     simulate : SimulatedInstrumentSpec | None
-        a drawn instrument in place of data.
+        Simulated instrument in place of measured data; by default the data are measured.
     """
 
     instrument: Ref
@@ -573,18 +561,18 @@ class AsBuiltSpec(Spec):
 
 
 def unknown_within(text: str, found: object, names: Mapping[str, Any], within: tuple[str, ...]) -> Problem:
-    """An unknown name at a key below."""
+    """Return the problem of an unknown name at a key below."""
     problem = unknown(text, found, tuple(names))
     return Problem(problem.problem, problem.found, problem.allowed, problem.suggestion, within=within)
 
 
 class AsBuiltSetup(ExperimentSetup[AsBuiltSpec]):
-    """The measurements of an instrument with the instrument and the prior.
+    """Estimate of an instrument as built, with its instrument and its prior.
 
     Attributes
     ----------
     base : ResolvedJob
-        The nominal job of the instrument, with the prior as its disturbances.
+        Nominal job of the instrument, with the prior as its disturbances.
     drawn : DisturbancesSpec | None
         Disturbances from which a simulated instrument is drawn; None for the prior.
     """
@@ -594,7 +582,7 @@ class AsBuiltSetup(ExperimentSetup[AsBuiltSpec]):
 
     @classmethod
     def parts(cls, test: AsBuiltSpec) -> dict[str, Any]:
-        """Return the nominal job, and what a simulated instrument is drawn from."""
+        """Return the nominal job, and the disturbances from which a simulated instrument is drawn."""
         base, simulated = resolve_on(test, test.instrument, test.prior), test.simulate
         if simulated is None or simulated.prior is None:
             return {"base": base}

@@ -1,4 +1,4 @@
-"""The test with two autocollimators, the principle experiment of paper 001 (section 3.1)."""
+"""Test with two autocollimators, the principle experiment of paper 001 (section 3.1)."""
 
 from __future__ import annotations
 
@@ -22,25 +22,26 @@ SMALLEST_WINDOW, LARGEST_WINDOW = 48, 512
 
 
 class LensSpec(Spec):
-    """The collimator's lens: one element, conic on the front. Radii are positive with the centre of curvature on the
-    side of the focal plane.
+    """Lens of the collimator: one element with a conic front surface.
+
+    A radius is positive if its centre of curvature lies on the side of the focal plane.
 
     Attributes
     ----------
     front_radius : Length
-        Of the surface toward the mirrors, metres.
+        Radius of curvature of the surface toward the mirrors, in metres.
     front_conic : Number
-        Its conic constant.
+        Conic constant of the front surface.
     back_radius : Length
-        Of the surface toward the focal plane, metres.
+        Radius of curvature of the surface toward the focal plane, in metres.
     thickness : PositiveLength
-        On the axis, metres.
+        Thickness on the axis, in metres.
     glass : GlassName
-        Of the catalogue.
+        Glass of the catalogue.
     diameter : PositiveLength
-        Clear aperture of both surfaces, metres.
+        Clear aperture of both surfaces, in metres.
     focal_distance : PositiveLength
-        From the back vertex to the focal plane, metres.
+        Distance from the back vertex to the focal plane, in metres.
     """
 
     front_radius: Length
@@ -62,28 +63,28 @@ class LensSpec(Spec):
 
 
 class AutocollimatorSpec(Spec):
-    """A digital autocollimator; both are alike.
+    """Digital autocollimator; both of the test are identical.
 
-    The pinhole and the area CCD stand side by side, symmetric about the lens's axis, so that a mirror square to the
-    axis sends the pinhole's image to the middle of the CCD.
+    The pinhole and the area CCD are side by side, symmetric about the lens's axis, so that a mirror perpendicular to
+    the axis sends the pinhole's image to the centre of the CCD.
 
     Attributes
     ----------
     wavelength : Wavelength
-        Of the source, metres.
+        Wavelength of the source, in metres.
     lens : LensSpec
-        The collimator.
+        Lens of the collimator.
     reticle : ReticleSpec
         Light source.
     area_ccd : AreaCcdSpec
-        Detector; its offset counts from the pinhole to the middle of the pixel grid along the system's Y (horizontal)
-        and X (up), metres.
+        Detector; its offset counts from the pinhole to the centre of the pixel grid along the system's Y (horizontal)
+        and X (up), in metres.
     window : Whole
-        Side of the square region around the spot that is read out, pixels.
+        Side of the square region around the spot that is read out, in pixels.
     distance : PositiveLength
-        From the lens's front vertex to the turntable's centre, metres.
+        Distance from the lens's front vertex to the turntable's centre, in metres.
     frames : Frames
-        Number of frames in one reading.
+        Number of frames in a reading.
     """
 
     wavelength: Wavelength
@@ -113,14 +114,14 @@ class AutocollimatorSpec(Spec):
 
 
 class MirrorsSpec(Spec):
-    """The two plane mirrors on the turntable.
+    """Two plane mirrors on the turntable.
 
     Attributes
     ----------
     aperture : PositiveLength
-        Their diameter, metres; it limits the beam.
+        Diameter of each mirror, in metres; it limits the beam.
     radius : PositiveLength
-        Distance of their middles from the turntable's centre, metres.
+        Distance of the mirrors' centres from the turntable's centre, in metres.
     """
 
     aperture: PositiveLength
@@ -128,7 +129,13 @@ class MirrorsSpec(Spec):
 
 
 class StandSpec(Spec):
-    """At which half angle theta the mirrors stand in the main series about each axis, radians."""
+    """Half angle theta between the mirrors in the main series about each axis.
+
+    Attributes
+    ----------
+    X, Y, Z : HalfAngle
+        Half angle theta for rotations about this axis, in radians.
+    """
 
     X: HalfAngle
     Y: HalfAngle
@@ -136,18 +143,18 @@ class StandSpec(Spec):
 
 
 class ProgrammeSpec(Spec):
-    """What is turned by how much.
+    """Programme of rotations.
 
     Attributes
     ----------
     steps : Whole
-        How many steps follow the first reading at zero.
+        Number of steps after the first reading at zero.
     small, table, large : Step
-        The three step sizes, radians; `table` is the one of the main series.
+        Step size, in radians: a smaller one, that of the main series (`table`) and a larger one.
     narrow, wide : HalfAngle
-        The two half angles theta between the mirrors, radians.
+        Half angle theta between the mirrors, in radians, in the narrow or the wide arrangement.
     stands : StandSpec
-        Half angle of each axis in the main series, radians.
+        Half angle theta of each axis in the main series.
     """
 
     steps: Annotated[Whole, Field(ge=1, le=100)]
@@ -160,22 +167,22 @@ class ProgrammeSpec(Spec):
 
 
 class BenchErrorsSpec(Spec):
-    """Standard deviations of what is not as it should be; all independent and normal, drawn from the seed.
+    """Standard deviations of the bench's errors, all independent and normally distributed, drawn from the seed.
 
     Attributes
     ----------
     focal_length : ScaleSigma
         Relative error of an autocollimator's focal length against its calibration.
     ccd_rotation : AngleSigma
-        Turn of an area CCD in its focal plane, radians.
+        Rotation of an area CCD in its focal plane, in radians.
     reading : AngleSigma
-        Unrest of an autocollimator about its own X and Y from one reading to the next, radians.
+        Instability of an autocollimator about its X and Y from one reading to the next, in radians.
     turntable_step : AngleSigma
-        Error of each position of the turntable, radians.
+        Error of each position of the turntable, in radians.
     axis_tilt : AngleSigma
-        Of each axis of the turntable toward the two others, radians.
+        Tilt of each axis of the turntable toward the two others, in radians.
     mirror_mount : AngleSigma
-        Of each mirror about its X and Y, radians.
+        Mounting error of each mirror about its X and Y, in radians.
     """
 
     focal_length: ScaleSigma
@@ -187,22 +194,18 @@ class BenchErrorsSpec(Spec):
 
 
 class AutocollimatorTestSpec(TitledSpec):
-    """The test with two autocollimators.
+    """Test with two autocollimators.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     autocollimator : AutocollimatorSpec
-        Both of them.
+        Both autocollimators.
     mirrors : MirrorsSpec
-        On the turntable.
+        Mirrors on the turntable.
     programme : ProgrammeSpec
-        What is turned.
+        Programme of rotations.
     errors : BenchErrorsSpec
-        Of the bench.
+        Errors of the bench.
     """
 
     autocollimator: AutocollimatorSpec
@@ -238,7 +241,7 @@ class AutocollimatorTestSpec(TitledSpec):
 
 @dataclass(frozen=True)
 class AutocollimatorSetup:
-    """A test with two autocollimators, with what its file refers to.
+    """Test with two autocollimators and the data sheet to which it refers.
 
     Attributes
     ----------

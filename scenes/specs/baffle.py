@@ -1,5 +1,6 @@
-"""What cuts light beside the stop: baffles (plates, boxes, tubes and rings) as an instrument's file gives them, and
-edges of surfaces as a camera's does.
+"""Parts that block light besides the stop: baffles of an instrument, and edges of a camera's surfaces.
+
+Baffles are plates, boxes, tubes and rings; every baffle is a set of flat plates.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.materials.fresnel_scatter import BLACK, Finish
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import Problem
-from scenes.yaml.spec import Spec, one_given
+from scenes.yaml.spec import Spec, require_one
 from scenes.yaml.unit_fields import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.yaml.units import ANGLE, LENGTH
 
@@ -25,20 +26,20 @@ TUBE_SIDES = 24
 
 @dataclass(frozen=True)
 class Plate:
-    """A flat plate of no thickness.
+    """Flat plate of zero thickness.
 
     Attributes
     ----------
     name : str
-        Of the part it belongs to; plates of one name are one part in the results.
+        Name of the part to which the plate belongs; plates with one name are one part in the results.
     body : str
-        Path of the body that carries it.
+        Path of the body that carries the plate.
     pose : Pose
-        Of the plate in that body's frame.
+        Pose of the plate in that body's frame.
     outline : Circle | Rectangle
-        Its edge in the plate's x, y; a ring has a hole.
+        Edge of the plate in its x, y; a ring has a hole.
     finish : Finish
-        Of both sides.
+        Finish of both sides.
     """
 
     name: str
@@ -49,18 +50,18 @@ class Plate:
 
 
 def box(name: str, body: str, pose: Pose, size: tuple[float, float, float]) -> tuple[Plate, ...]:
-    """A box, open at +z, whose bottom's middle is the pose's origin and whose walls rise along +z.
+    """Return the plates of a box that is open at +z.
 
     Parameters
     ----------
     name : str
-        Of the part.
+        Name of the part.
     body : str
-        Path of the body that carries it.
+        Path of the body that carries the box.
     pose : Pose
-        In that body's frame.
+        Pose in that body's frame. The origin is the centre of the bottom; the walls rise along +z.
     size : tuple[float, float, float]
-        Along x, y, z, metres.
+        Size along x, y, z, in metres.
     """
     x, y, z = (0.5 * s for s in size)
 
@@ -79,7 +80,10 @@ def box(name: str, body: str, pose: Pose, size: tuple[float, float, float]) -> t
 
 
 def tube(name: str, body: str, pose: Pose, radius: float, length: float) -> tuple[Plate, ...]:
-    """A tube along +z from the pose's origin, open at both ends, of flat sides that touch the circle of ``radius``."""
+    """Return the plates of a tube along +z from the pose's origin, open at both ends.
+
+    Its flat sides touch the circle of ``radius``, in metres.
+    """
     half = radius * float(np.tan(np.pi / TUBE_SIDES))
     plates = []
     for k in range(TUBE_SIDES):
@@ -91,7 +95,7 @@ def tube(name: str, body: str, pose: Pose, radius: float, length: float) -> tupl
 
 
 def ring(name: str, body: str, pose: Pose, inner: float, outer: float) -> tuple[Plate, ...]:
-    """A flat stop with a round hole; radii in metres."""
+    """Return the plate of a flat stop with a round hole; radii in metres."""
     return (Plate(name, body, pose, Circle(outer, inner=inner)),)
 
 
@@ -101,29 +105,33 @@ _NEEDS = {"plate": ("width", "height"), "box": ("width", "height", "length"), "t
 
 
 class BaffleSpec(Spec):
-    """A black mechanical part. The wave path does not see it; the path tracer, scene.glb and the picture do.
+    """Black mechanical part that blocks light: plate, box, tube or ring.
+
+    The path tracer, scene.glb and the picture include it; the wavefront calculation does not.
 
     Attributes
     ----------
     shape : Literal['plate', 'box', 'tube', 'ring']
-        Plate (width x height), box (width x height x length, open at +z), tube (diameter, length, open at both ends) or
-        ring (diameter, with a round hole).
+        Shape of the part: plate (width x height), box (width x height x length, open at +z), tube (diameter, length,
+        open at both ends) or ring (diameter, with a round hole).
     body : str
-        Path of the body that carries it.
+        Path of the body that carries the part.
     position : Vector3
-        In that body's frame, metres: the middle of a plate, a ring, a box's bottom or a tube's lower end.
+        Position in that body's frame, in metres: the centre of a plate, of a ring, of a box's bottom or of a tube's
+        lower end.
     rotate : tuple[float, float, float]
-        Rotation vector in that frame, radians; plates stand square to z, boxes and tubes run along z.
+        Rotation vector in that body's frame, in radians. Without rotation, plates are perpendicular to z, and boxes and
+        tubes extend along z.
     width : Size | None
-        Along x, metres.
+        Size along x, in metres, of a plate or a box.
     height : Size | None
-        Along y, metres.
+        Size along y, in metres, of a plate or a box.
     length : Size | None
-        Along z, metres.
+        Size along z, in metres, of a box or a tube.
     diameter : Size | None
-        metres.
+        Outer diameter of a tube or a ring, in metres.
     hole : Size | None
-        Diameter, metres.
+        Diameter of the hole of a ring, in metres.
     """
 
     shape: Literal["plate", "box", "tube", "ring"]
@@ -150,7 +158,7 @@ class BaffleSpec(Spec):
         return self
 
     def plates(self, name: str) -> tuple[Plate, ...]:
-        """The part as flat plates of that name."""
+        """Return the part as flat plates with this name."""
         pose = Pose(rotation_matrix(self.rotate), self.position)  # type: ignore[arg-type]
         width, height, length = self.width or 0.0, self.height or 0.0, self.length or 0.0
         radius = 0.5 * (self.diameter or 0.0)
@@ -178,32 +186,35 @@ SIZES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = FrozenMap(
         "polygon": (("corners",), ()),
     }
 )
-"""Shape -> the sizes that it needs, and those that it may have; all but a polygon may have a centre."""
+"""Shape -> its required sizes and its optional ones; every shape but a polygon may also have a centre."""
 
 
 class SurfaceEdgeSpec(Spec):
-    """An edge of a surface, in the surface's own x and y; one of ``clear`` and ``blocks`` says what it does.
+    """Edge of an optical surface, in the surface's own x and y.
+
+    Either ``clear`` or ``blocks`` has its shape; the keys below are its sizes.
 
     Attributes
     ----------
     clear : Shape | None
-        Shape inside of which light comes through.
+        Shape that transmits light inside and blocks it outside.
     blocks : Shape | None
-        Shape inside of which light is stopped.
+        Shape that blocks light inside.
     centre : Vector2 | None
-        Of the shape; of a ray the middle of its beginning; metres.
+        Centre of the shape, in metres; of a ray the middle of its start. By default the surface's vertex.
     radius : PositiveLength | None
-        Of a circle, metres.
+        Radius of a circle, in metres.
     inner : PositiveLength | None
-        Of a circle, radius of the hole in it, metres.
+        Radius of the hole in a circle, in metres; by default no hole.
     half : Half | None
-        Of a rectangle or an ellipse, half its width along x and along y, metres.
+        Half widths of a rectangle or an ellipse along x and y, in metres.
     width : PositiveLength | None
-        Of a ray, a vane that runs without end along x before it is turned, metres.
+        Width of a ray, a vane that extends without end along x before its rotation, in metres.
     turn : float | None
-        Of rectangle, ellipse or ray about its centre, right-handed about the surface's z, radians.
+        Rotation of a rectangle, an ellipse or a ray about its centre, right-handed about the surface's z, in radians;
+        zero by default.
     corners : tuple[Vector2, ...] | None
-        Of a polygon, one after the other, metres.
+        Corners of a polygon in sequence, in metres.
     """
 
     clear: Shape | None = None
@@ -218,7 +229,7 @@ class SurfaceEdgeSpec(Spec):
 
     @model_validator(mode="after")
     def _one_shape_with_its_sizes(self) -> SurfaceEdgeSpec:
-        one_given(self, ("clear", "blocks"), "an edge is clear or blocks", "clear: SHAPE, or blocks: SHAPE")
+        require_one(self, ("clear", "blocks"), "an edge is clear or blocks", "clear: SHAPE, or blocks: SHAPE")
         needed, possible = SIZES[self.shape]
         places = () if self.shape == "polygon" else ("centre",)
         for name in ("centre", "radius", "inner", "half", "width", "turn", "corners"):
@@ -234,11 +245,11 @@ class SurfaceEdgeSpec(Spec):
 
     @property
     def shape(self) -> str:
-        """The kind of shape."""
+        """Shape of the edge, whether clear or blocking."""
         return self.clear or self.blocks or ""
 
     def to_edge(self) -> Edge:
-        """What cuts the light."""
+        """Return the edge that the ray trace uses."""
         centre = self.centre or (0.0, 0.0)
         made: EdgeShape
         if self.radius is not None:

@@ -1,4 +1,7 @@
-"""A camera as a file in scenes/library/cameras gives it: prescription, line CCDs, and what of it is to be optimised."""
+"""Camera of a file in scenes/library/cameras: prescription and line CCDs.
+
+The module also has the optimisation of cameras and of monitor layouts.
+"""
 
 from __future__ import annotations
 
@@ -35,21 +38,21 @@ Diffusion = Annotated[float, Quantity(LENGTH, smallest="0 um", largest="1 mm")]
 
 
 class TdiSpec(Spec):
-    """How a line CCD collects light while the image moves across it.
+    """Time delay and integration (TDI): how a line CCD collects charge while the image moves across it.
 
     Attributes
     ----------
     stages : Whole
-        Lines over which the charge is collected.
+        Number of TDI stages, i.e. lines over which the charge is collected.
     phases : Whole
-        Steps in which the charge moves on by one pixel; between two steps it stands still and the image does not, which
-        blurs it along the track by one step.
+        Number of clock phases per pixel. Between two phases the charge stands still while the image moves, which blurs
+        it along the track by one step.
     open_share : Number
-        Share of each step in which light is collected.
+        Share of each step during which light is collected.
     line_time : instruments.Exposure
-        From one line to the next, seconds.
+        Time from one line to the next, in seconds.
     rate_error : float
-        Relative difference between the image's speed and the charge's; over all stages it blurs as well.
+        Relative difference between the speeds of the image and of the charge; it blurs the image over all stages.
     """
 
     stages: Annotated[Whole, Field(ge=1, le=4096)] = 1
@@ -60,24 +63,24 @@ class TdiSpec(Spec):
 
 
 class BandSpec(Spec):
-    """A line CCD in the focal plane and the light it sees.
+    """Line CCD of a spectral band in the focal plane.
 
     Attributes
     ----------
     offset : Length
-        Along X' (flight direction) from the line's centre, metres.
+        Position along X' (flight direction) relative to the line's centre, in metres.
     pixels : Whole
         Number of pixels along the line.
     pitch : PixelPitch
-        Of the pixels, which are square, metres.
+        Pitch of the square pixels, in metres.
     spectrum : Spectrum
-        The signal by wavelength; as two wavelengths, light that is evenly spread between them.
+        Relative signal by wavelength, or two wavelengths between which the light is evenly distributed.
     detector : Ref
-        Data sheet, by name or path.
+        Data sheet of the detector, by name or path.
     diffusion : Diffusion
-        Rms spread of charge between pixels (crosstalk), metres.
+        Charge diffusion between pixels (crosstalk), rms, in metres.
     tdi : TdiSpec
-        Time delay and integration.
+        Time delay and integration; a single stage by default.
     """
 
     offset: Length = 0.0
@@ -90,14 +93,15 @@ class BandSpec(Spec):
 
     @property
     def exposure(self) -> float:
-        """Exposure of all stages, over which dark current is collected, seconds; the data sheet gives it for all
-        stages.
+        """Exposure of all stages together, in seconds, during which dark current is collected.
+
+        The data sheet gives the dark current for all stages.
         """
         return self.tdi.stages * self.tdi.line_time
 
     @property
     def nyquist(self) -> float:
-        """Nyquist frequency of the pixels, cycles/m."""
+        """Nyquist frequency of the pixels, in cycles/m."""
         return 0.5 / self.pitch
 
 
@@ -108,32 +112,34 @@ PhotonRange = tuple[instruments.Photons, instruments.Photons]
 
 
 class BeamRangesSpec(Spec):
-    """What may vary of each of a monitor's beams, from and to; what is left out is as the start has it.
+    """Ranges, [smallest, largest], in which the search may vary each beam of a monitor.
 
-    A beam stands four times in a pair: at both ends of both cameras' lines, mirrored.
+    A quantity without a range keeps its value of the start.
+
+    In a pair each beam exists four times, mirrored: at both ends of the line of both cameras.
 
     Attributes
     ----------
     pupil_x : Vector2 | None
-        Of its middle in the entrance pupil, toward the central prism positive, metres.
+        Beam centre in the entrance pupil across the line, positive toward the central prism, in metres.
     pupil_y : Vector2 | None
-        Likewise along the line, positive toward the beam's own end of it, metres.
+        Beam centre in the entrance pupil along the line, positive toward the beam's end of the line, in metres.
     width : Vector2 | None
-        Diameter of its return face, metres; prisms are wider by as much as those of the start.
+        Diameter of the return face, in metres. The prisms' widths exceed it by the same amount as at the start.
     field : tuple[float, float] | None
-        Angle from the visual axis at which its area CCD stands, radians.
+        Field angle of the area CCD from the visual axis, in radians.
     prism_180_distance : Vector2 | None
-        From the camera's origin to its 180-deg prism, metres.
+        Distance from the camera's origin to the 180-degree prism, in metres.
     prism_0_distance : Vector2 | None
-        From its return face to its rhomboid, metres.
+        Distance from the return face to the rhomboid, in metres.
     shift : Vector2 | None
-        Of its rhomboid, metres.
+        Beam displacement by the rhomboid, in metres.
     spread_x : Vector2 | None
-        From the central prism's apex to its facet along the base's X, metres.
+        Distance of the facet from the central prism's apex along the base's X, in metres.
     spread_y : Vector2 | None
-        Likewise along Y, metres.
+        Distance of the facet from the central prism's apex along the base's Y, in metres.
     photons : PhotonRange | None
-        Of its spot, per frame; spots that would fill their pixels to the brim are refused.
+        Photons of a spot per frame; layouts whose spots would saturate their pixels are refused.
     """
 
     pupil_x: Vector2 | None = None
@@ -157,14 +163,14 @@ class BeamRangesSpec(Spec):
 
 
 class TransferChoiceSpec(Spec):
-    """What sends a beam back.
+    """Reflector that returns a beam, as one choice of the search.
 
     Attributes
     ----------
     material : instruments.MadeOf
-        Its glass, or what its mirrors stand on.
+        Glass of the prism, or material of the frame that carries the mirrors.
     kind : str | None
-        By its name among the reflectors; the prism when nothing is said.
+        Kind of reflector; by default the lateral-transfer prism.
     """
 
     material: instruments.MadeOf
@@ -177,14 +183,14 @@ class TransferChoiceSpec(Spec):
 
 
 class ShiftChoiceSpec(Spec):
-    """What displaces a beam.
+    """Reflector that displaces a beam, as one choice of the search.
 
     Attributes
     ----------
     material : instruments.MadeOf
-        Its glass, or what its mirrors stand on.
+        Glass of the prism, or material of the frame that carries the mirrors.
     kind : str | None
-        By its name among the reflectors; the rhomboid when nothing is said.
+        Kind of reflector; by default the rhomboid.
     """
 
     material: instruments.MadeOf
@@ -197,14 +203,14 @@ class ShiftChoiceSpec(Spec):
 
 
 class PrismChoiceSpec(Spec):
-    """What a beam may have for its two prisms.
+    """Pair of prisms that a beam may have, as one choice of the search.
 
     Attributes
     ----------
     prism_180 : TransferChoiceSpec
-        In place of the start's lateral-transfer prism.
+        Replacement of the start's lateral-transfer prism.
     prism_0 : ShiftChoiceSpec
-        In place of its rhomboid.
+        Replacement of the start's rhomboid.
     """
 
     prism_180: TransferChoiceSpec
@@ -212,17 +218,19 @@ class PrismChoiceSpec(Spec):
 
 
 class MonitorGoalSpec(Spec):
-    """What a layout is to reach: standard deviations that are left when the spots have been read; of both cameras the
-    worse, of several disturbances files the worst.
+    """Goals of a layout: standard deviations that remain after the spots have been read.
+
+    They hold for the worse of both cameras and for the worst of several disturbances files.
 
     Attributes
     ----------
     angle : float | None
-        Of the change of the intersection angle, radians.
+        Standard deviation of the change of the intersection angle, in radians; by default not a goal.
     d_f : PositiveLength | None
-        Of the change of a principal distance, metres.
+        Standard deviation of the change of a principal distance, in metres; by default not a goal.
     height : PositiveLength | None
-        Of a point on the ground, metres; needs the instrument's altitude.
+        Standard deviation of the height of a ground point, in metres, which needs the instrument's altitude; by default
+        not a goal.
     """
 
     angle: Annotated[float, Quantity(ANGLE, above_zero=True)] | None = None
@@ -237,24 +245,26 @@ class MonitorGoalSpec(Spec):
 
     @property
     def wanted(self) -> dict[str, float]:
-        """Those that are given, SI."""
+        """Goals that the file sets, by name, in SI units."""
         return {name: value for name in type(self).model_fields if (value := getattr(self, name)) is not None}
 
 
 class MonitorLimitsSpec(Spec):
-    """What a layout must not exceed.
+    """Limits that a layout must not exceed.
 
     Attributes
     ----------
     pupil_share : float | None
-        Of a camera's imaging pupil that its monitor's prisms take, at the worst place of the line.
+        Largest share of a camera's imaging pupil that the monitor's prisms block, at the worst field of the line; no
+        limit by default.
     mass : float | None
-        Of all prisms together, with what stands in their place and without the central prism, kg.
+        Largest mass of all prisms, or of the mirrors in their place, without the central prism, in kg; no limit by
+        default.
     spot_sigmas : Number
-        So many standard deviations of its place each spot stays on its area CCD.
+        Number of standard deviations of its position by which each spot stays within its area CCD.
     ghost_paths : Whole | None
-        Of every source, by which the layouts on the front are path-traced; one is left out whose ghosts have more than
-        a thousandth of a spot's light. None are traced when left out.
+        Number of paths per source for tracing ghosts of the layouts on the Pareto front. A layout whose ghosts have
+        more than a thousandth of a spot's light is excluded. By default no ghosts are traced.
     """
 
     pupil_share: Annotated[float, Quantity(SCALE, above_zero=True, largest="100 percent")] | None = None
@@ -264,26 +274,26 @@ class MonitorLimitsSpec(Spec):
 
 
 class MonitorSearchSpec(Spec):
-    """How long is searched.
+    """Effort of the search.
 
     Attributes
     ----------
     beams : Whole
-        That are drawn at random before anything is known.
+        Number of beams drawn at random at the beginning.
     layouts : Whole
-        Combinations of them that are compared, at most.
+        Largest number of combinations of beams that are compared.
     rounds : Whole
-        In which the beams of the best layouts are changed and combined anew, by steps that halve each time the round
-        before found nothing better.
+        Number of rounds that change the beams of the best layouts and combine them again. The steps are halved after a
+        round without an improvement.
     changed : Whole
-        Beams that each round tries.
+        Number of beams that each round tries.
     exact : Whole
-        Layouts that are built as a whole after the first draw, and after each round.
+        Number of layouts that are modelled completely after the first draw and after each round.
     refine : Whole
-        Steps by exact gradients with which the best layout is improved at last, at most.
+        Largest number of steps by exact gradients that finally improve the best layout.
     starts : Whole
-        Further searches, each from beams of its own that are drawn at random, and without those of the instrument: do
-        they come to the same end?
+        Number of further searches from other random beams, without those of the instrument, as a test of whether they
+        reach the same result.
     """
 
     beams: Annotated[Whole, Field(ge=1, le=100_000)] = 120
@@ -296,40 +306,40 @@ class MonitorSearchSpec(Spec):
 
 
 class MonitorDesignSpec(Spec):
-    """A monitor's layout to be found: how many beams, where and through which prisms.
+    """Search for the layout of a monitor: number of beams, their positions and their prisms.
 
     Attributes
     ----------
     instrument : Ref
-        To start from, by name or path; a pair whose monitor's channels are mirrored.
+        Instrument to start from, by name or path: a pair with mirrored monitor channels.
     name : Name
-        Of the new instrument.
+        Name of the new instrument.
     description : Text
-        Of the new instrument, for people.
+        Description of the new instrument for readers; the program does not use it.
     disturbances : tuple[Ref, ...] | None
-        Files of what is expected to move, by name or path; what the instrument names, when left out.
+        Files of disturbances, by name or path; by default the instrument's.
     beams : Whole
-        At each end of a line, at most.
+        Largest number of beams at each end of a line.
     vary : BeamRangesSpec
-        What may vary of each beam.
+        Ranges in which each beam may vary.
     prisms : Named[PrismChoiceSpec] | None
-        By a name of one's own, what each beam may have for prisms; the start's, when left out.
+        Name of your choice -> pair of prisms that a beam may have; by default those of the start.
     area_ccds : Named[instruments.AreaCcdChoiceSpec] | None
-        By a name of one's own, which area CCD all channels may have; the start's, when left out.
+        Name of your choice -> area CCD that all channels may have; by default that of the start.
     central_material : instruments.GlassName | None
-        Of the central prism, in place of the start's.
+        Glass of the central prism; by default that of the start.
     photons_per_frame : instruments.Photons | None
-        Of every spot, in place of the start's.
+        Photons of every spot per frame; by default those of the start.
     frames : instruments.Frames | None
-        Of a measurement, in place of the start's.
+        Number of frames in a measurement; by default that of the start.
     goal : MonitorGoalSpec
-        What is to be reached.
+        Standard deviations to be reached.
     limits : MonitorLimitsSpec
-        What must not be exceeded.
+        Limits that must not be exceeded.
     search : MonitorSearchSpec
-        How long is searched.
+        Effort of the search.
     seed : Seed
-        Of everything drawn.
+        Seed of all random numbers.
     """
 
     instrument: Ref
@@ -354,35 +364,36 @@ Light = Literal["refracts", "passes"]
 
 
 class MirrorSpec(Spec):
-    """A mirror about the parent axis; of revolution, unless ``sag`` has terms that are not. A camera may have faces of
-    lenses and a stop of its own among its mirrors: ``light`` says what happens there.
+    """Surface of a camera: a mirror, a face of a lens or the stop.
+
+    It is a surface of revolution about the parent axis unless ``sag``, ``decentre`` or ``rotate`` make it another one.
 
     Attributes
     ----------
     z : Length
-        Vertex on the parent axis, metres; light enters toward +z.
+        Position of the vertex on the parent axis, in metres; light enters toward +z.
     decentre : Vector2 | None
-        Of the vertex from the parent axis, along x and y, metres.
+        Displacement of the vertex from the parent axis along x and y, in metres; zero by default.
     rotate : Turn | None
-        Rotation vector by which the surface is turned about its vertex, radians.
+        Rotation vector of the surface about its vertex, in radians; zero by default.
     radius : Radius
-        Vertex radius of curvature, metres, positive if the centre of curvature lies toward +z; ``flat`` for a plane.
+        Vertex radius of curvature, in metres, positive if the centre of curvature lies toward +z; ``flat`` for a plane.
     conic : Number
         Conic constant k.
     aspheric : AsphereTerms
-        Terms A4, A6, ... of the sag beyond the conic's, 1/m^3, 1/m^5, ...; empty for a pure conic.
+        Coefficients A4, A6, ... of the sag beyond the conic's, in 1/m^3, 1/m^5, ...; by default a pure conic.
     sag : FrozenMap[str, SagTerm] | None
-        Further terms of the sag, by kind, each with its numbers.
+        Kind of a further sag term -> its coefficients; none by default.
     light : Light | None
-        What it does there, left out for a mirror; a plane that it passes is there to be the stop.
+        `refracts` for a face of a lens, `passes` for a plane that only serves as the stop; by default a mirror.
     index : Number | None
-        Refractive index behind a face of a lens, where light goes to, at the design wavelength; 1 where it leaves the
-        lens.
+        Refractive index behind a face of a lens at the design wavelength; 1 where the light leaves the lens.
     glass : LensGlass | None
-        What lies behind a face where light enters a lens, in place of its index there, which then follows from the
-        dispersion at every wavelength.
+        Glass behind a face where light enters a lens, in place of `index`; its dispersion gives the index at every
+        wavelength.
     edges : tuple[SurfaceEdgeSpec, ...] | None
-        What cuts light there beside the stop; several stop what any of them stops.
+        Edges that block light at this surface besides the stop; light must pass all of them. By default there are no
+        edges.
     """
 
     z: Length
@@ -417,26 +428,35 @@ class MirrorSpec(Spec):
 
     @property
     def enters_glass(self) -> bool:
-        """Whether light goes into a lens here."""
+        """True if light enters a lens at this face."""
         return self.light == "refracts" and self.index != 1.0
 
 
 class FieldSpec(Spec):
-    """Half angles of the field of view, radians: x along the line CCD, y across it, about the field bias."""
+    """Half angles of the field of view about the field bias.
+
+    Attributes
+    ----------
+    x : float
+        Half angle along the line CCD, in radians.
+    y : float
+        Half angle across the line CCD, in radians.
+    """
 
     x: Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
     y: Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
 
 
 class ImageSpec(Spec):
-    """The focal plane.
+    """Position and tilt of the focal plane.
 
     Attributes
     ----------
     z : Length
-        Where it crosses the parent axis, metres.
+        Position on the parent axis, in metres.
     tilt : float | None
-        About the prescription's x, along the line CCD, radians; left out for a plane square to the axis.
+        Rotation about the prescription's x, the direction of the line CCD, in radians; by default the plane is
+        perpendicular to the axis.
     """
 
     z: Length
@@ -444,51 +464,55 @@ class ImageSpec(Spec):
 
 
 class LineSpec(Spec):
-    """The line CCD, centred on the field bias: number of pixels and their pitch, metres."""
+    """Line CCD, centred on the field bias.
+
+    Attributes
+    ----------
+    pixels : Whole
+        Number of pixels along the line.
+    pitch : PixelPitch
+        Pixel pitch, in metres.
+    """
 
     pixels: Annotated[Whole, Field(ge=2, le=1_000_000)]
     pitch: PixelPitch
 
 
 class CameraSpec(TitledSpec):
-    """An off-axis mirror camera.
+    """Optical prescription of a camera with its line CCDs.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     focal_length : PositiveLength
-        Nominal, metres; the trace tells the exact one.
+        Nominal focal length, in metres; the ray trace computes the exact one.
     entrance_pupil : PositiveLength
-        Diameter of the entrance pupil, metres: of the beam along the axis before the first surface. Its rays make the
-        stop as large as they spread there, unless ``stop_diameter`` states that.
+        Diameter of the entrance pupil, in metres: of the axial beam before the first surface. Its rays define the size
+        of the stop, unless ``stop_diameter`` states it.
     field_bias : instruments.FieldPlace
-        Angle of the line CCD's centre from the parent axis, in the plane of symmetry, radians.
+        Angle of the line CCD's centre from the parent axis, in the plane of symmetry, in radians.
     field : FieldSpec
-        Half angles about the field bias.
+        Half angles of the field of view about the field bias.
     wavelength : Wavelength
-        Design wavelength, metres.
+        Design wavelength, in metres.
     stop : Name
-        Name of the mirror, or other surface, that is the aperture stop.
+        Name of the surface that is the aperture stop.
     stop_diameter : PositiveLength | None
-        Diameter of the stop, metres, where it is known; ``entrance_pupil`` is then nominal.
+        Diameter of the stop, in metres, if it is known; ``entrance_pupil`` is then nominal.
     mirrors : Named[MirrorSpec]
-        By name, in the order in which the light meets them; faces of lenses and a stop among them.
+        Name -> surface, in the order of the light: mirrors, and also faces of lenses and a separate stop.
     image : ImageSpec
         Focal plane.
     line : LineSpec
         Line CCD.
     bands : Named[BandSpec]
-        Line CCDs by spectral band, for images of targets; empty when none is described.
+        Name of a spectral band -> its line CCD, for images of targets; none by default.
     spectrum : Spectrum | None
-        Light of which the camera is judged over all wavelengths; that of its band when left out.
+        Light for polychromatic image quality; by default that of the panchromatic or first band.
     medium : Medium | None
-        What its lenses stand in at 20 C, which the index of a glass is against: ``air``, as prescriptions on the ground
-        take it, or ``vacuum``, also when left out.
+        Medium around the lenses at 20 C, to which the index of a glass refers: ``air``, as in prescriptions for use on
+        the ground, or ``vacuum``, the default.
     edge_margin : float
-        By how much a mirror's clear aperture is wider than the beams that use it, metres.
+        Margin by which a mirror's clear aperture exceeds the beams that use it, in metres.
     """
 
     focal_length: PositiveLength
@@ -546,7 +570,7 @@ class CameraSpec(TitledSpec):
         return self
 
     def _check_glasses(self) -> None:
-        """Refuse light at which a glass is not known. Raises Problem."""
+        """Raise `Problem` if a glass has no index at a wavelength of the camera's light."""
         lights: dict[tuple[str, ...], SpectrumSpec] = {
             ("bands", name, "spectrum"): band.spectrum for name, band in self.bands.items()
         }
@@ -564,20 +588,20 @@ class CameraSpec(TitledSpec):
                         raise Problem(f"{name}: {error}", within=key) from None
 
     def index_behind(self, name: str, wavelength: float | None = None) -> float:
-        """Refractive index behind a face of a lens, against what the lens stands in.
+        """Return the refractive index behind a face of a lens, relative to the medium around the lens.
 
         Parameters
         ----------
         name : str
-            Of the face.
+            Name of the face.
         wavelength : float | None
-            Metres; the design wavelength by default.
+            Wavelength in metres; the design wavelength by default.
 
         Raises
         ------
         ValueError
-            Its glass is not known there, or the face has an index alone and another wavelength is asked for than that
-            of the design.
+            The glass has no index at this wavelength, or the face has a bare index and the wavelength is not the design
+            wavelength.
         """
         mirror, colour = self.mirrors[name], self.wavelength if wavelength is None else wavelength
         if mirror.glass is not None:
@@ -589,12 +613,12 @@ class CameraSpec(TitledSpec):
         return mirror.index
 
     def warm_glass(self, name: str) -> WarmGlass:
-        """What heat does to the glass behind a face where light enters a lens, at the design wavelength.
+        """Return the thermal properties of the glass behind a face where light enters a lens, at the design wavelength.
 
         Raises
         ------
         ValueError
-            Nothing says it.
+            The thermal properties are not known.
         """
         mirror = self.mirrors[name]
         if mirror.glass is None:
@@ -606,7 +630,10 @@ class CameraSpec(TitledSpec):
 
     @property
     def light(self) -> SpectrumSpec | None:
-        """Of which it is judged over all wavelengths: its own, or its panchromatic or first band's; None for none."""
+        """Light for polychromatic image quality, None for none.
+
+        It is the camera's spectrum, else that of its panchromatic band, else that of its first band.
+        """
         if self.spectrum is not None or not self.bands:
             return self.spectrum
         return self.bands[PANCHROMATIC if PANCHROMATIC in self.bands else next(iter(self.bands))].spectrum
@@ -617,7 +644,7 @@ class CameraSpec(TitledSpec):
         Raises
         ------
         InputError
-            a table is not there or not right, or has wavelengths at which a glass is not known.
+            A table is missing or invalid, or has wavelengths at which a glass has no index.
         """
         bands = {
             name: band.model_copy(update={"spectrum": band.spectrum.read(self, ("bands", name, "spectrum"))})
@@ -634,19 +661,19 @@ class CameraSpec(TitledSpec):
         return read
 
     def require_mirrors(self, where: str, on_axis: bool = False) -> None:
-        """Refuse a camera that is not made of mirrors alone.
+        """Raise `InputError` unless the camera consists of mirrors alone.
 
         Parameters
         ----------
         where : str
-            Such a camera cannot stand, for the message.
+            Noun phrase for the thing that needs such a camera, for the message.
         on_axis : bool
-            Refuse mirrors that are flat, turned or off the parent axis, too.
+            Also refuse mirrors that are flat, rotated or off the parent axis.
 
         Raises
         ------
         InputError
-            It has a lens, a stop or edges of its own; with the line.
+            The camera has a lens, a separate stop or explicit edges; with the line.
         """
         for name, mirror in self.mirrors.items():
             if mirror.edges:
@@ -666,35 +693,32 @@ Vary = Literal["radius", "conic", "A4", "A6", "A8", "z"]
 
 
 class CameraDesignSpec(Spec):
-    """What is to be optimised.
-
-    The focal length along the line, the entrance pupil, the field and its bias stay as they are.
+    """Optimisation of a camera. Its focal length along the line, entrance pupil, field and field bias stay fixed.
 
     Attributes
     ----------
     camera : Ref
         Prescription to start from, by name or path.
     name : Name
-        Of the new camera.
+        Name of the new camera.
     description : Text
-        Of the new camera, for people.
+        Description of the new camera for readers; the program does not use it.
     vary : Named[tuple[Vary, ...]]
-        Mirror, or ``image`` -> what of it varies.
+        Name of a mirror, or ``image`` -> list of its variables.
     envelope : float | None
-        Extent along the parent axis over all mirrors and the image, relative to the start's; the largest.
+        Largest extent along the parent axis over all mirrors and the image, relative to the start's; free by default.
     clearance : Length
-        Least distance of every beam, in the plane of symmetry, from the edge of every mirror and of the focal plane
-        that it passes, metres.
+        Smallest distance, in the plane of symmetry, of every beam from the edge of every mirror and of the focal plane
+        that it passes, in metres.
     anamorphism : float | None
-        By how much the focal length along the line may differ from that across it, a share of the latter; free where it
-        is left out.
+        Largest relative difference of the focal length along the line from that across it; free by default.
     steps : Whole
-        In which the envelope is brought from the start's to the goal's.
+        Number of steps in which the envelope is reduced from the start's to the goal's.
     starts : Whole
-        How many: the camera itself with the envelope shortened in steps, the same at once, and others drawn about it.
-        One start finds one local optimum.
+        Number of starting points: the camera itself with the envelope reduced in steps, the same at once, and others
+        drawn at random about it. Each one leads to one local optimum.
     seed : Seed
-        Of the starts that are drawn.
+        Seed of the random starting points.
     """
 
     camera: Ref

@@ -1,5 +1,6 @@
-"""The laboratory's collimator and the tests of a camera in front of it: focal-plane alignment, interior orientation; on
-the simulated bench and, with `measured:`, on files of a real one (docs/measured_laboratory.md).
+"""Laboratory tests of a camera at the collimator: focal-plane alignment and distortion (interior orientation).
+
+The tests run on the simulated bench or, with `measured:`, on files of a real one (docs/measured_laboratory.md).
 """
 
 from typing import Annotated, Literal
@@ -13,7 +14,7 @@ from scenes.specs.instrument import Frames
 from scenes.specs.perturbation import FigureTerm, PlainPerturbationSpec
 from scenes.specs.turntable import TableAngle, TurntableFiles
 from scenes.yaml.errors import Problem
-from scenes.yaml.spec import Name, Number, Paths, Ref, Reference, Seed, Spec, Text, TitledSpec, Whole, one_given
+from scenes.yaml.spec import Name, Number, Paths, Ref, Reference, Seed, Spec, Text, TitledSpec, Whole, require_one
 from scenes.yaml.unit_fields import (
     Angle,
     AngleSigma,
@@ -28,16 +29,16 @@ from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity
 
 
 class CollimatorSpec(Spec):
-    """A long collimator with its target at the focus.
+    """Long collimator with its target at the focus.
 
     Attributes
     ----------
     focal_length : PositiveLength
-        metres.
+        Focal length, in metres.
     aperture : PositiveLength
-        Diameter, metres.
+        Diameter of the aperture, in metres.
     wavefront : dict[Term, FigureTerm]
-        Its error over the aperture by Zernike terms, Noll's numbering, metres rms.
+        Zernike term (Noll) -> wavefront error over the aperture, in metres rms; by default there is no error.
     """
 
     focal_length: PositiveLength
@@ -46,21 +47,21 @@ class CollimatorSpec(Spec):
 
     @property
     def model(self) -> Collimator:
-        """The collimator."""
+        """Optical model of the collimator."""
         terms = {noll(term): size for term, size in self.wavefront.items()}
         return Collimator(self.focal_length, 0.5 * self.aperture, terms)
 
 
 class CameraUnderTestSpec(Spec):
-    """The camera under test, alone in front of the collimator.
+    """Camera under test, alone in front of the collimator.
 
     Attributes
     ----------
     camera : Ref
-        Prescription, or an instrument as built to one, by name or path.
+        Prescription of the camera, or an instrument as built from it, by name or path.
     as_built : Paths[PlainPerturbationSpec]
-        How it departs from the prescription: ``M1``, ``M2`` ... or ``focal_plane`` -> perturbation, as in a job;
-        figures of mirrors for the most part.
+        Node (``M1``, ``M2`` ... or ``focal_plane``) -> deviation from the prescription, as in a job's `perturb`; mostly
+        figure errors of mirrors.
     """
 
     camera: Ref
@@ -83,14 +84,14 @@ Share = Annotated[Number, Field(ge=-1.0, le=1.0)]
 
 
 class EdgeSpec(Spec):
-    """The slanted knife edge, turned to measure along the line and along the track.
+    """Slanted knife edge, rotated to measure along the line and along the track.
 
     Attributes
     ----------
     angle : EdgeAngle
-        Between the edge and the pixel columns or rows, radians.
+        Angle between the edge and the pixel columns or rows, in radians.
     region : Whole
-        Side of the square region around it that is analysed, pixels.
+        Side of the square region around the edge that is analysed, in pixels.
     """
 
     angle: EdgeAngle
@@ -98,19 +99,19 @@ class EdgeSpec(Spec):
 
 
 class ScanSpec(Spec):
-    """How the target is moved through focus; lengths are those by which the image moves.
+    """Scan of the target through focus. Lengths are the corresponding movements of the image.
 
     Attributes
     ----------
     reach : PositiveLength
-        The first scan goes from -reach to +reach, metres.
+        Half range of the first scan, which goes from -reach to +reach, in metres.
     step : PositiveLength
-        Of the first scan, metres.
+        Step of the first scan, in metres.
     points : Whole
-        Of the second scan, about the peak that the first one found; fewer than seven would leave no room for an error
-        of the first.
+        Number of points of the second scan, centred on the peak of the first one; with fewer than seven an error of the
+        first peak could not be corrected.
     depth : Number
-        Half width of the second scan as a share of the defocus at which geometric blur takes all contrast at the
+        Half width of the second scan as a share of the defocus at which geometric blur removes all contrast at the
         Nyquist frequency.
     """
 
@@ -121,20 +122,20 @@ class ScanSpec(Spec):
 
 
 class MountSpec(Spec):
-    """How the focal-plane assembly is screwed to its mounting surface.
+    """Mount of the focal-plane assembly: screws with shims on the mounting surface.
 
     Attributes
     ----------
     holes : tuple[Vector3, ...]
-        Their places in the assembly's frame O'-X'Y'Z', metres.
+        Positions of the screw holes in the assembly's frame O'-X'Y'Z', in metres.
     tilt : Tilt
-        Of the mounting surface's normal from Z', about Y', radians.
+        Angle of the mounting surface's normal from Z', about Y', in radians.
     clearance : PositiveLength
-        By which the screws leave each hole free to slide, metres.
+        Clearance of the screws in their holes, within which the assembly can slide, in metres.
     thickness : PositiveLength
-        Of the shims before the work, metres.
+        Thickness of the shims before the alignment, in metres.
     step : PositiveLength
-        To which the workshop grinds a shim, metres.
+        Resolution to which the workshop grinds a shim, in metres.
     """
 
     holes: Annotated[tuple[Vector3, ...], Field(min_length=3)]
@@ -145,16 +146,16 @@ class MountSpec(Spec):
 
 
 class MissetSpec(Spec):
-    """Standard deviations of how the focal-plane assembly stands at the beginning, against the optics.
+    """Standard deviations of the initial misalignment of the focal-plane assembly relative to the optics.
 
     Attributes
     ----------
     rotate : AngleSigmas
-        About X', Y', Z' through the middle of the panchromatic line, radians.
+        Rotations about X', Y', Z' through the centre of the panchromatic line, in radians.
     shift : LengthSigmas
-        Along X', Y', Z', metres.
+        Shifts along X', Y', Z', in metres.
     chips : LengthSigma
-        Of the height of each line CCD above the assembly, which no shim can change, metres.
+        Height error of each line CCD relative to the assembly, which no shim can correct, in metres.
     """
 
     rotate: AngleSigmas
@@ -163,40 +164,36 @@ class MissetSpec(Spec):
 
 
 class FocusTestSpec(CameraUnderTestSpec):
-    """A focal-plane alignment.
+    """Alignment of a focal plane with the through-focus test.
 
     Attributes
     ----------
     name : Name
-        As the file is called.
+        Name of the test.
     description : Text
-        For people.
-    camera
-        Prescription, by name or path.
-    as_built
-        How it departs from the prescription, ``M1`` ... or ``focal_plane`` -> perturbation as in a job.
+        Description for readers; the program does not use it.
     collimator : CollimatorSpec
-        What the camera looks into.
+        Collimator in front of the camera.
     edge : EdgeSpec
-        The target.
+        Target.
     fields : tuple[Share, ...]
-        Where along the line it is imaged, as shares of half the line's length, -1 to 1.
+        Fields along the line, as shares of half the line's length, -1 to 1.
     white : Light
-        Signal of the bright side, as a share of the full well.
+        Signal of the bright side of the edge, as a share of the full well.
     frames : Frames
-        Images of each position of the target that are averaged.
+        Number of frames averaged at each position of the target.
     scan : ScanSpec
-        How the target is moved.
+        Scan of the target through focus.
     misset : MissetSpec
-        How the assembly stands at the beginning.
+        Initial misalignment of the assembly.
     mount : MountSpec
-        How it is mounted.
+        Mount of the assembly.
     level : AngleSigma
-        Standard deviation of the theodolite's reading of the line's level, radians.
+        Standard deviation of the theodolite's reading of the line's level, in radians.
     rounds : Whole
-        Of shimming.
+        Number of rounds of shimming.
     seed : Seed
-        Of everything that is drawn.
+        Seed of all random numbers.
     """
 
     name: Name
@@ -224,47 +221,43 @@ class FocusTestSpec(CameraUnderTestSpec):
 
 
 class DistortionTestSpec(CameraUnderTestSpec):
-    """The camera on a turntable looks at a pinhole in the collimator, point by point along its line.
+    """Distortion test: the camera on a turntable images a pinhole in the collimator, point by point along its line.
 
     Attributes
     ----------
     name : Name
-        As the file is called.
+        Name of the test.
     description : Text
-        For people.
-    camera
-        Prescription, by name or path.
-    as_built
-        How it departs from the prescription, ``M1`` ... or ``focal_plane`` -> perturbation as in a job.
+        Description for readers; the program does not use it.
     collimator : CollimatorSpec
-        What the camera looks into.
+        Collimator in front of the camera.
     turntable : Ref
-        Its dividing error and calibration, by name or path.
+        Turntable test with the dividing error and the calibration, by name or path.
     pinhole : PositiveLength
-        Diameter of the target, metres.
+        Diameter of the pinhole target, in metres.
     band : Name
-        Whose line CCD is measured.
+        Band whose line CCD is measured.
     points : Whole
-        Over the field.
+        Number of points over the field.
     reach : Number
-        Of the first and last point, as a share of half the line's length.
+        Distance of the first and last point from the line's centre, as a share of half the line's length.
     sets : Whole
-        How often all points are measured.
+        Number of times that all points are measured.
     light : Light
-        Of the brightest pixel, as a share of the full well.
+        Signal of the brightest pixel, as a share of the full well.
     frames : Frames
-        Images of each point that are averaged.
+        Number of frames averaged at each point.
     window : Whole
-        Side of the square region around the spot, pixels.
+        Side of the square region around the spot, in pixels.
     zero : AngleSigma
-        Standard deviation with which the middle of the line is put on the collimator's axis at the turntable's middle
-        angle, radians.
+        Standard deviation of aligning the line's centre to the collimator's axis at the middle angle of the turntable,
+        in radians.
     axis_tilt : AngleSigma
-        Standard deviation of the turntable's axis against the camera's X, radians.
+        Standard deviation of the tilt of the turntable's axis against the camera's X, in radians.
     setting : AngleSigma
-        Standard deviation with which the table stops at a wanted reading, radians.
+        Standard deviation with which the turntable stops at a required reading, in radians.
     seed : Seed
-        Of everything that is drawn.
+        Seed of all random numbers.
     """
 
     name: Name
@@ -290,14 +283,14 @@ Positive = Annotated[Number, Field(gt=0.0, le=1e9)]
 
 
 class LineSpec(Spec):
-    """A line CCD whose spots are given in pixels.
+    """Line CCD whose spot positions are given in pixels.
 
     Attributes
     ----------
     pitch : PositiveLength
-        Of its pixels, metres.
+        Pixel pitch, in metres.
     middle : Number
-        Column of the line's middle, where positions count from; the centre of the first pixel is 0.
+        Column of the line's centre, from which positions are counted; the centre of the first pixel is 0.
     """
 
     pitch: PositiveLength
@@ -305,23 +298,23 @@ class LineSpec(Spec):
 
 
 class DistortionFiles(Spec):
-    """Angles and spots of a camera on a turntable.
+    """Measured angles and spot positions of a camera on a turntable.
 
     Attributes
     ----------
     spots : Reference
-        Table of readings of the turntable and places of the spot on the line, a CSV file.
+        CSV file of turntable readings and spot positions on the line.
     zero : TableAngle
-        Reading at which the middle of the line is imaged, as near as it is known, radians; the fit finds its error.
+        Approximate reading at which the line's centre is imaged, in radians; the fit estimates its error.
     line : LineSpec | None
-        Pixels of the line, for a table whose places are columns; none for one of lengths.
+        Pixels of the line, for a table whose positions are columns; omitted if they are lengths.
     reversed : bool
-        Readings of the turntable rise where places on the line fall.
+        True if turntable readings increase while positions on the line decrease.
     turntable : TurntableFiles | None
-        Calibration of the turntable; without it angles count as read.
+        Calibration of the turntable; without it the readings are used as they are.
     angle_sigma : AngleSigma | None
-        Without a calibration: standard deviation of the error of each point's angle, independent from point to point
-        and the same in all sets, radians.
+        Standard deviation of the angle error of each point without a calibration, in radians: independent from point to
+        point and the same in all sets.
     """
 
     spots: Reference
@@ -334,25 +327,21 @@ class DistortionFiles(Spec):
     @model_validator(mode="after")
     def _one_source_of_sigmas(self) -> "DistortionFiles":
         problem = "how good the angles are is told in one way"
-        one_given(self, ("turntable", "angle_sigma"), problem, "turntable: or angle_sigma:")
+        require_one(self, ("turntable", "angle_sigma"), problem, "turntable: or angle_sigma:")
         return self
 
 
 class MeasuredDistortionSpec(TitledSpec):
-    """The distortion test on measured angles and spots.
+    """Distortion test with measured angles and spot positions.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     principal_distance : PositiveLength
-        Of the camera, about, metres; it serves to see the scatter between sets.
+        Approximate principal distance of the camera, in metres; it is used to evaluate the scatter between sets.
     measured : DistortionFiles
-        The angles and spots.
+        Angles and spot positions.
     seed : Seed
-        Of nothing; the fits of the turntable that compete here draw nothing.
+        Seed, without effect: nothing in this evaluation is random.
     """
 
     principal_distance: PositiveLength
@@ -361,24 +350,24 @@ class MeasuredDistortionSpec(TitledSpec):
 
 
 class NoiseSpec(Spec):
-    """Noise of the detector that took images, as a data sheet of EMVA 1288 has it.
+    """Noise of the detector that took the images, as in an EMVA 1288 data sheet.
 
     Attributes
     ----------
     gain_dn_per_e : Positive
-        Grey values per electron.
+        System gain, in grey values per electron.
     dark_noise_e : NotNegative
-        Read noise, electrons rms.
+        Read noise, in electrons rms.
     dark_signal_e : NotNegative
-        Dark signal of one exposure, electrons.
+        Dark signal of an exposure, in electrons.
     offset_dn : NotNegative
-        Black level, grey values.
+        Black level, in grey values.
     prnu : Number
-        Non-uniformity of the response, share rms.
+        Photo response non-uniformity, relative rms.
     dsnu_e : NotNegative
-        Non-uniformity of the dark signal, electrons rms.
+        Dark signal non-uniformity, in electrons rms.
     saturation_dn : Positive
-        Grey value from which the response is not linear.
+        Grey value above which the response is not linear.
     """
 
     gain_dn_per_e: Positive
@@ -391,14 +380,14 @@ class NoiseSpec(Spec):
 
 
 class LevelSpec(Spec):
-    """The line's level as a theodolite read it.
+    """Level of the line as read by a theodolite.
 
     Attributes
     ----------
     angle : Angle
-        Of the line out of the direction it is to have, about Z', radians.
+        Rotation of the line from its required direction, about Z', in radians.
     sigma : AngleSigma
-        Its standard deviation, radians.
+        Standard deviation of this angle, in radians.
     """
 
     angle: Angle
@@ -406,26 +395,25 @@ class LevelSpec(Spec):
 
 
 class FocusFiles(Spec):
-    """A through-focus series of many places.
+    """Measured through-focus series at several fields.
 
     Attributes
     ----------
     mtf : Reference | None
-        Table of MTF values with sigmas, a CSV file; or
+        CSV file of MTF values with their standard deviations; either this or `images` is required.
     images : Reference | None
-        Table of images of a slanted knife edge, a CSV file.
+        CSV file that lists images of a slanted knife edge; either this or `mtf` is required.
     moved : Literal['image', 'target', 'focal_plane']
-        What was moved through focus. ``image``: shifts are those of the image along the light; ``target``: of the
-        target along the light; ``focal_plane``: of the CCD along the light.
+        Component to which the shifts refer, always along the light: ``image``, ``target`` or ``focal_plane`` (the CCD).
     per_shift : Number | None
-        With ``target``: move of the image per move of the target, (f of the camera / f of the collimator)^2; a column
-        `per shift` of the table overrides it.
+        Image shift per target shift for ``target``, (f of the camera / f of the collimator)^2; a column `per shift` of
+        the table overrides it.
     frequency : Number
-        Of the MTF that is measured in images, cycles per pixel.
+        Spatial frequency of the MTF that is measured in images, in cycles per pixel.
     noise : dict[Name, NoiseSpec]
-        With images: name of a band -> its detector; a band without one has its noise estimated from the image.
+        Name of a band -> noise of its detector, for images; for other bands the noise is estimated from the image.
     level : LevelSpec | None
-        Of the line; without it the turn about Z' is left as it is.
+        Level of the line; without it the rotation about Z' is not corrected.
     """
 
     mtf: Reference | None = None
@@ -438,7 +426,7 @@ class FocusFiles(Spec):
 
     @model_validator(mode="after")
     def _one_table(self) -> "FocusFiles":
-        one_given(self, ("mtf", "images"), "one table is needed", "mtf: or images:")
+        require_one(self, ("mtf", "images"), "one table is needed", "mtf: or images:")
         if self.noise and self.images is None:
             problem = "sigmas of MTF values stand in their table"
             raise Problem(problem, "noise", "images: in place of mtf:", within=("noise",))
@@ -449,27 +437,23 @@ class FocusFiles(Spec):
 
 
 class MeasuredFocusSpec(TitledSpec):
-    """A focal-plane alignment from a measured through-focus series.
+    """Alignment of a focal plane from a measured through-focus series.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     measured : FocusFiles
-        The series.
+        Through-focus series.
     mount : MountSpec
-        How the assembly is mounted.
+        Mount of the assembly.
     shims : tuple[PositiveLength, ...] | None
-        Thickness of each hole's shim now, metres; by default all are as thick as `mount` says.
+        Present thickness of the shim at each hole, in metres; by default the `thickness` of `mount`.
     vertex_error : LengthSigma
-        Error that the form of the through-focus curve leaves in all vertices alike, metres; its default is that of F/8
-        to F/10 and wavefronts of 0.2 waves.
+        Standard deviation of an error common to all vertices that the shape of the through-focus curve causes, in
+        metres; the default holds for F/8 to F/10 and wavefront errors of 0.2 waves.
     vertex_trend : LengthSigma
-        By how much that error changes from the middle to the ends of the places, metres.
+        Standard deviation of the change of that error from the centre to the ends of the fields, in metres.
     seed : Seed
-        Of nothing; nothing is drawn.
+        Seed, without effect: nothing in this evaluation is random.
     """
 
     measured: FocusFiles

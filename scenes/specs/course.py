@@ -1,4 +1,4 @@
-"""A course: temperatures and motions that change with time, as a job's file or a CSV table of its own gives them."""
+"""Course: temperatures and motions of an instrument that change with time, from a job's file or a CSV table."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from optics.geometry.zernike import MAX_NOLL
-from optics.numerics.array_math import number_of
+from optics.numerics.array_math import index_of_value
 from optics.numerics.number_tree import FrozenMap
 from optics.thermal.heat import Temperature
 from scenes.yaml import units
@@ -21,7 +21,9 @@ from scenes.yaml.unit_fields import Quantity, Vector
 from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile
 
 TemperatureChange = Annotated[float, Quantity(units.TEMPERATURE_DIFFERENCE, largest="1000 K", unsigned="100 K")]
-"""Kelvin. Nothing in an instrument at work becomes 100 K warmer; 250 K without a sign is an absolute temperature."""
+"""Temperature change, in kelvin. No change of more than 100 K occurs in an instrument at work, so that 250 K without a
+sign is probably an absolute temperature.
+"""
 TemperatureGradient = Annotated[
     tuple[float, float, float], Vector(Quantity(units.TEMPERATURE_GRADIENT, largest="1000 K/m"))
 ]
@@ -36,12 +38,12 @@ _TERM = re.compile(r"Z([1-9][0-9]{0,3})")
 
 
 def noll(term: str) -> int:
-    """The Noll index of a figure term: 5 for "Z5".
+    """Return the Noll index of a figure term: 5 for "Z5".
 
     Raises
     ------
     Problem
-        Not Z1 .. Z66.
+        The term is not one of Z1 .. Z66.
     """
     match = _TERM.fullmatch(term)
     if match is None or int(match[1]) > MAX_NOLL:
@@ -70,7 +72,7 @@ def _some_times(times: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def ascending(times: tuple[float, ...]) -> tuple[float, ...]:
-    """The times, seconds. Problem where one is not after the one before it."""
+    """Return the times, in seconds; raise `Problem` if one of them is not later than the one before it."""
     for k, (before, after) in enumerate(pairwise(times), 1):
         if not after > before:
             raise Problem("the times do not ascend", moment(after), f"a time after {moment(before)}", within=(k,))
@@ -78,26 +80,27 @@ def ascending(times: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def moment(time: float) -> str:
-    """A time of a course as its file would write it: "12 min" for 720 s."""
+    """Return a time of a course as its file would write it: "12 min" for 720 s."""
     return units.format_quantity(time, units.MOMENT)
 
 
 def no_such_time(time: float, times: Sequence[float], allowed: str) -> Problem:
-    """What is wrong with a time, seconds, that is none of a course's."""
+    """Return the problem of a time, in seconds, that a course does not have."""
     near = min(times, key=lambda one: abs(one - time))
     return Problem("not one of the course's times", moment(time), allowed, moment(near))
 
 
 class TemperatureCourse(Spec):
-    """How the temperature of a body, and of all it carries that has none of its own, changes: for each of the course's
-    times change + gradient . r. What is left out is zero at all times.
+    """Temperature change of a body at each time of the course: change + gradient . r.
+
+    It also applies to the bodies that it carries without an entry. A quantity that is left out is zero at all times.
 
     Attributes
     ----------
     change : tuple[TemperatureChange, ...] | None
-        At the body's origin, kelvin.
+        Temperature change at the body's origin at each time, in kelvin; zero by default.
     gradient : tuple[TemperatureGradient, ...] | None
-        In the body's own frame, K/m.
+        Temperature gradient in the body's frame at each time, in K/m; zero by default.
     """
 
     change: tuple[TemperatureChange, ...] | None = None
@@ -105,19 +108,19 @@ class TemperatureCourse(Spec):
 
 
 class MotionCourse(Spec):
-    """How a body moves: for each of the course's times what `perturb` says of one state. What is left out is zero at
-    all times.
+    """Motion of a body at each time of the course, as `perturb` has it for a single state.
 
     Attributes
     ----------
     rotate : tuple[Rotation, ...] | None
-        Rotation vectors in the body's own frame about the pivot, radians; they come before the shifts.
+        Rotation vector in the body's frame about the pivot at each time, in radians; the rotation precedes the shift.
+        Zero by default.
     shift : tuple[Shift, ...] | None
-        In the body's own frame, metres.
+        Shift in the body's frame at each time, in metres; zero by default.
     scale : tuple[ScaleChange, ...] | None
-        Relative growth of the body and all it carries.
+        Relative change of scale of the body and all it carries at each time; zero by default.
     pivot : Name
-        Name of the body's point that rotation and scale leave in place, at all times.
+        Name of the body's point that rotation and scale leave in place at all times.
     """
 
     rotate: tuple[Rotation, ...] | None = None
@@ -127,11 +130,11 @@ class MotionCourse(Spec):
 
     @property
     def given(self) -> Mapping[str, tuple[Any, ...] | None]:
-        """Name -> values, one for each time."""
+        """Name of a quantity -> its values, one for each time."""
         return {"rotate": self.rotate, "shift": self.shift, "scale": self.scale}
 
     def at(self, k: int) -> "NodeMotion":
-        """The motion at time number ``k``."""
+        """Return the motion at time number ``k``."""
         return NodeMotion(
             NO_MOTION if self.rotate is None else self.rotate[k],
             NO_MOTION if self.shift is None else self.shift[k],
@@ -142,7 +145,7 @@ class MotionCourse(Spec):
 
 @dataclass(frozen=True)
 class NodeMotion:
-    """A body's motion at one time: rotation vector (radians), shift (metres), relative growth, name of the pivot."""
+    """Motion of a body at one time: rotation vector (radians), shift (metres), relative scale, name of the pivot."""
 
     rotate: tuple[float, float, float]
     shift: tuple[float, float, float]
@@ -151,27 +154,28 @@ class NodeMotion:
 
 
 class CourseSpec(Spec):
-    """A series of states: at each time the job's perturbation with these temperatures and motions added.
+    """Series of states: at each time the job's perturbation, with these temperatures and motions added.
 
-    A body that stands under `temperature` has a temperature of its own at all times, also where the table says 0 K.
-    Rotation vectors, shifts and scales are added, component by component, to what `perturb` says of the same node.
+    A body listed under `temperature` has its own temperature at all times, even where the value is 0 K, instead of that
+    of its carrier. Rotation vectors, shifts and scales are added, component by component, to those of `perturb` for the
+    same node.
 
     Attributes
     ----------
     times : tuple[Moment, ...]
-        Ascending, seconds; only their order matters to the instrument, which has no memory.
+        Ascending times, in seconds. The instrument has no memory, so that only their order affects the images.
     temperature : Paths[TemperatureCourse]
-        Node path -> its temperatures, one for each time.
+        Node path -> temperature at each time.
     motion : Paths[MotionCourse]
-        Node path -> its motions, one for each time.
+        Node path -> motion at each time.
     table : Reference | None
-        In place of times, temperatures and motions a CSV file with them, relative to the job's file. Heads name what a
-        column holds and its unit: `time [min]`, `base/forward/M2 shift z [um]`, `base/forward/M2 rotate x [arcsec]`,
-        `base/forward scale [ppm]`, `base/forward temperature [K]`, `base/forward gradient x [mK/m]`. Under `motion`
-        stand then only the pivots.
+        CSV file with times, temperatures and motions, in place of these keys; a path relative to the job's file. Each
+        head has quantity and unit: `time [min]`, `base/forward/M2 shift z [um]`, `base/forward/M2 rotate x [arcsec]`,
+        `base/forward scale [ppm]`, `base/forward temperature [K]`, `base/forward gradient x [mK/m]`. The key `motion`
+        then holds only pivots.
     detail : Moment | None
-        The one of the times that is shown in full, like the single state of a job without a course, seconds; the last
-        one by default.
+        Time whose state is reported in full, like the single state of a job without a course, in seconds; by default
+        the last one.
     """
 
     times: Annotated[tuple[Moment, ...], AfterValidator(_some_times), AfterValidator(ascending)] = ()
@@ -193,7 +197,7 @@ class CourseSpec(Spec):
             self._one_for_each_time(("temperature", path), {"change": heat.change, "gradient": heat.gradient})
         for path, moves in self.motion.items():
             self._one_for_each_time(("motion", path), moves.given)
-        if self.detail is not None and number_of(self.detail, self.times) is None:
+        if self.detail is not None and index_of_value(self.detail, self.times) is None:
             raise no_such_time(self.detail, self.times, "one of times").below("detail")
         return self
 
@@ -218,12 +222,12 @@ class CourseSpec(Spec):
 
     @property
     def shown(self) -> int:
-        """Number of the time that is shown in full, from 0."""
-        number = None if self.detail is None else number_of(self.detail, self.times)
+        """Number of the time that is reported in full, counted from 0."""
+        number = None if self.detail is None else index_of_value(self.detail, self.times)
         return len(self.times) - 1 if number is None else number
 
     def fields(self, k: int) -> dict[str, Temperature]:
-        """Node path -> what the table adds to its temperature at time number ``k``."""
+        """Return node path -> temperature change by the course at time number ``k``."""
         return {
             path: Temperature(
                 table.change[k] if table.change is not None else 0.0,
@@ -233,11 +237,11 @@ class CourseSpec(Spec):
         }
 
     def motions(self, k: int) -> dict[str, NodeMotion]:
-        """Node path -> what the table adds to its motion at time number ``k``."""
+        """Return node path -> motion by the course at time number ``k``."""
         return {path: moves.at(k) for path, moves in self.motion.items()}
 
     def key(self, path: str, k: int) -> tuple[str | int, ...]:
-        """Where in the course the temperature of a node at time number ``k`` stands."""
+        """Return the key path in the course of a node's temperature at time number ``k``."""
         name = "change" if self.temperature[path].change is not None else "gradient"
         return ("temperature", path, name, k)
 
@@ -245,10 +249,10 @@ class CourseSpec(Spec):
 TIME = "time"
 AXES = ("x", "y", "z")
 VECTORS = {"rotate": units.ANGLE, "shift": units.LENGTH, "gradient": units.TEMPERATURE_GRADIENT}
-"""What has a column for each axis; axes without one are zero."""
+"""Quantities with a column for each axis; axes without a column are zero."""
 NUMBERS = {"scale": units.SCALE, "temperature": units.TEMPERATURE_DIFFERENCE}
 HEAT = {"temperature": "change", "gradient": "gradient"}
-"""Name in a head -> key under ``temperature``; the others stand under ``motion``."""
+"""Name in a head -> key under ``temperature``; other quantities are under ``motion``."""
 HEADS = "'time [min]', 'NODE shift z [um]', 'NODE rotate x [arcsec]', 'NODE scale [ppm]', 'NODE temperature [K]' or "
 HEADS += "'NODE gradient x [mK/m]'"
 
@@ -257,18 +261,18 @@ _HEAD = re.compile(r"(?:(?P<node>\S+) +)?(?P<what>[a-z]+)(?: +(?P<axis>[a-z]))? 
 
 @dataclass(frozen=True)
 class _Column:
-    """What a column holds.
+    """Contents of a column.
 
     Attributes
     ----------
     what : str
         TIME, or a name of VECTORS or NUMBERS.
     node : str
-        Its path, empty for the time.
+        Path of the node, empty for the time.
     axis : int
-        0 to 2 of a vector.
+        Index of the component of a vector, 0 to 2.
     unit : str
-        Of its numbers.
+        Unit of the numbers.
     """
 
     what: str
@@ -278,26 +282,26 @@ class _Column:
 
     @property
     def place(self) -> KeyPath:
-        """In the course, without the number of the time."""
+        """Key path in the course, without the index of the time."""
         if self.what == TIME:
             return ("times",)
         return ("temperature", self.node, HEAT[self.what]) if self.what in HEAT else ("motion", self.node, self.what)
 
 
 def read_course(path: Path, named: CourseSpec) -> CourseSpec:
-    """The course that a table holds, with the detail and the pivots of the course that names it.
+    """Read the course of a table, with the detail and the pivots of the course that refers to it.
 
     Parameters
     ----------
     path : Path
-        Of a CSV file with a row for each time, whose heads name node, quantity, axis and unit.
+        CSV file with a row for each time, whose heads have node, quantity, axis and unit.
     named : CourseSpec
-        The course that names it.
+        Course that refers to the table.
 
     Raises
     ------
     InputError
-        The table cannot be read, with its line.
+        The table cannot be read; with its line.
     """
     file, rows = str(path), rows_of(path, LARGEST_BYTES)
     if len(rows) < 2:
@@ -308,7 +312,7 @@ def read_course(path: Path, named: CourseSpec) -> CourseSpec:
     places = [(*column.place, column.axis) for column in columns]
     twice = next((head for k, head in enumerate(heads) if places[k] in places[:k]), None)
     if twice is not None:
-        raise InputError(Issue("another column holds the same", file, head_line, (twice.strip(),)))
+        raise InputError(Issue("a second column with this head", file, head_line, (twice.strip(),)))
     if TIME not in [column.what for column in columns]:
         text, found = "no column has the times", names_text(heads)
         raise InputError(Issue(text, file, head_line, found=found, allowed="time [min]"))
@@ -333,7 +337,7 @@ def read_course(path: Path, named: CourseSpec) -> CourseSpec:
 
 
 def _column(head: str, file: str, line: int) -> _Column:
-    """InputError for a head that says nothing known."""
+    """Return the column of a head; raise `InputError` for an unknown head."""
     match = _HEAD.fullmatch(head.strip())
     if match is None:
         raise InputError(Issue("not the head of a column", file, line, found=shown(head.strip()), allowed=HEADS))
@@ -356,7 +360,7 @@ def _column(head: str, file: str, line: int) -> _Column:
 def _put(
     data: dict[str, Any], lines: dict[KeyPath, int], column: _Column, k: int, text: str, where: tuple[int, int]
 ) -> None:
-    """Put a cell at its place in the plain data of a course."""
+    """Store a cell in the plain data of a course."""
     line, count = where
     if column.what == TIME:
         data["times"][k] = text

@@ -1,5 +1,6 @@
-"""A detector by the numbers of its EMVA 1288 data sheet, as a file in scenes/library/detectors gives it, and what
-limits its pixels.
+"""Detector described by its EMVA 1288 data sheet, with its exposure limits.
+
+The data sheets are files of scenes/library/detectors.
 """
 
 from collections.abc import Mapping
@@ -14,42 +15,41 @@ from scenes.yaml.units import LENGTH, TIME, format_quantity
 
 LEAST_SIDE = 24
 AreaSide = Annotated[Whole, Field(ge=LEAST_SIDE, le=8192)]
-"""Rows or columns of an area CCD, from what a spot can be measured in on."""
+"""Number of rows or columns of an area CCD; the smallest number is that in which a spot can be measured."""
 PixelPitch = Annotated[float, Quantity(LENGTH, smallest="0.5 um", largest="1 mm")]
-"""Metres; pixels smaller than the smallest that are made would be a mistaken unit."""
+"""Pixel pitch, in metres; a value below the smallest pixels that are made would be a mistaken unit."""
 LEAST_STEPS = 1.0
-"""Grey values between the dark and a full well at least."""
+"""Smallest number of grey values between dark and full well."""
 
 
 class DetectorSpec(TitledSpec):
-    """Plain numbers in the units of EMVA 1288; e stands for electrons and DN for digital numbers (grey values).
+    """Data sheet of a detector: plain numbers in the units of EMVA 1288.
+
+    e stands for electrons and DN for digital numbers (grey values).
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     quantum_efficiency : Number
-        Electrons per photon at the wavelength it is used at.
+        Electrons per photon at the wavelength of use.
     system_gain_dn_per_e : Number
-        DN per electron (K of EMVA 1288).
+        System gain K of EMVA 1288, in DN per electron.
     dark_noise_e : Number
-        Temporal noise in the dark without dark current, rms.
+        Temporal noise in the dark without dark current, in electrons rms.
     dark_current_e_per_s : Number
-        Mean dark current of a pixel.
+        Mean dark current of a pixel, in electrons per second.
     full_well_e : Number
-        Saturation capacity.
+        Saturation capacity, in electrons.
     prnu : Number
         Photo response non-uniformity, relative rms.
     dsnu_e : Number
-        Dark signal non-uniformity, rms.
+        Dark signal non-uniformity, in electrons rms.
     bit_depth : Whole
-        Of the analogue-to-digital converter; frames are stored as 16 bits.
+        Resolution of the analogue-to-digital converter, in bits; frames are stored with 16 bits.
     offset_dn : Number
-        Grey value of no signal.
+        Grey value of zero signal, in DN.
     noise : Named[Number] | None
-        Beyond the model of EMVA 1288, name -> its number, electrons rms; None for nothing.
+        Name of a noise source beyond the model of EMVA 1288 -> its standard deviation, in electrons rms; none by
+        default.
     """
 
     quantum_efficiency: Annotated[Number, Field(gt=0.0, le=1.0)]
@@ -86,23 +86,24 @@ class DetectorSpec(TitledSpec):
 
     @property
     def saturation_dn(self) -> float:
-        """Grey value where the response stops being linear: the converter's end or the full well, whichever comes
-        first.
+        """Grey value at which the response ceases to be linear.
+
+        It is the converter's limit or the full well, whichever is lower.
         """
         return float(min(self.max_dn, self.offset_dn + self.system_gain_dn_per_e * self.full_well_e))
 
     @property
     def saturation_e(self) -> float:
-        """Electrons of a pixel there."""
+        """Electrons of a pixel at saturation."""
         return min(self.full_well_e, (self.max_dn - self.offset_dn) / self.system_gain_dn_per_e)
 
     def check_exposure(self, exposure: float) -> None:
-        """See whether the dark signal leaves room for light.
+        """Raise `InputError` if the dark signal leaves no room for light.
 
         Parameters
         ----------
         exposure : float
-            Of a frame, seconds.
+            Exposure of a frame, in seconds.
 
         Raises
         ------
@@ -121,7 +122,7 @@ class DetectorSpec(TitledSpec):
 
 
 def require_detector(setup: Spec, key: KeyPath, name: str, detectors: Mapping[str, DetectorSpec]) -> None:
-    """InputError at ``key`` unless a setup's data sheets hold that name: a config.yaml may have been changed."""
+    """Raise `InputError` at ``key`` unless a set-up has the data sheet; a config.yaml may have been edited."""
     if name not in detectors:
         allowed = names_text(detectors) or "a data sheet of that name in `detectors:`"
         raise setup.error("no such detector in this file", key, found=name, allowed=allowed)

@@ -1,9 +1,9 @@
-"""Disturbances: what is expected to move and to warm up between two measurements of the monitor, and by how much.
+"""Disturbances: motions and temperature changes expected between two measurements of the monitor, with their sigmas.
 
-The estimator `posterior` and the total sigmas of all others rest on this statement. It is a job's or an instrument's
-`disturbances: NAME`, a file of scenes/library/disturbances or of one's own.
+They are the prior of the estimator `posterior` and of the total sigmas of all others. A job or an instrument refers to
+them by `disturbances: NAME`, a file of scenes/library/disturbances or of the user.
 
-An error budget: an instrument, the light of its spots, and the causes whose errors are its lines.
+An error budget has an instrument, the light of its spots, and the causes whose errors are its lines.
 """
 
 import math
@@ -36,11 +36,11 @@ from scenes.yaml.spec import (
 from scenes.yaml.unit_fields import Quantity, Vector
 
 NONE = "none"
-"""`disturbances: none`: nothing is stated, and sigmas are those of the noise alone."""
+"""Value of `disturbances: none`: no disturbances, so that sigmas are those of the noise alone."""
 
 
 def _spread(kind: units.Kind, largest: str) -> Quantity:
-    """A standard deviation."""
+    """Return the annotation of a standard deviation."""
     return Quantity(kind, smallest=f"0 {kind.units[0]}", largest=largest)
 
 
@@ -51,7 +51,7 @@ def _something(value: Any) -> Any:
 
 
 STATED = BeforeValidator(_something)
-"""Validator of a key that may be left out, and not be empty: an empty standard deviation is a forgotten one."""
+"""Validator of an optional key that must not be empty: an empty standard deviation is a forgotten one."""
 ShiftSigma = Annotated[tuple[float, float, float], Vector(_spread(units.LENGTH, "10 mm"), alike=True)]
 RotateSigma = Annotated[tuple[float, float, float], Vector(_spread(units.ANGLE, "1 deg"), alike=True)]
 GradientSigma = Annotated[
@@ -68,14 +68,14 @@ Correlation = Annotated[Number, Field(ge=-1.0, le=1.0)]
 
 
 class TemperatureSigmaSpec(Spec):
-    """Standard deviations of a body's temperature field; what it does to light is worked out by the thermal model.
+    """Standard deviations of a body's temperature field. The thermal model computes their effect on the light.
 
     Attributes
     ----------
     change : float
-        Of its temperature at its origin, kelvin.
+        Standard deviation of the temperature at the body's origin, in kelvin.
     gradient : GradientSigma
-        Of each component of its gradient in the body's own frame, K/m.
+        Standard deviation of each component of the temperature gradient in the body's frame, in K/m.
     """
 
     change: Annotated[float, _spread(units.TEMPERATURE_DIFFERENCE, "100 K")] = 0.0
@@ -83,36 +83,40 @@ class TemperatureSigmaSpec(Spec):
 
 
 class TimeLawSpec(Spec):
-    """How a disturbance goes on from one time to another; its correlation between times t and t' is
+    """Time law of a disturbance in a series of measurements.
 
-        white: 1 at the same time, 0 at any other; constant: 1.
-        drift D: exp(-|t - t'| / D).  period T: cos(2 pi (t - t') / T).  Both: their product.
+    The correlation between times t and t' is
 
-    The others are an amplitude of unknown size; the standard deviation is that of its size:
+        white: 1 at the same time, 0 at any other; constant: 1. drift D: exp(-|t - t'| / D).  period T: cos(2 pi (t -
+        t') / T).  Both: their product.
 
-        trend S: (t - since) / S.  relaxation R: 1 - exp(-(t - since) / R) from `since` on, 0 before.
-        event E: 1 from E on, 0 before.  jump: an event at a time that nobody knows; jump T: one in T on average.
+    The other laws are functions of time with a random amplitude; the standard deviation is that of the amplitude:
 
-    A trend can be multiplied by a period, a swing that grows; an event by drift and period: what sets in at a moment.
+        trend S: (t - since) / S.  relaxation R: 1 - exp(-(t - since) / R) from `since` on, 0 before. event E: 1 from E
+        on, 0 before.  jump: an event at an unknown time; jump T: one in T on average.
+
+    A trend can be multiplied by a period (a growing oscillation), an event by drift and period (a disturbance that
+    begins at a known time).
 
     Attributes
     ----------
     kind : Literal['white', 'constant', 'jump'] | None
-        `white`, `constant` or `jump`, in place of the others.
+        Law without parameter, in place of the other keys: `white`, independent at every time; `constant`; or `jump`, a
+        step at an unknown time.
     drift : Span | None
-        Time in which it forgets where it was, seconds.
+        Correlation time, in seconds: the correlation decays exponentially.
     period : Span | None
-        It comes back with, seconds.
+        Period of an oscillation, in seconds.
     trend : Span | None
-        Time in which it grows by its standard deviation, seconds.
+        Time in which a linear trend grows by its standard deviation, in seconds.
     relaxation : Span | None
-        Time constant with which it goes to a new value, seconds.
+        Time constant of the exponential approach to a new value, in seconds.
     event : Moment | None
-        When it steps, seconds.
+        Time of a step, in seconds.
     jump : Span | None
-        Mean time between two jumps, seconds; what is too small to be found then counts in sigma.
+        Mean time between two jumps, in seconds; jumps below the detection threshold contribute to sigma.
     since : Moment | None
-        When a trend or relaxation starts, seconds; 0 by default.
+        Time at which a trend or relaxation starts, in seconds; 0 by default.
     """
 
     kind: Literal["white", "constant", "jump"] | None = None
@@ -138,7 +142,7 @@ class TimeLawSpec(Spec):
 
     @property
     def text(self) -> str:
-        """In words."""
+        """Law in words."""
         parts: list[str] = [self.kind or ""]
         for name in (*_TIMES, "since"):
             time = getattr(self, name)
@@ -147,12 +151,12 @@ class TimeLawSpec(Spec):
 
 
 _TIMES = ("drift", "period", "trend", "relaxation", "event", "jump")
-"""Keys of a law that make it one."""
+"""Keys that define a law."""
 _PRODUCTS = (
     *({"trend"}, {"trend", "period"}, {"relaxation"}, {"jump"}),
     *({"event"}, {"event", "drift"}, {"event", "period"}, {"event", "drift", "period"}),
 )
-"""Which of them go together, beside drift and period."""
+"""Combinations of keys that are allowed, besides drift with period."""
 _LAWS = (
     "white, constant, jump, {drift: 6 h}, {period: 95 min}, {trend: 365 d}, {relaxation: 30 d, since: 0 h}, "
     "{event: 12 h}, {jump: 400 d}"
@@ -169,7 +173,7 @@ MOVES = ("shift", "rotate", "scale", "figure", "radius", "conic", "temperature",
 
 
 def _check_matrix(rows: tuple[tuple[float, ...], ...], count: int, within: KeyPath = ()) -> None:
-    """Refuse rows that are no correlation matrix of ``count`` components but for its eigenvalues. Raises Problem."""
+    """Raise `Problem` unless rows form a correlation matrix of ``count`` components; eigenvalues are not checked."""
     if len(rows) != count or any(len(row) != count for row in rows):
         found = f"{len(rows)} rows of {names_text(dict.fromkeys(len(row) for row in rows)) or 'nothing'}"
         raise Problem("not a matrix of this size", found, f"{count} rows of {count} numbers", within=within)
@@ -184,17 +188,17 @@ def _check_matrix(rows: tuple[tuple[float, ...], ...], count: int, within: KeyPa
 
 
 class CorrelationSpec(Spec):
-    """Components of one cause that move together.
+    """Correlated components of a cause.
 
     Attributes
     ----------
     between : tuple[str, ...]
-        Their names: `base/forward/M1 shift z`, `NODE rotate x`, `NODE scale`, `NODE figure Z5`, `NODE radius`, `NODE
-        conic`, `NODE temperature`, `NODE gradient x`, `NODE index_gradient x`.
+        Names of the components: `base/forward/M1 shift z`, `NODE rotate x`, `NODE scale`, `NODE figure Z5`, `NODE
+        radius`, `NODE conic`, `NODE temperature`, `NODE gradient x`, `NODE index_gradient x`.
     correlation : Correlation | None
-        Of any two of them.
+        Correlation of any two of them.
     matrix : tuple[tuple[Correlation, ...], ...] | None
-        Their correlation matrix, in place of one number.
+        Correlation matrix of the components, in place of one number.
     """
 
     between: Annotated[tuple[Annotated[str, Field(strict=True)], ...], Field(min_length=2)]
@@ -213,7 +217,7 @@ class CorrelationSpec(Spec):
 
     @property
     def table(self) -> tuple[tuple[float, ...], ...]:
-        """The matrix."""
+        """Correlation matrix."""
         if self.matrix is not None:
             return self.matrix
         count, value = len(self.between), self.correlation
@@ -222,26 +226,26 @@ class CorrelationSpec(Spec):
 
 
 JOINT = "joint"
-"""Key of components that go together, and what their cause is called."""
+"""Key of the jointly distributed components, and name of their cause."""
 MOST_JOINT = 200
-"""Components that go together: a config.yaml holds the matrix of their correlations."""
+"""Largest number of joint components: a config.yaml holds the matrix of their correlations."""
 MOST_JOINT_BYTES = 4 << 20
-"""Of a table of their correlations."""
+"""Largest size of a table of their correlations, in bytes."""
 _AXES = ("x", "y", "z")
 
 
 def component_named(text: str) -> tuple[str, str, str, str]:
-    """The parts of a component's name: node, kind, axis or term, and pivot; parts that are not there are empty.
+    """Return the parts of a component's name: node, kind, axis or term, and pivot; missing parts are empty.
 
     Parameters
     ----------
     text : str
-        ``NODE KIND [AXIS] [about PIVOT]``, as the names of ``CorrelationSpec``.
+        Name of the form ``NODE KIND [AXIS] [about PIVOT]``, as in ``CorrelationSpec``.
 
     Raises
     ------
     Problem
-        It is not of this form.
+        The text is not of this form.
     """
     words = text.split()
     if len(words) > 1 and words[1] == "index_gradient":  # no perturbation of a job
@@ -264,13 +268,13 @@ _SPREADS: Mapping[str, Quantity] = {
     "gradient": _spread(units.TEMPERATURE_GRADIENT, "1000 K/m"),
     "index_gradient": _spread(units.PER_LENGTH, "1e-2 1/m"),
 }
-"""Kind of component -> its standard deviation."""
+"""Kind of component -> annotation of its standard deviation."""
 _PURE: Mapping[str, float] = {"conic": 1.0, "index": 0.1}
-"""Kind that is a pure number -> its largest standard deviation."""
+"""Kind of component that is a pure number -> its largest standard deviation."""
 
 
 def _sigma_of(name: str, value: Any) -> float:
-    """A standard deviation of a component, SI. Raises Problem."""
+    """Return the standard deviation of a component in the SI unit; raise `Problem` for another value."""
     kind = component_named(name)[1]
     if kind not in _PURE:
         return _SPREADS[kind].parse(value)
@@ -300,14 +304,14 @@ def _components(value: Any) -> Any:
 
 
 def written_sigma(name: str, sigma: float) -> str | float:
-    """A standard deviation of a component, SI, as a file has it.
+    """Return the standard deviation of a component in the form of a file.
 
     Parameters
     ----------
     name : str
-        Of the component.
+        Name of the component.
     sigma : float
-        Its standard deviation.
+        Standard deviation in the SI unit.
     """
     kind = component_named(name)[1]
     return sigma if kind in _PURE else _SPREADS[kind].format(sigma)
@@ -326,23 +330,24 @@ JointSigmas = Annotated[
 
 
 class JointSpec(Spec):
-    """Components of bodies that go together, with a standard deviation each and one matrix of correlations: for example
-    what an estimate of an instrument's state leaves unknown.
+    """Components of bodies with a joint distribution: a standard deviation for each and one correlation matrix.
+
+    An example is the remaining uncertainty of an estimate of an instrument's state.
 
     Attributes
     ----------
     components : JointSigmas
-        Name -> standard deviation with its unit, a plain number for `conic` and `index`. Names are those of
-        `correlations`, also `NODE index`; after a shift, a turn or a scale, `about PIVOT` names another pivot than the
-        body's centre, or its origin where it has none.
+        Name of a component -> standard deviation with its unit, or a plain number for `conic` and `index`. Names are
+        those of `correlations`, and `NODE index`; after a shift, a rotation or a scale, `about PIVOT` selects a pivot
+        other than the default, which is the body's centre if it has one, else its origin.
     correlation : tuple[tuple[Correlation, ...], ...] | None
-        Their correlation matrix, rows in the order of the components; independent without it.
+        Correlation matrix with rows in the order of the components; by default they are independent.
     correlation_file : Reference | None
-        a CSV file with the matrix in its place, and the names of the components as heads.
+        CSV file with the matrix and the names of the components as heads, in place of `correlation`.
     time : TimeLaw
-        How they go on in a series of measurements.
+        Time law of the components in a series of measurements.
     reason : Reason
-        Where the numbers come from.
+        Source of the numbers.
     """
 
     components: JointSigmas
@@ -360,12 +365,12 @@ class JointSpec(Spec):
         return self
 
     def with_table(self) -> "JointSpec":
-        """The same with the matrix of its file in it.
+        """Return the specification with the correlation matrix of its file.
 
         Raises
         ------
         InputError
-            The file cannot be read, or is no correlation matrix of these components.
+            The file cannot be read, or is not a correlation matrix of these components.
         """
         assert self.correlation_file is not None
         key = ("correlation_file",)
@@ -398,7 +403,7 @@ class JointSpec(Spec):
 
     @staticmethod
     def _row(path: Path, line: int, cells: list[str], count: int) -> list[float]:
-        """A row of correlations. Raises InputError."""
+        """Return a row of correlations; raise `InputError` if it is invalid."""
         allowed = f"{count} numbers from -1 to 1"
         if len(cells) != count:
             raise InputError(Issue("not a row of this table", str(path), line, (), f"{len(cells)} cells", allowed))
@@ -415,7 +420,7 @@ class JointSpec(Spec):
 
 
 class _CauseWords(Spec):
-    """What may be said of a cause."""
+    """Keys of a cause, all optional."""
 
     bodies: Annotated[BodyPatterns | None, STATED] = None
     shift: Annotated[ShiftSigma | None, STATED] = None
@@ -434,40 +439,41 @@ class _CauseWords(Spec):
 
 
 class CauseSpec(_CauseWords):
-    """One cause of change: its bodies and the standard deviation of each component of each of their motions. Components
-    are independent of each other unless it says otherwise.
+    """Cause of change: its bodies, and the standard deviation of each component of their motions.
+
+    Components are independent unless `together` or `correlations` say otherwise.
 
     Attributes
     ----------
     bodies : BodyPatterns
-        Node paths; `*` stands for one part of a path or a piece of it (`base/*/M?` are all mirrors), `<camera>` for the
-        name of a camera (`base/<camera>`).
+        Node paths, in which `*` stands for one part of a path or a piece of it (`base/*/M?` are all mirrors), and
+        `<camera>` for the name of a camera (`base/<camera>`).
     shift
-        Of the bodies in their own frames, metres.
+        Standard deviation of the shift along each axis of the body's frame, in metres.
     rotate
-        About the pivot, radians.
+        Standard deviation of the rotation about each axis through the pivot, in radians.
     scale
-        Relative growth of a camera and all in it.
+        Standard deviation of the relative change of scale of a camera and all in it.
     figure
-        Zernike term (Noll) -> of the surface error, metres.
+        Zernike term (Noll) -> standard deviation of the surface error, in metres.
     radius
-        Relative, of the vertex radius of curvature of a mirror or face.
+        Standard deviation of the relative change of the vertex radius of curvature of a mirror or face.
     conic
-        Of its conic constant, a pure number.
+        Standard deviation of the change of its conic constant, a pure number.
     temperature
-        Of the bodies' temperature fields.
+        Standard deviations of the body's temperature field.
     index_gradient
-        Of the refractive index in a prism, 1/m, other than by heat.
+        Standard deviation of the gradient of the refractive index in a prism from other causes than heat, in 1/m.
     pivot
-        Of turns and growth; by default the body's centre if it has one, else its origin.
+        Pivot of rotation and scale; by default the body's centre if it has one, else its origin.
     together
-        Correlation of the same component of any two of the bodies.
+        Correlation of the same component of any two of the bodies; by default they are independent.
     correlations : tuple[CorrelationSpec, ...]
-        Of single components.
+        Correlations of single components.
     time : TimeLaw
-        How it goes on in a series of measurements.
+        Time law in a series of measurements.
     reason : Reason
-        Where the numbers come from.
+        Source of the numbers.
     """
 
     bodies: BodyPatterns
@@ -483,25 +489,27 @@ class CauseSpec(_CauseWords):
 
 
 class CauseChangeSpec(_CauseWords):
-    """What a job says of a cause in place of the disturbances file, number by number; a cause that the file does not
-    have needs all that a cause needs.
+    """Change by a job of a cause in the disturbances file, key by key.
+
+    A cause that the file does not have needs all keys that a cause needs.
 
     Attributes
     ----------
     bodies, shift, rotate, scale, figure, radius, conic, temperature, index_gradient
-        As of a cause.
+        Replacement of this key of the cause; see there.
     pivot, together, correlations, time, reason
-        As of a cause.
+        Replacement of this key of the cause; see there.
     """
 
     @property
     def given(self) -> Mapping[str, Any]:
-        """What it says."""
+        """Keys that the job sets, with their values."""
         return {name: getattr(self, name) for name in self.model_fields_set if getattr(self, name) is not None}
 
     def made_to(self, cause: CauseSpec) -> CauseSpec:
-        """The cause with this change; what it does not say stays, of figures term by term and of temperatures number
-        by number.
+        """Return the cause with this change.
+
+        Other keys stay unchanged; figures are merged term by term, and temperatures number by number.
         """
         update = dict(self.given)
         if self.figure is not None and cause.figure is not None:
@@ -513,24 +521,20 @@ class CauseChangeSpec(_CauseWords):
 
 
 class DisturbancesSpec(TitledSpec):
-    """What is expected to change between the nominal measurement and a later one.
+    """Disturbances: changes that are expected between the nominal measurement and a later one.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     sigmas : Number
-        How many standard deviations every number of the file is; 3 for a list of 3-sigma values.
+        Number of standard deviations that each value of the file represents; 3 for a list of 3-sigma values.
     causes : Named[CauseSpec]
-        By name.
+        Name -> cause of change.
     joint : JointSpec | None
-        Components of bodies, each by its name, that go together as an estimate of them does; besides the causes, or in
-        their place.
+        Named components of bodies with a joint distribution, such as the result of an estimate; besides the causes or
+        in their place.
     jump_false_alarm : Number | None
-        Chance that a series in which nothing jumps has a jump reported, over all its times and all components whose law
-        in time is `jump`; 0.001 by default.
+        Probability that a jump is reported in a series without one, over all its times and all components whose time
+        law is `jump`; 0.001 by default.
     """
 
     sigmas: Annotated[Number, Field(gt=0.0, le=10.0)] = 1.0
@@ -548,18 +552,21 @@ class DisturbancesSpec(TitledSpec):
         return self
 
     def with_tables(self) -> "DisturbancesSpec":
-        """The statement with the correlations of the file that its `joint` names. Raises InputError: it is none."""
+        """Return the disturbances with the correlation matrix of the file of `joint`.
+
+        Raises InputError if it is invalid.
+        """
         if self.joint is None or self.joint.correlation_file is None:
             return self
         return self.model_copy(update={"joint": self.joint.with_table()})
 
     def changed(self, changes: "JobDisturbancesSpec") -> "DisturbancesSpec":
-        """Return the statement with a job's changes made.
+        """Return the disturbances with a job's changes.
 
         Raises
         ------
         InputError
-            It leaves out a cause that is not there, or adds one that is not complete.
+            The job excludes a cause that does not exist, or adds an incomplete one.
         """
         causes = dict(self.causes)
         for k, name in enumerate(changes.without):
@@ -587,18 +594,17 @@ class DisturbancesSpec(TitledSpec):
 
 
 class JobDisturbancesSpec(Spec):
-    """Which disturbances a job's sigmas rest on.
+    """Disturbances on which a job's sigmas are based.
 
     Attributes
     ----------
     file : Ref | None
-        Name of a file in scenes/library/disturbances, or path of one's own; the instrument's by default; `none` for
-        none at all.
+        Name of a file in scenes/library/disturbances, or the path of your file; `none` for no disturbances. By default
+        the instrument's.
     causes : Named[CauseChangeSpec]
-        What is to be said instead of, or besides, the causes of the file, in as many standard deviations as the file's
-        own numbers.
+        Name -> change of a cause of the file, or an additional cause, with the file's number of standard deviations.
     without : tuple[Name, ...]
-        Causes of the file that are left out.
+        Names of the file's causes that are excluded.
     """
 
     file: Ref | None = None
@@ -617,7 +623,7 @@ class JobDisturbancesSpec(Spec):
 
 
 def _as_file(value: Any) -> Any:
-    """A file's name, or what it says, stands for the file."""
+    """Expand the name of a file, or its content, to the mapping with `file`."""
     return {"file": value} if isinstance(value, str) or (isinstance(value, Mapping) and "name" in value) else value
 
 
@@ -625,7 +631,9 @@ JobDisturbances = Annotated[
     JobDisturbancesSpec,
     BeforeValidator(_as_file, json_schema_input_type=Reference | JobDisturbancesSpec | DisturbancesSpec),
 ]
-"""With its keys, the file's name alone, as `disturbances: orbit`, or what such a file says."""
+"""Disturbances as a mapping with its keys, the file's name alone, as `disturbances: orbit`, or the content of such a
+file.
+"""
 
 
 AngleErrors = Annotated[
@@ -634,27 +642,26 @@ AngleErrors = Annotated[
 
 
 class ErrorBudgetSpec(Spec):
-    """An error budget.
+    """Error budget of a monitor, whose lines are the causes of the disturbances.
 
     Attributes
     ----------
     description : Text
-        For people.
+        Description for readers; the program does not use it.
     instrument : Ref
-        Which, by name or path.
+        Instrument, by name or path.
     photons_per_frame : Number
-        Light of one spot in one frame; weak, as noise of the centroid is a line.
+        Photons of a spot per frame; few, so that the centroid's noise is a line of the budget.
     frames : Frames
-        Averaged in one measurement.
+        Number of frames averaged in a measurement.
     trials : Whole
         Number of random states for each line.
     all_together : Whole
         Number of random states with all causes at once.
     angle_errors : AngleErrors
-        Prism (prism_180 or prism_0) -> face -> tilt about its x and y, as made.
+        Prism (prism_180 or prism_0) -> face -> its manufacturing tilt about x and y, in radians.
     disturbances : Ref
-        What changes, and by how much: a file of scenes/library/disturbances or of one's own. Each of its causes is a
-        line.
+        File of disturbances: one of scenes/library/disturbances or the path of your file. Each of its causes is a line.
     """
 
     description: Text = ""
@@ -667,7 +674,7 @@ class ErrorBudgetSpec(Spec):
     disturbances: Ref
 
     def applied_to(self, instrument: InstrumentSpec) -> InstrumentSpec:
-        """The instrument with this budget's angle errors and light."""
+        """Return the instrument with this budget's angle errors and light."""
         monitor = instrument.autocollimator
         changed = {
             prism: getattr(monitor, prism).model_copy(update={"angle_errors": errors})

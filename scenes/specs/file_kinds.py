@@ -1,4 +1,4 @@
-"""All kinds of YAML files, how one is told from its keys, and which command reads it."""
+"""All kinds of YAML files: recognition by their keys, and the command that reads each kind."""
 
 import csv
 from collections.abc import Callable, Mapping
@@ -15,15 +15,16 @@ from scenes.yaml.yaml_file import read_yaml
 Given = TypeVar("Given")
 
 SLIPS = 1
-"""Keys that a file of a kind may have and the kind does not know: a typing error does not make it another kind."""
+"""Number of unknown keys that a file may have and still be of a kind: a typing error does not make it another kind."""
 
 _MOST = 2
-"""Kinds that a file may be and be told as such; of more its keys say nothing."""
+"""Largest number of kinds that a message lists for a file; if there are more, the keys are not conclusive."""
 
 
 def file_kinds() -> tuple[FileKind, ...]:
-    """Return every kind, in the order in which their schemas are listed: those in the table beside this module, then
-    those that are registered with a test.
+    """Return all kinds in the order in which their schemas are listed.
+
+    Those of the table beside this module come first, then those that are registered with a test.
     """
     with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as rows:
         listed = [FileKind(**row) for row in csv.DictReader(rows)]
@@ -32,17 +33,22 @@ def file_kinds() -> tuple[FileKind, ...]:
 
 
 _RESOLVED = {"job": "job", "study": "study"}
-"""Key of a config.yaml that names its kind; those of tests have ``test``, which is told as its own file would be."""
+"""Key of a config.yaml -> kind of the file. The config.yaml of a test has ``test``, whose content is recognised as the
+test's file would be.
+"""
 
 
 def kind_of(data: Any) -> FileKind | None:
-    """The kind of file, or of a run's config.yaml, that these plain data can only be; None where that is not clear."""
+    """Return the only kind of file that these plain data can be; None if that is not clear.
+
+    The data are those of a file or of a run's config.yaml.
+    """
     nearest = kinds_of(data)
     return nearest[0] if len(nearest) == 1 else None
 
 
 def kinds_of(data: Any) -> tuple[FileKind, ...]:
-    """The kinds that these plain data can be: more than one where no key tells them apart."""
+    """Return the kinds that these plain data can be: several if no key distinguishes them."""
     if not isinstance(data, Mapping):
         return ()
     keys = {key for key in data if isinstance(key, str)}
@@ -51,27 +57,27 @@ def kinds_of(data: Any) -> tuple[FileKind, ...]:
             return (next(kind for kind in file_kinds() if kind.name == name),)
     if "test" in keys:
         return kinds_of(data["test"])
-    found = [(strange, kind) for kind in file_kinds() if (strange := kind.strangers(keys)) is not None]
+    found = [(strange, kind) for kind in file_kinds() if (strange := kind.count_unknown(keys)) is not None]
     least = min((strange for strange, _ in found), default=SLIPS + 1)
     return tuple(kind for strange, kind in found if strange == least <= SLIPS)
 
 
 def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Given:
-    """What ``resolve`` makes of the file that was given to a command.
+    """Return the result of ``resolve`` for the file of a command.
 
     Parameters
     ----------
     command : str
-        As the user calls it, ``twin.lab focus``.
+        Command as the user types it, ``twin.lab focus``.
     file : Path
-        Given to it.
+        File that the user passed to the command.
     resolve : Callable[[Path], Given]
-        Raises InputError.
+        Function that reads the file and raises InputError.
 
     Raises
     ------
     InputError
-        As ``resolve``; for a file of another kind it says what the file is and which command reads it.
+        The error of ``resolve``; for a file of another kind it says which kind it is and which command reads it.
     """
     try:
         return resolve(file)
@@ -87,7 +93,7 @@ def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Give
 
 
 def _place(kind: FileKind, file: Path) -> str:
-    """Which command reads a file of a kind, and where its name belongs."""
+    """Return which command reads a file of a kind, and where its name belongs."""
     reads = f"python -m {kind.command} {file} does" if kind.command else ""
     named = f"its name belongs into {kind.place}" if kind.place else ""
     return ", or ".join(filter(None, (reads, named)))

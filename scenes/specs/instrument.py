@@ -1,6 +1,6 @@
-"""An instrument as its file gives it: cameras on a common base with their monitor channels and prisms.
+"""Instrument of an input file: cameras on a common base with their monitor channels and prisms.
 
-One instrument as it was built: another file's instrument, and how its bodies stand and are shaped against that.
+An instrument as built is another file's instrument with the deviations of its bodies from the design.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from scenes.yaml.spec import (
     TitledSpec,
     Whole,
     name_in,
-    one_given,
+    require_one,
 )
 from scenes.yaml.unit_fields import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, TEMPERATURE, TIME
@@ -41,8 +41,9 @@ BASE = "base"
 SIDES = ("left", "right")
 PRISM_180, PRISM_0 = "prism_180", "prism_0"
 PRISMS = (PRISM_180, PRISM_0)
-"""Prisms of a channel in the order of the light: keys of ``monitor`` in an instrument's file, and the last part of the
-paths of their bodies."""
+"""Prisms of a channel in the order of the light: keys of ``monitor`` in an instrument's file, and last parts of the
+paths of their bodies.
+"""
 CENTRAL_KEY = "central_prism"
 """Key of the central prism in an instrument's file."""
 CENTRAL_PRISM = f"{BASE}/{CENTRAL_KEY}"
@@ -50,33 +51,33 @@ CENTRAL_PRISM = f"{BASE}/{CENTRAL_KEY}"
 
 
 def prism_of(path: str) -> str | None:
-    """Which of ``PRISMS`` a body is or belongs to, by its path; None for none."""
+    """Return which of ``PRISMS`` a body is or belongs to, from its path; None for other bodies."""
     return next((part for part in path.split("/") if part in PRISMS), None)
 
 
 def channel_of(path: str) -> tuple[str, str] | None:
-    """Camera and name of the channel to whose prisms or boards a body belongs, by its path; None for no channel."""
+    """Return camera and channel to whose prisms or boards a body belongs, from its path; None for other bodies."""
     parts = path.split("/")
     return (parts[1], parts[3]) if len(parts) > 4 and parts[2] in ("monitor", "focal_plane") else None
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One monitor channel of one camera.
+    """Monitor channel of a camera.
 
     Attributes
     ----------
     camera, name : str
-        e.g. ``forward``, ``left``: the camera's and its own; those of a plain pair are ``left`` (the +Y end of the
-        line) and ``right``.
+        Names of the camera and of the channel, e.g. ``forward``, ``left``; those of a plain pair are ``left`` (the +Y
+        end of the line) and ``right``.
     pinhole, ccd : tuple[float, float]
-        Positions in the focal plane's X, Y, metres.
+        Positions in the focal plane's X, Y, in metres.
     pupil_offset : tuple[float, float]
-        Of its beam's middle in the entrance pupil, X and Y, metres.
+        Position of the beam's centre in the entrance pupil, X and Y, in metres.
     aperture : float
-        Diameter of its return face, metres.
+        Diameter of the return face, in metres.
     photons : float
-        That its spot gets in a frame.
+        Photons of the spot in a frame.
     """
 
     camera: str
@@ -89,7 +90,7 @@ class Channel:
 
     @property
     def key(self) -> str:
-        """``<camera>/<name>``, the prefix of the channel's elements and sequences."""
+        """Prefix ``<camera>/<name>`` of the channel's elements and sequences."""
         return f"{self.camera}/{self.name}"
 
     @property
@@ -103,11 +104,11 @@ class Channel:
         return f"{BASE}/{self.camera}/focal_plane/{self.name}/area_ccd"
 
     def prism_body(self, prism: str) -> str:
-        """Body path of one of ``PRISMS``."""
+        """Return the body path of one of ``PRISMS``."""
         return f"{BASE}/{self.camera}/monitor/{self.name}/{prism}"
 
     def prism_elements(self, prism: str) -> str:
-        """What the names of the elements of one of ``PRISMS`` begin with."""
+        """Return the prefix of the names of the elements of one of ``PRISMS``."""
         return f"{self.key}/{prism}"
 
     @property
@@ -120,15 +121,15 @@ Tilt = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="1 deg"), 2
 
 
 GlassName = Annotated[str, Field(strict=True), name_in("glass", GLASSES, glass)]
-"""A glass of the catalogue in optics/materials/glass.py."""
+"""Name of a glass in the catalogue of optics/materials/glass.py."""
 
 
 MadeOf = Annotated[str, Field(strict=True), Catalogued(lambda name: _spelt(name), MATERIALS)]
-"""A glass, or what a frame of mirrors is made of; see ``_check_made``."""
+"""Name of a glass, or of the material of a frame that carries mirrors; see ``check_made``."""
 
 
 def _spelt(name: str) -> str:
-    """A material's name in the catalogue's own spelling; another name as it is."""
+    """Return a material's name in the spelling of the catalogue; an unknown name unchanged."""
     try:
         return material(name).name
     except KeyError:
@@ -139,19 +140,19 @@ FaceErrors = Annotated[dict[Name, Tilt], NothingIsEmpty, AfterValidator(FrozenMa
 
 
 def reflector_kinds(returns: bool) -> OneOf:
-    """Names of the reflectors that send the beam back, or of those that send it on."""
+    """Return the names of the reflectors that return the beam, or of those that displace it."""
     return OneOf(lambda: (name for name, kind in REFLECTORS.items() if kind.returns == returns))
 
 
 def _check_faces(errors: Mapping[str, tuple[float, float]], reflector: Reflector) -> None:
-    """Refuse angle errors of faces that a reflector does not have."""
+    """Raise `Problem` for angle errors of faces that a reflector does not have."""
     for name in errors:
         if name not in reflector.faces:
             raise unknown("no such face", name, reflector.faces, ("angle_errors", name))
 
 
 def check_made(made_of: str, reflector: Reflector) -> None:
-    """Refuse what a reflector cannot be made of."""
+    """Raise `Problem` for a material that a reflector cannot be made of."""
     names = GLASSES if reflector.transparent else MATERIALS
     if made_of not in names:
         what = "no such glass" if reflector.transparent else "no such material"
@@ -161,25 +162,24 @@ def check_made(made_of: str, reflector: Reflector) -> None:
 
 
 class Prism180Spec(Spec):
-    """The lateral-transfer prism: three mutually perpendicular faces send the beam back parallel to itself.
+    """Lateral-transfer prism, whose three mutually perpendicular faces return the beam parallel to itself.
 
     Attributes
     ----------
     material : MadeOf
-        Its glass; of a kind without glass the material of its frame and mirrors.
+        Glass of the prism; for a kind without glass the material of its frame and mirrors.
     distance : PositiveLength
-        From the camera's origin to its window, along the line of sight, metres.
+        Distance from the camera's origin to the window, along the line of sight, in metres.
     width : PositiveLength
-        Of the clear apertures across the beam, metres; somewhat more than the return face's.
+        Width of the clear apertures across the beam, in metres; somewhat more than the return face's diameter.
     tilt : Tilt
-        Turn about its own x and y from where its faces stand square to the beam, about its null point, radians. It
-        leaves the beam's direction alone and sends the reflections off its faces past the area CCD.
+        Rotation about the prism's x and y and its null point, relative to faces perpendicular to the beam, in radians.
+        It leaves the beam's direction unchanged and keeps the reflections from the faces off the area CCD.
     angle_errors : FaceErrors
-        Face -> tilt about the face's own x and y, radians, as made. Faces: window, mirror, roof_a, roof_b; of the
-        hollow kind mirror, roof_a, roof_b.
+        Name of a face -> its manufacturing tilt about the face's x and y, in radians. Faces: window, mirror, roof_a,
+        roof_b; of the hollow kind mirror, roof_a, roof_b.
     kind : str | None
-        What stands in its place, by its name among ``REFLECTORS``: the prism (lateral_transfer) when nothing is said,
-        or three mirrors on a frame (hollow_transfer).
+        Kind of reflector: a prism (lateral_transfer, the default) or three mirrors on a frame (hollow_transfer).
     """
 
     material: MadeOf
@@ -191,7 +191,7 @@ class Prism180Spec(Spec):
 
     @property
     def reflector(self) -> Reflector:
-        """What stands there."""
+        """Reflector of this kind."""
         return REFLECTORS[self.kind or "lateral_transfer"]
 
     @model_validator(mode="after")
@@ -202,26 +202,25 @@ class Prism180Spec(Spec):
 
 
 class Prism0Spec(Spec):
-    """The rhomboid: two parallel reflecting faces displace the beam and keep its direction.
+    """Rhomboid, whose two parallel reflecting faces displace the beam and keep its direction.
 
     Attributes
     ----------
     material : MadeOf
-        Its glass; of a kind without glass the material of its frame and mirrors.
+        Glass of the prism; for a kind without glass the material of its frame and mirrors.
     distance : PositiveLength
-        From the return face to its centre, along the beam, metres.
+        Distance from the return face to the prism's centre, along the beam, in metres.
     shift : PositiveLength
-        By how much it displaces the beam, toward the central prism, metres.
+        Displacement of the beam, toward the central prism, in metres.
     width : PositiveLength
-        Of the clear apertures across the beam, metres.
+        Width of the clear apertures across the beam, in metres.
     tilt : Tilt
-        Turn about its own x and y from where its faces stand square to the beam, about its middle, radians.
+        Rotation about the prism's x and y and its centre, relative to faces perpendicular to the beam, in radians.
     angle_errors : FaceErrors
-        Face -> tilt, as for the 180-deg prism. Faces: entry, mirror_a, mirror_b, exit; of the periscope mirror_a,
-        mirror_b.
+        Name of a face -> its manufacturing tilt about the face's x and y, in radians. Faces: entry, mirror_a, mirror_b,
+        exit; of the periscope mirror_a, mirror_b.
     kind : str | None
-        What stands in its place, by its name among ``REFLECTORS``: the prism (rhomboid) when nothing is said, or two
-        mirrors on a frame (periscope).
+        Kind of reflector: a prism (rhomboid, the default) or two mirrors on a frame (periscope).
     """
 
     material: MadeOf
@@ -234,7 +233,7 @@ class Prism0Spec(Spec):
 
     @property
     def reflector(self) -> Reflector:
-        """What stands there."""
+        """Reflector of this kind."""
         return REFLECTORS[self.kind or "rhomboid"]
 
     @model_validator(mode="after")
@@ -248,19 +247,20 @@ Spread = Annotated[tuple[float, float], Vector(Quantity(LENGTH, above_zero=True,
 
 
 class CentralPrismSpec(Spec):
-    """The central prism, the common reference of all cameras: a block with one mirror facet per channel, which meet in
-    its apex.
+    """Central prism, the common reference of all cameras: a block with one mirror facet for each channel.
+
+    The facets meet in its apex.
 
     Attributes
     ----------
     position : Vector3
-        Of the apex in the base frame, metres.
+        Position of the apex in the base frame, in metres.
     material : GlassName
-        Of the block.
+        Glass of the block.
     spread : Spread
-        How far from the apex the beams meet their facets, along the base's X and Y, metres.
+        Distance from the apex at which the beams meet their facets, along the base's X and Y, in metres.
     height : PositiveLength
-        Of the block below the apex, metres.
+        Height of the block below the apex, in metres.
     """
 
     position: Vector3
@@ -279,14 +279,14 @@ Frames = Annotated[Whole, Field(ge=1, le=MOST_FRAMES)]
 
 
 class ReticleSpec(Spec):
-    """The light source of a monitor channel: a lit pinhole in the focal plane.
+    """Light source of a monitor channel: an illuminated pinhole in the focal plane.
 
     Attributes
     ----------
     pinhole : PositiveLength
-        Diameter, metres.
+        Diameter of the pinhole, in metres.
     photons_per_frame : Photons
-        Expected number of photons of one spot that reach the area CCD's plane during one exposure.
+        Expected number of photons of a spot that reach the plane of the area CCD during one exposure.
     """
 
     pinhole: PositiveLength
@@ -294,22 +294,22 @@ class ReticleSpec(Spec):
 
 
 class AreaCcdSpec(Spec):
-    """The area CCD of a monitor channel.
+    """Area CCD of a monitor channel.
 
     Attributes
     ----------
     detector : Ref
-        Its data sheet, by name or path.
+        Data sheet of the detector, by name or path.
     rows : AreaSide
         Number of pixel rows.
     columns : AreaSide
         Number of pixel columns.
     pitch : PixelPitch
-        Of the pixels, metres.
+        Pixel pitch, in metres.
     offset : Vector2
-        (X, Y) from the pinhole to the centre of the pixel grid, in the focal plane, metres.
+        Position (X, Y) of the pixel grid's centre relative to the pinhole, in the focal plane, in metres.
     exposure : Exposure
-        Of a frame, seconds.
+        Exposure of a frame, in seconds.
     """
 
     detector: Ref
@@ -321,14 +321,16 @@ class AreaCcdSpec(Spec):
 
 
 class AreaCcdChoiceSpec(Spec):
-    """An area CCD that the monitor may have: pixels of another size are another detector, with a data sheet of its own.
+    """Area CCD that the monitor may have, as one choice of the search.
+
+    Pixels of another size need another detector with its own data sheet.
 
     Attributes
     ----------
     detector : Ref
-        Its data sheet, by name or path.
+        Data sheet of the detector, by name or path.
     pitch : PixelPitch
-        Of its pixels, metres.
+        Pixel pitch, in metres.
     rows : AreaSide
         Number of pixel rows.
     columns : AreaSide
@@ -342,33 +344,39 @@ class AreaCcdChoiceSpec(Spec):
 
 
 class ReturnFaceSpec(Spec):
-    """The mirror coating of a central prism's facet, which returns the monitor's beam and limits it: diameter,
-    metres.
+    """Mirror-coated facet of the central prism, which returns the monitor's beam and limits it.
+
+    Attributes
+    ----------
+    aperture : PositiveLength
+        Diameter of the mirror coating, in metres.
     """
 
     aperture: PositiveLength
 
 
 class ChannelSpec(Spec):
-    """One channel of a camera's monitor, where a camera has others than the plain pair; what is left out is the
-    monitor's.
+    """Channel of a camera's monitor, for cameras with other channels than the plain pair.
+
+    Optional keys replace the values that the monitor has for all channels.
 
     Attributes
     ----------
     field : FieldPlace
-        Angle from the visual axis at which its area CCD stands, positive at the +Y end of the line, radians.
+        Field angle of the area CCD from the visual axis, positive at the +Y end of the line, in radians.
     pupil_offset : Vector2
-        Centre (X, Y) of its beam in the entrance pupil, metres.
+        Centre (X, Y) of the beam in the entrance pupil, in metres.
     return_face : ReturnFaceSpec | None
-        The mirror that returns its beam, and limits it.
+        Mirror that returns the beam and limits it; by default the monitor's.
     spread : Spread | None
-        How far from the central prism's apex its beam meets its facet, along the base's X and Y, metres.
+        Distance from the central prism's apex at which the beam meets its facet, along the base's X and Y, in metres;
+        by default the central prism's.
     photons_per_frame : Photons | None
-        Of its spot.
+        Photons of the spot per frame; by default those of the monitor's reticle.
     prism_180 : Prism180Spec | None
-        Its lateral-transfer prism.
+        Lateral-transfer prism; by default the monitor's.
     prism_0 : Prism0Spec | None
-        Its rhomboid.
+        Rhomboid; by default the monitor's.
     """
 
     field: FieldPlace
@@ -382,7 +390,7 @@ class ChannelSpec(Spec):
 
 @dataclass(frozen=True)
 class ChannelParts:
-    """What a channel has, its own or the monitor's; see `ChannelSpec`."""
+    """Parts of a channel after the defaults of the monitor; see `ChannelSpec`."""
 
     field: float
     pupil_offset: tuple[float, float]
@@ -394,27 +402,31 @@ class ChannelParts:
 
     @property
     def prisms(self) -> dict[str, Prism180Spec | Prism0Spec]:
-        """Both by their keys, in the order of the light."""
+        """Both prisms by their keys, in the order of the light."""
         return {PRISM_180: self.prism_180, PRISM_0: self.prism_0}
 
 
 class MountedCameraSpec(Spec):
-    """A camera in its place on the base, with the channels of its monitor: a plain pair at both ends of the line,
-    through the same part of the pupil, or any number of channels; none in an instrument without a monitor.
+    """Camera mounted on the base, with the channels of its monitor.
+
+    The channels are a plain pair at both ends of the line through one part of the pupil, or any number of channels. An
+    instrument without a monitor has no channels.
 
     Attributes
     ----------
     camera : Ref
-        Which camera, by name or path.
+        Prescription of the camera, by name or path.
     look : LookAngle
-        Angle of its visual axis from the base's +Z, about the base's Y, positive forward (toward +X), radians.
+        Look angle: angle of the visual axis from the base's +Z about the base's Y, positive forward (toward +X), in
+        radians.
     position : Vector3
-        Of the camera's origin in the base frame, metres.
+        Position of the camera's origin in the base frame, in metres.
     pupil_offset : Vector2 | None
-        Centre (X, Y) of a plain pair's sub-aperture in the entrance pupil, metres.
+        Centre (X, Y) of the sub-aperture in the entrance pupil of a plain pair of channels, at both ends of the line,
+        in metres.
     channels : Named[ChannelSpec] | None
-        By name, in place of a plain pair. The printed formulas are about a pair at opposite fields called left and
-        right; a camera without such a pair is measured by the estimators that take all spots.
+        Name -> channel, in place of a plain pair. The published formulas need a pair at opposite fields called left and
+        right; other cameras are measured by the estimators that use all spots.
     """
 
     camera: Ref
@@ -425,7 +437,7 @@ class MountedCameraSpec(Spec):
 
     @property
     def mirrored(self) -> MountedCameraSpec:
-        """The camera with every beam through the opposite part of the pupil."""
+        """Camera with every beam through the opposite part of the pupil."""
         if self.pupil_offset is not None:
             x, y = self.pupil_offset
             return self.model_copy(update={"pupil_offset": (-x, -y)})
@@ -439,21 +451,22 @@ class MountedCameraSpec(Spec):
 
 
 class MaterialsSpec(Spec):
-    """What the parts are made of, by name in the catalogue of optics/materials/material.py; prisms name their own
-    glass.
+    """Materials of the parts, by their names in the catalogue of optics/materials/material.py.
+
+    Prisms have their own key for the glass.
 
     Attributes
     ----------
     base : MaterialName
-        The common structure.
+        Material of the common structure.
     camera : MaterialName
-        Each camera's structure, with the monitor's brackets.
+        Material of each camera's structure and of the monitor's brackets.
     mirror : MaterialName
-        All mirrors.
+        Material of all mirrors.
     focal_plane : MaterialName
-        What carries the line CCD.
+        Material of the carrier of the line CCD.
     board : MaterialName
-        What carries reticle and area CCD at each end of it.
+        Material of the boards at each end of the line that carry reticle and area CCD.
     """
 
     base: MaterialName = "CFRP"
@@ -464,26 +477,26 @@ class MaterialsSpec(Spec):
 
 
 class MonitorSpec(Spec):
-    """The autocollimation monitor, alike in all cameras and in both channels of each.
+    """Autocollimation monitor. Its parts are the same in all cameras and in both channels of each.
 
     Attributes
     ----------
     wavelength : Wavelength
-        Of the source, metres.
+        Wavelength of the source, in metres.
     field : float
-        Angle from the visual axis at which the area CCDs stand, left at +Y and right at -Y, radians.
+        Field angle of the area CCDs from the visual axis, left at +Y and right at -Y, in radians.
     reticle : ReticleSpec
-        Light source.
+        Light source of each channel.
     area_ccd : AreaCcdSpec
-        detector.
+        Detector of each channel.
     prism_180 : Prism180Spec
-        The lateral-transfer prism of every channel.
+        Lateral-transfer prism of each channel.
     prism_0 : Prism0Spec
-        The rhomboid of every channel.
+        Rhomboid of each channel.
     return_face : ReturnFaceSpec
-        What sends the light back.
+        Mirror that returns the beam of each channel.
     frames : Frames
-        Number of frames in one measurement.
+        Number of frames in a measurement.
     """
 
     wavelength: Wavelength
@@ -502,33 +515,29 @@ class MonitorSpec(Spec):
 
 
 class InstrumentSpec(TitledSpec):
-    """Cameras on a common base, each with its monitor, or all without one.
+    """Instrument: cameras on a common base, either all with a monitor or all without one.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     cameras : Named[MountedCameraSpec]
-        By name; the first is the reference for the change of the intersection angle.
+        Name -> camera; the first one is the reference for the change of the intersection angle.
     central_prism : CentralPrismSpec | None
-        Common reference of the monitor.
+        Central prism, the common reference of the monitor; absent if there is no monitor.
     monitor : MonitorSpec | None
-        Of every camera; left out, with the central prism, where there is none.
+        Monitor of every camera; by default there is none.
     temperature : float
-        At which everything has its nominal shape, kelvin.
+        Temperature at which all parts have their nominal shape, in kelvin.
     materials : MaterialsSpec
-        What the parts are made of.
+        Materials of the parts.
     baffles : Named[BaffleSpec]
-        By name; none by default.
+        Name -> baffle; none by default.
     altitude : float | None
-        Of its orbit, metres; for what changes of a pair's cameras do to points on the ground.
+        Altitude of the orbit, in metres. It is needed to express changes of a pair's cameras as errors on the ground.
     disturbances : Ref | None
-        What is expected to move, unless a job says otherwise: a file of scenes/library/disturbances or of one's own.
+        Expected disturbances unless a job has its own: a file of scenes/library/disturbances or the path of your file.
     as_built : AsBuilt | None
-        Node -> how it stands and is shaped against all else that the file says, as in a job's `perturb`. What a job
-        perturbs comes on top of it, and changes count from it.
+        Node -> deviation of the built body from the rest of this file, as in a job's `perturb`. A job's perturbation is
+        added to it, and changes are counted from it.
     """
 
     cameras: Annotated[Named[MountedCameraSpec], Field(min_length=1)]
@@ -551,7 +560,7 @@ class InstrumentSpec(TitledSpec):
             if self.monitor is not None:
                 allowed = "one of pupil_offset and channels"
                 asked = "which channels does its monitor have?"
-                one_given(site, ("pupil_offset", "channels"), asked, allowed, ("cameras", name))
+                require_one(site, ("pupil_offset", "channels"), asked, allowed, ("cameras", name))
                 continue
             given = [key for key in ("pupil_offset", "channels") if getattr(site, key) is not None]
             if given:
@@ -561,26 +570,26 @@ class InstrumentSpec(TitledSpec):
 
     @classmethod
     def of_camera(cls, name: str, camera: str) -> InstrumentSpec:
-        """A camera by itself as an instrument: on the base, without a look angle and without a monitor.
+        """Return a single camera as an instrument: on the base, without a look angle and without a monitor.
 
         Parameters
         ----------
         name : str
-            Of the camera, and of the instrument.
+            Name of the camera and of the instrument.
         camera : str
-            Which camera, by name or path.
+            Prescription, by name or path.
         """
         site = MountedCameraSpec.model_construct(camera=camera, look=0.0, position=(0.0, 0.0, 0.0))
         return cls.model_construct(name=name, cameras=FrozenMap({name: site}))
 
     @property
     def autocollimator(self) -> MonitorSpec:
-        """The monitor of an instrument that has one.
+        """Monitor of the instrument.
 
         Raises
         ------
         InputError
-            It has none.
+            The instrument has no monitor.
         """
         if self.monitor is None:
             raise self._without_monitor()
@@ -588,7 +597,7 @@ class InstrumentSpec(TitledSpec):
 
     @property
     def reference_prism(self) -> CentralPrismSpec:
-        """The central prism of an instrument that has one. Raises InputError: it has none."""
+        """Central prism of the instrument. Raises InputError if it has none."""
         if self.central_prism is None:
             raise self._without_monitor()
         return self.central_prism
@@ -598,17 +607,16 @@ class InstrumentSpec(TitledSpec):
         return self.error(text, ("monitor",), allowed="an instrument with a monitor and a central_prism")
 
     def key_of(self, camera: str, channel: str, key: KeyPath) -> KeyPath:
-        """Where the file says something of a channel: at the channel itself if it does there, else where it says it of
-        all.
+        """Return the key at which the file sets a property of a channel: at the channel itself, or for all channels.
 
         Parameters
         ----------
         camera : str
-            Its name; one that is not in the file changes nothing.
+            Name of the camera; an unknown one leaves the key unchanged.
         channel : str
-            Its name, likewise.
+            Name of the channel; an unknown one leaves the key unchanged.
         key : KeyPath
-            Where it says it of all, e.g. ``("monitor", "prism_180", "width")``.
+            Key for all channels, e.g. ``("monitor", "prism_180", "width")``.
         """
         site = self.cameras.get(camera)
         if site is None or site.channels is None or channel not in site.channels:
@@ -628,12 +636,12 @@ class InstrumentSpec(TitledSpec):
         return key
 
     def channels_of(self, camera: str) -> dict[str, ChannelParts]:
-        """All channels of a camera's monitor, by name; none where there is no monitor.
+        """Return all channels of a camera's monitor by name; empty without a monitor.
 
         Parameters
         ----------
         camera : str
-            Its name.
+            Name of the camera.
         """
         site = self.cameras[camera]
         if self.monitor is None or self.central_prism is None:
@@ -659,28 +667,24 @@ class InstrumentSpec(TitledSpec):
 
 
 DESIGN = "design"
-"""Key by which the file of an instrument as built is told."""
+"""Key that identifies the file of an instrument as built."""
 
 
 class AsBuiltInstrumentSpec(TitledSpec):
-    """An instrument as it was built: the instrument of a design, and how its bodies stand and are shaped against that.
+    """Instrument as built: the instrument of a design, and the deviations of its bodies from that design.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     design : Ref
-        The instrument of the drawing: name of one in scenes/library/instruments, or path of an own file. A camera, as
-        `{camera: NAME or FILE}` or named like an instrument, is one without a monitor.
+        Instrument of the design: a name in scenes/library/instruments, or the path of your file. A camera, given as
+        `{camera: NAME or FILE}` or by its name, is an instrument without a monitor.
     as_built : AsBuilt
-        Node -> how it stands and is shaped against the drawing, as in a job's `perturb`, by the node's path or the last
-        parts of it; or a list of texts such as `M2 shift z 20 um`. What a job perturbs comes on top of it, and changes
-        count from it.
+        Node -> deviation from the design, as in a job's `perturb`; the node is given by its path or the last parts of
+        it. Or a list of texts such as `M2 shift z 20 um`. A job's perturbation is added to it, and changes are counted
+        from it.
     disturbances : Ref | None
-        What is expected to move, or how well it is known how the bodies stand: a file of scenes/library/disturbances or
-        of one's own; the design's by default.
+        Expected disturbances, or the uncertainty of the deviations: a file of scenes/library/disturbances or the path
+        of your file; by default the design's.
     """
 
     design: Ref
@@ -688,12 +692,12 @@ class AsBuiltInstrumentSpec(TitledSpec):
     disturbances: Ref | None = None
 
     def made_of(self, design: InstrumentSpec, disturbances: str | None = None) -> InstrumentSpec:
-        """The instrument that this one is.
+        """Return this instrument, made from its design.
 
         Parameters
         ----------
         design : InstrumentSpec
-            What `design` names.
+            Instrument to which `design` refers.
         disturbances : str | None
             Name or absolute path of the file of disturbances; None for the design's.
         """
@@ -704,24 +708,24 @@ class AsBuiltInstrumentSpec(TitledSpec):
 
 
 def as_built_of(state: State) -> FrozenMap[str, PlainPerturbationSpec]:
-    """A state of an instrument as `as_built` has it.
+    """Return a state of an instrument in the form of `as_built`.
 
     Parameters
     ----------
     state : State
-        Body path -> motion, for example what `optics.geometry.tree.compose` makes of the state that was found and of
-        the one that the file has already. Bodies at rest are left out.
+        Body path -> motion, for example the result of `optics.geometry.tree.compose` for an estimated state and the one
+        that the file already has. Bodies without motion are omitted.
 
     Raises
     ------
     ValueError
-        a motion that no file can say: with a scale, a stretch, a gradient of the index or a grid.
+        A motion has a scale, a stretch, an index gradient or a grid, which the file cannot express.
     """
     return FrozenMap({path: _built(path, motion) for path, motion in state.items() if motion != Motion()})
 
 
 def _built(path: str, motion: Motion) -> PlainPerturbationSpec:
-    if motion.scale or motion.stretch or any(motion.index_gradient) or motion.grid is not None:
+    if motion.scale or motion.expansion or any(motion.index_gradient) or motion.grid is not None:
         raise ValueError(f"{path}: only rigid motions, Zernike terms, radius, conic constant and index are as built")
     # of checked parts: to validate them would ask for quantities as text
     return PlainPerturbationSpec.model_construct(
@@ -743,28 +747,29 @@ def as_built_file(
     description: str = "",
     remark: str = "",
 ) -> str:
-    """Text of the file of an instrument as it was built; `scenes.specs.load.load_instrument` reads it back to exactly
-    this state.
+    """Return the text of the file of an instrument as built.
+
+    `scenes.specs.load.load_instrument` reads it back to exactly this state.
 
     Parameters
     ----------
     name : str
-        Of the instrument.
+        Name of the instrument.
     design : str | dict[str, Any]
-        Name or path of the instrument of the drawing, as the file is to say it, or what its file says.
+        Name or path of the design's instrument, as the file should have it, or the content of its file.
     state : State
-        Body path -> motion against the drawing.
+        Body path -> motion relative to the design.
     disturbances : str | None
-        Name of a file of disturbances, or its path from where the file is going to stand; None for those of the design.
+        Name of a file of disturbances, or its path relative to the new file's folder; None for those of the design.
     description : str
-        For people.
+        Description for readers.
     remark : str
-        At the top of the file, lines of comment.
+        Comment at the top of the file.
 
     Raises
     ------
     ValueError
-        As ``as_built_of``.
+        The state cannot be expressed, as in ``as_built_of``.
     """
     spec = AsBuiltInstrumentSpec.model_construct(
         name=name, description=description, design=name, as_built=as_built_of(state), disturbances=disturbances

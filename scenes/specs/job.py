@@ -1,4 +1,4 @@
-"""A job: which instrument, what is perturbed, what changes with time, what is rendered and how."""
+"""Job of `twin.render`: an instrument, its perturbation, its changes with time, and the images to be rendered."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,7 +31,7 @@ from scenes.yaml.units import ANGLE, SCALE
 
 
 def target_names() -> tuple[str, ...]:
-    """What ``render.images`` may name beside the monitor's spots: targets whose MTF is measured, then the others."""
+    """Return the names that ``render.images`` allows beside `spots`: targets whose MTF is measured, then the others."""
     return ("knife_edge", "bars", *TARGETS)
 
 
@@ -40,19 +40,19 @@ White = Annotated[float, Quantity(SCALE, smallest="0.1 percent", largest="100 pe
 
 
 class TargetsSpec(Spec):
-    """How the test targets are turned and exposed.
+    """Orientation and exposure of the test targets.
 
     Attributes
     ----------
     angle : EdgeAngle
-        Of the knife edge against the pixel columns or rows, radians.
+        Angle of the knife edge to the pixel columns or rows, in radians.
     region : Whole
-        Side of the recorded images, pixels.
+        Side of the recorded images, in pixels.
     white : White
-        Signal of a wide bright area in each frame, as a share of the full well, through a free pupil; what bodies in
-        the beam take is missing.
+        Signal of a large bright area in each frame through an unobstructed pupil, as a share of the full well; bodies
+        in the beam reduce it.
     frames : Frames | None
-        Number of frames, None for as many as there are of the spots.
+        Number of frames; by default that of the spots.
     """
 
     angle: EdgeAngle = float(np.radians(5.0))
@@ -62,34 +62,18 @@ class TargetsSpec(Spec):
 
 
 class PerturbationSpec(PlainPerturbationSpec):
-    """What happens to one body of a job's instrument: also temperatures at nodes and, for a mirror or a prism's face,
-    displaced nodes of a finite-element program. The other motions come on top of these.
+    """Perturbation of one body of a job's instrument.
+
+    Besides the motions it may have temperatures at nodes and, for a mirror or a prism's face, displaced nodes of a
+    finite-element program, to which the motions are added.
 
     Attributes
     ----------
-    rotate
-        Rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
-    shift
-        In the body's own frame, metres.
-    pivot
-        Name of the body's point that the rotation leaves in place and that the scale change starts from.
-    figure
-        Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
-    scale
-        Relative growth of the body and all it carries, 1e-6 for 1 ppm.
-    radius
-        Relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
-    conic
-        Change of the conic constant, a pure number.
-    index
-        Change of the refractive index of the lens that begins at this face, a pure number.
-    abbe
-        Relative change of the Abbe number of the lens that begins at this face; its index at the d line stays.
     temperature : job_tables.TableTemperature | None
-        Uniform change as `2 K`, with a gradient, or a table of temperatures at nodes, in place of what the body
-        inherits from the one that carries it, also where the change is `0 K`; None for what it inherits.
+        Temperature change: uniform as `2 K`, with a gradient, or a table of temperatures at nodes. It replaces the
+        change that the body inherits from its carrier, even if it is `0 K`; by default the change is inherited.
     deformation : job_tables.Deformation | None
-        The table of displaced nodes, or a mesh; None for none.
+        Table or mesh of displaced nodes; by default there is no deformation.
     """
 
     temperature: job_tables.TableTemperature | None = None
@@ -97,12 +81,12 @@ class PerturbationSpec(PlainPerturbationSpec):
 
     @property
     def heat(self) -> job_tables.TableTemperatureSpec:
-        """Its own temperature; no change where none is given."""
+        """Temperature change of the body; zero by default."""
         return job_tables.TableTemperatureSpec() if self.temperature is None else self.temperature
 
     @classmethod
     def of(cls, perturb: Mapping[str, PlainPerturbationSpec]) -> "FrozenMap[str, PerturbationSpec]":
-        """Perturbations of another file's as a job has them."""
+        """Return the perturbations of another file in the form of a job."""
         return FrozenMap(
             {
                 path: cls.model_construct(
@@ -118,12 +102,12 @@ class PerturbationSpec(PlainPerturbationSpec):
         )
 
     def uses(self) -> tuple[str, ...]:
-        """Which of the actions do something, deformation the last."""
+        """Return the actions that have an effect, deformation last."""
         return (*super().uses(), *(("deformation",) if self.deformation is not None else ()))
 
 
 def _some(images: tuple[str, ...]) -> tuple[str, ...]:
-    """Every image once, the spots first."""
+    """Return every image once, the spots first."""
     if not images:
         raise Problem("nothing to render", "an empty list", "[spots]")
     return tuple(dict.fromkeys(("spots", *images)))
@@ -135,9 +119,9 @@ class StraySpec(Spec):
     Attributes
     ----------
     paths : Whole
-        From every source.
+        Number of paths from every source.
     finishes : job_tables.FinishesSpec | None
-        Measured BSDFs and coatings of surfaces in place of the built-in finishes.
+        Measured BSDFs and coatings of surfaces; by default the built-in finishes.
     """
 
     paths: Annotated[Whole, Field(ge=10_000, le=1_000_000_000)] = 1_000_000
@@ -145,30 +129,31 @@ class StraySpec(Spec):
 
 
 def _switch(value: Any) -> Any:
-    """`stray: true` takes the defaults, `stray: false` is none."""
+    """Replace `stray: true` by the defaults and `stray: false` by None."""
     return {True: {}, False: None}[value] if isinstance(value, bool) else value
 
 
 class RenderSpec(Spec):
-    """What is rendered.
+    """Images and analyses of a job.
 
     Attributes
     ----------
     images : tuple[str, ...]
-        Which images: the monitor's spots, which are always among them, and test targets on the line CCDs.
+        Images to be rendered: the monitor's spots, which are always included, and test targets on the line CCDs.
     targets : TargetsSpec | None
-        How the test targets are turned and exposed, None for the defaults.
+        Orientation and exposure of the test targets; their defaults if omitted.
     stray : StraySpec | None
-        Whether ghosts and stray light are path-traced and added: true, or the number of paths.
+        Path tracing of ghosts and stray light: `true`, or a mapping with the number of paths; by default they are not
+        traced.
     quality : Flag
-        Whether wavefront errors, defocus and MTF on the line CCDs are worked out.
+        True to compute wavefront errors, defocus and MTF on the line CCDs.
     obstruction : Literal['traced', 'ignore']
-        `traced`: what prisms, baffles and other bodies take of the cameras' beams is missing in image quality and
-        targets; `ignore`: their pupils are free.
+        Treatment of prisms, baffles and other bodies in the cameras' beams: `traced`, they block light for image
+        quality and targets; `ignore`, the pupils are unobstructed.
     frames : Frames | None
-        Number of frames, None for as many as the instrument's monitor takes.
+        Number of frames; by default that of the instrument's monitor.
     seed : Seed
-        Of every random number in the job.
+        Seed of all random numbers of the job.
     """
 
     images: Annotated[tuple[Annotated[str, OneOf(lambda: ("spots", *target_names()))], ...], AfterValidator(_some)] = (
@@ -192,17 +177,23 @@ class RenderSpec(Spec):
 
     @property
     def obstructed(self) -> bool:
-        """Whether bodies in the cameras' beams count."""
+        """True if bodies block light of the cameras' beams."""
         return self.obstruction == "traced"
 
     @property
     def target_images(self) -> tuple[str, ...]:
-        """The test targets among the images, in the order of `target_names`."""
+        """Test targets among the images, in the order of `target_names`."""
         return tuple(name for name in target_names() if name in self.images)
 
 
 class AnalysisSpec(Spec):
-    """How the images are analysed: by which method the centres of the spots are found."""
+    """Analysis of the monitor's images.
+
+    Attributes
+    ----------
+    centroid : str
+        Method that measures the positions of the spots.
+    """
 
     centroid: Annotated[str, OneOf(Named("analysis.spots:CENTROIDS").get)] = "ml"
 
@@ -210,16 +201,16 @@ class AnalysisSpec(Spec):
 def pivot_problem(
     perturb: Mapping[str, PlainPerturbationSpec], course: CourseSpec, within: KeyPath = ()
 ) -> Problem | None:
-    """What is wrong where a course turns a node about another pivot than the perturbation that it is added to.
+    """Return the problem of a course that rotates a node about another pivot than the job's perturbation.
 
     Parameters
     ----------
     perturb : Mapping[str, PlainPerturbationSpec]
-        Of the job.
+        Perturbations of the job.
     course : CourseSpec
-        With its motions.
+        Course with its motions, which are added to the perturbations.
     within : KeyPath
-        Where the course stands.
+        Key path of the course.
     """
     for path, moves in course.motion.items():
         own = perturb.get(path)
@@ -230,25 +221,25 @@ def pivot_problem(
 
 
 class JobSpec(Spec):
-    """A job.
+    """Job of `twin.render`: an instrument, its perturbation and the images to be rendered.
 
     Attributes
     ----------
     instrument : Ref
-        Name of an instrument in scenes/library/instruments, or path of an own file, relative to the job's file. A
-        camera, as `{camera: NAME or FILE}` or named like an instrument, is one without a monitor.
+        Name of an instrument in scenes/library/instruments, or path of your file relative to the job's file. A camera,
+        given as `{camera: NAME or FILE}` or by its name, is an instrument without a monitor.
     perturb : Paths[PerturbationSpec]
-        Node -> perturbation, by the node's path or the last parts of it; or a list of texts such as `M2 shift z 20 um`.
-        Empty for the nominal state.
+        Node -> perturbation; the node is given by its path or the last parts of it. Or a list of texts such as `M2
+        shift z 20 um`. By default the instrument is in its nominal state.
     course : CourseSpec | None
-        Temperatures and motions that change with time, None for a single state.
+        Temperatures and motions that change with time; by default there is a single state.
     disturbances : JobDisturbances | None
-        What is expected to move, on which the sigmas rest: a file, or changes of single lines of it; the instrument's
-        own by default, `none` for the noise alone.
+        Expected disturbances, on which the sigmas are based: a file, or changes of single causes of it. By default
+        those of the instrument; `none` for sigmas of the noise alone.
     render : RenderSpec
-        What is rendered.
+        Images and analyses of the job.
     analysis : AnalysisSpec
-        How it is analysed.
+        Analysis of the monitor's images.
     """
 
     instrument: Ref
@@ -280,7 +271,7 @@ class JobSpec(Spec):
         return self
 
     def fields(self, time: int | None = None) -> dict[str, Temperature]:
-        """Node path -> change of its temperature, of the perturbation and of the course at time number ``time``."""
+        """Return node path -> temperature change by the perturbation and by the course at time number ``time``."""
         out = {path: what.heat.linear for path, what in self.perturb.items() if what.temperature is not None}
         if self.course is not None and time is not None:
             for path, added in self.course.fields(time).items():
@@ -289,7 +280,7 @@ class JobSpec(Spec):
 
 
 def _with_course(job: JobSpec) -> JobSpec:
-    """The job with the times, temperatures and motions of its course's table, which is then no longer named."""
+    """Return the job with the content of its course's table in place of the reference to it."""
     if job.course is None or job.course.table is None:
         return job
     path = job.course.file_at(("table",), job.course.table, Path(job.source.file).parent, "a CSV file")
@@ -300,13 +291,15 @@ def _with_course(job: JobSpec) -> JobSpec:
 
 
 def with_tables(job: JobSpec) -> JobSpec:
-    """The job with the contents of its course's table, and the full paths and checksums of its other tables: of nodes
-    that deform or warm its bodies, of finishes.
+    """Return the job with its tables read.
+
+    The content of the course's table replaces the reference to it. The tables of nodes and of finishes get their
+    absolute paths and checksums.
 
     Raises
     ------
     InputError
-        a table that cannot be read or is not the one of the checksum.
+        A table cannot be read, or its checksum differs.
     """
     job = _with_course(job)
     changed = {}
@@ -327,14 +320,14 @@ def with_tables(job: JobSpec) -> JobSpec:
 
 
 def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
-    """Check that every perturbed node exists, has the named pivot and allows what is done to it.
+    """Return the job with full paths of its nodes, after a check that each node allows its perturbation.
 
     Parameters
     ----------
     job : JobSpec
-        As loaded.
+        Job as loaded.
     nodes : Mapping[str, NodeInfo]
-        Node path -> what may be done to it, for all bodies of the instrument.
+        Node path -> allowed actions, for all bodies of the instrument.
 
     Returns
     -------
@@ -344,7 +337,8 @@ def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
     Raises
     ------
     InputError
-        One issue for each fault, with the nearest valid name.
+        A node does not exist, has no such pivot or does not allow an action; one issue for each fault, with the nearest
+        valid name.
     """
     perturb = in_full(job.perturb, nodes, lambda problem, name: job.issue(problem, ("perturb", name)))
     if perturb != job.perturb:

@@ -1,5 +1,6 @@
-"""Tables that jobs name: temperatures and displaced nodes of bodies, and measured finishes for stray light (BSDFs and
-coatings in place of the built-in ones).
+"""Tables of jobs: temperatures and displaced nodes of bodies, and measured finishes for stray light.
+
+A finish is a BSDF or a coating that replaces the built-in one.
 """
 
 from collections.abc import Mapping
@@ -24,19 +25,20 @@ from scenes.yaml.units import SCALE
 Checksum = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 MeshUnit = Literal["m", "mm", "um"]
 HEAT_KEYS = ("table", "frame", "values", "unit", "field", "sha256")
-"""Keys of a temperature that say which table and how it is read."""
+"""Keys of a temperature that refer to a table and say how to read it."""
 
 
 class TemperatureSpec(Spec):
-    """A change of a body's temperature, and of all it carries that has none of its own: change + gradient . r. It
-    stands in place of what the body would inherit, and no change does, too.
+    """Temperature change of a body, and of the bodies that it carries without an entry: change + gradient .
+
+    r. It replaces the change that the body would inherit, even if it is zero.
 
     Attributes
     ----------
     change : TemperatureChange
-        At the body's origin, kelvin.
+        Temperature change at the body's origin, in kelvin.
     gradient : TemperatureGradient
-        In the body's own frame, K/m.
+        Temperature gradient in the body's frame, in K/m.
     """
 
     change: TemperatureChange = 0.0
@@ -44,38 +46,35 @@ class TemperatureSpec(Spec):
 
     @property
     def linear(self) -> Temperature:
-        """The linear field."""
+        """Linear temperature field."""
         return Temperature(self.change, self.gradient)
 
     @property
     def warms(self) -> bool:
-        """Whether it changes anything."""
+        """True if the temperature changes anywhere."""
         return self.change != 0.0 or any(self.gradient)
 
 
 class TableTemperatureSpec(TemperatureSpec):
-    """A change of a body's temperature: change + gradient . r, to which a table of nodes is added.
+    """Temperature change of a body: change + gradient . r, to which a table of nodes is added.
 
     Attributes
     ----------
-    change
-        At the body's origin, kelvin.
-    gradient
-        In the body's own frame, K/m.
     table : Reference | None
         CSV file with the columns x, y, z and T (absolute, `T [degC]` or `T [K]`) or dT (`dT [K]`, changes from the
-        instrument's temperature), or a mesh (.vtu, .vtk, .msh, .med) with temperatures at its nodes; relative to this
-        file.
+        instrument's temperature), or a mesh (.vtu, .vtk, .msh, .med) with temperatures at its nodes; a path relative to
+        this file.
     frame : Reference | None
-        Path of the body in whose nominal frame the nodes are told; by default the warmed one.
+        Path of the body in whose nominal frame the nodes are given; by default the heated body.
     values : Literal['change', 'K', 'degC'] | None
-        Of a mesh: whether its numbers are changes in kelvin (`change`) or absolute temperatures (`K`, `degC`).
+        Meaning of a mesh's numbers: changes in kelvin (`change`) or absolute temperatures (`K`, `degC`).
     unit : MeshUnit | None
-        Of a mesh's coordinates, whose file has none.
+        Unit of a mesh's coordinates, which its file does not contain.
     field : Text | None
-        Name of the temperatures in a mesh; needed when it has several numbers at its nodes.
+        Name of the temperatures in a mesh; needed if it has several scalar fields at its nodes.
     sha256 : Checksum | None
-        Checksum of the table, which is filled in when it is read: another table is then refused.
+        Checksum of the table, filled in by the program when the table is read; a table with another checksum is
+        refused.
     """
 
     table: Reference | None = None
@@ -87,7 +86,7 @@ class TableTemperatureSpec(TemperatureSpec):
 
     @property
     def warms(self) -> bool:
-        """Whether it changes anything."""
+        """True if the temperature changes anywhere."""
         return super().warms or self.table is not None
 
     @model_validator(mode="after")
@@ -99,7 +98,7 @@ class TableTemperatureSpec(TemperatureSpec):
 
 
 def _table(value: Any) -> Any:
-    """`temperature: m1.csv` names a table."""
+    """Expand `temperature: m1.csv` to a mapping with the table."""
     if isinstance(value, str) and Path(value).suffix.lower() in (
         *node_table.TABLES,
         *node_table.MESHES,
@@ -111,29 +110,32 @@ def _table(value: Any) -> Any:
 
 _uniform = short_for("change", str, int, float)
 PlainTemperature = Annotated[TemperatureSpec, ZERO_IS_NONE, _uniform]
-"""With its keys, or the uniform change alone; zero is as none where nothing that carries the body is warmed."""
+"""Temperature as a mapping with its keys, or the uniform change alone; zero is the same as none where no carrier of the
+body is heated.
+"""
 TableTemperature = Annotated[TableTemperatureSpec, ZERO_IS_NONE, _uniform, BeforeValidator(_table)]
-"""With its keys, or the uniform change or the table's name alone."""
+"""Temperature as a mapping with its keys, or the uniform change or the table's name alone."""
 
 
 class DeformationSpec(Spec):
-    """Displaced nodes of a finite-element program, on a mirror's optical surface or a face.
+    """Displaced nodes of a finite-element program on a mirror's optical surface or a prism's face.
 
     Attributes
     ----------
     table : Reference
-        CSV file with the columns x, y, z, dx, dy and dz, units in its heads, or a mesh (.vtu, .vtk, .msh, .med) that
-        has displacements at its nodes; relative to this file.
+        CSV file with the columns x, y, z, dx, dy and dz with their units, or a mesh (.vtu, .vtk, .msh, .med) with
+        displacements at its nodes; a path relative to this file.
     frame : Reference | None
-        Path of the body in whose nominal frame nodes and displacements are told; by default the deformed one.
+        Path of the body in whose nominal frame nodes and displacements are given; by default the deformed body.
     terms : Whole
-        Highest Zernike term of the figure, by Noll's numbering; a grid holds the rest.
+        Highest Zernike term of the figure, by Noll's numbering; the residual is represented on a grid.
     unit : MeshUnit | None
-        Of a mesh, whose file has none.
+        Unit of a mesh, which its file does not contain.
     field : Text | None
-        Name of the displacements in a mesh; needed when it has several vectors at its nodes.
+        Name of the displacements in a mesh; needed if it has several vector fields at its nodes.
     sha256 : Checksum | None
-        Checksum of the table, which is filled in when it is read: another table is then refused.
+        Checksum of the table, filled in by the program when the table is read; a table with another checksum is
+        refused.
     """
 
     table: Reference
@@ -145,27 +147,27 @@ class DeformationSpec(Spec):
 
 
 Deformation = Annotated[DeformationSpec, short_for("table", str)]
-"""With its keys, or the table's name alone."""
+"""Deformation as a mapping with its keys, or the table's name alone."""
 
 TableSpec = TypeVar("TableSpec", DeformationSpec, TableTemperatureSpec)
 
 
 def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
-    """Fill in the table's full path and checksum, when it can be read.
+    """Return a specification with the absolute path and the checksum of its table, after reading it.
 
     Parameters
     ----------
     owner : Spec
-        The specification that names it, which knows its file.
+        Specification that refers to the table, which knows its file.
     key : KeyPath
-        Of the deformation or the temperature in there.
+        Key path of the deformation or the temperature in it.
     spec : TableSpec
-        As read, with a table.
+        Specification with a table.
 
     Raises
     ------
     InputError
-        No such table, one that is not right, or another one than the checksum says.
+        The table is missing or invalid, or its checksum differs.
     """
     heat = isinstance(spec, TableTemperatureSpec)
     assert spec.table is not None
@@ -202,14 +204,15 @@ Share = Annotated[float, Quantity(SCALE, smallest="0 percent", largest="100 perc
 
 
 class FinishTableSpec(Spec):
-    """A table of a finish.
+    """Table of a finish.
 
     Attributes
     ----------
     table : Reference
-        The file, relative to this one.
+        Path of the table, relative to this file.
     sha256 : Checksum | None
-        Its checksum, which is filled in when it is read: another table is then refused.
+        Checksum of the table, filled in by the program when the table is read; a table with another checksum is
+        refused.
     """
 
     table: Reference
@@ -220,17 +223,17 @@ FinishTable = Annotated[FinishTableSpec, short_for("table", str)]
 
 
 class FinishSpec(Spec):
-    """A measured finish of one kind of surface; what it does not say stays as built in.
+    """Measured finish of one kind of surface. Properties without a key keep their built-in values.
 
     Attributes
     ----------
     bsdf : FinishTable | None
-        Zemax's tabular BSDF of the reflected light (.bsdf), in place of the scatter lobe: shares of the incident light,
-        which come out of what is reflected.
+        Tabular BSDF of the reflected light in Zemax's format (.bsdf), in place of the built-in scatter lobe. Its values
+        are relative to the incident light, and the scattered share is part of the reflected light.
     coating : FinishTable | None
-        CSV file with the columns wavelength, angle, R and, if need be, T (or Rs and Rp, Ts and Tp).
+        CSV file with the columns wavelength, angle, R and optionally T (or Rs and Rp, Ts and Tp).
     reflectance : Share | None
-        Share that is reflected, specular and scattered together.
+        Reflectance, specular and scattered together.
     """
 
     bsdf: FinishTable | None = None
@@ -248,7 +251,7 @@ class FinishSpec(Spec):
 
 
 def _by_ending(value: Any) -> Any:
-    """`mirror: m1.bsdf` is a BSDF, `mirror: silver.csv` a coating."""
+    """Expand `mirror: m1.bsdf` to a BSDF and `mirror: silver.csv` to a coating."""
     if not isinstance(value, str):
         return value
     ending = Path(value).suffix.lower()
@@ -270,22 +273,22 @@ ALLOWS: Mapping[str, tuple[str, ...]] = FrozenMap(
         "detector": ("bsdf", "coating", "reflectance"),
     }
 )
-"""Kind of surface -> what may be measured of it."""
+"""Kind of surface -> properties that may be measured."""
 
 
 class FinishesSpec(Spec):
-    """Measured finishes, by kind of surface.
+    """Measured finishes by kind of surface.
 
     Attributes
     ----------
     mirror : Finish | None
-        Of the cameras' mirrors; metallised faces of prisms keep theirs.
+        Finish of the cameras' mirrors; metallised faces of prisms keep their built-in one.
     black : Finish | None
-        Of the backs of mirrors, boards and baffles: with a table nothing else comes back from them.
+        Finish of the backs of mirrors, of boards and of baffles; with a table they reflect nothing else.
     coated : Finish | None
-        Of faces of glass that light goes through, from outside and inside.
+        Finish of glass faces in transmission, from outside and inside.
     detector : Finish | None
-        Of CCDs; what is not reflected is recorded.
+        Finish of the CCDs; light that is not reflected is recorded.
     """
 
     mirror: Finish | None = None
@@ -307,17 +310,17 @@ class FinishesSpec(Spec):
 
     @property
     def given(self) -> dict[str, FinishSpec]:
-        """Kind -> finish, of those that are given."""
+        """Kind of surface -> finish, for kinds with a finish."""
         return {kind: spec for kind in ALLOWS if (spec := getattr(self, kind)) is not None}
 
     @property
     def tables(self) -> dict[tuple[str, str], FinishTableSpec]:
-        """Kind and what is measured -> table."""
+        """Kind of surface and property -> table."""
         both = ((kind, what, getattr(spec, what)) for kind, spec in self.given.items() for what in ("bsdf", "coating"))
         return {(kind, what): table for kind, what, table in both if table is not None}
 
     def with_tables(self, tables: Mapping[tuple[str, str], FinishTableSpec]) -> "FinishesSpec":
-        """Return the finishes with other tables, kind and what is measured -> table."""
+        """Return the finishes with other tables, given as (kind of surface, property) -> table."""
         changed = dict(self.given)
         for (kind, what), table in tables.items():
             changed[kind] = changed[kind].model_copy(update={what: table})
@@ -325,21 +328,21 @@ class FinishesSpec(Spec):
 
 
 def checked_finishes(owner: Spec, key: KeyPath, spec: FinishesSpec) -> FinishesSpec:
-    """Fill in the tables' full paths and checksums, when they can be read.
+    """Return finishes with the absolute paths and the checksums of their tables, after reading them.
 
     Parameters
     ----------
     owner : Spec
-        The specification that names them, which knows its file.
+        Specification that refers to the tables, which knows its file.
     key : KeyPath
-        Of the finishes in there.
+        Key path of the finishes in it.
     spec : FinishesSpec
-        As read.
+        The finishes.
 
     Raises
     ------
     InputError
-        No such table, one that is not right, or another one than the checksum says.
+        A table is missing or invalid, or its checksum differs.
     """
     out = {}
     for (kind, what), table in spec.tables.items():
@@ -352,7 +355,7 @@ def checked_finishes(owner: Spec, key: KeyPath, spec: FinishesSpec) -> FinishesS
             raise owner.error(text, place, found=table.table, allowed=names_text(right))
         digest = digest_of(path)
         if table.sha256 is not None and digest != table.sha256:
-            text = "not the table that was used: its checksum is another"
+            text = "not the table that was used: its checksum differs"
             raise owner.error(text, place, found=digest, allowed=f"sha256 {table.sha256}")
         if what == "bsdf":
             read_bsdf(path)

@@ -1,8 +1,8 @@
-"""What references lead to: files of the library that comes with the twin, by name, a user's own files, by path, or the
-mapping that stands in the place of a file.
+"""Resolution of references: names in the library of the twin, paths of a user's files, or mappings in place of a file.
 
 The library's folders are cameras, instruments, detectors, payloads, disturbances and budgets in scenes/library,
-scenes/lab (experiments on the ground) and scenes/orbit (in flight); a file's name without .yaml is its name there.
+scenes/lab (experiments on the ground) and scenes/orbit (in flight). The name of a file there is its file name without
+.yaml.
 """
 
 from pathlib import Path
@@ -32,17 +32,17 @@ LAB, BUDGETS, ORBIT, PAYLOADS, DISTURBANCES = "lab", "budgets", "orbit", "payloa
 
 
 def _folder(name: str) -> Path:
-    """Where the files of one kind stand."""
+    """Return the folder of one kind of library file."""
     return (SCENES if name in (LAB, ORBIT, "examples") else LIBRARY) / name
 
 
 def library_names(folder: str) -> tuple[str, ...]:
-    """The names in one folder of the library ("cameras", "instruments" or "detectors"), sorted."""
+    """Return the sorted names in one folder of the library, such as "cameras", "instruments" or "detectors"."""
     return tuple(sorted(path.stem for path in _folder(folder).glob("*.yaml")))
 
 
 def load_job(path: str | Path) -> JobSpec:
-    """Read a job. The instrument it names is looked for, not read.
+    """Read a job; its instrument must exist but is not read.
 
     Raises
     ------
@@ -55,35 +55,36 @@ def load_job(path: str | Path) -> JobSpec:
 
 
 def _instrument_file(reference: str | Path, owner: Spec | None, key: KeyPath) -> YamlFile:
-    """What a reference to an instrument leads to: a camera alone is one, too."""
+    """Return the file of an instrument or, as an instrument without a monitor, of a camera."""
     alone = str(reference) not in library_names(INSTRUMENTS) and str(reference) in library_names(CAMERAS)
     folder = CAMERAS if alone and not isinstance(reference, Inline) else INSTRUMENTS
     return referred(folder, reference, owner, key, (CAMERAS,))
 
 
 def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
-    """Read an error budget; arguments and errors as `load_instrument`."""
+    """Read an error budget; arguments and errors as in `load_instrument`."""
     return load_named(ErrorBudgetSpec, BUDGETS, name_or_path)
 
 
 def load_instrument(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> InstrumentSpec:
-    """Read an instrument. The cameras and the detector it names are looked for, not read. Of one as built the design
-    is read as well, to which its errors and its paths belong.
+    """Read an instrument; its cameras and detector must exist but are not read.
+
+    For an instrument as built, the design is also read; its errors are reported and its paths are relative to its file.
 
     Parameters
     ----------
     reference : str | Path
-        a name in the library, a path from the folder of the owner's file (anything with a slash or ending in .yaml or
-        .yml), or the mapping itself. Of a camera it is the instrument that consists of this camera alone.
+        Name in the library, path from the folder of the owner's file (anything with a slash or ending in .yaml or
+        .yml), or the mapping itself. A camera becomes the instrument that consists of this camera alone.
     owner : Spec | None
-        The specification that refers to it; None for a path from the current folder.
+        Specification that has the reference; None for a path from the current folder.
     key : KeyPath
-        Where the owner refers to it.
+        Key of the reference in the owner.
 
     Raises
     ------
     InputError
-        As `load_job`.
+        The file cannot be read or is not valid, or there is no such file; one issue for each fault.
     """
     text = _instrument_file(reference, owner, key)
     data = text.data if isinstance(text.data, dict) else {}
@@ -104,7 +105,7 @@ def load_instrument(reference: str | Path, owner: Spec | None = None, key: KeyPa
 
 
 def _as_built(spec: AsBuiltInstrumentSpec) -> InstrumentSpec:
-    """The instrument that was built to the design of a file."""
+    """Return the instrument as built, made from its design."""
     data = _instrument_file(spec.design, spec, (DESIGN,)).data
     if isinstance(data, dict) and DESIGN in data:
         problem, its = "this design is itself an instrument as built", shown(data[DESIGN])
@@ -117,26 +118,26 @@ def _as_built(spec: AsBuiltInstrumentSpec) -> InstrumentSpec:
 
 
 def is_instrument(data: Any) -> bool:
-    """Whether plain data of a file are an instrument's, as drawn or as built."""
+    """Return whether plain data of a file are those of an instrument, nominal or as built."""
     return isinstance(data, dict) and bool({"cameras", DESIGN} & set(data)) and not _OTHERS & set(data)
 
 
 _OTHERS = {"job", "study", "test", "detector", "camera"}
-"""Keys of a run's config.yaml, and no instrument's."""
+"""Keys that occur in a run's config.yaml and in no instrument's file."""
 
 
 def load_disturbances(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> DisturbancesSpec:
-    """Read a disturbances file; arguments and errors as `load_instrument`."""
+    """Read a disturbances file; arguments and errors as in `load_instrument`."""
     return load_named(DisturbancesSpec, DISTURBANCES, reference, owner, key).with_tables()
 
 
 def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesSpec | None:
-    """What is stated for a job: its own file or its instrument's, with the job's changes; None for nothing.
+    """Return the disturbances of a job: its own file or its instrument's, with the job's changes; None for none.
 
     Raises
     ------
     InputError
-        There is no such file or it is not valid, or a change of what it does not have.
+        The file is missing or invalid, or the job changes a cause that the file does not have.
     """
     asked = job.disturbances
     owner: Spec = job
@@ -154,16 +155,16 @@ def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesS
 
 
 AREA_CCD: KeyPath = ("monitor", "area_ccd", "detector")
-"""Key at which an instrument refers to the data sheet of its area CCDs."""
+"""Key of the data sheet of an instrument's area CCDs."""
 
 
 def load_cameras(instrument: InstrumentSpec) -> FrozenMap[str, CameraSpec]:
-    """The prescriptions of an instrument's cameras, by the names that its file gives them.
+    """Return the prescriptions of an instrument's cameras by the references in its file.
 
     Raises
     ------
     InputError
-        a camera is not there or not valid, or two that are described in the file have one name.
+        A camera is missing or invalid, or two different cameras in the file have one name.
     """
     cameras: dict[str, CameraSpec] = {}
     for name, mounted in instrument.cameras.items():
@@ -175,7 +176,7 @@ def load_cameras(instrument: InstrumentSpec) -> FrozenMap[str, CameraSpec]:
 
 
 def load_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> CameraSpec:
-    """Read a camera; arguments and errors as `load_instrument`."""
+    """Read a camera; arguments and errors as in `load_instrument`."""
     text = referred(CAMERAS, reference, owner, key)
     if isinstance(text.data, dict) and DESIGN in text.data:
         problem = "an instrument as built is no prescription of a camera"
@@ -185,29 +186,32 @@ def load_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath =
 
 
 def load_detector(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> DetectorSpec:
-    """Read a detector's data sheet; arguments and errors as `load_instrument`."""
+    """Read a detector's data sheet; arguments and errors as in `load_instrument`."""
     return load_named(DetectorSpec, DETECTORS, reference, owner, key)
 
 
 def load_autocollimator_test(name_or_path: str | Path = "principle_experiment") -> AutocollimatorSetup:
-    """Read a test with two autocollimators and the data sheet of their CCDs; arguments, errors as `load_instrument`."""
+    """Read a test with two autocollimators and the data sheet of their CCDs.
+
+    Arguments and errors as in `load_instrument`.
+    """
     spec = load_named(AutocollimatorTestSpec, LAB, name_or_path)
     key = ("autocollimator", "area_ccd", "detector")
     return AutocollimatorSetup(spec, load_detector(spec.autocollimator.area_ccd.detector, spec, key))
 
 
 def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
-    """The camera under test and the test; of a camera as built, with what was built in the test's `as_built`.
+    """Return a test and its camera; for a camera as built, its deviations are added to the test's `as_built`.
 
     Parameters
     ----------
     test : TestType
-        Names the camera: a prescription, or an instrument as built that consists of one camera.
+        Test whose camera is a prescription, or an instrument as built that consists of one camera.
 
     Raises
     ------
     InputError
-        As `load_instrument`; the instrument has several cameras, or both files say how a body was built.
+        The camera is missing or invalid, the instrument has several cameras, or both files have deviations of one body.
     """
     key = ("camera",)
     text = referred(CAMERAS, test.camera, test, key)
@@ -231,7 +235,10 @@ def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
 
 
 def load_band_detectors(camera: CameraSpec) -> FrozenMap[str, DetectorSpec]:
-    """Data sheets of a camera's line CCDs, by the name that the bands give. Raises InputError as `load_instrument`."""
+    """Return the data sheets of a camera's line CCDs by the references of the bands.
+
+    Errors as in `load_instrument`.
+    """
     bands = camera.bands.items()
     return FrozenMap({b.detector: load_detector(b.detector, camera, ("bands", name, "detector")) for name, b in bands})
 
@@ -239,31 +246,31 @@ def load_band_detectors(camera: CameraSpec) -> FrozenMap[str, DetectorSpec]:
 def load_named(
     model: type[SpecType], folder: str, reference: str | Path, owner: Spec | None = None, key: KeyPath = ()
 ) -> SpecType:
-    """Read a file of one folder of the library, a user's own of that kind, or the mapping in its place.
+    """Read a file of one folder of the library, a user's file of that kind, or the mapping in its place.
 
     Parameters
     ----------
     model : type[SpecType]
-        What its kind of files may say.
+        Model of this kind of file.
     folder : str
-        Of the library, for a name.
+        Folder of the library, for a name.
     reference : str | Path
-        As of `load_instrument`, likewise owner and key.
+        Reference as in `load_instrument`.
     owner : Spec | None
-        That refers to it.
+        Specification that has the reference.
     key : KeyPath
-        where.
+        Key of the reference in the owner.
 
     Raises
     ------
     InputError
-        As `load_instrument`.
+        The file is missing or invalid, as in `load_instrument`.
     """
     return validate(model, referred(folder, reference, owner, key))
 
 
 def _names(folders: tuple[str, ...]) -> list[str]:
-    """All names in folders of the library, those of the first folder first."""
+    """Return all names in folders of the library, those of the first folder first."""
     return list(dict.fromkeys(name for folder in folders for name in library_names(folder)))
 
 
@@ -276,25 +283,25 @@ def _names_and_paths(folders: tuple[str, ...]) -> str:
 def referred(
     folder: str, reference: str | Path, owner: Spec | None = None, key: KeyPath = (), others: tuple[str, ...] = ()
 ) -> YamlFile:
-    """Return what a reference leads to: the one way in which names, paths and mappings are resolved.
+    """Return the content to which a reference leads; all names, paths and mappings are resolved here.
 
     Parameters
     ----------
     folder : str
-        Of the library, for a name.
+        Folder of the library, for a name.
     reference : str | Path
-        a name there, a path from the folder of the owner's file, or the mapping itself.
+        Name in that folder, path from the folder of the owner's file, or the mapping itself.
     owner : Spec | None
-        The specification that refers to it; None for a path from the current folder.
+        Specification that has the reference; None for a path from the current folder.
     key : KeyPath
-        Where the owner refers to it.
+        Key of the reference in the owner.
     others : tuple[str, ...]
-        Folders whose names may be meant by a name that is unknown, since they may stand here as well.
+        Further folders whose names are allowed there, and are suggested for an unknown name.
 
     Raises
     ------
     InputError
-        There is no such file or it cannot be read; with the line of the reference and the nearest name.
+        The file is missing or cannot be read; with the line of the reference and the nearest name.
     """
     if isinstance(reference, Inline):
         return reference.placed(Source() if owner is None else owner.source, key).yaml
@@ -304,7 +311,7 @@ def referred(
 def find_named(
     folder: str, reference: str | Path, owner: Spec | None, key: KeyPath, others: tuple[str, ...] = ()
 ) -> Path:
-    """The file that a name or a path leads to; arguments and errors as of `referred`."""
+    """Return the file to which a name or a path leads; arguments and errors as in `referred`."""
     path = place_of(folder, reference, owner)
     folders = (folder, *others)
     if path is None:
@@ -318,7 +325,7 @@ def find_named(
 
 
 def placed(folder: str, reference: str, owner: Spec, key: KeyPath, others: tuple[str, ...] = ()) -> str:
-    """Return a reference that leads to the same wherever it stands; arguments and errors as of `referred`."""
+    """Return a reference that is valid from any folder; arguments and errors as in `referred`."""
     if isinstance(reference, Inline):
         return reference.placed(owner.source, key)
     found = find_named(folder, reference, owner, key, others)
@@ -326,13 +333,13 @@ def placed(folder: str, reference: str, owner: Spec, key: KeyPath, others: tuple
 
 
 def is_path(name_or_path: str | Path) -> bool:
-    """Whether a reference is a path, and not a name in the library."""
+    """Return whether a reference is a path instead of a name in the library."""
     text = str(name_or_path)
     return isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml"))
 
 
 def place_of(folder: str, reference: str | Path, owner: Spec | None) -> Path | None:
-    """Where a reference leads: a library file that exists, a path that may not, or None for an unknown name."""
+    """Return the path of a reference: a library file that exists, or a path that may not; None for an unknown name."""
     text = str(reference)
     if is_path(reference):
         return (Path(owner.source.file).parent if owner is not None and owner.source.file else Path()) / text

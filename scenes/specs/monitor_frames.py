@@ -1,4 +1,4 @@
-"""A measurement of a monitor: frames that its area CCDs recorded before and after, and what its file refers to."""
+"""Measurement of a monitor: frames of its area CCDs before and after a change, and the files to which it refers."""
 
 from __future__ import annotations
 
@@ -21,39 +21,40 @@ from scenes.specs.resolved import ExperimentSetup, ResolvedJob, resolve_job
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import file_beside, is_file, unusable
-from scenes.yaml.spec import Named, NothingIsEmpty, Paths, Ref, Reference, Spec, Whole, one_given, short_for
+from scenes.yaml.spec import Named, NothingIsEmpty, Paths, Ref, Reference, Spec, Whole, require_one, short_for
 from scenes.yaml.unit_fields import PositiveLength
 from scenes.yaml.units import MOMENT, parse_quantity
 from scenes.yaml.yaml_file import LARGEST_BYTES
 
 ALL = "all"
-"""In place of a channel: every channel."""
+"""Name that stands for all channels."""
 MOST_FILES, MOST_TIMES = 10_000, 1000
 
 
 _Several = Field(min_length=1, max_length=MOST_FILES)
 Files = Annotated[tuple[Reference, ...], short_for(None, str, schema=Reference | tuple[Reference, ...]), _Several]
-"""Image files whose frames are taken together, relative to the file that names them."""
+"""Image files whose frames are averaged together, relative to the file that refers to them."""
 
 
 PerChannel = Annotated[Paths[Files], short_for(ALL, str, list, schema=Files | dict[str, Files]), Field(min_length=1)]
-"""Image files by channel, ``CAMERA/CHANNEL``, or for all."""
+"""Image files by channel, ``CAMERA/CHANNEL``, or for all channels."""
 FirstPixel = tuple[Annotated[Whole, Field(ge=0, le=65535)], Annotated[Whole, Field(ge=0, le=65535)]]
 
 
 class ChannelFramesSpec(Spec):
-    """The frames of one channel.
+    """Frames of one channel.
 
     Attributes
     ----------
     before : Files
-        Files of the nominal state.
+        Image file, or list of files, of the nominal state.
     after : tuple[Files, ...]
-        Files of the state to be measured; of a series one entry for each time, a file or a list of files.
+        Image file, or list of files, of the state to be measured; for a series one entry for each time.
     offset : FirstPixel
-        Row and column of the CCD at which the frames' first pixel stands; needed for frames of a part of it.
+        Row and column on the CCD of the frames' first pixel, for frames of a part of the CCD.
     offset_after : FirstPixel | None
-        The same of the frames after, where it is another one; needed where they have another size.
+        Row and column of the first pixel of the frames after the change, if it differs from `offset`; required if these
+        frames have another size.
     """
 
     before: Files
@@ -63,22 +64,22 @@ class ChannelFramesSpec(Spec):
 
 
 class GeometrySpec(Spec):
-    """What the formulas need of one camera's monitor, where the instrument is not modelled.
+    """Geometry of one camera's monitor that the formulas need, for an instrument without a model.
 
     Attributes
     ----------
     principal_distance : PositiveLength
-        Along the line, metres.
+        Principal distance along the line, in metres.
     separation : PositiveLength
-        Distance of the two area CCDs, metres.
+        Distance of the two area CCDs, in metres.
     pitch : PixelPitch
-        Of their pixels, metres.
+        Pixel pitch of the area CCDs, in metres.
     look : LookAngle
-        Angle of the camera's line of sight about the base's Y, radians.
+        Look angle: angle of the camera's line of sight about the base's Y, in radians.
     field : FieldPlace
-        Angle from the visual axis at which the area CCDs stand, radians.
+        Field angle of the area CCDs from the visual axis, in radians.
     principal_distance_across : PositiveLength | None
-        Plate scale across the line, metres; the principal distance by default.
+        Plate scale across the line, in metres; by default the principal distance.
     """
 
     principal_distance: PositiveLength
@@ -90,43 +91,42 @@ class GeometrySpec(Spec):
 
 
 class MeasurementSpec(Spec):
-    """A measurement.
+    """Measurement of a monitor by frames before and after a change.
 
     Attributes
     ----------
     instrument : Ref | None
-        Name of an instrument in scenes/library/instruments, or path of an own file: its model gives the spots' shape
-        and what moves them.
+        Name of an instrument in scenes/library/instruments, or path of your file. Its model predicts the spots' shape
+        and their response to motions.
     geometry : Named[GeometrySpec] | None
-        Camera -> the few numbers of the formulas, in place of an instrument.
+        Camera -> geometry for the published formulas, in place of an instrument.
     frames : Reference | Paths[ChannelFramesSpec]
         Folder with CAMERA_CHANNEL_before.tiff and CAMERA_CHANNEL_after.tiff (or .fits), a CSV table of files, or
         CAMERA/CHANNEL -> files.
     times : tuple[Moment, ...] | None
-        Of a series, of each entry of `after`.
+        Time of each entry of `after`, for a series; by default a single state is measured.
     disturbances : JobDisturbances | None
-        What is expected to move, on which the sigmas rest, as in a job.
+        Expected disturbances, on which the sigmas are based, as in a job; by default the instrument's.
     template : Literal['twin', 'measured']
-        Where the calibrated shape of the spots is from: `twin`, or `measured` from the frames before.
+        Source of the spots' calibrated shape: `twin` for the model, or `measured` for the frames before the change.
     detector : Ref | None
-        Data sheet of the area CCDs in place of the instrument's; name in the library or path.
+        Data sheet of the area CCDs, a name in the library or a path; by default the instrument's.
     exposure : Exposure | None
-        Of a frame, in place of the instrument's, seconds.
+        Exposure of a frame, in seconds; by default the instrument's.
     photon_transfer : Literal['stated', 'measured']
-        Where gain and noise of the CCDs are from: `stated` in the data sheet, or `measured` in the dark and flat
-        frames.
+        Source of gain and noise of the CCDs: `stated` for the data sheet, or `measured` for the dark and flat frames.
     dark : PerChannel | None
-        Frames without light, for all channels or by channel.
+        Dark frames, for all channels or by channel; by default there are none.
     flat : PerChannel | None
-        Frames of even light, likewise.
+        Flat-field frames, for all channels or by channel; by default there are none.
     bad_pixels : PerChannel | None
-        Image in which every pixel that is not 0 is bad, likewise.
+        Image in which bad pixels are not 0, for all channels or by channel; by default there is none.
     corrections : Literal['automatic', 'none']
-        Whether the frames are searched for defects, which are then left out or fitted: `automatic`, or `none`.
+        Search of the frames for defects, which are then excluded or fitted: `automatic`, or `none`.
     vibration : Literal['none', 'fitted']
-        Whether the smear by vibration during an exposure is fitted: `none`, or `fitted`.
+        Smear by vibration during an exposure: `none`, or `fitted`.
     analysis : AnalysisSpec
-        How the centres of the spots are found.
+        Analysis of the frames.
     """
 
     instrument: Ref | None = None
@@ -150,7 +150,7 @@ class MeasurementSpec(Spec):
     @model_validator(mode="after")
     def _model_or_geometry(self) -> MeasurementSpec:
         allowed = "instrument: NAME, or geometry: {CAMERA: {...}}"
-        one_given(self, ("instrument", "geometry"), "an instrument or its geometry is needed", allowed)
+        require_one(self, ("instrument", "geometry"), "an instrument or its geometry is needed", allowed)
         if self.geometry is None:
             return self
         if self.template == "twin":
@@ -194,12 +194,12 @@ class MeasurementSpec(Spec):
         return self
 
     def states(self, files: ChannelFramesSpec) -> tuple[tuple[str, ...], ...]:
-        """Files of each state after.
+        """Return the files of each state after the change.
 
         Parameters
         ----------
         files : ChannelFramesSpec
-            Of a channel.
+            Files of a channel.
         """
         if self.times is not None:
             return files.after
@@ -207,32 +207,32 @@ class MeasurementSpec(Spec):
 
 
 def per_channel(files: Any, channel: str) -> tuple[str, ...]:
-    """Files for one channel, or those for all; none where there are none.
+    """Return the files for one channel, or those for all; empty if there are none.
 
     Parameters
     ----------
     files : Any
-        By channel, None for none at all.
+        Channel -> files; None for no files.
     channel : str
-        Its name.
+        Name of the channel.
     """
     return () if files is None else tuple(files.get(channel, files.get(ALL, ())))
 
 
 ENDINGS = (".tiff", ".tif", ".fits", ".fit", ".fts", ".png")
-"""Endings of frames in a folder, in the order in which they are looked for."""
+"""Suffixes of frames in a folder, in the order of the search."""
 BEFORE, AFTER = "before", "after"
 HEADS = "channel, when (before or after) or 'time [min]' (before or a number), file, and perhaps row, column"
 _TIME_HEAD = re.compile(r"time *\[(?P<unit>[^\[\]]+)\]")
 
 
 class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
-    """A measurement with all it refers to; the paths of its files are absolute.
+    """Measurement with the content of its references; the paths of its files are absolute.
 
     Attributes
     ----------
     model : ResolvedJob | None
-        The instrument as a job to which nothing happens; None where only its geometry is given.
+        Nominal job of the instrument; None if only its geometry is given.
     detector : DetectorSpec
         Data sheet of the area CCDs.
     """
@@ -242,7 +242,7 @@ class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
 
     @classmethod
     def parts(cls, test: MeasurementSpec) -> dict[str, Any]:
-        """Return the model of the instrument and the data sheet, and the measurement with absolute paths."""
+        """Return the instrument's model, the data sheet, and the measurement with absolute paths."""
         model = None if test.instrument is None else _model(test, test.instrument)
         if test.detector is not None:
             detector = load_detector(test.detector, test, ("detector",))
@@ -256,7 +256,7 @@ class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """``CAMERA/CHANNEL`` of every channel, in the order of the spots."""
+        """Name ``CAMERA/CHANNEL`` of every channel, in the order of the spots."""
         return _channels(self.test, self.model)
 
 
@@ -280,7 +280,7 @@ def _channels(spec: MeasurementSpec, model: ResolvedJob | None) -> tuple[str, ..
 
 
 def _located(spec: MeasurementSpec, channels: tuple[str, ...], base: Path) -> MeasurementSpec:
-    """The measurement with all its files by their absolute paths."""
+    """Return the measurement with absolute paths of all files."""
     update: dict[str, Any] = {}
     if isinstance(spec.frames, str):
         frames, times = _found(spec, base / spec.frames, channels)
@@ -319,14 +319,14 @@ _IMAGES = "an image file (TIFF, FITS, PNG)"
 
 
 def _paths(spec: Spec, key: KeyPath, files: Iterable[str], base: Path) -> tuple[str, ...]:
-    """Absolute paths. Raises InputError for a file that is not there."""
+    """Return absolute paths; raise `InputError` for a missing file."""
     return tuple(str(spec.file_at(key, file, base, _IMAGES)) for file in files)
 
 
 def _found(
     spec: MeasurementSpec, place: Path, channels: tuple[str, ...]
 ) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
-    """Frames in a folder, or listed in a table; and the times of a series, none for a single state."""
+    """Return the frames in a folder or a table, and the times of a series; no times for a single state."""
     if is_file(place) and place.suffix.lower() == ".csv":
         return read_frame_table(place, channels)
     if is_file(place):
@@ -357,8 +357,9 @@ def _found(
 
 
 def _is_picture(file: Path) -> bool:
-    """Whether a file is a PNG with 8 bits, as the twin writes one beside the frames of every channel. Raw frames of
-    such a camera are named one by one.
+    """Return whether a file is a PNG with 8 bits, as the twin writes one beside the frames of every channel.
+
+    Raw frames of a camera with 8 bits must be listed one by one.
     """
     try:
         with file.open("rb") as stream:
@@ -369,26 +370,31 @@ def _is_picture(file: Path) -> bool:
 
 
 def read_frame_table(path: Path, channels: tuple[str, ...]) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
-    """Frames of every channel, by their absolute paths, and the times of a series; none for a single state.
+    """Return the frames of every channel by their absolute paths, and the times of a series.
 
     Parameters
     ----------
     path : Path
-        Of the CSV table.
+        Path of the CSV table.
     channels : tuple[str, ...]
-        That it has to list.
+        Channels that the table must list.
+
+    Returns
+    -------
+    tuple
+        Channel -> frames, and the times in seconds; no times for a single state.
 
     Raises
     ------
     InputError
-        The table cannot be read, with its line.
+        The table cannot be read; with its line.
     """
     return _FrameTable(path, channels).read()
 
 
 @dataclass(frozen=True)
 class _FrameTable:
-    """A CSV table with a row for each file: its channel, its time or state, the first pixel of its frames."""
+    """CSV table with a row for each file: its channel, its time or state, and the first pixel of its frames."""
 
     path: Path
     channels: tuple[str, ...]

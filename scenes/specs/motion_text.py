@@ -1,6 +1,6 @@
-"""Perturbations in words, ``M2 shift z 20 um``, and the short names of bodies.
+"""Perturbations as text, ``M2 shift z 20 um``, and the short names of bodies.
 
-Jobs, studies, the command line and scripts share this grammar. The live page calls its knobs by the same names.
+Jobs, studies, the command line and scripts share this grammar. The controls of the live page use the same names.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ KINDS = {
     "temperature": "DIFFERENCE",
     "gradient": "x|y|z DIFFERENCE/LENGTH",
 }
-"""Kind of a perturbation -> what follows it."""
+"""Kind of a perturbation -> the rest of its text."""
 PURE = ("conic", "index")
 """Kinds whose amounts are pure numbers."""
 NOTHING = {"shift": "0 um", "rotate": "0 arcsec", "gradient": "0 K/m"}
-"""Kind of a vector -> what its components are that nothing says."""
+"""Kind of a vector -> value of the components that no text sets."""
 FORMS = (
     '"M2 shift z 20 um", "M2 rotate x 3 arcsec about centre", "M2 figure Z5 10 nm", "M2 radius 100 ppm", '
     '"M2 conic 1e-4", "forward scale 20 ppm", "base temperature 2 K", "base gradient z 50 mK/m"'
 )
-"""What perturbations in words look like, for messages and help."""
+"""Examples of perturbations as text, for messages and help."""
 _ABOUT = "about"
 
 
 def meant(name: str, nodes: Iterable[str]) -> list[str]:
-    """The bodies that a name may mean: the one with this path, else all whose paths end with it.
+    """Return the bodies to which a name may refer: the one with this path, else all whose paths end with it.
 
     Parameters
     ----------
     name : str
-        ``base/forward/M2``, ``forward/M2`` or ``M2``.
+        Name such as ``base/forward/M2``, ``forward/M2`` or ``M2``.
     nodes : Iterable[str]
         Paths of all bodies.
     """
@@ -54,19 +54,20 @@ def meant(name: str, nodes: Iterable[str]) -> list[str]:
 
 
 def node_named(name: str, nodes: Iterable[str]) -> str:
-    """The body that a name means: its path, or the last parts of the path where only one body ends so.
+    """Return the path of the body to which a name refers.
 
     Parameters
     ----------
     name : str
-        ``base/forward/M2``, ``forward/M2``, or ``M2`` in an instrument with one.
+        Path, or the last parts of a path that only one body has: ``base/forward/M2``, ``forward/M2``, or ``M2`` in an
+        instrument with one.
     nodes : Iterable[str]
         Paths of all bodies.
 
     Raises
     ------
     Problem
-        No body is called so, or several are.
+        The name fits no body, or several.
     """
     found = meant(name, nodes)
     if len(found) == 1:
@@ -77,12 +78,12 @@ def node_named(name: str, nodes: Iterable[str]) -> str:
 
 
 def short_name(path: str, nodes: Iterable[str]) -> str:
-    """The last parts of a body's path, as many as tell it from all others.
+    """Return the shortest unique name of a body: the last parts of its path.
 
     Parameters
     ----------
     path : str
-        Of the body.
+        Path of the body.
     nodes : Iterable[str]
         Paths of all bodies.
     """
@@ -92,12 +93,12 @@ def short_name(path: str, nodes: Iterable[str]) -> str:
 
 
 def motion_of(text: str) -> tuple[str, str, str, str, str]:
-    """The parts of a motion in words: node, kind, axis or term, quantity, and pivot.
+    """Return the parts of a motion's text: node, kind, axis or term, quantity, and pivot.
 
     Parameters
     ----------
     text : str
-        ``NODE KIND [AXIS] [QUANTITY] [about PIVOT]``; parts that are not there are empty.
+        Text of the form ``NODE KIND [AXIS] [QUANTITY] [about PIVOT]``; missing parts are empty.
 
     Raises
     ------
@@ -127,12 +128,12 @@ def motion_of(text: str) -> tuple[str, str, str, str, str]:
 
 
 def key_below(kind: str, axis: str) -> tuple[str | int, ...]:
-    """Where a component stands in a node's perturbation: ``("shift", 2)``, ``("temperature", "gradient", 0)``.
+    """Return the key of a component in a node's perturbation: ``("shift", 2)``, ``("temperature", "gradient", 0)``.
 
     Parameters
     ----------
     kind : str
-        Of ``KINDS``.
+        One of ``KINDS``.
     axis : str
         ``x``, ``y`` or ``z``, a figure's term, or empty.
     """
@@ -142,20 +143,20 @@ def key_below(kind: str, axis: str) -> tuple[str | int, ...]:
 
 
 def put(keys: dict[str, Any], kind: str, axis: str, value: Any, nothing: Any) -> None:
-    """Put a component where a node's perturbation has it.
+    """Store a component in a node's perturbation.
 
     Parameters
     ----------
     keys : dict[str, Any]
-        Of the perturbation, which are added to.
+        Perturbation, which is extended.
     kind : str
-        As of ``key_below``.
+        Kind as in ``key_below``.
     axis : str
-        As of ``key_below``.
+        Axis as in ``key_below``.
     value : Any
-        Of the component.
+        Value of the component.
     nothing : Any
-        Of the other components of a vector, where they are not said.
+        Value of the other components of a vector, if they are not set.
     """
     *above, last = key_below(kind, axis)
     inner: Any = keys
@@ -166,7 +167,7 @@ def put(keys: dict[str, Any], kind: str, axis: str, value: Any, nothing: Any) ->
 
 
 def _pure(kind: str, quantity: str, text: str) -> float:
-    """An amount that is a pure number. Raises Problem."""
+    """Return an amount that is a pure number; raise `Problem` for other text."""
     try:
         amount = float(quantity)
     except ValueError:
@@ -177,17 +178,17 @@ def _pure(kind: str, quantity: str, text: str) -> float:
 
 
 def perturbation_in_words(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """What texts come to: ``perturb`` of a job's file. Nodes are called as in the texts.
+    """Return ``perturb`` of a job's file for a list of texts. Nodes keep the names of the texts.
 
     Parameters
     ----------
     texts : Iterable[str]
-        Such as ``M2 shift z 20 um``; several of one body add to its perturbation.
+        Texts such as ``M2 shift z 20 um``; several of one body are combined.
 
     Raises
     ------
     Problem
-        a text is not of this form, or two say the same component.
+        A text is not of this form, or two texts set the same component.
     """
     out: dict[str, dict[str, Any]] = {}
     said: set[tuple[str, str, str]] = set()

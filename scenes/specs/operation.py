@@ -1,9 +1,7 @@
-"""A plan of operation: what is expected of an instrument over years, what events do to it, and what it has to keep.
+"""Plan of operation, under which `twin.operate` estimates an instrument's state from its record over years.
 
-The estimate of `twin.operate` follows a record under such a plan.
-
-What can happen to an instrument in operation, by the names that tables, records and plans use; and the tables of
-readings that it sends down.
+The plan has the expected disturbances, the effects of events and the requirements. The module also has the names of
+events in tables, records and plans, and the description of tables of readings (telemetry).
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from scenes.yaml.yaml_file import read_yaml
 
 Event = Literal["safe_mode", "heater_set_point", "refocus", "eclipse_season_begins", "eclipse_season_ends"]
 EVENTS: tuple[str, ...] = get_args(Event)
-"""What can happen to an instrument, other than being read."""
+"""Events in operation, other than readings."""
 
 
 ENDINGS: Mapping[str, tuple[Kind, str]] = FrozenMap(
@@ -40,7 +38,7 @@ ENDINGS: Mapping[str, tuple[Kind, str]] = FrozenMap(
         "percent": (SCALE, "percent"),
     }
 )
-"""Ending of a quantity's key -> what it measures, and the unit in which it is given."""
+"""Suffix of a quantity's key -> kind of quantity and its unit."""
 MOST_REQUIREMENTS, MOST_CAUSES = 100, 100
 Span = Annotated[float, Quantity(MOMENT, above_zero=True, largest="1000000 h")]
 Causes = Annotated[
@@ -59,17 +57,17 @@ def _known_events(value: Mapping[str, tuple[Name, ...]]) -> FrozenMap[str, tuple
 
 
 class RequirementSpec(Spec):
-    """What one quantity has to keep.
+    """Requirement on one quantity in operation.
 
     Attributes
     ----------
     quantity : Text
-        `GROUP KEY`: a camera with `d_alpha_arcsec`, `d_beta_arcsec`, `d_gamma_arcsec` or `d_f_um`; `intersection_angle
-        change_arcsec`; `ground along_m`, `across_m` or `height_m`.
+        Quantity as `GROUP KEY`: a camera with `d_alpha_arcsec`, `d_beta_arcsec`, `d_gamma_arcsec` or `d_f_um`;
+        `intersection_angle change_arcsec`; `ground along_m`, `across_m` or `height_m`.
     limit : Text
-        That the size of its change must not exceed, with its unit.
+        Largest absolute value of its change, with unit.
     probability : Number
-        With which it has to keep it at every time.
+        Probability with which the limit must be met at every time.
     """
 
     quantity: Text
@@ -98,22 +96,22 @@ class RequirementSpec(Spec):
 
     @property
     def group(self) -> str:
-        """A camera, ``intersection_angle`` or ``ground``."""
+        """Name of a camera, ``intersection_angle`` or ``ground``."""
         return self.quantity.split()[0]
 
     @property
     def key(self) -> str:
-        """Which of its readings; ends in its unit."""
+        """Key of the reading, which ends in its unit."""
         return self.quantity.split()[1]
 
     @property
     def name(self) -> str:
-        """Group and key with one blank between them."""
+        """Group and key, separated by a space."""
         return f"{self.group} {self.key}"
 
     @property
     def largest(self) -> float:
-        """The limit in the unit in which the key ends."""
+        """Limit in the unit in which the key ends."""
         kind, unit = self._kind
         return parse_quantity(self.limit, kind) / parse_quantity(f"1 {unit}", kind)
 
@@ -123,28 +121,28 @@ class RequirementSpec(Spec):
 
 
 class OperationSpec(Spec):
-    """How the state of an instrument is followed in operation.
+    """Plan of operation: the expected changes of an instrument and the requirements on it over its mission.
 
     Attributes
     ----------
     instrument : Ref
-        Name of an instrument in scenes/library/instruments, or path of an own file; that of the record.
+        Instrument of the record: a name in scenes/library/instruments, or the path of your file.
     disturbances : Ref
-        What is expected to move over years, with its laws of time: name of a file in scenes/library/disturbances, or
-        path of an own one.
+        Expected disturbances over years with their time laws: a name in scenes/library/disturbances, or the path of
+        your file.
     events : dict[str, Causes]
-        Event of the record -> causes of the disturbances file whose motions step then by their standard deviations. An
-        event without causes steps nothing.
+        Event of the record -> causes of the disturbances file whose motions then change by a step with their standard
+        deviations. An event without causes has no effect.
     coefficients : float
-        Standard deviation of what heat does to light, of each body with a sensor, over the computed value.
+        Relative standard deviation of the computed thermal response of each body with a temperature sensor.
     mission : Span
-        Life over which the disturbances' `jump_false_alarm` counts.
+        Duration of the mission, to which `jump_false_alarm` of the disturbances refers.
     window : Whole
-        Readings for which a jump is looked for after it has come.
+        Number of readings after a jump within which it is searched for.
     horizon : Span
-        How far a forecast reaches.
+        Time span of a forecast.
     requirements : tuple[RequirementSpec, ...]
-        What has to be kept; no quantity twice.
+        Requirements; each quantity occurs once.
     """
 
     instrument: Ref
@@ -167,14 +165,14 @@ class OperationSpec(Spec):
 
 
 class OperationSetup(Spec):
-    """A plan with all it refers to, so that one text says under what a record was followed.
+    """Plan with the content of its references, so that one text documents the analysis of a record.
 
     Attributes
     ----------
     operation : OperationSpec
         The plan.
     model : ResolvedJob
-        The instrument, with what the plan states to move.
+        The instrument, with the plan's disturbances.
     """
 
     operation: OperationSpec
@@ -182,24 +180,27 @@ class OperationSetup(Spec):
 
     @property
     def disturbances(self) -> DisturbancesSpec:
-        """What is expected to move."""
+        """Expected disturbances."""
         assert self.model.disturbances is not None  # a plan names them
         return self.model.disturbances
 
 
 def read_operation(path: str | Path) -> OperationSetup:
-    """Read a plan of operation and all it refers to.
+    """Read a plan of operation with the content of its references.
 
     Raises
     ------
     InputError
-        Any of the files cannot be read or is not valid, or an event steps a cause that is not there.
+        A file cannot be read or is not valid, or an event refers to a cause that does not exist.
     """
     return resolve_operation(validate(OperationSpec, read_yaml(path)))
 
 
 def resolve_operation(spec: OperationSpec) -> OperationSetup:
-    """A plan with all it refers to, whose references hold from anywhere. Raises InputError as `read_operation`."""
+    """Return a plan with the content of its references, which are valid from any folder.
+
+    Errors as in `read_operation`.
+    """
     update: dict[str, str] = {}
     for key, place, others in (("instrument", INSTRUMENTS, ("cameras",)), ("disturbances", DISTURBANCES, ())):
         reference = getattr(spec, key)
@@ -221,9 +222,9 @@ def resolve_operation(spec: OperationSpec) -> OperationSetup:
 VALUES: Mapping[str, tuple[Kind, Kind]] = FrozenMap(
     {"temperature": (TEMPERATURE, TEMPERATURE_DIFFERENCE), "attitude": (ANGLE, ANGLE), "focus": (LENGTH, LENGTH)}
 )
-"""Sort of reading that is numbers in a table -> what they measure, and what their sigmas do."""
+"""Kind of reading with numbers in a table -> kind of quantity of the numbers and of their sigmas."""
 RUNS = ("monitor", "calibration", "angle")
-"""Sorts of reading that a run folder holds, which a row of a table names."""
+"""Kinds of reading that are run folders, to which a row of a table refers."""
 EVENT = "event"
 QUATERNION = "quaternion"
 """Unit of an attitude whose four columns are a quaternion."""
@@ -231,17 +232,17 @@ Heads = Annotated[tuple[Text, ...], short_for(None, str, schema=Text | tuple[Tex
 
 
 class ReadingColumnSpec(Spec):
-    """The columns of one body, star tracker or camera.
+    """Columns of one body, star tracker or camera in a table of readings.
 
     Attributes
     ----------
     column : Heads
-        Head of its column, or the list of the heads of its components: three angles of an attitude, or the four numbers
-        of its quaternion, the scalar last.
+        Head of the column, or list of the heads of the components: three angles of an attitude, or the four numbers of
+        its quaternion, the scalar last.
     unit : Text
-        Of the numbers; `quaternion` of a quaternion.
+        Unit of the numbers; `quaternion` for a quaternion.
     sigma : Text
-        Standard deviation of each of them, with its unit; of a quaternion the angle about each axis.
+        Standard deviation of each number, with unit; for a quaternion that of the angle about each axis.
     """
 
     column: Heads
@@ -250,33 +251,34 @@ class ReadingColumnSpec(Spec):
 
 
 class ReadingTableSpec(Spec):
-    """Tables of one form, with a row for each moment.
+    """Tables of readings of one format, with a row for each time.
 
     Attributes
     ----------
     kind : str
-        What a row is: `temperature` of bodies, `attitude` of star trackers, `focus` of cameras; `monitor`,
-        `calibration` or `angle`, whose row names a run folder; or `event`.
+        Content of a row: `temperature` of bodies, `attitude` of star trackers, `focus` of cameras; `monitor`,
+        `calibration` or `angle` for a row that refers to a run folder; or `event`.
     files : Reference
-        Of the tables, relative to this file; `*` and `?` stand for any letters.
+        Paths of the tables, relative to this file; `*` and `?` are wildcards.
     form : Literal['csv', 'keywords']
-        `csv`, whose first row has the heads; or `keywords`, lines of `KEYWORD = TIME NUMBER` as CCSDS has them.
+        Format: `csv` with the heads in the first row, or `keywords`, lines of `KEYWORD = TIME NUMBER` as in CCSDS
+        messages.
     time : Text
         Head of the column of times.
     time_scale : TimeScale
-        What the clock shows.
+        Time scale of the clock.
     epoch : ClockReading | None
-        Reading of that clock at 0, where the column has numbers and not dates.
+        Reading of that clock at 0, if the column has numbers instead of dates.
     time_unit : Text
-        Of those numbers.
+        Unit of those numbers.
     columns : Paths[ReadingColumnSpec]
-        Body, star tracker or camera -> its columns, for sorts that are numbers.
+        Body, star tracker or camera -> its columns, for kinds with numbers.
     name : Text | None
-        Head of the column with the run folder or the event, relative to the table.
+        Head of the column with the event or the run folder, whose path is relative to the table.
     detail : Text | None
-        Head of the column that says more of an event.
+        Head of the column with details of an event.
     events : Paths[Event]
-        Name of an event in the table -> what it is.
+        Name of an event in the table -> kind of event.
     """
 
     kind: Literal["temperature", "attitude", "focus", "monitor", "calibration", "angle", "event"]
@@ -311,7 +313,7 @@ class ReadingTableSpec(Spec):
 
 
 def _is_measured(kind: str, one: ReadingColumnSpec, where: tuple[str, ...]) -> None:
-    """Refuse columns whose number, unit or sigma are not those of a sort of reading. Raises Problem."""
+    """Raise `Problem` for columns whose number, unit or sigma do not fit a kind of reading."""
     value, sigma = VALUES[kind]
     count = {QUATERNION: 4}.get(one.unit, 3) if kind == "attitude" else 1
     if len(one.column) != count:
@@ -336,14 +338,14 @@ def _measures(unit: str, kind: Kind, where: tuple[str, ...]) -> None:
 
 
 class TelemetrySpec(Spec):
-    """What the tables of an instrument's readings hold.
+    """Telemetry: description of the tables of an instrument's readings.
 
     Attributes
     ----------
     instrument : Ref
-        That was read: name of an instrument in scenes/library/instruments, or path of an own file.
+        Instrument that sent the readings: a name in scenes/library/instruments, or the path of your file.
     readings : tuple[ReadingTableSpec, ...]
-        The tables.
+        Tables of readings.
     """
 
     instrument: Ref

@@ -1,4 +1,4 @@
-"""What happens to one body of an instrument, as a file says it, and what may be done to which body."""
+"""Perturbation of a body of an instrument, and the actions that each body allows."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -31,36 +31,38 @@ from scenes.yaml.units import LENGTH
 FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um"), ZERO_IS_NONE]
 
 ACTIONS = ("rotate", "shift", "figure", "scale", "radius", "conic", "index", "abbe", "temperature")
-"""What can be done to a node, as its perturbation names it; `NodeInfo.allows` says which of them."""
+"""Actions on a node, by their keys in a perturbation; `NodeInfo.allows` has those that a node allows."""
 
 
 class PlainPerturbationSpec(Spec):
-    """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, for a
-    mirror or a face an error of its figure, radius or conic constant, and for a lens of its index.
+    """Perturbation of one body: a small rigid motion, a change of scale, temperature, surface shape or index.
+
+    Figure, radius and conic constant are those of a mirror or a face, the index that of a lens.
 
     Attributes
     ----------
     rotate : Rotation
-        Rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
+        Rotation vector in the body's frame, about the pivot, in radians; the rotation precedes the shift.
     shift : Shift
-        In the body's own frame, metres.
+        Shift in the body's frame, in metres.
     pivot : Name
-        Name of the body's point that the rotation leaves in place and that the scale change starts from.
+        Name of the body's point that rotation and scale leave in place.
     figure : dict[Term, FigureTerm]
-        Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
+        Zernike term, by Noll's numbering and normalisation -> surface error of a mirror or a face, in metres.
     scale : ScaleChange
-        Relative growth of the body and all it carries, 1e-6 for 1 ppm.
+        Relative change of scale of the body and all it carries.
     radius : RadiusChange | None
-        Relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
+        Relative change of the vertex radius of curvature of a mirror or a face; zero by default.
     conic : ConicChange | None
-        Change of the conic constant, a pure number.
+        Change of the conic constant, a pure number; zero by default.
     index : IndexChange | None
-        Change of the refractive index of the lens that begins at this face, a pure number.
+        Change of the refractive index of the lens that begins at this face, a pure number; zero by default.
     abbe : AbbeChange | None
-        Relative change of the Abbe number of the lens that begins at this face; its index at the d line stays.
+        Relative change of the Abbe number of the lens that begins at this face; its index at the d line is unchanged.
+        Zero by default.
     temperature : job_tables.PlainTemperature | None
-        Uniform change as `2 K`, or with a gradient, in place of what the body inherits from the one that carries it,
-        also where the change is `0 K`; None for what it inherits.
+        Temperature change: uniform as `2 K`, or with a gradient. It replaces the change that the body inherits from its
+        carrier, even if it is `0 K`; by default the change is inherited.
     """
 
     rotate: Rotation = NO_MOTION
@@ -76,12 +78,13 @@ class PlainPerturbationSpec(Spec):
 
     @property
     def heat(self) -> job_tables.TemperatureSpec:
-        """Its own temperature; no change where none is given."""
+        """Temperature change of the body; zero by default."""
         return job_tables.TemperatureSpec() if self.temperature is None else self.temperature
 
     def uses(self) -> tuple[str, ...]:
-        """Which of ACTIONS do something; a temperature that is given does, since no change is another one than that of
-        a warmed carrier.
+        """Return the ACTIONS that have an effect.
+
+        A temperature of 0 K has one: it differs from that of a heated carrier.
         """
         done = {
             "rotate": any(self.rotate),
@@ -93,13 +96,14 @@ class PlainPerturbationSpec(Spec):
         return tuple(name for name, does in done.items() if does)
 
     def needs(self) -> tuple[str, ...]:
-        """Which of these a node has to allow: all but a temperature that is no change, which a node without heat may
-        have as well.
+        """Return the ACTIONS that a node has to allow.
+
+        A temperature of 0 K is not one of them, since a node without thermal properties may have it.
         """
         return tuple(name for name in self.uses() if name != "temperature" or self.heat.warms)
 
     def motion(self) -> Motion:
-        """All of it but the temperature, as a state has it."""
+        """Return the perturbation without its temperature as a motion of a state."""
         figure = {noll(term): value for term, value in self.figure.items()}
         return Motion(
             self.rotate,
@@ -115,7 +119,7 @@ class PlainPerturbationSpec(Spec):
 
 
 def _in_words(value: Any) -> Any:
-    """`[M2 shift z 20 um]` is what it says of each node."""
+    """Expand a list of texts such as `[M2 shift z 20 um]` to a mapping from nodes to perturbations."""
     words = isinstance(value, list | tuple) and all(isinstance(text, str) for text in value)
     return perturbation_in_words(value) if words else value
 
@@ -126,16 +130,16 @@ IN_WORDS = BeforeValidator(_in_words)
 
 @dataclass(frozen=True)
 class NodeInfo:
-    """What may be done to a body of the instrument.
+    """Actions that a body of the instrument allows.
 
     Attributes
     ----------
     pivots : tuple[str, ...]
-        Names of its pivots.
+        Names of the pivots.
     allows : frozenset[str]
-        Which of ACTIONS.
+        Those of ACTIONS that are allowed.
     cold : str
-        Why it has no temperature, where that is not plain.
+        Reason why the body has no temperature, where it is not obvious.
     """
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
@@ -144,12 +148,12 @@ class NodeInfo:
 
     @property
     def known_pivots(self) -> tuple[str, ...]:
-        """Names of its pivots and of the one that every body has."""
+        """Names of the body's pivots and of the one that every body has."""
         return tuple(dict.fromkeys((*self.pivots, DEFAULT_PIVOT)))
 
 
 BUILT = ("shift", "rotate", "pivot", "figure", "radius", "conic", "index")
-"""Keys of a perturbation that tell how a body was built."""
+"""Keys of a perturbation that describe a body as built."""
 
 
 def _standing(value: Mapping[str, PlainPerturbationSpec]) -> Mapping[str, PlainPerturbationSpec]:
@@ -165,7 +169,7 @@ def _standing(value: Mapping[str, PlainPerturbationSpec]) -> Mapping[str, PlainP
 
 
 AsBuilt = Annotated[Paths[PlainPerturbationSpec], IN_WORDS, AfterValidator(_standing)]
-"""Node -> how it stands and is shaped against the drawing."""
+"""Node -> deviation of the built body from the design."""
 
 
 Perturbed = TypeVar("Perturbed", bound=PlainPerturbationSpec)
@@ -174,21 +178,21 @@ Perturbed = TypeVar("Perturbed", bound=PlainPerturbationSpec)
 def in_full(
     perturb: Mapping[str, Perturbed], nodes: Mapping[str, NodeInfo], issue: Callable[[Problem, str], Issue]
 ) -> FrozenMap[str, Perturbed]:
-    """Perturbations by the paths of their nodes; names of no node stay as they are.
+    """Return perturbations by the full paths of their nodes; unknown names stay unchanged.
 
     Parameters
     ----------
     perturb : Mapping[str, Perturbed]
-        By path, or by the last parts of it.
+        Perturbations by path, or by the last parts of it.
     nodes : Mapping[str, NodeInfo]
-        Node path -> what may be done to it.
+        Node path -> allowed actions.
     issue : Callable[[Problem, str], Issue]
-        What is wrong with a name -> the issue of it.
+        Function from a problem and a name to an issue.
 
     Raises
     ------
     InputError
-        a name of several nodes, or two names of one.
+        A name fits several nodes, or two names fit one node.
     """
     issues: list[Issue] = []
     named: dict[str, str] = {}
@@ -208,20 +212,20 @@ def in_full(
 def perturbation_issues(
     owner: Spec, nodes: Mapping[str, NodeInfo], path: str, what: PlainPerturbationSpec, key: KeyPath
 ) -> list[Issue]:
-    """What is wrong with a perturbation of the node ``path`` that stands at ``key`` of a specification.
+    """Return the issues of a perturbation of the node ``path`` at ``key`` of a specification.
 
     Parameters
     ----------
     owner : Spec
         The specification.
     nodes : Mapping[str, NodeInfo]
-        Node path -> what may be done to it.
+        Node path -> allowed actions.
     path : str
-        Of the node.
+        Path of the node.
     what : PlainPerturbationSpec
-        Is done to it.
+        The perturbation.
     key : KeyPath
-        Where it is written.
+        Its key path.
     """
     if path not in nodes:
         return [no_such_node(owner, nodes, path, key)]
@@ -237,19 +241,19 @@ def perturbation_issues(
 
 
 def no_such_node(owner: Spec, nodes: Mapping[str, NodeInfo], path: str, key: KeyPath) -> Issue:
-    """An issue of a node that the instrument does not have."""
+    """Return the issue of a node that the instrument does not have."""
     return owner.issue(unknown("no such node", path, sorted(nodes)), key)
 
 
 def not_allowed(owner: Spec, info: NodeInfo, action: str, key: KeyPath) -> Issue:
-    """An issue of what a node does not allow."""
+    """Return the issue of an action that a node does not allow."""
     allowed = names_text(sorted(info.allows)) or "nothing"
     why = f": {info.cold}" if action == "temperature" and info.cold else ""
     return owner.issue(f"this node does not allow {action}{why}", key, allowed=allowed)
 
 
 def in_words(perturb: Mapping[str, PlainPerturbationSpec]) -> str:
-    """Perturbations for people: ``base/gf7/M2 shift (0 um, 0 um, 20 um); ...``."""
+    """Return perturbations as readable text: ``base/gf7/M2 shift (0 um, 0 um, 20 um); ...``."""
     parts = []
     for path, what in perturb.items():
         plain = what.plain()
@@ -258,7 +262,7 @@ def in_words(perturb: Mapping[str, PlainPerturbationSpec]) -> str:
 
 
 def _short(value: Any) -> str:
-    """A quantity, or several, as a reader sees them."""
+    """Return a quantity, or several, in short form."""
     if isinstance(value, dict):
         known = {key: part for key, part in value.items() if part not in ("0 K", ["0 K/m"] * 3)}
         return ", ".join(f"{key} {_short(part)}" for key, part in known.items())

@@ -1,8 +1,8 @@
-"""The tests that commands run, each listed once: which files it reads, what runs it, what it computes, its report.
+"""Tests that commands run: for each its files, its computation, its results and its report.
 
-Commands and their help, the JSON Schemas, studies, the documentation and `twin.perform` read this list. What a test
-names is imported when it is used: help and messages about files wait for nothing that computes, and what computes waits
-for nothing that draws.
+Commands and their help, the JSON Schemas, studies, the documentation and `twin.perform` use this table. A function of a
+test is imported on first use: help and messages about files do not wait for numerical modules, and computations do not
+wait for plotting modules.
 """
 
 from __future__ import annotations
@@ -19,39 +19,41 @@ from scenes.yaml.named import FileKind, Named
 
 @dataclass(frozen=True)
 class Procedure:
-    """A test, of whose run a command makes a report and a study takes the numbers.
+    """Test that a command runs, with a report, and whose results a study can use.
 
-    Functions and the set-up may be given as names that `Named` takes. No module that ``run`` and ``numbers`` need draws
-    anything or fills a template.
+    Functions and the set-up may be given as names for `Named`. The modules that ``run`` and ``numbers`` need neither
+    plot nor fill templates.
 
     Attributes
     ----------
     kind : str
-        For example ``focus``; KIND.json has the numbers.
+        Name of the result file without .json, for example ``focus``.
     setup : Any
-        Class of the simulated test with all it refers to, an `ExperimentSetup`; or what reads its file.
+        Class of the simulated test with the content of its references, an `ExperimentSetup`; or a function that reads
+        the file.
     run : Any
-        Set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
+        Function from set-up, backend, seed and progress to the complete result. Raises InputError, BenchError.
     numbers : Any
-        Run -> what KIND.json holds, plain data; keys end in their unit.
+        Function from the result to the plain data of KIND.json, whose keys end in their unit.
     report : Any
-        Run -> `twin.framework.report.Report`.
+        Function from the result to a `twin.framework.report.Report`.
     measured : Any
-        Class of the test on measurements, chosen by the keys of the file; None where there is none.
+        Class of the test on measurements, chosen by the keys of the file; None if there is none.
     export : Any
-        Run -> path and contents of files with what was measured; the command then has an option ``--export``.
+        Function from the result to paths and contents of files with the measured data, for the option ``--export``;
+        None if there is none.
     files : tuple[FileKind, ...]
-        Kinds of file that it reads beside those in file_kinds.csv; their command is known from the list.
+        Kinds of file that the test reads beside those in file_kinds.csv.
     varied : bool
-        Whether a study can vary it.
+        True if a study can vary the test.
     judged : bool
-        Whether the user is warned of cameras among what the test is given that are blurred as designed.
+        True if the user is warned of cameras that are blurred even as designed.
     seeded : bool
-        Whether anything is drawn at random; config.yaml then states the seed.
+        True if the test draws random numbers; config.yaml then has the seed.
     about : str
-        What ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
+        Text of ``--help`` in Markdown; its first paragraph is shown in the list of subcommands.
     frames : Mapping[str, str]
-        Quantity of KIND.json -> what it refers to, where `twin.framework.reference_frames` does not say it.
+        Quantity of KIND.json -> its reference frame, where `twin.framework.reference_frames` has none.
     """
 
     kind: str
@@ -69,7 +71,7 @@ class Procedure:
     frames: Mapping[str, str] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
-        """Functions that are given by name are imported when they are called."""
+        """Replace names of functions by references that import them on first use."""
         for name in ("run", "numbers", "report", "export"):
             if isinstance(path := getattr(self, name), str):
                 object.__setattr__(self, name, Named(path))
@@ -80,19 +82,19 @@ class Procedure:
         return Named(self.setup).get() if isinstance(self.setup, str) else self.setup
 
     def resolve(self, path: Path | str, *named: str | None) -> Any:
-        """Read a test with all it refers to.
+        """Read a test with the content of its references.
 
         Parameters
         ----------
         path : Path | str
-            Of its file or of a run's config.yaml, or the name of a test in the library.
+            Path of its file or of a run's config.yaml, or name of a test in the library.
         named : str | None
-            What else is named of a set-up that is read by a function.
+            Further arguments of a function that reads the set-up.
 
         Raises
         ------
         InputError
-            a file cannot be read or is not valid, or they do not fit together.
+            A file cannot be read or is not valid, or the files do not fit together.
         """
         if self.measured is not None:
             measured = Named(self.measured).get()
@@ -106,16 +108,17 @@ BASES: dict[str, Named] = {
     "render": Named("twin.study.runs.render_base:RenderBase"),
     "tolerance": Named("twin.tolerance.samples:ToleranceBase"),
 }
-"""Command -> what evaluates many of its runs at once for a study; tests of `PROCEDURES` are run one after the other."""
+"""Command -> class that evaluates many of its runs at once for a study; tests of `PROCEDURES` run one after the other.
+"""
 
 
 def studied() -> tuple[str, ...]:
-    """Commands that a study can vary."""
+    """Return the commands that a study can vary."""
     return (*BASES, *(name for name, procedure in PROCEDURES.items() if procedure.varied))
 
 
 SENSORS = ("ties", "control", "monitor", "laser", "terrain", "tracker_angles")
-"""What the adjustment of a block can be asked to do without; the command's help names them."""
+"""Sensors that the adjustment of a block can exclude; the command's help lists them."""
 
 _PROCEDURES: dict[str, Procedure] = {
     "lab focus": Procedure(
@@ -436,4 +439,4 @@ _PROCEDURES: dict[str, Procedure] = {
     ),
 }
 PROCEDURES = ExtensionTable("procedures", _PROCEDURES, Procedure)
-"""Name of the command after ``twin.`` -> the test. A test is its own modules and one entry here."""
+"""Command without the leading ``twin.`` -> test. A new test consists of its modules and one entry here."""

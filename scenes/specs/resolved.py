@@ -1,4 +1,4 @@
-"""A job, a laboratory test or a camera together with everything it refers to."""
+"""Jobs, laboratory tests and cameras together with the content of all their references."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ TestType = TypeVar("TestType", bound=Spec)
 
 
 class ResolvedJob(Spec):
-    """A job with its instrument, cameras and detector.
+    """Job with its instrument, cameras and detectors.
 
     Attributes
     ----------
     job : JobSpec
-        As the user wrote it, defaults filled in.
+        The job with its defaults.
     instrument : InstrumentSpec
-        What `job.instrument` names.
+        Instrument to which `job.instrument` refers.
     cameras : Paths[CameraSpec]
-        What `instrument.cameras.<name>.camera` says -> prescription.
+        Reference in `instrument.cameras.<name>.camera` -> prescription.
     detector : DetectorSpec | None
-        Data sheet of the monitor's area CCDs; None where there is no monitor.
+        Data sheet of the monitor's area CCDs; None without a monitor.
     line_detectors : Paths[DetectorSpec] | None
-        As cameras -> data sheet of the line CCD on which targets are imaged, None without targets.
+        Reference of a camera -> data sheet of the line CCD that images targets; None without targets.
     disturbances : DisturbancesSpec | None
-        On which the sigmas rest, the job's changes made; None for the noise alone.
+        Disturbances on which the sigmas are based, with the job's changes; None for the noise alone.
     """
 
     job: JobSpec
@@ -53,25 +53,25 @@ class ResolvedJob(Spec):
 
     @property
     def frames(self) -> int:
-        """Number of frames: the job's if it gives one, else the monitor's; one where there is no monitor."""
+        """Number of frames: that of the job, else that of the monitor, else one."""
         monitor = self.instrument.monitor
         return self.job.render.frames or (1 if monitor is None else monitor.frames)
 
     @property
     def area_detector(self) -> DetectorSpec:
-        """Data sheet of the monitor's area CCDs. Raises InputError: the instrument has no monitor."""
+        """Data sheet of the monitor's area CCDs. Raises InputError if the instrument has no monitor."""
         self.instrument.autocollimator  # noqa: B018 - says so where there is none
         assert self.detector is not None
         return self.detector
 
     @property
     def quality(self) -> bool:
-        """Whether image quality is worked out: where the job asks for it, and always where there is no monitor."""
+        """True if image quality is computed: if the job asks for it, and always without a monitor."""
         return self.job.render.quality or self.instrument.monitor is None
 
     @property
     def targets(self) -> TargetsSpec:
-        """How test targets are recorded, with the number of frames filled in."""
+        """Orientation and exposure of test targets, with the number of frames filled in."""
         targets = self.job.render.targets or TargetsSpec()
         return targets if targets.frames else targets.model_copy(update={"frames": self.frames})
 
@@ -81,11 +81,11 @@ class ResolvedJob(Spec):
         return self.job.render.seed
 
     def with_seed(self, seed: int) -> ResolvedJob:
-        """Return the job with another seed and its number of frames."""
+        """Return the job with another seed and an explicit number of frames."""
         return self.with_render(self.frames, seed)
 
     def with_job(self, job: JobSpec) -> ResolvedJob:
-        """Return the same with another job on the same instrument."""
+        """Return another job on the same instrument."""
         return self.model_copy(update={"job": job})
 
     def with_render(self, frames: int, seed: int) -> ResolvedJob:
@@ -94,7 +94,7 @@ class ResolvedJob(Spec):
         return self.model_copy(update={"job": self.job.model_copy(update={"render": render})})
 
     def instrument_file(self) -> dict[str, Any]:
-        """Return what a file of the instrument says that refers to no other; nothing is expected to move there."""
+        """Return the content of an instrument's file without references and without disturbances."""
         plain = self.plain()
         instrument: dict[str, Any] = plain["instrument"]
         instrument.pop("disturbances", None)
@@ -105,17 +105,17 @@ class ResolvedJob(Spec):
         return instrument
 
     def to_yaml(self) -> str:
-        """The text of a config.yaml; `resolve` reads it back to exactly the same values."""
+        """Return the text of a config.yaml; `resolve` reads it back to exactly the same values."""
         return dump_yaml(self.plain())
 
 
 def resolve(path: str | Path) -> ResolvedJob:
-    """Read a job and all it refers to. The config.yaml of an earlier run can be given in place of a job.
+    """Read a job and all files to which it refers, or the config.yaml of an earlier run.
 
     Raises
     ------
     InputError
-        Any of the files cannot be read or is not valid.
+        A file cannot be read or is not valid.
     """
     yaml = read_yaml(path)
     if isinstance(yaml.data, dict) and "job" in yaml.data:
@@ -124,7 +124,7 @@ def resolve(path: str | Path) -> ResolvedJob:
 
 
 def resolve_job(job: JobSpec) -> ResolvedJob:
-    """A job with all it refers to. Raises InputError as `resolve`."""
+    """Return a job with the content of its references. Raises InputError as `resolve` does."""
     return _with_instrument(job, load.load_instrument(job.instrument, job, ("instrument",)))
 
 
@@ -148,12 +148,12 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
 
 
 def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
-    """The nominal job on an error budget's instrument, with what the budget states to change.
+    """Return the nominal job on an error budget's instrument, with the budget's disturbances.
 
     Raises
     ------
     InputError
-        As `resolve`; or the budget names no disturbances.
+        A file cannot be read or is not valid, or the budget has no disturbances.
     """
     resolved = resolve_on(budget, budget.instrument, budget.disturbances)
     if resolved.disturbances is None:
@@ -163,40 +163,40 @@ def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
 
 
 def resolve_on(owner: Spec, instrument: str, disturbances: Any = None) -> ResolvedJob:
-    """The nominal job on the instrument of another file.
+    """Return the nominal job on the instrument of another file.
 
     Parameters
     ----------
     owner : Spec
-        The file, whose keys `instrument` and `disturbances` these are.
+        File with the keys `instrument` and `disturbances`.
     instrument : str
-        That it refers to.
+        Reference to the instrument.
     disturbances : Any
-        That it refers to, as in a job; None for the instrument's own.
+        Reference to the disturbances, as in a job; None for the instrument's.
 
     Raises
     ------
     InputError
-        As `resolve`.
+        A file cannot be read or is not valid.
     """
     plain = {"instrument": instrument, "disturbances": disturbances}
     return resolve_job(JobSpec.model_validate(plain).with_source(owner.source))
 
 
 def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJob:
-    """A job, or an instrument to which nothing happens, with all it refers to.
+    """Return a job, or the nominal job of an instrument, with the content of its references.
 
     Parameters
     ----------
     file : str | Path
-        Of a job or an instrument, the config.yaml of a run, or the name of an instrument in the library.
+        Path of a job, an instrument or the config.yaml of a run, or name of an instrument in the library.
     disturbances : str | None
-        Name in the library or path of a disturbances file, in place of what is stated; None for that.
+        Name in the library or path of a disturbances file that replaces those of the file; None to keep them.
 
     Raises
     ------
     InputError
-        As `resolve`; there is no such instrument or no such disturbances file.
+        A file cannot be read or is not valid, or there is no such instrument or disturbances file.
     """
     text = str(file)
     named = not load.is_path(text) and not Path(text).is_file()
@@ -213,12 +213,12 @@ def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJ
 
 
 def target_band(camera: CameraSpec) -> str:
-    """The band on whose line CCD a camera images test targets: P (panchromatic) if it has one, else its first.
+    """Return the band whose line CCD images test targets: P (panchromatic) if the camera has it, else the first.
 
     Raises
     ------
     InputError
-        It has none.
+        The camera has no bands.
     """
     if not camera.bands:
         raise camera.error("images of targets need a line CCD, and this camera describes none", ("bands",))
@@ -226,23 +226,23 @@ def target_band(camera: CameraSpec) -> str:
 
 
 def line_detector(camera: CameraSpec) -> DetectorSpec:
-    """Data sheet of the line CCD with which a camera images.
+    """Return the data sheet of the line CCD with which a camera images test targets.
 
     Parameters
     ----------
     camera : CameraSpec
-        With bands.
+        Camera with bands.
 
     Raises
     ------
     InputError
-        It has no band, or there is no such sheet.
+        The camera has no band, or there is no such data sheet.
     """
     return load.load_band_detectors(camera)[camera.bands[target_band(camera)].detector]
 
 
 def _complete(resolved: ResolvedJob) -> ResolvedJob:
-    """Check that every camera of the instrument is there, and read the job's tables."""
+    """Return a job of a config.yaml with its tables read; raise `InputError` if cameras or data sheets are missing."""
     if (resolved.detector is None) != (resolved.instrument.monitor is None):
         text = "the data sheet of the monitor's area CCDs belongs to an instrument with a monitor"
         raise resolved.error(text, ("detector",), allowed="both, or neither")
@@ -257,35 +257,35 @@ def _complete(resolved: ResolvedJob) -> ResolvedJob:
 
 
 class ExperimentSetup(Spec, Generic[TestType]):
-    """A test together with all it refers to, so that one file says all that went into a run.
+    """Test with the content of its references, so that one file documents all inputs of a run.
 
-    A kind of test is a subclass: its fields are what is read, ``parts`` reads them, ``checked`` holds them against each
-    other.
+    Each kind of test is a subclass: its fields hold the content, ``parts`` reads it, and ``checked`` checks that the
+    parts fit together.
 
     Attributes
     ----------
     test : TestType
-        What the test's file says.
+        Content of the test's file.
     """
 
     FOLDER: ClassVar[str] = load.LAB
-    """Folder of the library in which tests of this kind have names."""
+    """Folder of the library with tests of this kind."""
 
     test: TestType
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Return a test and all it refers to.
+        """Read a test with the content of its references.
 
         Parameters
         ----------
         path : str | Path
-            Of the test's file, or of a run's config.yaml; or the name of a test in the library.
+            Path of the test's file or of a run's config.yaml, or name of a test in the library.
 
         Raises
         ------
         InputError
-            a file cannot be read or is not valid, or they do not fit together.
+            A file cannot be read or is not valid, or the files do not fit together.
         """
         yaml = load.referred(cls.FOLDER, path)
         if isinstance(yaml.data, dict) and "test" in yaml.data:
@@ -296,53 +296,53 @@ class ExperimentSetup(Spec, Generic[TestType]):
 
     @classmethod
     def parts(cls, test: Any) -> dict[str, Any]:
-        """Return what a test refers to, by field. Raises InputError."""
+        """Return the content of a test's references by field; raise `InputError` if it cannot be read."""
         return {}
 
     def checked(self) -> Self:
-        """Return the set-up, complete. Raises InputError where test and parts do not fit."""
+        """Return the complete set-up; raise `InputError` if test and parts do not fit together."""
         return self
 
     @classmethod
     def measured_by(cls, keys: Mapping[str, Any]) -> bool:
-        """Return whether a file with these keys is a test of this kind on measurements; asked of set-ups that are."""
+        """Return whether a file with these keys is a test on measurements; only asked of set-ups for measurements."""
         return MEASURED in keys
 
     @property
     def seed(self) -> int:
-        """Seed of all that is drawn; 0 where nothing is."""
+        """Seed of all random numbers; 0 if there are none."""
         return getattr(self.test, "seed", 0)
 
     def with_seed(self, seed: int) -> Self:
-        """Return the set-up with another seed, for one that a command overrides; where nothing is drawn, itself."""
+        """Return the set-up with a seed from the command line; unchanged if the test draws no random numbers."""
         if "seed" not in type(self.test).model_fields:
             return self
         return self.with_test(seed=seed)
 
     def with_test(self, **values: Any) -> Self:
-        """Return the set-up with other values of the test's keys, which are checked already."""
+        """Return the set-up with other, already checked values of the test's keys."""
         return self.model_copy(update={"test": self.test.model_copy(update=values)})
 
     def to_yaml(self) -> str:
-        """Text of a config.yaml, which ``read`` reads back to the same values."""
+        """Return the text of a config.yaml, which ``read`` reads back to the same values."""
         return dump_yaml(self.plain())
 
 
 MEASURED = "measured"
-"""Key of a test whose data come from files and not from a simulated bench."""
+"""Key of a test whose data come from files instead of a simulated bench."""
 DATA_FILES = ("comparisons", "held_out", "spots", "mtf", "images")
-"""Keys of `measured` that name files."""
+"""Keys of `measured` that are paths of files."""
 
 
 class CameraTestSetup(ExperimentSetup[TestType], Generic[TestType]):
-    """A test of a camera in the laboratory.
+    """Laboratory test of a camera.
 
     Attributes
     ----------
     camera : CameraSpec
         Prescription and bands.
     detectors : Paths[DetectorSpec]
-        As the bands name them -> data sheet.
+        Reference of a band -> data sheet.
     """
 
     camera: CameraSpec
@@ -350,12 +350,12 @@ class CameraTestSetup(ExperimentSetup[TestType], Generic[TestType]):
 
     @classmethod
     def parts(cls, test: Any) -> dict[str, Any]:
-        """Return the camera with its detectors, and the test with what was built in its `as_built`."""
+        """Return the camera with its detectors, and the test with the camera's deviations in `as_built`."""
         test, camera = load.load_camera_under_test(test)
         return {"test": test, "camera": camera, "detectors": load.load_band_detectors(camera)}
 
     def checked(self) -> Self:
-        """Check that the camera has line CCDs, and that their data sheets are there."""
+        """Check that the camera has line CCDs and that their data sheets are present."""
         if not self.camera.bands:
             text = f"the camera {self.camera.name} has no line CCDs"
             raise self.test.error(text, ("camera",), allowed="a camera with `bands:` in its file")
@@ -365,10 +365,10 @@ class CameraTestSetup(ExperimentSetup[TestType], Generic[TestType]):
 
 
 class FocusSetup(CameraTestSetup[FocusTestSpec]):
-    """A focal-plane alignment with its camera and detectors."""
+    """Focal-plane alignment with its camera and detectors."""
 
     def checked(self) -> Self:
-        """Check also that the tilt about the line can be told: not by bands at one X' alone."""
+        """Check also that the bands have different offsets X', which the tilt about the line requires."""
         super().checked()
         if len({band.offset for band in self.camera.bands.values()}) < 2:
             text = (
@@ -379,19 +379,19 @@ class FocusSetup(CameraTestSetup[FocusTestSpec]):
 
 
 class DistortionSetup(CameraTestSetup[DistortionTestSpec]):
-    """A distortion test with its camera, detectors and turntable.
+    """Distortion test with its camera, detectors and turntable.
 
     Attributes
     ----------
     turntable : TurntableTestSpec
-        Its dividing error and calibration.
+        Dividing error and calibration of the turntable.
     """
 
     turntable: TurntableTestSpec
 
     @classmethod
     def parts(cls, test: DistortionTestSpec) -> dict[str, Any]:
-        """Return also the turntable."""
+        """Return the parts of a camera test and the turntable."""
         turntable = load.load_named(TurntableTestSpec, load.LAB, test.turntable, test, ("turntable",))
         return {**super().parts(test), "turntable": turntable}
 
@@ -404,38 +404,38 @@ class DistortionSetup(CameraTestSetup[DistortionTestSpec]):
 
 
 class TurntableSetup(ExperimentSetup[TurntableTestSpec]):
-    """A turntable test, which refers to nothing else."""
+    """Turntable test, which has no references."""
 
 
 class MeasuredSetup(ExperimentSetup[TestType], Generic[TestType]):
-    """A test of the laboratory on measurements."""
+    """Laboratory test on measurements."""
 
     def checked(self) -> Self:
-        """Make the paths of the data absolute, so that a run's config.yaml finds them from anywhere."""
+        """Make the paths of the data absolute, so that a run's config.yaml is valid from any folder."""
         folder = Path(self.test.source.file).parent.absolute()
         measured = _absolute(getattr(self.test, MEASURED), folder)
         return self.model_copy(update={"test": self.test.model_copy(update={MEASURED: measured})})
 
 
 class MeasuredFocusSetup(MeasuredSetup[MeasuredFocusSpec]):
-    """A focal-plane alignment on measurements."""
+    """Focal-plane alignment on measurements."""
 
 
 class MeasuredDistortionSetup(MeasuredSetup[MeasuredDistortionSpec]):
-    """A distortion test on measurements."""
+    """Distortion test on measurements."""
 
 
 class MeasuredTurntableSetup(MeasuredSetup[MeasuredTurntableSpec]):
-    """A turntable test on measurements."""
+    """Turntable test on measurements."""
 
 
 def test_keys(path: str | Path) -> Mapping[str, Any]:
-    """What a test's file, or the test in a run's config.yaml, holds at its top; nothing for a name in the library.
+    """Return the top-level mapping of a test's file, or of the test in a run's config.yaml; empty for a library name.
 
     Raises
     ------
     InputError
-        It cannot be read.
+        The file cannot be read.
     """
     data = read_yaml(path).data if load.is_path(path) else {}
     inner = data.get("test", data) if isinstance(data, dict) else {}
@@ -443,7 +443,7 @@ def test_keys(path: str | Path) -> Mapping[str, Any]:
 
 
 def _absolute(files: Spec, folder: Path) -> Spec:
-    """Make every path of a section absolute."""
+    """Return a section with absolute paths."""
     changed: dict[str, Any] = {}
     for name in type(files).model_fields:
         value = getattr(files, name)
@@ -458,20 +458,20 @@ ALLOWED = "the file of a camera or of an instrument, or the config.yaml of a run
 
 
 class CameraSetup(Spec):
-    """A camera, with its instrument if it is to be looked at as mounted there.
+    """Camera, alone or as mounted in its instrument.
 
     Attributes
     ----------
     camera : CameraSpec
-        Its prescription.
+        Prescription of the camera.
     mounted : Name | None
-        Its name in the instrument.
+        Name of the camera in the instrument.
     instrument : InstrumentSpec | None
-        That holds it; None for a camera by itself.
+        Instrument that carries the camera; None for a camera alone.
     cameras : Paths[CameraSpec]
-        What the instrument's cameras are called -> prescription.
+        Reference in the instrument -> prescription.
     perturb : Paths[PerturbationSpec]
-        What happens to bodies of the instrument, as in a job; of a camera by itself to its parts.
+        Perturbations of bodies of the instrument, as in a job; for a camera alone of its parts.
     """
 
     camera: CameraSpec
@@ -482,12 +482,12 @@ class CameraSetup(Spec):
     seed: ClassVar[int] = 0
 
     def with_seed(self, seed: int) -> CameraSetup:
-        """Return the camera, of which nothing is drawn."""
+        """Return the camera unchanged, since it has no random numbers."""
         return self
 
     @property
     def standing(self) -> tuple[InstrumentSpec, Mapping[str, CameraSpec], str]:
-        """The instrument, its cameras and the name of this one in it; a camera by itself is its own instrument."""
+        """Instrument, its cameras and the name of this one in it; a camera alone forms an instrument."""
         if self.instrument is not None and self.mounted is not None:
             return self.instrument, self.cameras, self.mounted
         name = self.camera.name
@@ -495,22 +495,22 @@ class CameraSetup(Spec):
 
     @property
     def job(self) -> JobSpec:
-        """The job that perturbs its instrument so."""
+        """Job that perturbs the camera's instrument."""
         job = JobSpec.model_construct(instrument=self.standing[0].name, perturb=self.perturb)
         return job.with_source(self._source)
 
     def perturbed(self, words: Sequence[str]) -> CameraSetup:
-        """The same with further perturbations.
+        """Return the camera with further perturbations.
 
         Parameters
         ----------
         words : Sequence[str]
-            Such as ``M2 shift z 20 um``; they replace what was said of the same node.
+            Texts such as ``M2 shift z 20 um``; they replace earlier perturbations of the same node.
 
         Raises
         ------
         InputError
-            a text that says no perturbation.
+            A text is not a perturbation.
         """
         if not words:
             return self
@@ -519,34 +519,34 @@ class CameraSetup(Spec):
 
     @property
     def title(self) -> str:
-        """What it is called in a report."""
+        """Name of the camera in a report."""
         return self.camera.name if self.instrument is None else f"{self.camera.name} as {self.mounted} of {self.where}"
 
     @property
     def where(self) -> str:
-        """The instrument's name, empty for none."""
+        """Name of the instrument, empty for a camera alone."""
         return "" if self.instrument is None else self.instrument.name
 
     def to_yaml(self) -> str:
-        """Text of a config.yaml, which ``resolve_camera`` reads back to the same values."""
+        """Return the text of a config.yaml, which ``resolve_camera`` reads back to the same values."""
         return dump_yaml({key: value for key, value in self.plain().items() if value != {}})
 
 
 def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
-    """Read a camera and all it refers to.
+    """Read a camera with the content of its references.
 
     Parameters
     ----------
     file : Path | str
-        Name of a camera or instrument of the library, path of such a file, of a job, or a run's config.yaml; a job's
-        perturbations come with it.
+        Name of a camera or instrument of the library, path of such a file, of a job, or of a run's config.yaml; a job's
+        perturbations are included.
     name : str | None
-        Which camera, where there are several.
+        Name of the camera, if there are several.
 
     Raises
     ------
     InputError
-        The file cannot be read or is not valid, holds no camera, or several and ``name`` none of them.
+        The file cannot be read or is not valid, holds no camera, or several of which ``name`` selects none.
     """
     text = str(file)
     place: Path | str = text if not load.is_path(text) and not is_file(Path(text)) else Path(text)
@@ -565,7 +565,7 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
 
 
 def _of_job(resolved: ResolvedJob, file: str, name: str | None) -> CameraSetup:
-    """A camera of a job's instrument, perturbed as the job says."""
+    """Return a camera of a job's instrument with the job's perturbations."""
     job = resolved.job
     if job.course is not None:
         allowed = "a job without a course; python -m twin.render follows the course"
@@ -590,7 +590,7 @@ def _mounted(instrument: InstrumentSpec, file: str, name: str | None) -> CameraS
 
 
 def _of_run(yaml: YamlFile, name: str | None) -> CameraSetup:
-    """From a run's config.yaml; a study's has its own below ``base``."""
+    """Return a camera of a run's config.yaml; that of a study has its base below ``base``."""
     below = yaml.data if isinstance(yaml.data, dict) else {}
     if "study" in below and isinstance(below.get("base"), dict):
         yaml, below = yaml.part("base"), below["base"]
@@ -605,7 +605,7 @@ def _of_run(yaml: YamlFile, name: str | None) -> CameraSetup:
 
 
 def _chosen(names: tuple[str, ...], file: str, name: str | None) -> str:
-    """The camera that is meant. InputError if it is none, or nothing says which of several."""
+    """Return the name of the selected camera; raise `InputError` if it is unknown or not specified among several."""
     if name is None:
         if len(names) == 1:
             return names[0]

@@ -1,7 +1,4 @@
-"""The light that a camera sees: how much signal comes at which wavelength.
-
-Light of a black body.
-"""
+"""Spectrum of a camera's light: signal by wavelength, and the radiance of a black body."""
 
 from __future__ import annotations
 
@@ -16,20 +13,20 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 from optics.numerics.quadrature import gauss, gauss_of
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import KeyPath, Problem
-from scenes.yaml.spec import Number, Reference, Spec, one_given, short_for
+from scenes.yaml.spec import Number, Reference, Spec, require_one, short_for
 from scenes.yaml.unit_fields import Quantity, Vector, Wavelength
 from scenes.yaml.units import LENGTH, TEMPERATURE, format_quantity
 
 
 def black_body_photons(wavelength: np.ndarray, temperature: float) -> np.ndarray:
-    """Spectral radiance of a black body as photons, by Planck's law.
+    """Return the spectral photon radiance of a black body by Planck's law.
 
     Parameters
     ----------
     wavelength : np.ndarray
-        Metres, of any shape.
+        Wavelengths in metres, of any shape.
     temperature : float
-        kelvin.
+        Temperature in kelvin.
 
     Returns
     -------
@@ -44,7 +41,7 @@ def black_body_photons(wavelength: np.ndarray, temperature: float) -> np.ndarray
 
 
 WavelengthRange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, smallest="100 nm", largest="100 um"), 2)]
-"""Shortest and longest, metres."""
+"""Shortest and longest wavelength, in metres."""
 
 MOST_LINES = 100
 MOST_SAMPLES = 20_000
@@ -55,27 +52,27 @@ law is a polynomial to rounding; and points of all pieces together, at least: fa
 
 
 class SpectrumSpec(Spec):
-    """How much signal comes at which wavelength, of a source that looks the same everywhere.
+    """Spectrum: relative signal by wavelength of a source that looks the same everywhere. Signal is counted in photons.
 
-    Signal counts photons: ``weights`` and a table's response are signal per photon (transmission times quantum
-    efficiency), and a black body gives photons. Only ratios count.
+    ``weights`` and a table's response are signal per photon (transmission times quantum efficiency), and a black body
+    emits photons. Only ratios matter.
 
     Attributes
     ----------
     between : WavelengthRange | None
-        Shortest and longest wavelength of light that is evenly spread between them, metres.
+        Shortest and longest wavelength of light that is evenly distributed between them, in metres.
     wavelengths : tuple[Wavelength, ...] | None
-        Of lines, ascending, metres.
+        Wavelengths of spectral lines, ascending, in metres.
     weights : tuple[Number, ...] | None
-        Signal of each line; all alike when left out.
+        Relative signal of each line; by default all are equal.
     table : Reference | None
-        CSV file with the columns `wavelength` (unit in its head) and `response`; relative to this file. Between its
-        rows the response is linear, beyond them nothing.
+        CSV file with the columns `wavelength` (with unit) and `response`; a path relative to this file. The response is
+        linear between its rows and zero beyond them.
     curve : tuple[tuple[Wavelength, Number], ...] | None
-        What the table says, which is filled in when it is read; a table is not looked for where it is given.
+        Content of the table, filled in by the program when it is read; the table's file is then not needed.
     black_body : float | None
-        Temperature of a source whose photons the band or the table takes, kelvin; as many at all wavelengths when left
-        out.
+        Temperature of a black body as the source for the band or the table, in kelvin; by default the photon flux is
+        the same at all wavelengths.
     """
 
     between: WavelengthRange | None = None
@@ -89,7 +86,7 @@ class SpectrumSpec(Spec):
     def _one_form(self) -> SpectrumSpec:
         given = "table" if self.table is not None else "curve"
         allowed = "between, wavelengths or table"
-        one_given(self, ("between", "wavelengths", given), "a spectrum is given in one way", allowed)
+        require_one(self, ("between", "wavelengths", given), "a spectrum is given in one way", allowed)
         if self.weights is not None and len(self.weights) != len(self.wavelengths or ()):
             problem, found = "one weight for each wavelength", f"{len(self.weights)} weights"
             raise Problem(problem, found, f"{len(self.wavelengths or ())} of them", within=("weights",))
@@ -116,18 +113,18 @@ class SpectrumSpec(Spec):
 
     @model_serializer(mode="wrap")
     def _short(self, handler: SerializerFunctionWrapHandler) -> Any:
-        """An even band is written as its ends."""
+        """Return an even band as its two wavelengths."""
         full = handler(self)
         return full["between"] if self.between is not None and self.black_body is None else full
 
     @classmethod
     def evenly(cls, first: float, last: float) -> SpectrumSpec:
-        """Light that is evenly spread between two wavelengths, metres."""
+        """Return the spectrum of light evenly distributed between two wavelengths, in metres."""
         return cls.model_construct(between=(first, last))
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Shortest and longest wavelength with signal, metres."""
+        """Shortest and longest wavelength with signal, in metres."""
         if self.between is not None:
             return self.between
         if self.wavelengths is not None:
@@ -138,30 +135,30 @@ class SpectrumSpec(Spec):
 
     @property
     def lines(self) -> bool:
-        """Whether it consists of lines, whose sum is exact."""
+        """True if the spectrum consists of lines, whose sum is exact."""
         return self.wavelengths is not None
 
     @property
     def mean(self) -> float:
-        """Mean wavelength of the signal, metres."""
+        """Mean wavelength of the signal, in metres."""
         points, weights = self.rule(2)
         return float(points @ weights)
 
     def rule(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Wavelengths and weights for means over the signal, by Gauss' rule for this very spectrum.
+        """Return wavelengths and weights for means over the signal, by the Gauss rule of this spectrum.
 
-        What depends on the wavelength like a polynomial of degree below 2 ``count`` has its exact mean, whatever the
-        response looks like. Lines are all given, in place of a rule.
+        The mean of a function of the wavelength is exact if it is a polynomial of degree below 2 ``count``, for any
+        response. For lines, all of them are returned in place of a rule.
 
         Parameters
         ----------
         count : int
-            Of wavelengths.
+            Number of wavelengths.
 
         Returns
         -------
         tuple[np.ndarray, np.ndarray]
-            Wavelengths, metres, and weights that sum to 1, (K,) each.
+            (K,) wavelengths in metres, and (K,) weights that sum to 1.
 
         Raises
         ------
@@ -178,26 +175,26 @@ class SpectrumSpec(Spec):
         return points, weights / np.sum(weights)
 
     def even(self, count: int) -> np.ndarray:
-        """Wavelengths evenly from the shortest to the longest, metres, (count,); of lines all of them."""
+        """Return (count,) evenly spaced wavelengths from shortest to longest, in metres; for lines all of them."""
         if self.wavelengths is not None:
             return np.array(self.wavelengths)
         first, last = self.ends
         return np.linspace(first, last, count) if last > first else np.array([first])
 
     def read(self, owner: Spec, key: KeyPath) -> SpectrumSpec:
-        """Return it with its table's curve filled in.
+        """Return the spectrum with the curve of its table.
 
         Parameters
         ----------
         owner : Spec
-            The specification whose file names the table.
+            Specification whose file refers to the table.
         key : KeyPath
-            Of this spectrum in there.
+            Key of this spectrum in the owner.
 
         Raises
         ------
         InputError
-            No such table, or one that is not right.
+            The table is missing or invalid.
         """
         if self.table is None or self.curve is not None:
             return self
@@ -222,7 +219,7 @@ class SpectrumSpec(Spec):
 
 @lru_cache(maxsize=64)
 def _parts(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Wavelengths with signal and how much each has, as many as it takes to have all of it."""
+    """Return wavelengths with signal and their weights, fine enough to represent the whole spectrum."""
     if spectrum.wavelengths is not None:
         weights = np.ones(len(spectrum.wavelengths)) if spectrum.weights is None else np.array(spectrum.weights)
         return np.array(spectrum.wavelengths)[weights > 0.0], weights[weights > 0.0]
@@ -239,7 +236,7 @@ def _parts(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _corners(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Wavelengths between which the response is linear, and the response there."""
+    """Return the wavelengths between which the response is linear, and the response at them."""
     if spectrum.between is not None:
         corners = np.linspace(*spectrum.between, _PIECES + 1)
         return corners, np.ones_like(corners)
@@ -252,4 +249,4 @@ def _corners(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
 
 
 Spectrum = Annotated[SpectrumSpec, short_for("between", list, tuple)]
-"""With its keys, or the shortest and the longest wavelength alone."""
+"""Spectrum as a mapping with its keys, or the shortest and the longest wavelength alone."""

@@ -1,6 +1,6 @@
-"""A design trade study, as its file gives it: base job, factors and the values they take, design, responses, report.
+"""Trade study of an input file: base job, factors and their values, design of experiments, responses, report.
 
-Samplers of studies: how a design spreads its runs over the values of its factors.
+The module also has the samplers, which distribute the runs of a design over the values of the factors.
 """
 
 from __future__ import annotations
@@ -35,22 +35,23 @@ from scenes.yaml.spec import (
 from scenes.yaml.units import split_quantity, unit_ratio
 
 GRID = "grid"
-"""The kind that draws nothing: every combination."""
+"""Kind of design without random numbers: every combination."""
 
 
 @dataclass(frozen=True)
 class Sampler:
-    """How a design spreads its runs.
+    """Sampler: distribution of a design's runs over the unit cube.
 
     Attributes
     ----------
     title : str
-        For readers.
+        Name for reports.
     points : Callable[[int, int, np.random.Generator], np.ndarray]
-        Number of runs, number of independent factors, generator of all that is drawn -> points of the unit cube, (runs,
-        factors) in [0, 1]. A factor takes the value at which its distribution function is the point's coordinate.
+        Function from number of runs, number of independent factors and random generator to points of the unit cube,
+        (runs, factors) in [0, 1]. A factor takes the value at which its distribution function equals the point's
+        coordinate.
     even : bool
-        Whether the points lie more evenly than independent ones, so that means are known better than by sigma/sqrt(n).
+        True if the points are more even than independent ones, so that means are more accurate than sigma/sqrt(n).
     """
 
     title: str
@@ -88,11 +89,11 @@ _SAMPLERS: dict[str, Sampler] = {
     "monte_carlo": Sampler("Monte Carlo", _monte_carlo),
 }
 SAMPLERS = ExtensionTable("samplers", _SAMPLERS, Sampler)
-"""Kind of a design that draws -> its sampler. A new one is added here, and its name can be written in a study."""
+"""Kind of a design -> its sampler. A new sampler is added here, and its name can then be used in a study."""
 
 
 def unit_cube(kind: str, runs: int, factors: int, seed: int) -> np.ndarray:
-    """Points of a design in the open unit cube, (runs, factors).
+    """Return the points of a design in the open unit cube, (runs, factors).
 
     Parameters
     ----------
@@ -103,14 +104,14 @@ def unit_cube(kind: str, runs: int, factors: int, seed: int) -> np.ndarray:
     factors : int
         Number of coordinates.
     seed : int
-        Of what is drawn.
+        Seed of the random numbers.
 
     Raises
     ------
     KeyError
-        No such kind.
+        There is no such sampler.
     ValueError
-        The sampler gave no points of that cube.
+        The sampler returned points outside that cube or of another shape.
     """
     generator = np.random.default_rng(np.random.SeedSequence(seed))
     cube = np.asarray(SAMPLERS[kind].points(runs, factors, generator), np.float64)
@@ -125,7 +126,7 @@ Scalar = (
     | Annotated[float, Field(strict=True, allow_inf_nan=False)]
     | Annotated[str, Field(strict=True, max_length=1000)]
 )
-"""A value as it stands in the base's file: a quantity with its unit, a number, a name, true or false."""
+"""Value in the form of the base's file: a quantity with its unit, a number, a name, true or false."""
 Key = Annotated[tuple[Annotated[str, Field(strict=True)] | Whole, ...], Field(min_length=1)]
 """Keys and list indices from the root of a tree."""
 MOST_RUNS = 10_000_000
@@ -135,14 +136,14 @@ CONTINUOUS = ("range", "uniform", "normal", "truncated")
 
 
 class NormalSpec(Spec):
-    """A normal distribution.
+    """Normal distribution of a factor.
 
     Attributes
     ----------
     mean : Scalar
-        Its middle, with the unit of the base's value.
+        Mean, with the unit of the base's value.
     sigma : Scalar
-        Standard deviation.
+        Standard deviation, with unit.
     """
 
     mean: Scalar
@@ -150,16 +151,16 @@ class NormalSpec(Spec):
 
 
 class TruncatedSpec(Spec):
-    """A normal distribution that is cut off.
+    """Truncated normal distribution of a factor.
 
     Attributes
     ----------
     mean : Scalar
-        Middle of the normal distribution before it is cut.
+        Mean of the normal distribution before truncation, with unit.
     sigma : Scalar
-        Its standard deviation.
+        Standard deviation of the normal distribution before truncation, with unit.
     limits : tuple[Scalar, Scalar]
-        Smallest and largest value.
+        Smallest and largest value, with units.
     """
 
     mean: Scalar
@@ -168,16 +169,16 @@ class TruncatedSpec(Spec):
 
 
 class TableSpec(Spec):
-    """A column of a table; columns of one file belong together, row by row.
+    """Column of a table. Columns of one file are varied together, row by row.
 
     Attributes
     ----------
     file : Reference
-        CSV with a line of names first, relative to the study's file.
+        CSV file with names in its first line, relative to the study's file.
     column : Text
         Name of the column.
     values : tuple[Scalar, ...] | None
-        What stands there; a study's config.yaml holds them, so that it needs no other file.
+        Values of the column, filled in by the program in a study's config.yaml, which then needs no other file.
     """
 
     file: Reference
@@ -186,15 +187,16 @@ class TableSpec(Spec):
 
 
 class ScaleSpec(Spec):
-    """A value that follows a factor: the base's own, or what another factor sets it to, times a power of the factor
-    over its value in the base. Several factors may scale one value.
+    """Value that is scaled by a power of the ratio of a factor to its value in the base.
+
+    The scaled value is the base's, or that set by another factor. Several factors may scale one value.
 
     Attributes
     ----------
     key : Key
-        Where it stands in the base's resolved config.yaml; a number or a quantity.
+        Key path in the base's resolved config.yaml of the number or quantity that is scaled.
     power : Number
-        Of the ratio, 2 for what grows with an area when the factor is a diameter.
+        Exponent of the ratio; 2 for an area if the factor is a diameter.
     """
 
     key: Key
@@ -202,33 +204,35 @@ class ScaleSpec(Spec):
 
 
 class FactorSpec(Spec):
-    """What is changed and how: one of key and keys, or scales alone, and exactly one of values, range, uniform, normal,
-    truncated and table.
+    """Factor of a study: the value that varies and its values.
+
+    It has one of key, motion and keys, or scales alone, and exactly one of values, range, uniform, normal, truncated
+    and table.
 
     Attributes
     ----------
     key : Key | None
-        Where in the base's resolved config.yaml, keys and list indices.
+        Key path in the base's resolved config.yaml: keys and list indices.
     motion : Text | None
-        In place of the key of a number below `perturb` of a job, `M2 shift z`.
+        Motion below `perturb` of a job, such as `M2 shift z`, in place of its key.
     keys : tuple[Key, ...] | None
-        Several such places that all get the same value.
+        Several key paths that all get the same value.
     scales : tuple[ScaleSpec, ...]
-        Values that follow the factor; one without key and keys is itself the ratio, 1 for the base as it is.
+        Values that scale with the factor. A factor without key and keys is the ratio itself, 1 for the unchanged base.
     values : tuple[Scalar, ...] | None
-        a list of values; a design that draws takes each as often as the others.
+        List of values; designs other than a grid use each of them equally often.
     range : tuple[Scalar, Scalar] | None
-        Smallest and largest value, evenly spaced in a grid and evenly spread in designs that draw.
+        Smallest and largest value: evenly spaced in a grid, uniformly distributed in other designs.
     count : Count | None
         Number of values of a range in a grid.
     uniform : tuple[Scalar, Scalar] | None
         Smallest and largest value of a uniform distribution.
     normal : NormalSpec | None
-        a normal distribution.
+        Normal distribution.
     truncated : TruncatedSpec | None
-        a normal distribution within limits.
+        Truncated normal distribution.
     table : TableSpec | None
-        a column of a CSV file.
+        Column of a CSV file.
     """
 
     key: Key | None = None
@@ -246,7 +250,7 @@ class FactorSpec(Spec):
     @model_validator(mode="before")
     @classmethod
     def _motion_is_a_key(cls, data: Any) -> Any:
-        """`motion: M2 shift z` stands for the key of that number in a job."""
+        """Replace `motion: M2 shift z` by the key of that number in a job."""
         if not isinstance(data, Mapping) or not isinstance(data.get("motion"), str):
             return data
         if "key" in data:
@@ -279,25 +283,25 @@ class FactorSpec(Spec):
 
     @property
     def kind(self) -> str:
-        """Which of KINDS it is."""
+        """Source of the values, one of KINDS."""
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
     @property
     def places(self) -> tuple[KeyPath, ...]:
-        """All places that get the value."""
+        """All key paths that get the value."""
         return self.keys if self.keys is not None else (self.key,) if self.key is not None else ()
 
     def key_of(self, k: int) -> KeyPath:
-        """Where in the factor the place number k stands."""
+        """Return the key in this factor of key path number k."""
         return ("key",) if self.key is not None else ("keys", k)
 
     @property
     def unit(self) -> str | None:
-        """The unit in which the numbers of a quantity are given, the first one that is written; None without unit."""
+        """Unit of the numbers, the first one in the file; None without unit."""
         return Numbers.of(self.scalars(), self.kind).unit
 
     def scalars(self) -> tuple[Any, ...]:
-        """All values or parameters, as they are written."""
+        """Return all values or parameters in the form of the file."""
         if self.normal is not None:
             return (self.normal.mean, self.normal.sigma)
         if self.truncated is not None:
@@ -307,11 +311,11 @@ class FactorSpec(Spec):
         return self.values or self.range or self.uniform or ()
 
     def numbers(self) -> Numbers:
-        """All values or parameters as numbers in one unit."""
+        """Return all values or parameters as numbers in one unit."""
         return Numbers.of(self.scalars(), self.kind)
 
     def _check_scales(self) -> None:
-        """What scales is a number greater than zero, and a pure number if it scales by itself."""
+        """Raise `Problem` unless a factor that scales is a positive number, and a pure number if it has no key."""
         own = next((k for k, scale in enumerate(self.scales) if scale.key in self.places), None)
         if own is not None:
             raise Problem("the factor sets this value itself", None, "another key", within=("scales", own, "key"))
@@ -325,7 +329,7 @@ class FactorSpec(Spec):
             raise Problem("a factor without a key is a ratio", found, allowed, within=(self.kind,))
 
     def _check_numbers(self) -> None:
-        """Parameters of a distribution are numbers of one kind, in order and not negative where they must not be."""
+        """Raise `Problem` unless parameters of a distribution are ordered numbers of one kind with a positive sigma."""
         numbers = self.numbers()
         if self.kind not in CONTINUOUS:
             return
@@ -344,18 +348,18 @@ class FactorSpec(Spec):
 
 
 class Numbers(tuple[float, ...]):
-    """Values of a factor.
+    """Values of a factor as numbers.
 
     Attributes
     ----------
     numeric : bool
-        Whether they are numbers, with or without a unit.
+        True if the values are numbers, with or without a unit.
     unit : str | None
-        Of all of them; None without.
+        Unit of all of them; None without unit.
     values
         The numbers in that unit.
     whole : bool
-        Whether all are whole numbers, written so.
+        True if all are written as whole numbers.
     """
 
     numeric: bool
@@ -364,17 +368,17 @@ class Numbers(tuple[float, ...]):
 
     @property
     def values(self) -> tuple[float, ...]:
-        """The numbers."""
+        """Tuple of the numbers."""
         return tuple(self)
 
     @classmethod
     def of(cls, scalars: tuple[Any, ...], kind: str) -> Numbers:
-        """Numbers that stand in a factor.
+        """Return the values of a factor as numbers.
 
         Raises
         ------
         Problem
-            Some have a unit and others not, or the units measure different things.
+            Only some have a unit, or the units measure different kinds of quantity.
         """
         parts = [split_quantity(scalar) for scalar in scalars]
         plain = [isinstance(s, int | float) and not isinstance(s, bool) for s in scalars]
@@ -401,17 +405,17 @@ class Numbers(tuple[float, ...]):
 
 
 class DesignSpec(Spec):
-    """Which combinations of the factors' values are run.
+    """Design of experiments: the combinations of the factors' values that are run.
 
     Attributes
     ----------
     kind : str
-        Grid, every combination; latin_hypercube and sobol, evenly spread over all factors; monte_carlo, drawn
-        independently.
+        Design: grid, every combination; latin_hypercube or sobol, evenly distributed over all factors; monte_carlo,
+        independent random draws.
     runs : Whole | None
         Number of runs; a grid has as many as there are combinations.
     seed : Seed
-        Of what is drawn, and of the noise of every run.
+        Seed of the draws, and of the noise of every run.
     """
 
     kind: Annotated[str, OneOf(lambda: (GRID, *SAMPLERS))] = GRID
@@ -438,14 +442,14 @@ def _amount(text: str) -> str:
 
 
 class LimitsSpec(Spec):
-    """What a study may use.
+    """Limits on the resources of a study.
 
     Attributes
     ----------
     runs : Whole
-        More than these are run only with --yes.
+        Number of runs beyond which the study needs --yes.
     memory : str
-        Of all processes together, with its unit MB or GB.
+        Memory of all processes together, with the unit MB or GB.
     """
 
     runs: Annotated[Whole, Field(ge=1, le=MOST_RUNS)] = 20_000
@@ -453,7 +457,7 @@ class LimitsSpec(Spec):
 
     @property
     def bytes(self) -> float:
-        """The memory, bytes."""
+        """Memory in bytes."""
         return float(self.memory[:-2]) * (1e9 if self.memory.endswith("GB") else 1e6)
 
 
@@ -465,16 +469,16 @@ UNITS = {
     "k_per_m": "K/m",
     "m_per_s": "m/s",
 }
-"""Ending of a result's key -> unit."""
+"""Suffix of a result's key -> unit."""
 
 
 class BaseSpec(Spec):
-    """The job that every run of the study changes.
+    """Base of a study: the job or test that every run changes.
 
     Attributes
     ----------
     command : str
-        What runs it, as `python -m twin.COMMAND`.
+        Command that runs it, as in `python -m twin.COMMAND`.
     file : Reference
         Its file, or the config.yaml of one of its runs, relative to the study's file; for lab and orbit also a name in
         the library.
@@ -489,22 +493,22 @@ TOTAL, NOISE = "_sigma", "_sigma_noise"
 
 
 class ResponseSpec(Spec):
-    """A number that is kept of every run.
+    """Response: a number that is stored for every run.
 
     Attributes
     ----------
     key : Key
-        Where in the results: the run folder's JSON file without .json, then its keys and list indices.
+        Key path in the results: the JSON file of the run folder without .json, then its keys and list indices.
     unit : Text | None
-        Of the number; read from the ending of its key if it is not given.
+        Unit of the number; by default read from the suffix of its key.
     sigma : Key | None
-        Where its standard deviation stands, if the results have one: of all that is stated, for readings of the monitor
-        noise and motions that the spots cannot separate.
+        Key path of its total standard deviation, if the results have one; for readings of the monitor it covers noise
+        and motions that the spots cannot separate.
     noise : Key | None
-        Where its standard deviation by the noise of the run alone stands, which differs from run to run; for readings
-        of the monitor the key that ends in ``_sigma_noise``.
+        Key path of its standard deviation by the noise of a run alone, which differs from run to run; for readings of
+        the monitor the key that ends in ``_sigma_noise``.
     minus : Key | None
-        Where a number stands that is subtracted: an error is what is recovered minus what is true.
+        Key path of a number that is subtracted, such as the true value, so that the response is an error.
     """
 
     key: Key
@@ -523,29 +527,29 @@ class ResponseSpec(Spec):
 
     @property
     def units(self) -> str:
-        """The unit, empty for a pure number."""
+        """Unit, empty for a pure number."""
         return self.unit if self.unit is not None else unit_of(self.key)
 
     @property
     def stated(self) -> dict[str, KeyPath]:
-        """Ending of a column of the result -> where the standard deviation in it stands."""
+        """Suffix of a column of the result -> key path of the standard deviation in it."""
         given = {TOTAL: self.sigma, NOISE: self.noise}
         return {ending: key for ending, key in given.items() if key is not None}
 
 
 class ThresholdSpec(Spec):
-    """A requirement on a response, in the response's unit: the report tells the share of runs that meet it.
+    """Requirement on a response, in the response's unit. The report gives the share of runs that meet it.
 
     Attributes
     ----------
     response : Name
-        Its name.
+        Name of the response.
     at_most : Number | None
-        Largest value that is good.
+        Largest value that meets the requirement.
     at_least : Number | None
-        Smallest value that is good.
+        Smallest value that meets the requirement.
     magnitude : Flag
-        Judge the size of the response, without its sign.
+        True to judge the absolute value of the response.
     """
 
     response: Name
@@ -561,7 +565,7 @@ class ThresholdSpec(Spec):
 
 
 class ParetoSpec(Spec):
-    """Two responses, or a factor and a response, that compete; `max` in place of `min` where more is better.
+    """Pareto front of two competing responses, or of a factor and a response.
 
     Attributes
     ----------
@@ -570,9 +574,9 @@ class ParetoSpec(Spec):
     y : Name
         Name of a factor or response.
     best_x : Literal['min', 'max']
-        Whether small or large x is wanted.
+        Direction of improvement of x: `min` if smaller is better, `max` if larger is better.
     best_y : Literal['min', 'max']
-        Whether small or large y is wanted.
+        Direction of improvement of y: `min` if smaller is better, `max` if larger is better.
     """
 
     x: Name
@@ -582,20 +586,20 @@ class ParetoSpec(Spec):
 
 
 class StudyReportSpec(Spec):
-    """What the report shows beside the table of the responses.
+    """Content of the report beside the table of the responses.
 
     Attributes
     ----------
     histograms : tuple[Name, ...] | None
-        Responses whose distribution is drawn; all when it is not given.
+        Responses with a histogram; by default all.
     scatter : tuple[tuple[Name, Name], ...]
-        Pairs of names, of a factor or response along x and of one along y.
+        Scatter plots: pairs of names of factors or responses, [along x, along y].
     pareto : tuple[ParetoSpec, ...]
-        Pairs whose best compromises are sought.
+        Pareto fronts.
     sobol : Flag
-        Whether variance-based sensitivity indices are estimated.
+        True to estimate variance-based (Sobol) sensitivity indices.
     thresholds : Named[ThresholdSpec]
-        By name, requirements on responses.
+        Name -> requirement on a response.
     """
 
     histograms: tuple[Name, ...] | None = None
@@ -605,7 +609,7 @@ class StudyReportSpec(Spec):
     thresholds: Named[ThresholdSpec] = Field(default_factory=dict, validate_default=True)
 
     def names(self) -> list[tuple[KeyPath, str, bool]]:
-        """(where it stands, name, whether it must be a response) of everything the report mentions."""
+        """Return (key path, name, whether it must be a response) for every name in the report."""
         out: list[tuple[KeyPath, str, bool]] = [
             (("histograms", k), name, True) for k, name in enumerate(self.histograms or ())
         ]
@@ -616,28 +620,24 @@ class StudyReportSpec(Spec):
 
 
 class StudySpec(TitledSpec):
-    """A design trade study.
+    """Trade study: a job or a test repeated with factors that vary.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     base : BaseSpec
-        The job that is varied.
+        Job or test that is varied.
     factors : Named[FactorSpec]
-        By name, what varies in it.
+        Name -> factor.
     design : DesignSpec
-        Which combinations are run.
+        Design of experiments.
     noise : Literal['own', 'shared']
-        Own, every run has noise of its own; shared, all have that of the base job's seed.
+        Noise of the runs: `own`, independent in every run, or `shared`, that of the base job's seed in all runs.
     responses : Named[ResponseSpec]
-        By name, what is kept of each run.
+        Name -> number that is stored for each run.
     limits : LimitsSpec
-        What the study may use.
+        Limits on the resources of the study.
     report : StudyReportSpec
-        What the report shows.
+        Content of the report.
     """
 
     base: BaseSpec
@@ -687,20 +687,21 @@ class StudySpec(TitledSpec):
             raise Problem(text, None, "count: 5", within=("factors", name))
 
     def _clash(self) -> str | None:
-        """A name that two columns of the result would have."""
+        """Return a name that two columns of the result would have, or None."""
         stated = [f"{name}{ending}" for name, one in self.responses.items() for ending in one.stated]
         names = ["run", "failed", "message", "seed", *self.factors, *self.responses, *stated]
         return next((name for name in names if names.count(name) > 1), None)
 
 
 _UNIT_WORDS = frozenset(UNITS) | {"m2", "mm2", "um2"}
-"""Words that end what a key says of its unit."""
+"""Words of a key that end its unit."""
 
 
 def unit_of(key: KeyPath) -> str:
-    """Return the unit that a result's key says, empty if it says none: "um" for d_f_um, d_f_um_sigma_noise and other
-    keys whose last words, after the unit, say which number it is (d_f_um_true), "m/arcsec" for height_m_per_arcsec,
-    "1/mm" for nyquist_per_mm. A name below such a key has its unit: "um" for defocus_um, centre.
+    """Return the unit in the name of a result's key, empty for none.
+
+    Words after the unit are skipped: "um" for d_f_um, d_f_um_sigma_noise and d_f_um_true; "m/arcsec" for
+    height_m_per_arcsec, "1/mm" for nyquist_per_mm. A name below such a key has its unit: "um" for defocus_um, centre.
     """
     *above, last = [str(part) for part in key if isinstance(part, str)] or [""]
     words = last.removesuffix(NOISE).removesuffix(TOTAL).split("_")

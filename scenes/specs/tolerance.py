@@ -1,4 +1,4 @@
-"""A tolerance budget, as its file gives it: what varies, what is adjusted for it, and what is asked of the camera."""
+"""Tolerance budget of an input file: tolerances, compensators and the requirements on the camera."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from scenes.yaml.units import (
 )
 
 Amount = Annotated[str, Field(strict=True, max_length=100)] | Number
-"""A quantity with its unit, or a pure number where the motion has no unit."""
+"""Quantity with its unit, or a pure number if the motion has no unit."""
 Share = Annotated[Number, Field(gt=0.0, lt=1.0)]
 Cost = Annotated[Number, Field(gt=0.0)]
 
@@ -45,20 +45,22 @@ MEASURES: Mapping[str, Kind] = FrozenMap(
         "gradient": TEMPERATURE_GRADIENT,
     }
 )
-"""Kind of a motion -> what its amounts measure; the others are pure numbers."""
+"""Kind of a motion -> kind of quantity of its amounts; the other amounts are pure numbers."""
 MOST_ABBE = 0.1
-"""Relative limit of an Abbe number at which, at ten times of it, no Abbe number is left."""
+"""Upper bound of the relative limit of an Abbe number: the program tries ten times the limit, at which no Abbe number
+would be left.
+"""
 SPECTRUM = "figure"
 """Kind of a motion that, without a term, is a whole figure error."""
 
 
 class Varied(Spec):
-    """Base of what a motion in words says: which body, how, about which point.
+    """Motion of a body without its amount, as text.
 
     Attributes
     ----------
     motion : Text
-        Of one body, `M2 shift z`, `M2 rotate x about centre`, `M1 radius`; without an amount.
+        Motion of one body without an amount: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`.
     carrying : tuple[Text, ...]
         Further bodies that move rigidly with it, about the same point.
     """
@@ -81,12 +83,12 @@ class Varied(Spec):
         return motion_of(self.motion)
 
     def si(self, value: Amount, key: str, positive: bool = False) -> float:
-        """An amount of the motion in SI.
+        """Return an amount of the motion in the SI unit.
 
         Raises
         ------
         Problem
-            Another unit than the motion's, or not greater than zero where it has to be.
+            The amount has another unit than the motion's, or is not greater than zero where it has to be.
         """
         kind = self.parts[1]
         try:
@@ -99,7 +101,7 @@ class Varied(Spec):
 
 
 def amount_si(value: Amount, kind: str) -> float:
-    """An amount of a kind of motion in SI. Raises Problem: another unit, or none."""
+    """Return an amount of a kind of motion in the SI unit; raise `Problem` for a missing or wrong unit."""
     if kind in PURE:
         if isinstance(value, str):
             raise Problem(f"a change of the {kind} is a pure number", shown(value), "a number such as 1e-4")
@@ -108,44 +110,44 @@ def amount_si(value: Amount, kind: str) -> float:
 
 
 def amount_text(value: float, kind: str) -> str | float:
-    """An amount as files have it."""
+    """Return an amount in the form of the files."""
     return value if kind in PURE else format_quantity(value, MEASURES[kind])
 
 
 class ToleranceSpec(Varied):
-    """One tolerance.
+    """Tolerance of one parameter.
 
     Attributes
     ----------
     motion
-        What varies: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`, `M1 conic`, `L1 index`, `L1 abbe`
-        (relative), `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
+        Parameter: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`, `M1 conic`, `L1 index`, `L1 abbe` (relative),
+        `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
     carrying
         Further bodies that move rigidly with the first.
     limit : Amount
-        Largest amount either way; of a figure error its rms over the clear aperture, about its mean.
+        Largest deviation in either direction; for a figure error its rms over the clear aperture, about its mean.
     law : Literal['normal', 'uniform', 'ends']
-        How it is distributed: `normal` within the limit, which is `sigmas` standard deviations; `uniform` within it;
-        `ends`, one of both ends.
+        Distribution: `normal` with the limit at `sigmas` standard deviations; `uniform` within the limit; `ends`, one
+        of both ends.
     sigmas : Number
-        Standard deviations that the limit of a normal law is.
+        Number of standard deviations of a normal distribution at the limit.
     mean : Amount | None
-        About which it is distributed, for what has been measured and is not adjusted.
+        Mean of the distribution, for a deviation that has been measured and is not corrected; zero by default.
     measured : tuple[Amount, ...] | None
-        In place of the law, amounts that were measured of such parts, each drawn as often as the others.
+        Measured deviations of such parts, each drawn equally often, in place of a distribution.
     terms : tuple[Text, Text] | None
-        Of a figure error, the first and the last term of Noll's, `[Z5, Z36]`.
+        First and last Zernike term (Noll) of a figure error, `[Z5, Z36]`.
     power : Number
-        Of a figure error: the variance of its terms falls with the power of their radial order.
+        Exponent of a figure error's spectrum: the variance of its terms falls with this power of their radial order.
     cost : Cost
-        Of holding it as stated, in any unit.
+        Cost of the stated limit, in any unit.
     exponent : Number
-        The cost goes with the inverse limit to this power.
+        Exponent of the cost: it is proportional to the inverse limit to this power.
     costs : tuple[tuple[Amount, Cost], ...] | None
-        In place of both, what limits cost where it is known, `[[20 um, 1], [10 um, 3]]`; between them and beyond their
-        ends along a smooth line in logarithms.
+        Known costs of limits, `[[20 um, 1], [10 um, 3]]`, in place of cost and exponent; they are interpolated and
+        extrapolated by a smooth curve in logarithms.
     kept : Flag
-        Whether the allocation leaves it as it is.
+        True if the allocation must not change this limit.
     """
 
     limit: Amount
@@ -163,7 +165,7 @@ class ToleranceSpec(Varied):
     @model_validator(mode="before")
     @classmethod
     def _whole_figure(cls, data: Any) -> Any:
-        """`M1 figure` alone is one of many terms, kept as the first of them in words."""
+        """Expand `M1 figure` to a motion with its first term, and its range of terms."""
         if isinstance(data, Mapping) and isinstance(data.get("motion"), str):
             text = data["motion"].split()
             if len(text) == 2 and text[1] == SPECTRUM:
@@ -197,7 +199,7 @@ class ToleranceSpec(Varied):
         return self
 
     def _costs_fall(self) -> None:
-        """Refuse costs that say something twice. Raises Problem."""
+        """Raise `Problem` for costs that contradict each other or `cost` and `exponent`."""
         if self.costs is None:
             return
         if (self.cost, self.exponent) != (1.0, 1.0):
@@ -210,52 +212,52 @@ class ToleranceSpec(Varied):
 
     @property
     def cost_points(self) -> tuple[tuple[float, float], ...]:
-        """Limits over the stated one and what they cost, ascending, two at least."""
+        """Limits relative to the stated one with their costs, ascending, at least two."""
         if self.costs is None:
             return (1.0, self.cost), (2.0, self.cost * 2.0**-self.exponent)
         return tuple(sorted((amount_si(limit, self.parts[1]) / self.limit_si, cost) for limit, cost in self.costs))
 
     @property
     def spectrum(self) -> tuple[int, ...]:
-        """Noll's numbers of the terms of a whole figure error; empty for anything else."""
+        """Noll indices of the terms of a whole figure error; empty for other parameters."""
         return () if self.terms is None else tuple(range(noll(self.terms[0]), noll(self.terms[1]) + 1))
 
     @property
     def words(self) -> str:
-        """The motion in words, `M1 figure` where it has many terms."""
+        """Motion as text, `M1 figure` for a whole figure error."""
         return self.motion if self.terms is None else self.motion.rsplit(maxsplit=1)[0]
 
     @property
     def limit_si(self) -> float:
-        """The limit, SI."""
+        """Limit in the SI unit."""
         return amount_si(self.limit, self.parts[1])
 
     @property
     def mean_share(self) -> float:
-        """The mean, in units of the limit."""
+        """Mean in units of the limit."""
         return 0.0 if self.mean is None else amount_si(self.mean, self.parts[1]) / self.limit_si
 
     @property
     def measured_shares(self) -> tuple[float, ...]:
-        """What was measured, in units of the limit."""
+        """Measured deviations in units of the limit."""
         return tuple(amount_si(value, self.parts[1]) / self.limit_si for value in self.measured or ())
 
 
 class CompensatorSpec(Varied):
-    """One adjustment; those that are listed first are made first.
+    """Compensator: an adjustment of every camera. Compensators are applied in the order of the file.
 
     Attributes
     ----------
     motion
-        What is moved: `focal_plane shift z`.
+        Motion of the compensator: `focal_plane shift z`.
     carrying
         Further bodies that move rigidly with the first.
     range : Amount
-        Largest amount either way; zero leaves it as it is.
+        Largest amount in either direction; zero disables the compensator.
     step : Amount | None
-        Of which it is moved by a whole number, None for any amount.
+        Step of which the amount is a multiple; by default any amount is possible.
     accuracy : Amount | None
-        Standard deviation of a move.
+        Standard deviation of a move; zero by default.
     """
 
     range: Amount
@@ -274,23 +276,23 @@ class CompensatorSpec(Varied):
 
     @property
     def range_si(self) -> float:
-        """The range, SI."""
+        """Range in the SI unit."""
         return amount_si(self.range, self.parts[1])
 
     @property
     def step_si(self) -> float:
-        """The step, SI; 0 for none."""
+        """Step in the SI unit; 0 for none."""
         return 0.0 if self.step is None else amount_si(self.step, self.parts[1])
 
     @property
     def accuracy_si(self) -> float:
-        """Standard deviation of a move, SI; 0 for none."""
+        """Standard deviation of a move in the SI unit; 0 for none."""
         return 0.0 if self.accuracy is None else amount_si(self.accuracy, self.parts[1])
 
 
 FieldShare = Annotated[Number, Field(ge=-1.0, le=1.0)]
 NINE = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
-"""Fields that a merit has when it says none: shares of the half field, along the line and along the track."""
+"""Default fields of a merit: shares of the half field along the line and along the track."""
 MERIT_UNITS: Mapping[str, Kind | None] = FrozenMap(
     {
         "wavefront": None,
@@ -305,48 +307,48 @@ MERIT_UNITS: Mapping[str, Kind | None] = FrozenMap(
         "monitor_focus": LENGTH,
     }
 )
-"""Kind of a merit -> what it measures; None for a pure number (waves of the design wavelength, MTF)."""
+"""Kind of a merit -> kind of its quantity; None for a pure number (waves of the design wavelength, MTF)."""
 MORE_IS_BETTER = ("mtf",)
 OF_MONITOR = ("monitor_angle", "monitor_focus")
-"""Kinds of merits that are about the readings of a monitor."""
+"""Kinds of merits that concern the readings of a monitor."""
 POSTERIOR = "posterior"
-"""Estimator of a monitor's readings that has the least variance."""
+"""Estimator of a monitor's readings with the least variance."""
 
 
 class MeritSpec(Spec):
-    """What is asked of the camera.
+    """Merit: a requirement on the camera.
 
     Attributes
     ----------
     kind : str
-        `wavefront`, rms error in waves of the design wavelength; `mtf` of the optics; `boresight`, angle by which the
-        line of sight turns; `roll` of the line about it; `principal_distance`, its change; `distortion`, largest change
-        of an image's place along the line that neither of these three explains; `chief_ray`, largest turn of a chief
-        ray at the line CCD; `obstruction`, largest share of a field's beam, by area of the stop, that bodies of the
-        instrument take; `monitor_angle` and `monitor_focus`, standard deviation that the monitor's readings of a
-        rotation and of `d_f` have under the disturbances. The budget's `light` says in which light wavefronts and MTFs
-        are.
+        Quantity: `wavefront`, rms wavefront error in waves of the design wavelength; `mtf` of the optics; `boresight`,
+        rotation of the line of sight; `roll` of the line about the line of sight; `principal_distance`, its change;
+        `distortion`, largest change of an image position along the line that these three do not explain; `chief_ray`,
+        largest rotation of a chief ray at the line CCD; `obstruction`, largest share of a field's beam, by area of the
+        stop, that bodies of the instrument block; `monitor_angle` and `monitor_focus`, standard deviation of the
+        monitor's readings of a rotation and of `d_f` under the disturbances. The budget's `light` selects the light for
+        wavefronts and MTFs.
     fields : tuple[tuple[FieldShare, FieldShare], ...]
-        Of wavefront, mtf, chief_ray and obstruction, the worst of which counts: shares of the half field along the line
-        and the track.
+        Fields for wavefront, mtf, chief_ray and obstruction, of which the worst one counts: shares of the half field,
+        [along the line, along the track].
     frequency : Number | None
-        Of mtf, cycles per mm; that of the pixels (Nyquist) if not given.
+        Spatial frequency of mtf, in cycles per mm; by default the Nyquist frequency of the pixels.
     direction : Literal['line', 'track', 'worse']
-        Of mtf: along the line, along the track, or the worse of both.
+        Direction of mtf: along the line, along the track, or the worse of both.
     reading : Literal['angle', 'd_alpha', 'd_beta', 'd_gamma'] | None
-        Of monitor_angle: `angle` between the lines of sight of a pair, or `d_alpha`, `d_beta`, `d_gamma` of the camera;
-        by default that angle of a pair, and the worst of these three of one camera.
+        Reading of monitor_angle: `angle` between the lines of sight of a pair, or `d_alpha`, `d_beta`, `d_gamma` of the
+        camera; by default the angle of a pair, and the worst of these three for one camera.
     estimator : Name
-        Of the monitor's readings.
+        Estimator of the monitor's readings.
     at_most : Amount | None
-        Largest value that passes; a change counts either way.
+        Largest value that passes, for all kinds but mtf; changes are judged by their absolute value.
     at_least : Number | None
-        Smallest value that passes, of mtf.
+        Smallest value that passes, for mtf.
     probability : Share
-        Share of cameras that are to pass.
+        Required share of cameras that pass.
     loss : Amount | None
-        Of the inverse: what one tolerance alone may spoil of the merit; by default what is left between design and
-        requirement over the square root of the number of tolerances.
+        Loss of the merit that a single tolerance may cause, for the inverse sensitivity analysis; by default the margin
+        between design and requirement over the square root of the number of tolerances.
     """
 
     kind: Literal[
@@ -402,12 +404,12 @@ class MeritSpec(Spec):
 
     @property
     def more_is_better(self) -> bool:
-        """Whether large values are good."""
+        """True if large values are good."""
         return self.kind in MORE_IS_BETTER
 
     @property
     def requirement(self) -> float:
-        """The value that just passes, SI."""
+        """Value that just passes, in the SI unit."""
         if self.at_least is not None:
             return float(self.at_least)
         assert self.at_most is not None
@@ -415,23 +417,23 @@ class MeritSpec(Spec):
 
     @property
     def loss_si(self) -> float | None:
-        """What one tolerance may spoil, SI; None for the default."""
+        """Loss that a single tolerance may cause, in the SI unit; None for the default."""
         return None if self.loss is None else self._si(self.loss, "loss")
 
 
 class AllocationSpec(Spec):
-    """Limits that meet the yield at the least cost.
+    """Allocation of limits that achieve the yield at the least cost.
 
     Attributes
     ----------
     target : Share
-        Share of cameras that are to pass all requirements.
+        Yield: share of cameras that must pass all requirements.
     grades : tuple[Number, ...]
-        Limits are rounded to these numbers times powers of ten.
+        Preferred numbers: limits are rounded to these times powers of ten.
     loosest : Number
-        By what limits may grow at most.
+        Largest factor by which a limit may increase.
     tightest : Number
-        By what limits may shrink at most.
+        Largest factor by which a limit may decrease.
     """
 
     target: Share = 0.9
@@ -441,35 +443,34 @@ class AllocationSpec(Spec):
 
 
 class ToleranceBudgetSpec(Spec):
-    """A tolerance budget of a camera.
+    """Tolerance budget of a camera.
 
     Attributes
     ----------
     instrument : Ref
-        a camera or an instrument, by name or path, as in a job.
+        Camera or instrument, by name or path, as in a job.
     camera : Name | None
-        Which camera of an instrument is judged; may be left out where there is one.
+        Name of the camera that is judged; may be omitted if the instrument has one camera.
     disturbances : JobDisturbances | None
-        What is expected to move between two measurements of the monitor, as in a job; those of the instrument if not
-        given.
+        Disturbances between two measurements of the monitor, as in a job; by default those of the instrument.
     tolerances : Named[ToleranceSpec]
-        By name, what varies.
+        Name -> tolerance.
     compensators : Named[CompensatorSpec]
-        By name, what is adjusted in every camera, in this order; the mean square wavefront error over all fields of the
-        merits is made least.
+        Name -> adjustment of every camera, in this order; the adjustments minimise the mean square wavefront error over
+        all fields of the merits.
     merits : Named[MeritSpec]
-        By name, what is asked.
+        Name -> requirement.
     light : Literal['spectrum', 'design'] | None
-        In which wavefronts and MTFs are judged: `spectrum`, that of the camera, or `design`, its design wavelength
-        alone; the spectrum of a camera with lenses that has one, when left out.
+        Light for wavefronts and MTFs: `spectrum` of the camera, or `design` for its design wavelength alone. By default
+        the spectrum for a camera with lenses that has one, else the design wavelength.
     samples : Whole
-        Cameras that are drawn.
+        Number of cameras in the Monte Carlo run.
     seed : Seed
-        Of everything drawn.
+        Seed of all random numbers.
     allocation : AllocationSpec | None
-        Whether limits are allocated anew, and for which yield.
+        Allocation of new limits; by default the limits are not changed.
     limits : LimitsSpec
-        What the Monte Carlo run may use.
+        Limits on the resources of the Monte Carlo run.
     """
 
     instrument: Ref
@@ -493,14 +494,14 @@ class ToleranceBudgetSpec(Spec):
 
 
 class ToleranceSetup(ExperimentSetup[ToleranceBudgetSpec]):
-    """A tolerance budget with its instrument.
+    """Tolerance budget with its instrument.
 
     Attributes
     ----------
     base : ResolvedJob
-        The nominal job of the instrument.
+        Nominal job of the instrument.
     draws : dict[str, Number]
-        By number that varies, what one camera has of it, in units of its limit; those that are left out are zero.
+        Name of a varying number -> value in one camera, in units of its limit; missing numbers are zero.
     """
 
     base: ResolvedJob

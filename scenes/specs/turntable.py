@@ -1,6 +1,6 @@
-"""The turntable test of paper 004 (section 3.3): a table with a dividing error that nobody knows, and its calibration.
+"""Turntable test of paper 004 (section 3.3): calibration of a turntable with an unknown dividing error.
 
-Dividing error = reading - true angle. With `measured:` the comparisons are those of a real bench, from files.
+Dividing error = reading - true angle. With `measured:` the comparisons come from files of a real bench.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ MOST_LINES = 10_000_000
 
 
 class GraduationSpec(Spec):
-    """Errors of the grating's lines: a random curve from harmonics of the turn.
+    """Errors of the grating's lines: a random curve of harmonics of the full circle.
 
     Attributes
     ----------
     rms : AngleSigma
-        Over the full circle, expected, radians.
+        Expected rms over the full circle, in radians.
     first, last : Whole
-        Harmonics; the shortest wave is 360 deg / last.
+        First or last harmonic; the shortest wavelength of the curve is 360 deg / last.
     slope : Number
-        The amplitude of harmonic k falls as k^-slope.
+        Exponent of the spectrum: the amplitude of harmonic k falls as k^-slope.
     """
 
     rms: AngleSigma
@@ -53,11 +53,11 @@ class SubdivisionSpec(Spec):
     Attributes
     ----------
     rms : AngleSigma
-        Expected, radians.
+        Expected rms, in radians.
     lines : Whole
-        Periods of the signal in a full turn.
+        Number of signal periods in a full circle.
     harmonics : tuple[Whole, ...]
-        Of the signal that carry it, equal in the mean.
+        Harmonics of the signal with this error; they are equal on average.
     """
 
     rms: AngleSigma
@@ -70,26 +70,28 @@ class SubdivisionSpec(Spec):
 
     @property
     def period(self) -> float:
-        """Period of the signal, radians."""
+        """Period of the signal, in radians."""
         return 2.0 * math.pi / self.lines
 
 
 class DividingErrorSpec(Spec):
-    """What the dividing error is made of. Sizes are RMS values over the full circle that the draws have in the mean;
-    the amplitude and phase of each harmonic are drawn from the seed.
+    """Components of the dividing error.
+
+    Sizes are expected RMS values over the full circle; the amplitude and phase of each harmonic are drawn from the
+    seed.
 
     Attributes
     ----------
     axis : AngleSigma
-        Wobble of the axis, first and second harmonic, radians.
+        Wobble of the axis, first and second harmonic, in radians.
     eccentricity : AngleSigma
-        Of the grating, first harmonic, radians.
+        Eccentricity of the grating, first harmonic, in radians.
     graduation : GraduationSpec
-        Of the lines.
+        Errors of the grating's lines.
     subdivision : SubdivisionSpec
-        Within a period of the signal.
+        Interpolation error within a period of the signal.
     repeatability : AngleSigma
-        Standard deviation of one reading, radians.
+        Standard deviation of a single reading, in radians.
     """
 
     axis: AngleSigma
@@ -100,18 +102,18 @@ class DividingErrorSpec(Spec):
 
 
 class ReferenceSpec(Spec):
-    """The reference: a polygon on an indexing table, seen by an autocollimator.
+    """Reference standard: a polygon on an indexing table, read by an autocollimator.
 
     Attributes
     ----------
     calibration : AngleSigma
-        Standard deviation of what its certificate leaves unknown at each position, the same in all repeats, radians.
+        Standard uncertainty of the reference's certificate at each position, the same error in all repeats, in radians.
     noise : AngleSigma
-        Standard deviation of one reading of the autocollimator, radians.
+        Standard deviation of a single reading of the autocollimator, in radians.
     gross_error : AngleSigma
-        Size of a gross error (a shock, a draught), either sign, radians.
+        Size of a gross error (a shock, a draught), of either sign, in radians.
     gross_probability : Number
-        Of one in a comparison.
+        Probability of a gross error in a comparison.
     """
 
     calibration: AngleSigma
@@ -121,15 +123,17 @@ class ReferenceSpec(Spec):
 
 
 class HeldOutSpec(Spec):
-    """Angles that no fit sees, in the middle of the calibration's steps, measured in a series of their own.
+    """Held-out angles, in the middle of the calibration's steps, which no fit uses.
+
+    They are measured in a separate series.
 
     Attributes
     ----------
     repeats : Whole
-        Of each.
+        Number of repeats of each angle.
     spread : AngleSigma
-        The table is set off the middle by a random amount within +- this, radians, so that readings fall at all phases
-        of the grating's signal, as in use.
+        Half range of a random offset of the turntable from the middle of a step, in radians, so that readings cover all
+        phases of the grating's signal, as in use.
     """
 
     repeats: Annotated[Whole, Field(ge=2, le=1000)]
@@ -137,18 +141,18 @@ class HeldOutSpec(Spec):
 
 
 class CalibrationPlanSpec(Spec):
-    """Which readings are compared how often.
+    """Plan of the calibration: the readings that are compared with the reference.
 
     Attributes
     ----------
     first, last, step : TableAngle
-        Of the readings, radians.
+        First reading, last reading or step of the readings, in radians.
     repeats : Whole
-        Of each.
+        Number of repeats of each comparison.
     folds : Whole
-        Of the cross-validation.
+        Number of folds of the cross-validation.
     held_out : HeldOutSpec
-        The angles for the comparison of the fits.
+        Held-out angles by which the fits are compared.
     """
 
     first: TableAngle
@@ -194,24 +198,20 @@ class CalibrationPlanSpec(Spec):
 
 
 class TurntableTestSpec(TitledSpec):
-    """The turntable test.
+    """Turntable test.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     dividing_error : DividingErrorSpec
-        Of the table; the analysis does not know it.
+        True dividing error of the simulated turntable; the analysis does not use it.
     reference : ReferenceSpec
-        What the table is compared with.
+        Reference standard.
     calibration : CalibrationPlanSpec
-        What is compared.
+        Plan of the calibration.
     camera_angle : TableAngle
-        Reading of the table at the middle of the camera's field in the distortion test, radians.
+        Reading of the turntable at the centre of the camera's field in the distortion test, in radians.
     seed : Seed
-        Of everything that is drawn.
+        Seed of all random numbers.
     """
 
     dividing_error: DividingErrorSpec
@@ -235,20 +235,19 @@ class TurntableTestSpec(TitledSpec):
 
 
 class TurntableFiles(Spec):
-    """Readings of a turntable that were compared with a reference.
+    """Readings of a turntable and their comparisons with a reference.
 
     Attributes
     ----------
     comparisons : Reference
-        Table of the calibrated readings, a CSV file.
+        CSV file of the calibrated readings.
     held_out : Reference | None
-        Table of readings between them, measured in a series of their own, by which the fits are judged; without it
-        cross-validation judges them, and an error of a period below the step stays unseen.
+        CSV file of readings between the calibrated ones, from a separate series, by which the fits are judged. Without
+        it, cross-validation judges them and does not detect an error with a period below the step.
     reference : AngleSigma
-        Standard deviation of what the reference's certificate leaves unknown at each position, the same in all repeats,
-        radians.
+        Standard uncertainty of the reference's certificate at each position, the same error in all repeats, in radians.
     folds : Whole
-        Of the cross-validation.
+        Number of folds of the cross-validation.
     """
 
     comparisons: Reference
@@ -258,18 +257,14 @@ class TurntableFiles(Spec):
 
 
 class MeasuredTurntableSpec(TitledSpec):
-    """The turntable test on measured readings.
+    """Turntable test on measured readings.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     measured : TurntableFiles
-        The readings.
+        Comparisons of readings with a reference.
     seed : Seed
-        Of the network's starts.
+        Seed of the neural network's starting values.
     """
 
     measured: TurntableFiles

@@ -1,1 +1,1 @@
-"""YAML at the edge: files, units, errors with line and remedy."""
+"""Reading of input files: YAML, tables, units, and error messages with file, line and remedy."""

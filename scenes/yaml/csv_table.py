@@ -1,8 +1,8 @@
-"""Tables of measured numbers from CSV files: heads with units, `time [s], x [mm]`, and one row for each reading.
+"""Reader of CSV tables of measured numbers, with units in the heads: `time [s], x [mm]`.
 
-Columns may stand in any order and in any unit of their kind; numbers come out in SI units. Lines that are empty or
-begin with # are left out. A million rows take some seconds. Rows become numbers some thousands at a time, so that a
-table takes little more memory than its text and its numbers.
+Columns may have any order and any unit of their kind; numbers are returned in SI units. Empty lines and lines that
+begin with # are skipped. A million rows take some seconds. Rows are converted to numbers in blocks of some thousands,
+so that a table needs little more memory than its text and its numbers.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from scenes.yaml.input_file import read_bytes, read_text
 from scenes.yaml.units import TEMPERATURE, Kind, parse_quantity, unit_ratio
 
 LARGEST_NUMBER = 1e100
-"""In a table, in its unit: whatever is worked out of larger ones leaves the range of floating-point numbers."""
+"""Largest absolute value of a number in a table, in the table's unit: results computed from larger ones would overflow.
+"""
 LARGEST_TABLE = 1 << 30
-"""Bytes."""
+"""Largest size of a table, in bytes."""
 _HEAD = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
 _DELIMITERS = (",", ";", "\t")
 _LEAST, _MOST = -np.inf, np.inf
@@ -31,24 +32,24 @@ _LEAST, _MOST = -np.inf, np.inf
 
 @dataclass(frozen=True)
 class Column:
-    """A column that a table may have.
+    """Column that a table may have.
 
     Attributes
     ----------
     name : str
-        Its head, without the unit.
+        Head of the column, without the unit.
     kind : Kind | None
-        Of the quantity; its head then ends in a unit in square brackets. None for numbers without a unit.
+        Kind of the quantity; the head then ends in a unit in square brackets. None for numbers without a unit.
     text : bool
-        Whether it holds names and not numbers.
+        True if the cells are names instead of numbers.
     needed : bool
-        Whether a table without it is refused.
+        True if a table without this column is refused.
     least, most : float
-        Of its numbers, both allowed, SI units.
+        Smallest and largest number allowed, both inclusive, in SI units.
     whole : bool
-        Whether its numbers are whole.
+        True if only whole numbers are allowed.
     bare : bool
-        Whether the unit may be missing, and numbers are then in the SI unit.
+        True if the head may omit the unit; the numbers are then in the SI unit.
     """
 
     name: str
@@ -62,24 +63,24 @@ class Column:
 
     @property
     def head(self) -> str:
-        """An example of its head."""
+        """Head with an example unit, for messages."""
         return self.name if self.kind is None or self.bare else f"{self.name} [{self.kind.units[0]}]"
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """What a table holds.
+    """Contents of a CSV table.
 
     Attributes
     ----------
     file : str
-        Its path, as the user gave it.
+        Path as the user wrote it.
     lines : np.ndarray
-        (N,) line of each row in the file, counted from 1.
+        (N,) line number of each row in the file, counted from 1.
     heads : Mapping[str, str]
-        Name of a column -> its head as it stands in the file.
+        Name of a column -> its head as written in the file.
     columns : Mapping[str, np.ndarray]
-        Name -> (N,) numbers in SI units, or names; those that the file does not have are missing.
+        Name of a column -> (N,) numbers in SI units, or names; only for columns that the file has.
     """
 
     file: str
@@ -97,7 +98,7 @@ class Table:
         return self.columns[name]
 
     def stacked(self, *names: str) -> np.ndarray:
-        """(N, K) of K columns of numbers."""
+        """Return K columns of numbers as one (N, K) array."""
         return np.stack([self.columns[name] for name in names], axis=-1)
 
     def error(
@@ -109,28 +110,28 @@ class Table:
         allowed: str | None = None,
         suggestion: str | None = None,
     ) -> InputError:
-        """What is wrong with a cell, or with the whole row for an empty name."""
+        """Return the input error of one cell, or of the whole row if the name of the column is empty."""
         key = (self.heads[name],) if name else ()
         return InputError(Issue(problem, self.file, int(self.lines[row]), key, found, allowed, suggestion))
 
 
 def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1) -> Table:
-    """A table of a file.
+    """Read a table of a CSV file.
 
     Parameters
     ----------
     path : str | Path
-        Of the file, UTF-8 text with commas, semicolons or tabs between its cells.
+        Path of the file: UTF-8 text with commas, semicolons or tabs between the cells.
     columns : Sequence[Column]
-        That it may have; another one is refused.
+        Columns that the table may have; any other column is refused.
     least_rows : int
-        That it must have.
+        Smallest number of rows.
 
     Raises
     ------
     InputError
-        The file cannot be read, a needed column is missing, a cell holds no number or one that is not allowed; with the
-        line and the head of the column.
+        The file cannot be read, a needed column is missing, or a cell is not a number or is out of range. The error has
+        the line and the head of the column.
     """
     file = str(path)
     pieces = _rows(file, table_text(path))
@@ -138,16 +139,16 @@ def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1)
     allowed = ", ".join(repr(c.head) + ("" if c.needed else " (may be missing)") for c in columns)
     if not rows:
         raise InputError(Issue("an empty table", file, 1, allowed=f"a row of heads: {allowed}"))
-    found = _heads(file, lines[0], rows[0], columns, allowed)
+    layout = _heads(file, lines[0], rows[0], columns, allowed)
     if len(rows) <= least_rows and len(rows) < _TOGETHER:
         text = f"{len(rows) - 1} rows below the heads"
         raise InputError(Issue(text, file, lines[0], allowed=f"{least_rows} or more"))
     heads = [head.strip() for head in rows[0]]
-    parts = [_numbers(file, lines[1:], rows[1:], heads, found)]
-    parts += [_numbers(file, lines, rows, heads, found) for lines, rows in pieces]
+    parts = [_numbers(file, lines[1:], rows[1:], heads, layout)]
+    parts += [_numbers(file, lines, rows, heads, layout) for lines, rows in pieces]
     numbers = np.concatenate([own for own, _ in parts])
-    values = {column.name: np.concatenate([own[column.name] for _, own in parts]) for column, _, _ in found}
-    return Table(file, numbers, FrozenMap({column.name: heads[k] for column, k, _ in found}), FrozenMap(values))
+    values = {column.name: np.concatenate([own[column.name] for _, own in parts]) for column, _, _ in layout}
+    return Table(file, numbers, FrozenMap({column.name: heads[k] for column, k, _ in layout}), FrozenMap(values))
 
 
 def _numbers(
@@ -155,9 +156,9 @@ def _numbers(
     lines: Sequence[int],
     rows: Sequence[Sequence[str]],
     heads: Sequence[str],
-    found: Sequence[tuple[Column, int, _Scale]],
+    layout: Sequence[tuple[Column, int, _Scale]],
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Lines of some rows, and their SI numbers or names in the columns that were found."""
+    """Return the line numbers of some rows, and the SI numbers or names in their columns."""
     width = len(heads)
     uneven = next((k for k, row in enumerate(rows) if len(row) != width), None)
     if uneven is not None:
@@ -166,62 +167,62 @@ def _numbers(
         raise InputError(Issue(text, file, lines[uneven], allowed=allowed))
     numbers, cells = np.array(lines, int), list(zip(*rows, strict=True)) or [()] * width
     return numbers, {
-        column.name: _values(file, numbers, heads[k], column, cells[k], scale) for column, k, scale in found
+        column.name: _values(file, numbers, heads[k], column, cells[k], scale) for column, k, scale in layout
     }
 
 
 def table_text(path: str | Path, what: str = "a CSV file", most: int = LARGEST_TABLE) -> str:
-    """The text of a file of measured numbers.
+    """Read the text of a file of measured numbers.
 
     Parameters
     ----------
     path : str | Path
-        Of the file, UTF-8 text.
+        Path of the file, UTF-8 text.
     what : str
-        It should be, for messages.
+        Noun phrase for the expected file, for messages.
     most : int
-        Bytes that it may have.
+        Largest size, in bytes.
 
     Raises
     ------
     InputError
-        There is none, it cannot be read, is too large or holds other than UTF-8 text.
+        The file is missing, cannot be read, is too large or is not UTF-8 text.
     """
     return read_text(path, what, most, (Path(path).suffix,))
 
 
 _TOGETHER = 1 << 16
-"""Rows that are cells of text at a time."""
+"""Number of rows converted from text to numbers at a time, which limits the memory."""
 _LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")
 
 
 def lines_of(text: str) -> Iterator[str]:
-    """The lines of a text with their ends, as a file opened with ``newline=""`` has them, one at a time.
+    """Iterate over the lines of a text with their line ends, as a file opened with ``newline=""`` does.
 
     Parameters
     ----------
     text : str
-        whole.
+        The whole text.
     """
     return (match[0] for match in _LINE.finditer(text))
 
 
 def rows_apart(path: str | Path, most: int) -> list[tuple[int, list[str] | str]]:
-    """Return line and cells of every row of a small table whose rows are taken or refused one by one.
+    """Return line number and cells of every row of a small table whose rows are accepted or refused one by one.
 
-    Each line is a row: a quotation mark that is never closed spoils its own row alone.
+    Each line is a row: a quotation mark that is never closed invalidates its own row alone.
 
     Parameters
     ----------
     path : str or Path
-        File, as for `read_table`.
+        Path of the file, as for `read_table`.
     most : int
-        Bytes that it may have.
+        Largest size, in bytes.
 
     Returns
     -------
     list of (int, list of str or str)
-        Line, counted from 1, and its cells, or what is wrong with it.
+        Line number, counted from 1, and the cells, or a text that says why the row cannot be read.
 
     Raises
     ------
@@ -233,7 +234,7 @@ def rows_apart(path: str | Path, most: int) -> list[tuple[int, list[str] | str]]
     delimiter = _delimiter(text)
     for number, line in enumerate(lines_of(text), 1):
         if "\0" in line or "\ufffd" in line:
-            rows.append((number, "a byte that is no text" if "\0" in line else "not UTF-8 text"))
+            rows.append((number, "a byte that is not text" if "\0" in line else "not UTF-8 text"))
             continue
         try:
             cells = next(csv.reader([line], delimiter=delimiter, strict=True), [])
@@ -246,17 +247,18 @@ def rows_apart(path: str | Path, most: int) -> list[tuple[int, list[str] | str]]
 
 
 def _delimiter(text: str) -> str:
+    """Return the delimiter of a table: the first of `_DELIMITERS` that occurs in its first row."""
     first = next((row for row in lines_of(text) if row.strip() and not row.lstrip().startswith("#")), "")
     return next((sign for sign in _DELIMITERS if sign in first), ",")
 
 
 def _holds(row: Sequence[str]) -> bool:
-    """Return whether a row holds something and is no remark."""
+    """Return whether a row has content and is not a comment."""
     return bool(row) and not row[0].lstrip().startswith("#") and any(map(str.strip, row))
 
 
 def _rows(file: str, text: str) -> Iterator[tuple[list[int], list[list[str]]]]:
-    """Lines and cells of the rows that hold something, ``_TOGETHER`` at a time."""
+    """Iterate over line numbers and cells of the rows with content, ``_TOGETHER`` rows at a time."""
     reader = csv.reader(lines_of(text), delimiter=_delimiter(text), strict=True)
     lines: list[int] = []
     rows: list[list[str]] = []
@@ -275,20 +277,21 @@ def _rows(file: str, text: str) -> Iterator[tuple[list[int], list[list[str]]]]:
 
 
 def rows_of(path: str | Path, most: int) -> list[tuple[int, list[str]]]:
-    """Line, counted from 1, and cells of every row of a small table; empty lines and those that begin with # are left
-    out.
+    """Return line number, counted from 1, and cells of every row of a small table.
+
+    Empty lines and lines that begin with # are skipped.
 
     Parameters
     ----------
     path : str | Path
-        Of the file, as for ``read_table``.
+        Path of the file, as for ``read_table``.
     most : int
-        Bytes that it may have.
+        Largest size, in bytes.
 
     Raises
     ------
     InputError
-        It cannot be read, or is no table.
+        The file cannot be read, or is not a table.
     """
     pieces = _rows(str(path), table_text(path, most=most))
     return [row for lines, rows in pieces for row in zip(lines, rows, strict=True)]
@@ -297,37 +300,38 @@ def rows_of(path: str | Path, most: int) -> list[tuple[int, list[str]]]:
 def _heads(
     file: str, line: int, heads: Sequence[str], columns: Sequence[Column], allowed: str
 ) -> list[tuple[Column, int, _Scale]]:
-    """The columns that stand in the file, where, and how their numbers become SI ones."""
+    """Return each column of the file with its index and its conversion to the SI unit."""
     known = {column.name: column for column in columns}
-    found: list[tuple[Column, int, _Scale]] = []
+    layout: list[tuple[Column, int, _Scale]] = []
     for k, head in enumerate(heads):
         text = head.strip()
         match = _HEAD.fullmatch(text)
         name = "" if match is None else match["name"]
         if match is None or name not in known:
-            meant = nearest(name, known)
+            near = nearest(name, known)
             issue = Issue(
-                "no such column", file, line, (text[:LONGEST_SHOWN],), shown(text), allowed, meant and known[meant].head
+                "no such column", file, line, (text[:LONGEST_SHOWN],), shown(text), allowed, near and known[near].head
             )
             raise InputError(issue)
         column = known[name]
-        if any(column is other for other, _, _ in found):
-            raise InputError(Issue("another column holds the same", file, line, (text,)))
-        found.append((column, k, _scale(file, line, text, column, match["unit"])))
-    missing = next((c for c in columns if c.needed and not any(c is other for other, _, _ in found)), None)
+        if any(column is other for other, _, _ in layout):
+            raise InputError(Issue("a second column with this head", file, line, (text,)))
+        layout.append((column, k, _scale(file, line, text, column, match["unit"])))
+    missing = next((c for c in columns if c.needed and not any(c is other for other, _, _ in layout)), None)
     if missing is not None:
         have = names_text([head.strip() for head in heads])
         raise InputError(Issue(f"no column {missing.head!r}", file, line, found=have, allowed=allowed))
-    return found
+    return layout
 
 
 _Scale = tuple[float, float]
-"""Factor and offset from a head's unit to the SI unit: SI = factor * (number + offset). Degrees Celsius alone have an
-offset."""
+"""Factor and offset from the unit of a head to the SI unit: SI = factor * (number + offset). Only degrees Celsius have
+an offset.
+"""
 
 
 def _scale(file: str, line: int, head: str, column: Column, unit: str | None) -> _Scale:
-    """From the unit of a head to the SI unit."""
+    """Return factor and offset from the unit of a head to the SI unit."""
     if column.kind is None:
         if unit is not None:
             raise InputError(Issue("this column has no unit", file, line, (head,), shown(unit), repr(column.head)))
@@ -337,8 +341,8 @@ def _scale(file: str, line: int, head: str, column: Column, unit: str | None) ->
     if not unit:
         raise InputError(Issue("a head without a unit", file, line, (head,), allowed=repr(column.head)))
     try:
-        one = parse_quantity(f"1 {unit.strip()}", column.kind)
-        if column.kind == TEMPERATURE and one > 2.0:
+        si_value = parse_quantity(f"1 {unit.strip()}", column.kind)
+        if column.kind == TEMPERATURE and si_value > 2.0:
             return 1.0, parse_quantity(f"0 {unit.strip()}", column.kind)
         return unit_ratio(unit.strip(), column.kind.si), 0.0
     except Problem as problem:
@@ -348,7 +352,7 @@ def _scale(file: str, line: int, head: str, column: Column, unit: str | None) ->
 
 
 def _values(file: str, lines: np.ndarray, head: str, column: Column, cells: Sequence[str], scale: _Scale) -> np.ndarray:
-    """SI numbers, or names, of a column."""
+    """Return the SI numbers, or the names, of a column."""
     factor, offset = scale
 
     def wrong(row: int, problem: str, allowed: str | None = None) -> InputError:
@@ -366,7 +370,7 @@ def _values(file: str, lines: np.ndarray, head: str, column: Column, cells: Sequ
         comma = ", with a point and not a comma" if "," in cells[row] else ""
         raise wrong(row, "not a number", f"a number{comma}") from None
     odd = next((k for k, cell in enumerate(cells) if "_" in cell), None)
-    if odd is not None:  # Python takes 1_000 for a number
+    if odd is not None:  # float() accepts 1_000, which no table means
         raise wrong(odd, "not a number", "a number")
     finite = np.isfinite(numbers)
     huge = finite & (np.abs(numbers) > LARGEST_NUMBER)
@@ -393,6 +397,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _range(column: Column, scale: _Scale) -> str:
+    """Return the allowed range of a column's numbers in the unit of its head, for messages."""
     factor, offset = scale
     low, high = column.least / factor - offset, column.most / factor - offset
     if np.isinf(high):

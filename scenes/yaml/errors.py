@@ -1,6 +1,4 @@
-"""What is wrong with an input, said so that the user can mend it: file, line, key, what was found, what is allowed,
-what was meant.
-"""
+"""Input errors that a user can act on: file, line, key, the value found, the values allowed, the nearest valid name."""
 
 from __future__ import annotations
 
@@ -9,32 +7,34 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 KeyPath = tuple[str | int, ...]
-"""Where a value stands in a YAML file: keys and list indices from the root, for instance ("perturb", "base/forward/M2",
+"""Position of a value in a YAML file: keys and list indices from the root, for instance ("perturb", "base/forward/M2",
 "shift", 2).
 """
 
 LONGEST_SHOWN = 60
-"""A found value is cut after this many characters: enough to recognise it, and the message stays a line."""
+"""Number of characters after which a value is cut in a message: enough to recognise it, and the message stays on one
+line.
+"""
 
 
 @dataclass(frozen=True)
 class Issue:
-    """One fault of an input.
+    """Single fault of an input.
 
     Attributes
     ----------
     problem : str
         What is wrong, in a few words.
     file : str
-        Path as the user gave it; "" if the input did not come from a file.
+        Path as the user wrote it; "" if the input did not come from a file.
     line : int | None
-        Counted from 1; None if unknown.
+        Line number, counted from 1; None if unknown.
     key : KeyPath
-        Where in the file; empty for the file as a whole.
+        Position in the file; empty for the file as a whole.
     found : str | None
-        What stands there, None if that says nothing.
+        The value found there; None if showing it would not help.
     allowed : str | None
-        What may stand there.
+        The values that are allowed there.
     suggestion : str | None
         The nearest valid name.
     """
@@ -48,16 +48,16 @@ class Issue:
     suggestion: str | None = None
 
     def __str__(self) -> str:
-        place = self.file or "input"
+        position = self.file or "input"
         if self.line is not None:
-            place += f":{self.line}"
+            position += f":{self.line}"
         if self.key:
-            place += f": {key_text(self.key)}"
-        text = f"{place}: {self.problem}"
-        known = [] if self.found is None else [f"found {self.found}"]
-        known += [] if self.allowed is None else [f"allowed: {self.allowed}"]
-        rest = ", ".join(known)
-        if self.suggestion is not None:  # first: the lists of what is allowed can be long
+            position += f": {key_text(self.key)}"
+        text = f"{position}: {self.problem}"
+        details = [] if self.found is None else [f"found {self.found}"]
+        details += [] if self.allowed is None else [f"allowed: {self.allowed}"]
+        rest = ", ".join(details)
+        if self.suggestion is not None:  # comes first because the list of allowed values can be long
             text += f"; did you mean {self.suggestion!r}?" + (f" {rest[0].upper()}{rest[1:]}" if rest else "")
         elif rest:
             text += f"; {rest}"
@@ -65,14 +65,16 @@ class Issue:
 
 
 class InputError(Exception):
-    """An input that cannot be used: one or more issues, one a line in the message. Commands end with exit code 2 on it.
+    """Input that cannot be used, with one or more issues; a command ends with exit code 2 on it.
+
+    The message has one line for each issue.
 
     Attributes
     ----------
-    issues
-        All of them.
+    issues : tuple of Issue
+        All issues.
     file, line, key, found, allowed, suggestion
-        Of the first one.
+        Fields of the first issue.
     """
 
     def __init__(self, *issues: Issue) -> None:
@@ -88,14 +90,14 @@ class InputError(Exception):
 
 
 class Problem(ValueError):
-    """Raised by the reader of a value, which knows what is wrong with it but not where it stands.
+    """Fault of a value, raised by a reader that does not know where in the file the value is.
 
     Attributes
     ----------
     problem, found, allowed, suggestion
-        As in `Issue`.
-    within
-        Where in the value the fault lies; empty for the value as a whole.
+        Fields as in `Issue`.
+    within : KeyPath
+        Position of the fault inside the value; empty for the value as a whole.
     """
 
     def __init__(
@@ -114,40 +116,40 @@ class Problem(ValueError):
         return self.problem
 
     def below(self, *key: str | int) -> Problem:
-        """Tell the problem at a key within the value."""
+        """Return the problem with a key put before its position."""
         return Problem(self.problem, self.found, self.allowed, self.suggestion, (*key, *self.within))
 
     def at(self, file: str = "", line: int | None = None, key: KeyPath = ()) -> Issue:
-        """The fault of the file in which the value stands."""
+        """Return the issue for this problem of the value at a file, line and key."""
         return Issue(self.problem, file, line, (*key, *self.within), self.found, self.allowed, self.suggestion)
 
 
 def unknown(
     problem: str, name: object, known: Iterable[str], within: KeyPath = (), allowed: str | None = None
 ) -> Problem:
-    """A name that is none of the known ones, with these and the nearest of them, for the caller to raise.
+    """Return the problem of an unknown name, with the known names and the nearest of them, for the caller to raise.
 
     Parameters
     ----------
     problem : str
-        What is wrong, "no such line".
+        What is wrong, such as "no such line".
     name : object
-        As it was found.
+        The name that was found.
     known : Iterable[str]
-        Names that may stand there.
+        Names that are allowed.
     within : KeyPath
-        Where in the value it stands.
+        Position of the name inside the value.
     allowed : str | None
-        What may stand there, where the names alone do not say it.
+        Text of what is allowed, where the list of names is not enough.
     """
     names = tuple(known)
     return Problem(problem, shown(name), allowed or names_text(names), nearest(str(name), names), within)
 
 
 def nearest(name: str, names: Iterable[str]) -> str | None:
-    """The one of `names` that `name` was probably meant to be, or None if none comes near. Case is ignored.
+    """Return the known name nearest to `name`, ignoring case, or None if none is near.
 
-    Of a path the last parts are enough: M2 is near to base/forward/M2.
+    For a path, its last parts are enough: M2 is near to base/forward/M2.
     """
     wanted = name.casefold()
     folded = {candidate.casefold(): candidate for candidate in names}
@@ -161,7 +163,7 @@ def nearest(name: str, names: Iterable[str]) -> str | None:
 
 
 def key_text(key: KeyPath) -> str:
-    """A key path as text: `perturb.base/forward/M2.shift[2]`."""
+    """Return a key path as text: `perturb.base/forward/M2.shift[2]`."""
     text = ""
     for part in key:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
@@ -169,7 +171,7 @@ def key_text(key: KeyPath) -> str:
 
 
 def shown(value: object) -> str:
-    """A found value as it appears in a message: on one line, not too long, and text in quotes."""
+    """Return a value as messages show it: on one line, cut to `LONGEST_SHOWN` characters, text in quotes."""
     if isinstance(value, dict):
         text = "a mapping" + (f" with keys {names_text(value)}" if value else " without keys")
     elif isinstance(value, list):
@@ -184,10 +186,10 @@ def shown(value: object) -> str:
 
 
 def printable(text: str) -> str:
-    """Text on one line without what a terminal would act upon: control characters come out as escapes."""
+    """Return the text on one line, with control characters, on which a terminal would act, as escapes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def names_text(names: Iterable[object]) -> str:
-    """Names as a list to read: `a, b, c`."""
+    """Return names as a readable list: `a, b, c`."""
     return ", ".join(str(name) for name in names)

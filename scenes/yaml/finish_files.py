@@ -18,16 +18,16 @@ Source  Measured
     1.2E-01  ...        one row for each azimuth, one number for each radial angle
     DataEnd
 
-Angles are in degrees, azimuth and radial angle about the specular direction (`fresnel_scatter`); lines
-that are empty or begin with # are left out. Numbers of one list may go on in the next line.
+Angles are in degrees; azimuth and radial angle are about the specular direction (`fresnel_scatter`). Empty lines and
+lines that begin with # are skipped. A list of numbers may continue on the next line. A coating file is a CSV table:
 
 wavelength [nm],angle [deg],R [percent],T [percent]
     640,0,0.21,99.7
     640,30,0.25,99.6
     660,0,0.23,99.6
 
-Shares may be told for s and p apart (Rs and Rp, Ts and Tp): light here is unpolarised, and takes their mean. Heads
-without a unit hold shares of 0 to 1.
+Reflectance and transmittance may be given separately for s and p (Rs and Rp, Ts and Tp); the light is taken as
+unpolarised, so that their mean is used. Columns without a unit hold shares from 0 to 1.
 """
 
 from __future__ import annotations
@@ -48,10 +48,12 @@ from scenes.yaml.units import ANGLE, LENGTH, SCALE
 
 ENDING = ".bsdf"
 LARGEST = 64 << 20
-"""Bytes of a file at most."""
+"""Largest size of a file, in bytes."""
 MOST_ANGLES = {"SampleRotation": 360, "AngleOfIncidence": 181, "ScatterAzimuth": 721, "ScatterRadial": 2000}
 TIS_TOLERANCE = 0.25
-"""Relative, by which the TIS that a file states may differ from the integral of its table: rough lists of angles do."""
+"""Largest relative difference between the TIS that a file states and the integral of its table; coarse lists of angles
+cause differences of this order.
+"""
 WORDS = {
     "Source": ("Measured",),
     "Symmetry": ("PlaneSymmetrical", "ASymmetrical", "ASymmetrical4D"),
@@ -62,14 +64,14 @@ WORDS = {
 
 @dataclass(frozen=True, eq=False)
 class MeasuredScatter:
-    """What a file holds.
+    """Contents of a BSDF file.
 
     Attributes
     ----------
     table : ScatterTable
         The BSDF.
     stated : tuple[float, ...]
-        Total integrated scatter as the file states it, one for each of the table's angles of incidence.
+        Total integrated scatter that the file states, for each of the table's angles of incidence.
     """
 
     table: ScatterTable
@@ -77,7 +79,7 @@ class MeasuredScatter:
 
 
 class _Lines:
-    """The lines of a file that say something, one after the other."""
+    """Lines of a BSDF file without comments and empty lines, read one after the other."""
 
     def __init__(self, file: str, text: str) -> None:
         self.file = file
@@ -91,7 +93,7 @@ class _Lines:
 
     @property
     def line(self) -> int:
-        """Number of the line that comes next, or of the last one."""
+        """Number of the next line, or of the last one at the end of the file."""
         return self.rows[min(self.at, len(self.rows) - 1)][0] if self.rows else 1
 
     def error(self, problem: str, key: str = "", found: object = None, allowed: str | None = None) -> InputError:
@@ -99,27 +101,27 @@ class _Lines:
         return InputError(Issue(problem, self.file, self.line, (key,) if key else (), text, allowed))
 
     def next(self, key: str, allowed: str | None = None) -> list[str]:
-        """Cells of the line that comes next, which is still to be passed."""
+        """Return the cells of the next line without advancing."""
         if self.at >= len(self.rows):
             raise self.error("the file ends too early", key, None, allowed or f"a line that begins with {key}")
         return self.rows[self.at][1]
 
     def word(self, key: str) -> str:
-        """The word that stands behind a key, in the spelling of the format."""
+        """Read the word after a key, in the spelling of the format."""
         cells = self._keyed(key)
         known = {word.lower(): word for word in WORDS[key]}
         if len(cells) != 2 or cells[1].lower() not in known:
             found = " ".join(cells[1:])
-            meant = nearest(found, WORDS[key])
+            near = nearest(found, WORDS[key])
             issue = Issue(
-                "not a value of this line", self.file, self.line, (key,), shown(found), ", ".join(WORDS[key]), meant
+                "not a value of this line", self.file, self.line, (key,), shown(found), ", ".join(WORDS[key]), near
             )
             raise InputError(issue)
         self.at += 1
         return known[cells[1].lower()]
 
     def angles(self, key: str) -> np.ndarray:
-        """A list of angles behind its number, radians."""
+        """Read a number of angles and the angles after it; return them in radians."""
         cells = self._keyed(key)
         most = MOST_ANGLES[key]
         plain = len(cells) == 2 and cells[1].isascii() and cells[1].isdigit() and len(cells[1]) < 7
@@ -135,7 +137,7 @@ class _Lines:
         return np.radians(degrees)
 
     def numbers(self, count: int, key: str, least: float, most: float) -> list[float]:
-        """So many numbers, of this line and those that follow."""
+        """Read `count` numbers from this line and the next ones."""
         out: list[float] = []
         while len(out) < count:
             for cell in self.next(key, f"{count - len(out)} more numbers"):
@@ -159,7 +161,7 @@ class _Lines:
 
 
 def _number(cell: str) -> float | None:
-    """A finite number, None for anything else."""
+    """Return the finite number in a cell, None for anything else."""
     if "_" in cell:
         return None
     try:
@@ -170,12 +172,12 @@ def _number(cell: str) -> float | None:
 
 
 def read_bsdf(path: str | Path) -> MeasuredScatter:
-    """The table of a file.
+    """Read the table of a BSDF file.
 
     Raises
     ------
     InputError
-        It cannot be read or is not such a table, or one that is not taken here, with the line.
+        The file cannot be read, is not a BSDF table, or has a kind of table that is not supported; with the line.
     """
     file = str(path)
     lines = _Lines(file, read_text(path, "a BSDF file", LARGEST, (ENDING,)))
@@ -184,14 +186,14 @@ def read_bsdf(path: str | Path) -> MeasuredScatter:
     if lines.word("SpectralContent") != "Monochrome":
         lines.at -= 1
         allowed = "Monochrome: a monitor has one wavelength"
-        raise lines.error("a table of three colours", "SpectralContent", "XYZ", allowed)
+        raise lines.error("a table of three colours (XYZ)", "SpectralContent", "XYZ", allowed)
     if lines.word("ScatterType") != "BRDF":
         lines.at -= 1
-        raise lines.error("light scattered on its way through", "ScatterType", "BTDF", "BRDF: of what reflects")
+        raise lines.error("scattering in transmission", "ScatterType", "BTDF", "BRDF: scattering in reflection")
     rotations = lines.angles("SampleRotation")
     if len(rotations) > 1:
-        text = "scattering that changes as the sample is turned"
-        raise lines.error(text, "SampleRotation", len(rotations), "1: surfaces here have no direction of their own")
+        text = "scattering that depends on the rotation of the sample"
+        raise lines.error(text, "SampleRotation", len(rotations), "1: surfaces scatter alike in every orientation")
     incidence = lines.angles("AngleOfIncidence")
     azimuth = lines.angles("ScatterAzimuth")
     radial = lines.angles("ScatterRadial")
@@ -200,20 +202,20 @@ def read_bsdf(path: str | Path) -> MeasuredScatter:
         closed = azimuth[0] == 0.0 and 2.0 * np.pi - azimuth[-1] <= 1.5 * float(np.max(np.diff(azimuth)))
         if not closed:
             allowed = "0 to 360 degrees; the last may be missing"
-            raise lines.error("azimuths that leave a part of the turn out", "ScatterAzimuth", None, allowed)
+            raise lines.error("azimuths that do not cover the full circle", "ScatterAzimuth", None, allowed)
     for word in ("Monochrome", "DataBegin"):
         cells = lines.next(word)
         if [cell.lower() for cell in cells] != [word.lower()]:
             raise lines.error("another line is expected here", word, " ".join(cells)[:60], f"the line {word}")
         lines.at += 1
-    stated, blocks = [], []
+    stated_tis, blocks = [], []
     for _ in incidence:
         cells = lines.next("TIS")
         value = _number(cells[1]) if len(cells) == 2 and cells[0].lower() == "tis" else None
         if value is None or not 0.0 <= value <= 1.0:
             allowed = f"TIS and a share of 0 to 1 before the values of each of {len(incidence)} angles of incidence"
             raise lines.error("not a TIS", "TIS", " ".join(cells)[:60], allowed)
-        stated.append((lines.line, value))
+        stated_tis.append((lines.line, value))
         lines.at += 1
         blocks.append([lines.numbers(len(radial), "ScatterRadial", 0.0, 1e15) for _ in azimuth])
     cells = lines.next("DataEnd")
@@ -221,7 +223,7 @@ def read_bsdf(path: str | Path) -> MeasuredScatter:
         raise lines.error("more data than angles", "DataEnd", " ".join(cells)[:60], "the line DataEnd")
     lines.at += 1
     if lines.at < len(lines.rows):
-        raise lines.error("lines behind the data", "DataEnd", " ".join(lines.rows[lines.at][1])[:60], "nothing more")
+        raise lines.error("lines after the data", "DataEnd", " ".join(lines.rows[lines.at][1])[:60], "nothing more")
     values = np.array(blocks)
     if symmetry != "PlaneSymmetrical" and len(azimuth) > 1 and azimuth[-1] < 2.0 * np.pi * (1.0 - 1e-9):
         azimuth, values = np.append(azimuth, 2.0 * np.pi), np.concatenate([values, values[:, :1]], axis=1)
@@ -229,16 +231,16 @@ def read_bsdf(path: str | Path) -> MeasuredScatter:
         table = ScatterTable(incidence, azimuth, radial, values)
     except ValueError as error:
         raise InputError(Issue(f"not a BSDF: {error}", file, line)) from None
-    _agrees(file, table, stated)
-    return MeasuredScatter(table, tuple(value for _, value in stated))
+    _agrees(file, table, stated_tis)
+    return MeasuredScatter(table, tuple(value for _, value in stated_tis))
 
 
-def _agrees(file: str, table: ScatterTable, stated: Sequence[tuple[int, float]]) -> None:
-    """Refuse a table that scatters another share than its file states."""
-    for (line, value), angle in zip(stated, table.incidence, strict=True):
+def _agrees(file: str, table: ScatterTable, stated_tis: Sequence[tuple[int, float]]) -> None:
+    """Raise `InputError` if the integral of a table differs from the TIS that its file states."""
+    for (line, value), angle in zip(stated_tis, table.incidence, strict=True):
         total = table.total(float(angle))
         if abs(total - value) > TIS_TOLERANCE * max(total, value):
-            text = f"the table scatters {total:.4g} of the light at {np.degrees(angle):g} deg and not what is stated"
+            text = f"the table scatters {total:.4g} of the light at {np.degrees(angle):g} deg, not the stated TIS"
             allowed = f"the integral of f cos over the hemisphere, to {100 * TIS_TOLERANCE:.0f} %"
             raise InputError(Issue(text, file, line, ("TIS",), shown(value), allowed))
 
@@ -250,28 +252,28 @@ COLUMNS = (
     *(Column(name, SCALE, needed=False, least=0.0, most=1.0 + 1e-12, bare=True) for name in SHARES),
 )
 OVER = 5e-3
-"""By which measured reflectance and transmittance may exceed 1 together; the transmittance is then lowered."""
+"""Largest excess over 1 of the sum of measured reflectance and transmittance; the transmittance is then reduced."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredCoating:
-    """What a file holds: at each wavelength a coating, metres -> table, wavelengths ascending."""
+    """Contents of a coating file: wavelength in metres -> coating, wavelengths ascending."""
 
     by_wavelength: Mapping[float, CoatingTable]
 
     def at(self, wavelength: float) -> CoatingTable:
-        """The coating at a wavelength in metres, linear between the two beside it.
+        """Return the coating at a wavelength in metres, interpolated linearly between the neighbouring wavelengths.
 
         Raises
         ------
         ValueError
-            The wavelength lies outside of the table.
+            The wavelength lies outside the table.
         """
         known = np.array(list(self.by_wavelength))
         near = 1e-9 * wavelength
         if not known[0] - near <= wavelength <= known[-1] + near:
             ends = f"{1e9 * known[0]:.6g} to {1e9 * known[-1]:.6g} nm"
-            raise ValueError(f"{1e9 * wavelength:.6g} nm lie outside of {ends}")
+            raise ValueError(f"{1e9 * wavelength:.6g} nm is outside {ends}")
         k = int(np.clip(np.searchsorted(known, wavelength), 1, max(len(known) - 1, 1)))
         low = self.by_wavelength[float(known[k - 1])]
         if len(known) == 1:
@@ -290,12 +292,12 @@ class MeasuredCoating:
 
 
 def read_coating(path: str | Path) -> MeasuredCoating:
-    """The coating of a file.
+    """Read the coating of a file.
 
     Raises
     ------
     InputError
-        It cannot be read, a column is missing or twice there, or a row cannot be, with line and column.
+        The file cannot be read, a column is missing or occurs twice, or a row is not possible; with line and column.
     """
     table = read_table(path, COLUMNS)
     reflected = _mean(table, "R")
@@ -313,27 +315,27 @@ def read_coating(path: str | Path) -> MeasuredCoating:
             raise table.error(row, "", "more light leaves than arrives", found, "R + T of 1 at most")
         through = np.minimum(through, 1.0 - reflected)
     wavelength, angle = table["wavelength"], np.minimum(table["angle"], 0.5 * np.pi)
-    seen: dict[tuple[float, float], int] = {}
-    for row, place in enumerate(zip(wavelength.tolist(), angle.tolist(), strict=True)):
-        other = seen.setdefault(place, row)
-        if other != row:
-            text = f"the wavelength and angle that line {table.lines[other]} has"
+    first_rows: dict[tuple[float, float], int] = {}
+    for row, pair in enumerate(zip(wavelength.tolist(), angle.tolist(), strict=True)):
+        first_row = first_rows.setdefault(pair, row)
+        if first_row != row:
+            text = f"repeats the wavelength and angle of line {table.lines[first_row]}"
             raise table.error(row, "angle", text, allowed="each pair once")
     out = {}
     for value in np.unique(wavelength):
-        own = np.flatnonzero(wavelength == value)
-        own = own[np.argsort(angle[own])]
-        out[float(value)] = CoatingTable(angle[own], reflected[own], None if through is None else through[own])
+        rows = np.flatnonzero(wavelength == value)
+        rows = rows[np.argsort(angle[rows])]
+        out[float(value)] = CoatingTable(angle[rows], reflected[rows], None if through is None else through[rows])
     return MeasuredCoating(FrozenMap(out))
 
 
 def _mean(table: Table, name: str) -> np.ndarray | None:
-    """Shares of unpolarised light: the column itself, or the mean of those for s and p; None where there is neither."""
+    """Return the column for unpolarised light, or the mean of those for s and p; None if there is neither."""
     s, p = f"{name}s", f"{name}p"
     if name in table:
         both = next((other for other in (s, p) if other in table), None)
         if both is not None:
-            raise table.error(0, both, f"another column than {name} for the same", None, f"{name}, or {s} and {p}")
+            raise table.error(0, both, f"{name} and {both} at once", None, f"{name}, or {s} and {p}")
         return table[name]
     if s in table and p in table:
         return np.asarray(0.5 * (table[s] + table[p]))

@@ -1,6 +1,6 @@
-"""Bytes and text of files that nobody has vetted: every file that a user names is read by one of these.
+"""Reader of bytes, text and JSON of untrusted files.
 
-JSON that nobody has vetted: results in run folders, points of other programs.
+Every file to which a user refers is read by one of these functions.
 """
 
 import hashlib
@@ -14,35 +14,35 @@ from typing import Any
 from scenes.yaml.errors import InputError, Issue, nearest
 
 DEEPEST = 32
-"""Levels of mappings and lists in a file."""
+"""Largest number of nested levels of mappings and lists in a file."""
 _UNITS = ((10**9, "GB"), (10**6, "MB"), (10**3, "kB"), (1, "bytes"))
 
 
 def read_bytes(path: str | Path, what: str, most: int, ends: Sequence[str]) -> bytes:
-    """What a file holds.
+    """Read the bytes of a file.
 
     Parameters
     ----------
     path : str | Path
-        Of the file.
+        Path of the file.
     what : str
-        It should be, for messages.
+        Noun phrase for the expected file, for messages.
     most : int
-        Bytes that it may have.
+        Largest size, in bytes.
     ends : Sequence[str]
-        Of names of the files beside it that may have been meant where there is none.
+        Suffixes of files in the same folder that may be suggested if the file is missing.
 
     Raises
     ------
     InputError
-        There is none, it cannot be read or is too large.
+        The file is missing, cannot be read or is too large.
     """
     file = str(path)
     # A device or a pipe could be endless or block.
     wrong = no_file(Path(path))
     if wrong == MISSING:
-        meant = file_beside(Path(path), ends)
-        raise InputError(Issue(wrong, file, suggestion=meant and str(Path(path).with_name(meant))))
+        near = file_beside(Path(path), ends)
+        raise InputError(Issue(wrong, file, suggestion=near and str(Path(path).with_name(near))))
     if wrong is not None:
         raise InputError(Issue(wrong, file, allowed=what))
     try:
@@ -58,12 +58,12 @@ def read_bytes(path: str | Path, what: str, most: int, ends: Sequence[str]) -> b
 
 
 def read_text(path: str | Path, what: str, most: int, ends: Sequence[str]) -> str:
-    """The text of a file, UTF-8 with or without a mark; arguments as `read_bytes`.
+    """Read the text of a file, UTF-8 with or without byte order mark; arguments as in `read_bytes`.
 
     Raises
     ------
     InputError
-        As `read_bytes`, and where it holds other than UTF-8 text.
+        The file cannot be read as in `read_bytes`, or is not UTF-8 text.
     """
     content = read_bytes(path, what, most, ends)
     try:
@@ -75,10 +75,10 @@ def read_text(path: str | Path, what: str, most: int, ends: Sequence[str]) -> st
 
 
 def why_unreadable(error: BaseException) -> str:
-    """What a library's error tells a user about a damaged file, in at most 200 characters of one line.
+    """Return the message of a library's error about a damaged file, on one line of at most 200 characters.
 
-    Libraries stumble over damaged files in ways that they do not foresee. A text that speaks of the inside of the
-    program, such as the shapes of its arrays, helps nobody and is left out.
+    Libraries fail on damaged files in ways that they do not foresee. A text about the program's internals, such as
+    shapes of arrays, does not help a user and is replaced by "it is damaged".
     """
     inside = isinstance(
         error, LookupError | AttributeError | TypeError | AssertionError | OverflowError | Warning | SystemExit
@@ -99,17 +99,17 @@ _KINDS = {
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file; there is none of a name that no file can have."""
+    """Return whether a path is that of a regular file; False also for a name that no file can have."""
     return no_file(path) is None
 
 
 def no_file(path: Path) -> str | None:
-    """Why a path is not that of a regular file, found without opening it; None where it is.
+    """Return why a path is not that of a regular file, without opening it; None if it is one.
 
     Parameters
     ----------
     path : Path
-        Of what may be missing, or of a kind that could be endless or block: a device, a pipe.
+        Path that may be missing, or a device or pipe, which could be endless or block.
 
     Returns
     -------
@@ -127,60 +127,63 @@ def no_file(path: Path) -> str | None:
 
 
 def unusable(path: Path) -> str:
-    """Why a path is not that of a regular file, with the path, for a message at the key of the file that names it; of a
-    path that is not a file's.
+    """Return the message, with the path, for a path that is not that of a regular file.
+
+    It is shown at the key of the file that has the path.
     """
     wrong = no_file(path) or MISSING
     return f"{wrong}: {path}" if wrong == MISSING else f"{path} {wrong}"
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file that was read."""
+    """Return the SHA-256 of a readable file."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def file_beside(path: Path, ends: Sequence[str] = ()) -> str | None:
-    """Name of the file in the same folder that was probably meant; None where none comes near.
+    """Return the name of the file in the same folder that was probably meant; None if none is near.
 
     Parameters
     ----------
     path : Path
-        Of a file that is not there.
+        Path of a missing file.
     ends : Sequence[str]
-        Of names that may have been meant; by default any.
+        Suffixes of the files that may be meant; any by default.
     """
     try:
-        names = sorted(place.name for place in path.parent.iterdir() if not ends or place.suffix in ends)
+        names = sorted(entry.name for entry in path.parent.iterdir() if not ends or entry.suffix in ends)
     except (OSError, ValueError):
         return None
     return nearest(path.name, names)
 
 
 LARGEST_JSON = 500_000_000
-"""Bytes of a file; a study of a million runs and twenty responses has a hundredth of it."""
+"""Largest size of a JSON file, in bytes; a study of a million runs with twenty responses has a hundredth of it."""
 MOST_DIGITS = 300
-"""Most digits of a whole number, so that it is a finite floating-point number, too."""
+"""Largest number of digits of a whole number, so that it is also a finite floating-point number."""
 
 
 def read_json(path: str | Path) -> Any:
-    """Plain data of a JSON file.
+    """Read plain data from a JSON file.
 
     Raises
     ------
     InputError
-        The file cannot be read, is too large or not JSON.
+        The file cannot be read, is too large or is not JSON.
     """
     return parse_json(read_text(path, "a JSON file", LARGEST_JSON, (".json",)), str(path))
 
 
 def parse_json(text: str, file: str) -> Any:
-    """Plain data of JSON; `file` is what messages call it. NaN and infinities are taken, as Python writes them.
+    """Return plain data of JSON text; `file` is its name in messages.
+
+    NaN and infinities are read as Python writes them.
 
     Raises
     ------
     InputError
-        It is not JSON, is nested deeper than YAML may be, or has whole numbers that no computation takes.
+        The text is not JSON, is nested deeper than YAML may be, or has a whole number that is too large.
     """
     try:
         data = json.loads(text, parse_int=_whole)
@@ -192,8 +195,8 @@ def parse_json(text: str, file: str) -> Any:
         raise InputError(Issue(f"not JSON: {error}", file)) from None
     level = [data] if isinstance(data, dict | list) else []
     for _ in range(DEEPEST):
-        level = [one for held in level for one in (held.values() if isinstance(held, dict) else held)]
-        level = [one for one in level if isinstance(one, dict | list)]
+        level = [value for items in level for value in (items.values() if isinstance(items, dict) else items)]
+        level = [value for value in level if isinstance(value, dict | list)]
         if not level:
             return data
     raise InputError(_too_deep(file))

@@ -1,4 +1,4 @@
-"""What a command does with its own process before anything else; no library may do so with its user's."""
+"""Settings that a command makes for its own process at its start; a library must not make them for its user's."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ from types import TracebackType
 
 
 def end_quietly() -> None:
-    """Let Ctrl-C end this program with one line instead of a traceback, also while its modules are being imported; and
-    let it search less for cyclic garbage.
+    """Make Ctrl-C end this program with one line instead of a traceback, and reduce the work of the garbage collector.
 
-    For a program's own start, before it imports anything else: a library leaves ``sys.excepthook`` and the garbage
-    collector alone. The program still ends as the signal would end it, so that a shell sees 130.
+    A program calls this at its start, before other imports, so that it also holds while its modules are imported. A
+    library leaves ``sys.excepthook`` and the garbage collector alone. The program still ends as the signal would end
+    it, so that a shell sees exit code 130.
     """
-    sys.excepthook = _told
-    # the imports of a command make hundreds of thousands of objects that stay, and at its end all that is left ends
-    # with the process
+    sys.excepthook = _report_uncaught
+    # the imports of a command create hundreds of thousands of objects that live until the process ends, so that
+    # searching them for cycles is wasted time
     gc.set_threshold(50_000)
-    # pydantic would look through the metadata of all installed packages for plugins of its own
+    # pydantic would otherwise search the metadata of all installed packages for plugins
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     atexit.register(gc.freeze)
 
 
-def _told(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+def _report_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Report an uncaught exception: one line for Ctrl-C and for a full disk, the traceback for anything else."""
     if issubclass(kind, KeyboardInterrupt):
         sys.stderr.write("interrupted\n")
     elif isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
-        # help is written by a library, which has no word for it
+        # the library that prints help does not report this error
         from scenes.yaml.standard_output import leave_stdout
 
         sys.stderr.write(f"error: cannot write to the standard output: {error.strerror}\n")

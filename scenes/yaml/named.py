@@ -1,6 +1,7 @@
-"""Functions and classes that are named by module and name, and imported when they are used.
+"""Functions and classes named by text and imported on first use, and the description of a kind of input file.
 
-A kind of file that a user writes: its model, how it is told from others, and the command that reads it.
+A `FileKind` holds the model of a YAML file, the keys that distinguish it from other kinds, and the command that reads
+it.
 """
 
 from __future__ import annotations
@@ -15,53 +16,53 @@ if TYPE_CHECKING:
 
 _BEFORE = __name__.removesuffix("scenes.yaml.named")
 _OURS = ("analysis", "optics", "scenes", "twin")
-"""The packages that a wheel holds within one, and what stands before their names there (docs/wheel)."""
+"""Packages that a wheel holds inside one package; `_BEFORE` is the prefix of their names there (docs/wheel)."""
 
 
 @dataclass(frozen=True)
 class Named:
-    """A function or a class that is imported when it is used.
+    """Reference to a function or a class, which is imported when it is first used.
 
     Attributes
     ----------
     path : str
-        Module and name, ``twin.laboratory.export:export_focus``; of a method ``module:Class.method``.
+        Module and name, such as ``twin.laboratory.export:export_focus``; ``module:Class.method`` for a method.
     """
 
     path: str
 
     def get(self) -> Any:
-        """The function or the class."""
+        """Import the module and return the function or class."""
         module, _, name = self.path.partition(":")
         before = _BEFORE if module.partition(".")[0] in _OURS else ""
         return attrgetter(name)(import_module(before + module))
 
     def __call__(self, *values: Any, **named: Any) -> Any:
-        """Import the function and call it."""
+        """Import the function and call it with these arguments."""
         return self.get()(*values, **named)
 
 
 @dataclass(frozen=True)
 class FileKind:
-    """A kind of file.
+    """Kind of input file, one row of file_kinds.csv.
 
     Attributes
     ----------
     name : str
-        Of its JSON Schema.
+        Name of the kind, and of its JSON Schema.
     described : str
-        Model of what it may say, as `Named` takes its name; with a dot before it one of `scenes.specs`.
+        Model of the file's contents, as ``module:Class``; a leading dot means a module of `scenes.specs`.
     what : str
-        It is, with article, for messages.
+        Noun phrase for messages, with its article: "a focus test".
     needs : str
-        Keys, in words, that the model requires and few other kinds have: a file without them is known to be of another
-        kind before the model is imported.
+        Required keys that few other kinds have, separated by spaces. A file without them is ruled out before the model
+        is imported.
     command : str
-        That reads it, as the user calls it; empty for what only other files name.
+        Command that reads the file, as the user types it; empty for a file that only other files refer to.
     place : str
-        Where other files name it; empty for what only a command reads.
+        Key of another file that refers to this kind; empty for a file that only a command reads.
     one_of : str
-        Keys, in words, of which it has at least one.
+        Keys, separated by spaces, at least one of which the file has.
     """
 
     name: str
@@ -74,16 +75,16 @@ class FileKind:
 
     @property
     def model(self) -> type[Spec]:
-        """What it may say."""
+        """Pydantic model of the file's contents."""
         model: type[Spec] = Named(f"scenes.specs{self.described}" if self.described[0] == "." else self.described).get()
         return model
 
     def may_be(self, keys: set[str]) -> bool:
-        """Whether a file with these keys can be one of this kind, by what is known before the model is imported."""
+        """Return whether a file with these keys can be of this kind, without importing the model."""
         return keys >= set(self.needs.split()) and (not self.one_of or bool(keys & set(self.one_of.split())))
 
-    def strangers(self, keys: set[str]) -> int | None:
-        """How many of the keys are none of this kind's; None if one that it needs is missing."""
+    def count_unknown(self, keys: set[str]) -> int | None:
+        """Return the number of keys that this kind does not have; None if a required key is missing."""
         if not self.may_be(keys):
             return None
         fields = self.model.model_fields

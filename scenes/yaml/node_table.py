@@ -1,4 +1,7 @@
-"""Nodes of finite-element programs, with displacements or temperatures, from CSV files, and from meshes by meshlane."""
+"""Reader of nodes of finite-element programs with displacements or temperatures.
+
+CSV files are read by `csv_table`, meshes by meshlane.
+"""
 
 import contextlib
 import io
@@ -11,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from optics.numerics.number_tree import FrozenMap
-from optics.thermal.nodal_deformation import LEAST_NODES
+from optics.thermal.nodal_deformation import MIN_NODES
 from scenes.yaml.csv_table import LARGEST_TABLE, Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.input_file import digest_of, is_file, no_file, why_unreadable
@@ -19,38 +22,40 @@ from scenes.yaml.units import LENGTH, TEMPERATURE, TEMPERATURE_DIFFERENCE, unit_
 
 PLACES, MOVES = ("x", "y", "z"), ("dx", "dy", "dz")
 FARTHEST = 100.0
-"""Metres: no coordinate of a node and no displacement is larger."""
+"""Largest absolute coordinate of a node and largest displacement, in metres."""
 COLUMNS = (
     *(Column(name, LENGTH, least=-FARTHEST, most=FARTHEST) for name in (*PLACES, *MOVES)),
     Column("node", text=True, needed=False),
 )
-"""Columns of a table of displacements; the nodes' own numbers say nothing here."""
+"""Columns of a table of displacements; the node numbers are not used."""
 ABSOLUTE, CHANGE = "T", "dT"
 HOTTEST = 2000.0
-"""Kelvin: no node is hotter, and none changes by more."""
+"""Highest temperature of a node and largest change of it, in kelvin."""
 HEAT_COLUMNS = (
     *COLUMNS[:3],
     Column(ABSOLUTE, TEMPERATURE, needed=False, least=0.0, most=HOTTEST),
     Column(CHANGE, TEMPERATURE_DIFFERENCE, needed=False, least=-HOTTEST, most=HOTTEST),
     COLUMNS[-1],
 )
-"""Columns of a table of temperatures: absolute ones, or changes from the instrument's."""
+"""Columns of a table of temperatures: absolute ones, or changes from the temperature of the instrument."""
 LONGEST_READING, LONGEST_PER_BYTE = 10.0, 2e-6
-"""Seconds for a mesh, and for each of its bytes: ten times what whole files take."""
+"""Time limit for reading a mesh in seconds, and its increase for each byte: ten times what intact files take."""
 ZERO_CELSIUS = 273.15
 MOST_NODES = 1_000_000
 TABLES = (".csv", ".tsv", ".txt")
 MESHES = FrozenMap({".vtu": "vtu", ".vtk": "vtk", ".msh": "gmsh", ".med": "med"})
-"""Ending of a mesh's file -> its format in meshlane: those that carry displacements of the nodes, all in one file."""
+"""Suffix of a mesh file -> its format in meshlane: the formats that hold nodal displacements in a single file."""
 INPUT_DECKS = (".inp", ".bdf", ".nas", ".fem", ".dat", ".cdb", ".ans", ".rst", ".op2", ".f06", ".odb")
-"""Input of NASTRAN, ANSYS and Abaqus has no results, and their own result files are not read."""
+"""Suffixes of files that are refused: input decks of NASTRAN, ANSYS and Abaqus, which have no results, and their own
+result formats, for which there is no reader.
+"""
 HEAT_DECKS_NEED = "a table with the heads 'x [mm]', 'y [mm]', 'z [mm]', 'T [degC]', or a .vtu file"
 DECKS_NEED = "a table with the heads 'x [mm]', 'y [mm]', 'z [mm]', 'dx [mm]', 'dy [mm]', 'dz [mm]', or a .vtu file"
 
 
 @dataclass(frozen=True, eq=False)
 class DisplacedNodes:
-    """Nodes and their displacements, metres, (N, 3) each, in the frame that the specification names."""
+    """Nodes and their displacements, (N, 3) arrays in metres, in the frame that the specification names."""
 
     points: np.ndarray
     moves: np.ndarray
@@ -63,11 +68,11 @@ class WarmNodes:
     Attributes
     ----------
     points : np.ndarray
-        Metres, (N, 3), in the frame that the specification names.
+        (N, 3) coordinates in metres, in the frame that the specification names.
     values : np.ndarray
-        Kelvin, (N,).
+        (N,) temperatures in kelvin.
     absolute : bool
-        Whether they are absolute temperatures, and not changes from the instrument's.
+        True for absolute temperatures, False for changes from the temperature of the instrument.
     """
 
     points: np.ndarray
@@ -78,23 +83,23 @@ class WarmNodes:
 def read_nodes(
     path: str | Path, unit: str | None = None, field: str | None = None, sha256: str | None = None
 ) -> DisplacedNodes:
-    """The displaced nodes of a table or a mesh.
+    """Read nodes and displacements from a table or a mesh.
 
     Parameters
     ----------
     path : str | Path
-        Of the file; its ending says what it is.
+        Path of the file; its suffix determines the format.
     unit : str | None
-        Of a mesh.
+        Unit of length of a mesh; metres by default.
     field : str | None
-        Name of the displacements in a mesh, None for its only vectors.
+        Name of the displacements in a mesh; None for its only vector field.
     sha256 : str | None
-        Checksum that the file must have, None for any.
+        Checksum that the file must have; None for any.
 
     Raises
     ------
     InputError
-        It cannot be read, with the line and the column of a table, or is not the one of the checksum.
+        The file cannot be read (the error has line and column of a table), or its checksum differs.
     """
     _checked(Path(path), sha256)
     if Path(path).suffix.lower() in MESHES:
@@ -115,25 +120,25 @@ def read_temperatures(
     reading: str | None = None,
     sha256: str | None = None,
 ) -> WarmNodes:
-    """The temperatures of a table's or a mesh's nodes.
+    """Read nodes and temperatures from a table or a mesh.
 
     Parameters
     ----------
     path : str | Path
-        Of the file; its ending says what it is.
+        Path of the file; its suffix determines the format.
     unit : str | None
-        Of a mesh's coordinates.
+        Unit of a mesh's coordinates; metres by default.
     field : str | None
-        Name of the temperatures in a mesh, None for its only numbers.
+        Name of the temperatures in a mesh; None for its only scalar field.
     reading : str | None
-        Of a mesh: what they are, "change", "K" or "degC".
+        Meaning of a mesh's numbers: "change", "K" or "degC".
     sha256 : str | None
-        Checksum that the file must have, None for any.
+        Checksum that the file must have; None for any.
 
     Raises
     ------
     InputError
-        As ``read_nodes``.
+        The file cannot be read (the error has line and column of a table), or its checksum differs.
     """
     _checked(Path(path), sha256)
     if Path(path).suffix.lower() in MESHES:
@@ -147,24 +152,25 @@ def read_temperatures(
             raise InputError(Issue(text, str(path), found=shown(float(values[number])), allowed="values: change"))
         return WarmNodes(points, values, absolute)
     table = _table(path, HEAT_COLUMNS)
-    given = [name for name in (ABSOLUTE, CHANGE) if name in table]
-    if len(given) != 1:
-        text = "absolute temperatures and changes" if given else "no temperatures"
+    columns = [name for name in (ABSOLUTE, CHANGE) if name in table]
+    if len(columns) != 1:
+        text = "absolute temperatures and changes" if columns else "no temperatures"
         allowed = "either 'T [degC]' (or 'T [K]'), absolute, or 'dT [K]', changes from the instrument's temperature"
         raise InputError(Issue(text, str(path), int(table.lines[0]) - 1, allowed=allowed))
-    points, values = table.stacked(*PLACES), table[given[0]]
+    points, values = table.stacked(*PLACES), table[columns[0]]
     _one_load_case(table, points, values[:, None], "temperature")
-    return WarmNodes(points, values, given[0] == ABSOLUTE)
+    return WarmNodes(points, values, columns[0] == ABSOLUTE)
 
 
 def _checked(path: Path, sha256: str | None) -> None:
+    """Raise `InputError` if the checksum of a file differs."""
     if sha256 is not None and is_file(path) and (digest := digest_of(path)) != sha256:
-        text = "not the table that was used: its checksum is another"
+        text = "not the table that was used: its checksum differs"
         raise InputError(Issue(text, str(path), found=digest, allowed=f"sha256 {sha256}, as the job says"))
 
 
 def _table(path: str | Path, columns: tuple[Column, ...]) -> Table:
-    table = read_table(path, columns, LEAST_NODES)
+    table = read_table(path, columns, MIN_NODES)
     if len(table.lines) > MOST_NODES:
         allowed = f"at most {MOST_NODES}: those of the optical surface alone"
         raise InputError(Issue(f"{len(table.lines)} nodes", str(path), int(table.lines[MOST_NODES]), allowed=allowed))
@@ -172,20 +178,21 @@ def _table(path: str | Path, columns: tuple[Column, ...]) -> Table:
 
 
 def _one_load_case(table: Table, points: np.ndarray, values: np.ndarray, what: str) -> None:
-    """Refuse a node that has two values (N, K)."""
+    """Raise `InputError` if a node occurs twice with different (N, K) values."""
     first: dict[bytes, int] = {}
-    for row, place in enumerate(points):
-        other = first.setdefault(place.tobytes(), row)
+    for row, point in enumerate(points):
+        other = first.setdefault(point.tobytes(), row)
         if other != row and np.any(values[other] != values[row]):
-            text = f"another {what} of the node that line {table.lines[other]} has"
+            text = f"a second {what} of the node in line {table.lines[other]}"
             raise table.error(row, "", text, allowed="one load case in a table, every node once")
 
 
 def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes of a mesh, metres, (N, 3), and their vectors (N, 3) or temperatures (N,) as they stand in it, by meshlane,
-    whose readers end in any exception.
+    """Read nodes (N, 3) in metres and vectors (N, 3) or temperatures (N,), in the mesh's unit, by meshlane.
+
+    The readers of meshlane may raise any exception.
     """
-    import meshlane  # only a job with a mesh waits for it
+    import meshlane  # slow to import, and only needed for a job with a mesh
 
     file = str(path)
     wrong = no_file(path)
@@ -195,7 +202,7 @@ def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> 
         raise InputError(Issue("too large", file, allowed="at most 1 GB"))
     form = MESHES[path.suffix.lower()]
     try:
-        # of a file of HDF5 that it cannot read meshlane keeps the file open
+        # meshlane leaves an HDF5 file open that it cannot read, so it gets the bytes instead
         content = io.BytesIO(path.read_bytes()) if form == "med" else file
         mesh = _in_time(path, lambda: meshlane.read(content, file_format=form))
         points = np.asarray(mesh.points, np.float64)
@@ -219,19 +226,17 @@ def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> 
         text = f"no such {what} at its nodes"
         raise InputError(Issue(text, file, None, (), shown(name), names_text(known) or "none", nearest(name, known)))
     points = points * unit_ratio(unit, LENGTH.si)
-    if points.ndim != 2 or points.shape[1] != 3 or not LEAST_NODES <= len(points) <= MOST_NODES:
-        raise InputError(
-            Issue(f"nodes of shape {points.shape}", file, allowed=f"{LEAST_NODES} to {MOST_NODES} in space")
-        )
+    if points.ndim != 2 or points.shape[1] != 3 or not MIN_NODES <= len(points) <= MOST_NODES:
+        raise InputError(Issue(f"nodes of shape {points.shape}", file, allowed=f"{MIN_NODES} to {MOST_NODES} in space"))
     _within(file, points, FARTHEST, "coordinates", "up to 100 m")
     return points, fields[name] if what == "vectors" else fields[name].reshape(len(points))
 
 
 def _in_time(path: Path, read: Callable[[], Any]) -> Any:
-    """What a reader of meshes returns or raises; refused when it takes longer than any mesh of that size.
+    """Run a reader of meshes, return its result or raise its exception; refuse the mesh after a time limit.
 
-    With a count of nodes that is not that of the file some readers go on for hours. A thread that does so is left
-    behind: the program's end does not wait for it.
+    With a wrong node count in the file some readers run for hours. Such a thread is abandoned: it does not delay the
+    end of the program.
     """
     ended: dict[str, Any] = {}
 
@@ -242,20 +247,20 @@ def _in_time(path: Path, read: Callable[[], Any]) -> Any:
             ended["error"] = error
 
     thread = threading.Thread(target=run, daemon=True)
-    # readers print their complaints, and leave the program for some
+    # some readers print errors or exit the program
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         thread.start()
         thread.join(LONGEST_READING + path.stat().st_size * LONGEST_PER_BYTE)
     if thread.is_alive():
-        text = "meshlane does not come to an end with this mesh"
-        raise InputError(Issue(text, str(path), allowed="a whole file, whose counts are those of its nodes and cells"))
+        text = "meshlane does not finish reading this mesh"
+        raise InputError(Issue(text, str(path), allowed="an intact file, whose counts match its nodes and cells"))
     if "error" in ended:
         raise ended["error"]
     return ended["value"]
 
 
 def _within(file: str, values: np.ndarray, most: float, what: str, allowed: str) -> None:
-    """Refuse numbers (N, K) of nodes that are not finite or too large."""
+    """Raise `InputError` if (N, K) numbers of nodes are not finite or too large."""
     bad = ~np.all(np.isfinite(values) & (np.abs(values) <= most), axis=1)
     if np.any(bad):
         number = int(np.argmax(bad))

@@ -1,6 +1,6 @@
 """Specifications: immutable pydantic models that hold SI floats, made from plain YAML data.
 
-A specification is what a YAML file says, checked. Quantities are text with a unit in the file and SI floats in the
+A specification is the checked content of a YAML file. Quantities are text with a unit in the file and SI floats in the
 model.
 """
 
@@ -45,37 +45,37 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Whole = Annotated[int, Field(strict=True)]
 """A whole number; 3.0 and true are not."""
 Name = Annotated[str, StringConstraints(strict=True, pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,63}$")]
-"""A name: letters, digits, _ and -, beginning with a letter."""
+"""Name: letters, digits, _ and -, beginning with a letter."""
 Text = Annotated[str, Field(strict=True, max_length=2000)]
 """Free text."""
 Flag = Annotated[bool, Field(strict=True)]
-"""True or false, and no number or word."""
+"""True or false; no number and no word."""
 
 
 @dataclass(frozen=True)
 class Catalogued(AfterValidator):
-    """Validator of a name that a catalogue knows.
+    """Validator of a name that must be in a catalogue.
 
     Attributes
     ----------
     names : Iterable[str]
-        That may be given.
+        Names that are allowed.
     """
 
     names: Iterable[str] = ()
 
 
 def name_in(what: str, catalogue: Mapping[str, Any], look_up: Callable[[str], Any]) -> Catalogued:
-    """A name that a catalogue knows, brought to the catalogue's own spelling.
+    """Return a validator of a name in a catalogue, which changes it to the spelling of the catalogue.
 
     Parameters
     ----------
     what : str
-        Is named, for the error message.
+        Noun for the named thing, for the error message.
     catalogue : Mapping[str, Any]
-        The names that may be given.
+        Catalogue, whose keys are the allowed names.
     look_up : Callable[[str], Any]
-        Name -> entry with a ``name``; KeyError for an unknown one.
+        Function from a name to an entry with a ``name``; raises KeyError for an unknown name.
     """
 
     def check(name: str) -> str:
@@ -89,23 +89,24 @@ def name_in(what: str, catalogue: Mapping[str, Any], look_up: Callable[[str], An
 
 @dataclass(frozen=True, eq=False)
 class OneOf:
-    """Annotation of a text that must be one of the names that are registered somewhere when the file is read; errors
-    and JSON Schema are those of a ``Literal`` of these names.
+    """Annotation of a text that must be one of the names registered when the file is read.
+
+    Errors and JSON Schema are those of a ``Literal`` of these names.
 
     Attributes
     ----------
     names : Callable[[], Iterable[str]]
-        Gives them in the order in which a message lists them.
+        Function that returns the names in the order in which a message lists them.
     """
 
     names: Callable[[], Iterable[str]]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
-        """Checked by ``_known``."""
+        """Return a schema that checks with ``_known``."""
         return core_schema.no_info_plain_validator_function(self._known)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """The names at this moment."""
+        """Return an enumeration of the names registered at this moment."""
         return {"enum": list(self.names()), "type": "string"}
 
     def _known(self, value: Any) -> str:
@@ -116,7 +117,7 @@ class OneOf:
 
 
 def _nothing_is_empty(value: Any) -> Any:
-    """`perturb:` with nothing after it means an empty mapping."""
+    """Return an empty mapping for None: `perturb:` with nothing after it."""
     return {} if value is None else value
 
 
@@ -125,54 +126,54 @@ def _freeze(value: Mapping[str, Value]) -> FrozenMap[str, Value]:
 
 
 Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)]
-"""Seed of every random number."""
+"""Seed of all random numbers."""
 Reference = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
-"""Path of a file of one's own, relative to the file that names it."""
+"""Path of a user's file, relative to the file that refers to it."""
 
 
 class Inline(str):
-    """A reference in whose place stands the mapping itself; as text it is the mapping's name.
+    """Reference replaced by the mapping itself; as text it is the mapping's name.
 
     Attributes
     ----------
     yaml : YamlFile
-        The mapping; with its file, lines and place where these are known, else with its place below the key of the
-        reference.
+        The mapping, with its file, lines and position where these are known, else with its position below the key of
+        the reference.
     """
 
     yaml: YamlFile
 
     def __new__(cls, name: str, yaml: YamlFile) -> Self:
-        """Make one of the mapping's name and the mapping."""
+        """Create a reference from the mapping's name and the mapping."""
         reference = super().__new__(cls, name)
         reference.yaml = yaml
         return reference
 
     def __getnewargs__(self) -> tuple[str, YamlFile]:  # type: ignore[override]
-        """What a copy in another process is made of."""
+        """Return the arguments from which another process creates a copy."""
         return str(self), self.yaml
 
     def placed(self, source: Source, key: KeyPath) -> Inline:
-        """Return the reference with the place of its mapping.
+        """Return the reference with the position of its mapping in the file.
 
         Parameters
         ----------
         source : Source
-            Of the specification that has the reference.
+            Source of the specification that has the reference.
         key : KeyPath
-            Of the reference there.
+            Key of the reference in that specification.
         """
         if self.yaml.file or self.yaml.lines:
             return self
         full = (*source.prefix, *key)
-        while full and source.lines and full not in source.lines:  # the key of which the reference is the short form
+        while full and source.lines and full not in source.lines:  # a short form has the line of a shorter key
             full = full[:-1]
         place = (*full, *self.yaml.prefix)
         return Inline(str(self), YamlFile(source.file, self.yaml.data, source.lines, place))
 
 
 def _referred(value: Any, handler: ValidatorFunctionWrapHandler, within: KeyPath = ()) -> Any:
-    """Take a name, a path or a mapping, each also as ``{camera: ...}``."""
+    """Return a name, a path or a mapping as a reference; each may also be given as ``{camera: ...}``."""
     if isinstance(value, Inline):
         return value
     if isinstance(value, Mapping):
@@ -191,27 +192,29 @@ Ref = Annotated[
     Field(strict=True, min_length=1, max_length=1000),
     WrapValidator(_referred, json_schema_input_type=Reference | dict[str, Any]),
 ]
-"""Reference to another specification: its name in the library (`gf7`), the path of its file, relative to the file that
-names it, or the mapping itself. ``{camera: ...}`` of an instrument is the camera by itself. `scenes.specs.load` reads
-what it refers to.
+"""Reference to another specification: its name in the library (`gf7`), the path of its file relative to the file that
+refers to it, or the mapping itself. ``{camera: ...}`` in place of an instrument means the camera alone.
+`scenes.specs.load` reads the specification.
 """
 
 Named = Annotated[dict[Name, Value], AfterValidator(_freeze)]
-"""A mapping from names to values of one sort."""
+"""Mapping from names to values of one type."""
 Paths = Annotated[dict[str, Value], BeforeValidator(_nothing_is_empty), AfterValidator(_freeze)]
-"""A mapping from node paths to values of one sort; may be left empty."""
+"""Mapping from node paths to values of one type; may be left empty."""
 NothingIsEmpty = BeforeValidator(_nothing_is_empty)
-"""For a section that may be written without contents."""
+"""Validator of a section that may be written without contents."""
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Where a specification was read. All sources compare equal: where a value was read does not make it another value.
+    """Origin of a specification: file, lines and key path.
+
+    All sources compare equal, so that specifications with equal values from different files are equal.
 
     Attributes
     ----------
     file : str
-        Path as the user gave it, "" if it did not come from a file.
+        Path as the user wrote it, "" if the specification did not come from a file.
     lines : Mapping[KeyPath, int]
         Key path -> line, counted from 1.
     prefix : KeyPath
@@ -229,13 +232,13 @@ class Source:
         return 0
 
     def line(self, key: KeyPath) -> int | None:
-        """The line of this key, or of the nearest thing around it that has one."""
+        """Return the line of a key, or of the nearest enclosing key that has one."""
         full = (*self.prefix, *key)
         return next((self.lines[full[:n]] for n in range(len(full), -1, -1) if full[:n] in self.lines), None)
 
 
-class _Told(TypedDict, total=False):
-    """What a message says beside what is wrong."""
+class _IssueDetails(TypedDict, total=False):
+    """Details of an issue besides the problem."""
 
     found: object
     allowed: str | None
@@ -245,9 +248,9 @@ class _Told(TypedDict, total=False):
 class Spec(BaseModel):
     """Base of all specifications: immutable, and unknown keys are errors.
 
-    What checks a model is built when the first file of its kind is read (``defer_build``). A default that is itself a
-    specification is therefore made by ``model_construct``, which needs no checks: an instance of the class would have
-    them built at the import.
+    The validator of a model is built when the first file of its kind is read (``defer_build``). A default that is
+    itself a specification is therefore made by ``model_construct``, which does not validate: an ordinary instance would
+    build the validator at import time.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=False, defer_build=True)
@@ -256,120 +259,123 @@ class Spec(BaseModel):
 
     @property
     def source(self) -> Source:
-        """Where it was read; defaults and what was made in other ways do not know."""
+        """Origin of the specification; empty for defaults and for specifications that did not come from a file."""
         return self._source
 
     def with_source(self, source: Source) -> Self:
-        """Return the specification with another place where it was read."""
+        """Return a copy of the specification with another origin."""
         copy = self.model_copy()
         copy._source = source
         return copy
 
-    def issue(self, problem: str | Problem, key: KeyPath = (), **told: Unpack[_Told]) -> Issue:
-        """Something wrong with what stands at `key`, with the file and line it was read from.
+    def issue(self, problem: str | Problem, key: KeyPath = (), **details: Unpack[_IssueDetails]) -> Issue:
+        """Return the issue of the value at `key`, with the file and line from which it was read.
 
         Parameters
         ----------
         problem : str | Problem
-            What is wrong; or a Problem, which says all but the key.
+            What is wrong; or a Problem, which holds everything but the key.
         key : KeyPath
-            In this specification.
+            Key path in this specification.
         told : Unpack[_Told]
-            Found (what stands there), allowed (what may stand there) and suggestion (the nearest valid name).
+            The value found, the values allowed, and the nearest valid name as `suggestion`.
         """
         if not isinstance(problem, Problem):
-            found = told.get("found")
+            found = details.get("found")
             text = None if found is None else shown(found)
-            problem = Problem(problem, text, told.get("allowed"), told.get("suggestion"))
+            problem = Problem(problem, text, details.get("allowed"), details.get("suggestion"))
         source = self._source
         return problem.at(source.file, source.line((*key, *problem.within)), (*source.prefix, *key))
 
-    def error(self, problem: str | Problem, key: KeyPath = (), **told: Unpack[_Told]) -> InputError:
-        """An `InputError` with one `issue`, for the caller to raise."""
-        return InputError(self.issue(problem, key, **told))
+    def error(self, problem: str | Problem, key: KeyPath = (), **details: Unpack[_IssueDetails]) -> InputError:
+        """Return an `InputError` with one `issue`, for the caller to raise."""
+        return InputError(self.issue(problem, key, **details))
 
     def file_at(self, key: KeyPath, value: str, folder: Path, what: str) -> Path:
-        """The absolute path of a file that a specification names.
+        """Return the absolute path of a file to which a specification refers.
 
         Parameters
         ----------
         key : KeyPath
-            That names it.
+            Key of the reference.
         value : str
-            Its path, as it is written there.
+            Path as written at the key.
         folder : Path
-            That relative paths start from.
+            Folder from which relative paths start.
         what : str
-            The file should be, for messages.
+            Noun phrase for the expected file, for messages.
 
         Raises
         ------
         InputError
-            There is none.
+            There is no such file.
         """
         path = folder / value
         if is_file(path):
             return path.absolute()
-        meant = file_beside(path)
-        suggestion = None if meant is None else os.path.join(os.path.dirname(value), meant)
+        near = file_beside(path)
+        suggestion = None if near is None else os.path.join(os.path.dirname(value), near)
         raise self.error(unusable(path), key, allowed=f"{what}, relative to this file", suggestion=suggestion)
 
     def plain(self) -> dict[str, Any]:
-        """Plain data, ready for YAML: quantities as text with units that reads back to the same bits, nothing that is
-        None.
+        """Return plain data for YAML, without keys that are None.
+
+        Quantities are text with units that reads back to the same bits.
         """
         return self.model_dump(mode="json", exclude_none=True)
 
 
 class TitledSpec(Spec):
-    """Base of the files that have a name of their own.
+    """Base of the files that have a name.
 
     Attributes
     ----------
     name : Name
-        As the file is called.
+        Name of the file's content, which results and other files refer to.
     description : Text
-        For people.
+        Description for readers; the program does not use it. Empty by default.
     """
 
     name: Name
     description: Text = ""
 
     def file_text(self, remark: str, **others: Any) -> str:
-        """Text of a file that says this, with remarks at its top; keys without a value are left out.
+        """Return the text of a file with this content, with comments at its top; empty keys are omitted.
 
         Parameters
         ----------
         remark : str
-            Lines of comment.
+            Lines of the comment.
         others : Any
-            Plain data of keys that are to be written in place of their own.
+            Plain data that replace the values of keys.
         """
         head = "".join(f"# {line}\n" for line in remark.splitlines())
         plain = {**self.plain(), **others}
         return head + dump_yaml({key: value for key, value in plain.items() if value not in ("", {})})
 
 
-def one_given(spec: Spec, names: Sequence[str], problem: str, allowed: str | None = None, within: KeyPath = ()) -> None:
-    """Refuse a specification that has none or several of the keys of which it needs one.
+def require_one(
+    spec: Spec, names: Sequence[str], problem: str, allowed: str | None = None, within: KeyPath = ()
+) -> None:
+    """Raise `Problem` unless a specification has exactly one of some keys.
 
     Parameters
     ----------
     spec : Spec
-        That was read.
+        Specification to check.
     names : Sequence[str]
-        Of the keys.
+        The keys.
     problem : str
-        What is wrong then.
+        Text of the problem.
     allowed : str | None
         What may be written.
     within : KeyPath
-        The key at which that is told.
+        Key at which the problem is reported.
 
     Raises
     ------
     Problem
-        Not one of them is given.
+        None or several of the keys have a value.
     """
     given = [name for name in names if getattr(spec, name) is not None]
     if len(given) != 1:
@@ -378,7 +384,7 @@ def one_given(spec: Spec, names: Sequence[str], problem: str, allowed: str | Non
 
 
 def not_empty(problem: str, allowed: str) -> AfterValidator:
-    """Validator that refuses a list or a mapping without entries."""
+    """Return a validator that refuses a list or a mapping without entries."""
 
     def check(value: Any) -> Any:
         if not value:
@@ -389,17 +395,16 @@ def not_empty(problem: str, allowed: str) -> AfterValidator:
 
 
 def short_for(key: str | None, *types: type, schema: Any = PydanticUndefined) -> BeforeValidator:
-    """Validator of what may be written short: a value of one of the types stands for ``{key: value}``, or for a list
-    that holds it if the key is None.
+    """Return a validator that expands a short form: a value of one of the types becomes ``{key: value}``.
 
     Parameters
     ----------
     key : str | None
-        Which the value stands for.
+        Key for which the value is short; None for a list that holds the value.
     types : type
-        Of a value that is short for it.
+        Types of a value that is a short form.
     schema : Any
-        What editors are told that may be written; by default the long form.
+        Type that the JSON Schema shows to editors; by default the long form.
     """
 
     def widen(value: Any) -> Any:
@@ -414,30 +419,30 @@ SpecType = TypeVar("SpecType", bound=Spec)
 
 
 def validate(model: type[SpecType], yaml: YamlFile) -> SpecType:
-    """The specification that a YAML file holds.
+    """Return the specification that a YAML file holds.
 
     Raises
     ------
     InputError
-        One issue for each fault, in the order of the file.
+        The file has faults; one issue for each, in the order of the file.
     """
     source = Source(yaml.file, yaml.lines, yaml.prefix)
     try:
         spec = model.model_validate(yaml.data)
     except ValidationError as error:
         details = error.errors(include_url=False)
-        # A list with wrong items is too short only because they are not counted.
+        # Pydantic does not count invalid items, so a list with some is also reported as too short.
         wrong = {detail["loc"][:-1] for detail in details} | {detail["loc"][:-2] for detail in details}
-        told = [one for one in details if one["type"] != "too_short" or one["loc"] not in wrong]
-        issues = [_issue(model, detail, source) for detail in told]
+        faults = [detail for detail in details if detail["type"] != "too_short" or detail["loc"] not in wrong]
+        issues = [_issue(model, fault, source) for fault in faults]
         raise InputError(*sorted(issues, key=lambda issue: issue.line or 0)) from None
     spec = spec.with_source(source)
-    _tell_parts(spec, source)
+    _set_sources(spec, source)
     return spec
 
 
-def _tell_parts(value: Any, source: Source) -> None:
-    """Let every specification below ``value`` know where it was read; defaults were not, and are shared."""
+def _set_sources(value: Any, source: Source) -> None:
+    """Set the origin of every specification below ``value``, except defaults, which are shared."""
     parts: typing.Iterable[tuple[Any, Any]] = ()
     if isinstance(value, Spec):
         parts = [(name, getattr(value, name)) for name in type(value).model_fields if name in value.model_fields_set]
@@ -446,15 +451,15 @@ def _tell_parts(value: Any, source: Source) -> None:
     elif isinstance(value, tuple | list):
         parts = enumerate(value)
     for name, part in parts:
-        own = Source(source.file, source.lines, (*source.prefix, name))
+        part_source = Source(source.file, source.lines, (*source.prefix, name))
         if isinstance(part, Spec):
-            part._source = own
+            part._source = part_source
         if isinstance(part, Spec | Mapping | tuple | list):
-            _tell_parts(part, own)
+            _set_sources(part, part_source)
 
 
 _NOT_A_NAME = ("not a name", "letters, digits, _ and -, beginning with a letter")
-_SAID = {
+_MESSAGES = {
     **dict.fromkeys(("int_type", "int_from_float"), ("not a whole number", "a whole number")),
     "float_type": ("not a number", "a plain number, without a unit"),
     "finite_number": ("not a finite number", "a plain number, without a unit"),
@@ -463,7 +468,7 @@ _SAID = {
     "string_pattern_mismatch": _NOT_A_NAME,
     **dict.fromkeys(("tuple_type", "list_type"), ("not a list", "a list: [...]")),
 }
-"""Pydantic's kind of an error -> what is wrong, and what is allowed, where its own words do not say it."""
+"""Type of a pydantic error -> the problem and what is allowed, where pydantic's own message is not clear enough."""
 _LIMITS = {
     "greater_than": ("gt", "greater than"),
     "greater_than_equal": ("ge", "at least"),
@@ -473,8 +478,9 @@ _LIMITS = {
 
 
 def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
+    """Return the issue of a pydantic error."""
     key, value = detail["loc"], detail["input"]
-    # A fault of a key itself rather than of what it leads to.
+    # The fault is in the key itself, not in its value.
     of_key = bool(key) and key[-1] == "[key]"
     key = key[:-1] if of_key else key
     context: dict[str, Any] = detail.get("ctx", {})
@@ -509,8 +515,8 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
     elif kind in _LIMITS:
         name, text = _LIMITS[kind]
         problem, allowed = "outside the limits", f"{text} {context[name]:g}"
-    elif kind in _SAID:
-        problem, allowed = _SAID[kind]
+    elif kind in _MESSAGES:
+        problem, allowed = _MESSAGES[kind]
         if isinstance(value, str) and (comma := decimal_comma(value)) is not None:
             problem, allowed = comma.problem, comma.allowed
     elif kind == "too_short":
@@ -522,7 +528,7 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
 
 
 def _fields(model: type[Spec], key: KeyPath) -> list[str]:
-    """The keys that the mapping at `key` may have, empty if they are free or it is no mapping."""
+    """Return the allowed keys of the mapping at `key`; empty if they are free or there is no mapping."""
     annotation = annotation_at(model, key)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return list(annotation.model_fields)
@@ -530,7 +536,7 @@ def _fields(model: type[Spec], key: KeyPath) -> list[str]:
 
 
 def _named(key: KeyPath) -> KeyPath:
-    """The key up to its last name: without the place in a row."""
+    """Return the key path up to its last name, without list indices at its end."""
     return _named(key[:-1]) if key and isinstance(key[-1], int) else key
 
 
@@ -544,19 +550,19 @@ def _field_metadata(model: type[Spec], key: KeyPath) -> list[Any]:
 
 
 class ZeroIsNone:
-    """Metadata of the type of a number that may be absent: zero has the same effect as no value."""
+    """Metadata of the type of an optional number for which zero has the same effect as no value."""
 
 
 ZERO_IS_NONE = ZeroIsNone()
 
 
 def annotation_at(model: type[Spec], key: KeyPath) -> Any:
-    """The type that a model declares for the value at `key`, without its annotations; None if `key` leads nowhere."""
+    """Return the type that a model declares for the value at `key`, without annotations; None for no such key."""
     return _bare(_declared_at(model, key))
 
 
 def metadata_at(model: type[Spec], key: KeyPath) -> tuple[Any, ...]:
-    """Return the metadata of the type that a model declares for the value at `key`, of an optional value, too."""
+    """Return the metadata of the type that a model declares for the value at `key`, also of an optional value."""
     declared = _declared_at(model, key)
     if typing.get_origin(declared) in (types.UnionType, typing.Union):
         declared = next(item for item in typing.get_args(declared) if item is not type(None))
@@ -571,7 +577,7 @@ def _declared_at(model: type[Spec], key: KeyPath) -> Any:
             field = annotation.model_fields.get(str(part))
             declared = field.annotation if field is not None else None
         else:
-            # A mapping's value type stands last, and so does the item type of a tuple without its ellipsis.
+            # The last argument is a mapping's value type, or a tuple's item type once the ellipsis is removed.
             items = [item for item in typing.get_args(annotation) if item is not Ellipsis]
             declared = items[-1] if items else None
     return declared
@@ -581,6 +587,6 @@ def _bare(annotation: Any) -> Any:
     if typing.get_origin(annotation) is typing.Annotated:
         return _bare(typing.get_args(annotation)[0])
     if typing.get_origin(annotation) in (types.UnionType, typing.Union):
-        # "or None": what may be left out
+        # an optional value: its type without None
         return _bare(next(item for item in typing.get_args(annotation) if item is not type(None)))
     return annotation

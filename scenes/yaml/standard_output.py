@@ -1,4 +1,7 @@
-"""What commands write: results to stdout, all of them or an exit code that says so, and errors to stderr."""
+"""Output of commands: results to stdout, errors to stderr.
+
+A command that cannot write all of its results ends with an exit code that says so.
+"""
 
 from __future__ import annotations
 
@@ -18,39 +21,40 @@ from scenes.yaml.errors import printable
 
 BAD_INPUT, FAILURE = 2, 1
 _OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
-"""Error numbers of failures of the machine, such as a full disk, and not of what a user named."""
+"""Error numbers of failures of the machine, such as a full disk, in contrast to those caused by a path of the user."""
 PIPE_CLOSED = 128 + signal.SIGPIPE
-"""Exit code with which a shell tells of a program that the signal has ended."""
+"""Exit code with which a shell reports a program that SIGPIPE has ended."""
 
 
 def print_error(errors: Console, text: str) -> None:
-    """One error message, as it is: no markup, no wrapping; control characters as escapes."""
+    """Print one error message without markup or wrapping, with control characters as escapes."""
     text = "\n".join(printable(line) for line in text.split("\n"))
     errors.print(f"error: {text}", style="bold red", markup=False, highlight=False, soft_wrap=True)
 
 
 def code_of(error: BaseException | None) -> int:
-    """Return the exit code of a failure to write: FAILURE where the machine is its cause, else BAD_INPUT."""
+    """Return the exit code of a failure to write: FAILURE if the machine is its cause, else BAD_INPUT."""
     return FAILURE if isinstance(error, OSError) and error.errno in _OF_THE_MACHINE else BAD_INPUT
 
 
 @contextmanager
 def to_stdout(errors: Console, kept: str = "") -> Iterator[None]:
-    """Inside the block the results are written to stdout, all of them before it ends.
+    """Flush all results that the block writes to stdout, and report when they cannot be written.
 
-    A reader that has seen enough, as ``head`` has, ends the command without a word, as it does other programs.
+    A reader that closes the pipe early, as ``head`` does, ends the command without a message, as it ends other
+    programs.
 
     Parameters
     ----------
     errors : Console
-        Where it is told that stdout cannot be written, on a full disk for instance.
+        Console for the message that stdout cannot be written, for instance on a full disk.
     kept : str
-        Where the results are all the same, for this message.
+        Text that says where the results are stored besides, for this message.
 
     Raises
     ------
     typer.Exit
-        It cannot.
+        The results cannot be written.
     """
     try:
         yield
@@ -66,25 +70,25 @@ def to_stdout(errors: Console, kept: str = "") -> Iterator[None]:
 
 
 def leave_stdout() -> None:
-    """Let nobody try again to write what is left in the buffers: the interpreter does at its end."""
+    """Redirect stdout to the null device, so that the interpreter does not write the rest of the buffers at its end."""
     try:
-        place = sys.stdout.fileno()
-    except (OSError, ValueError):  # it is no file
+        descriptor = sys.stdout.fileno()
+    except (OSError, ValueError):  # stdout is not a file
         return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, place)
-    os.close(nowhere)
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, descriptor)
+    os.close(null)
 
 
 class Terminal(Console):
-    """The terminal for results. That nobody reads any longer is left to ``to_stdout``."""
+    """Terminal for results that leaves a closed pipe to ``to_stdout``."""
 
     def on_broken_pipe(self) -> None:
-        """Raise it again."""
+        """Raise the exception again."""
         raise
 
 
 def print_json(data: Any, indent: int | None = None) -> None:
-    """One line of JSON on stdout; NaN and infinities are refused, since JSON has none."""
+    """Print data as one line of JSON on stdout; NaN and infinities are refused, since JSON has neither."""
     json.dump(data, sys.stdout, indent=indent, allow_nan=False)
     sys.stdout.write("\n")

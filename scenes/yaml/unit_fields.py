@@ -1,13 +1,11 @@
-"""Quantities as fields of a specification: text with a unit in YAML, an SI float in the model, text again in YAML.
+"""Fields of a specification that are quantities: text with a unit in YAML, SI floats in the model.
 
 class Lens(Spec):
     focal_length: Length                                            # metres
     tilt: Annotated[float, Quantity(ANGLE, largest="5 deg")]        # radians
 
-How the quantities of the files are written, by key: what a message shows where one is missing or cannot be read.
-
-A kind of quantity has an example of its own; of a length that would be the 20 um of a shift, which no entrance pupil
-has.
+`EXAMPLES` has an example of a quantity for a key, for messages where it is missing or cannot be read: the example of
+its kind, such as 20 um for a length, would be misleading for an entrance pupil.
 """
 
 from __future__ import annotations
@@ -35,15 +33,16 @@ class Quantity:
     Attributes
     ----------
     kind : units.Kind
-        What it measures.
+        Kind of the quantity.
     largest : str | None
-        Limit on its size (its absolute value), with unit; None for no limit.
+        Largest absolute value, with unit; None for no limit.
     smallest : str | None
-        Limit from below on the signed value, with unit.
+        Smallest signed value, with unit; None for no limit.
     above_zero : bool
-        It must be greater than zero.
+        True if the value must be greater than zero.
     unsigned : str | None
-        Of a difference: a larger one is written with its sign, since without it is hardly meant as one.
+        Largest value, with unit, that may be written without a sign, for a difference: a larger unsigned value is
+        probably meant as an absolute one. None for no limit.
     """
 
     kind: units.Kind
@@ -54,7 +53,7 @@ class Quantity:
 
     @cached_property
     def limits(self) -> str:
-        """The limits in words, for messages and JSON Schema."""
+        """Limits in words, for messages and JSON Schema."""
         parts = []
         if self.above_zero:
             parts.append("greater than zero")
@@ -67,12 +66,12 @@ class Quantity:
         return " and ".join(parts)
 
     def parse(self, text: object) -> float:
-        """The SI value of the text.
+        """Return the SI value of a text.
 
         Raises
         ------
         Problem
-            Not a quantity of this kind, or outside the limits.
+            The text is not a quantity of this kind, or is outside the limits.
         """
         value = units.parse_quantity(text, self.kind)
         outside = (
@@ -83,15 +82,15 @@ class Quantity:
         if outside:
             raise Problem("outside the limits", shown(text), self.limits)
         if self._lacks_sign(value) and not str(text).lstrip().startswith("+"):
-            meant = f"+{str(text).strip()} if it is meant as a change; at most {self.unsigned} without a sign"
-            raise Problem(f"hardly meant as {self.kind.name}", shown(text), meant)
+            remedy = f"+{str(text).strip()} if it is meant as a change; at most {self.unsigned} without a sign"
+            raise Problem(f"hardly meant as {self.kind.name}", shown(text), remedy)
         return value
 
     def _lacks_sign(self, value: float) -> bool:
         return self.unsigned is not None and value > units.parse_quantity(self.unsigned, self.kind)
 
     def format(self, value: float) -> str:
-        """Text with unit that `parse` reads back to exactly this value."""
+        """Return text with a unit that `parse` reads back to exactly this value."""
         return ("+" if self._lacks_sign(value) else "") + units.format_quantity(value, self.kind)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -111,17 +110,18 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Vector:
-    """Annotation that makes a tuple field a list of quantities of one sort and fixed length, in YAML `[0 um, 0 um, 3
-    um]` or, with one unit for all, `0 0 3 um`.
+    """Annotation that makes a tuple field a list of quantities of one kind and fixed length.
+
+    In YAML it is `[0 um, 0 um, 3 um]` or, with one unit for all, `0 0 3 um`.
 
     Attributes
     ----------
     of : Quantity
-        What each of them is.
+        Annotation of each item.
     length : int
-        How many there are.
+        Number of items.
     alike : bool
-        `3 um` is allowed, too, and means `3 3 3 um`.
+        True if `3 um` is allowed for `3 3 3 um`.
     """
 
     of: Quantity
@@ -147,7 +147,7 @@ class Vector:
         if isinstance(value, str):
             row = units.split_row(value, self.length)
             if row is None and self.alike:
-                self.of.parse(value)  # what is wrong with it is said once
+                self.of.parse(value)  # raises the problem of a single quantity
                 row = [value] * self.length
             if row is None and (comma := units.decimal_comma(value)) is not None:
                 raise comma
@@ -157,18 +157,18 @@ class Vector:
         example = ", ".join([self.of.kind.example] * self.length)
         found = f"{len(value)} of them" if isinstance(value, list | tuple) else shown(value)
         allowed = f"{self.length} times {self.of.kind.name}: [{example}]"
-        one = f"{self.of.kind.name} for all, {self.of.kind.example}, or " if self.alike else ""
-        raise Problem(f"not a list of {self.length} quantities", found, one + allowed)
+        single = f"{self.of.kind.name} for all, {self.of.kind.example}, or " if self.alike else ""
+        raise Problem(f"not a list of {self.length} quantities", found, single + allowed)
 
 
 @dataclass(frozen=True)
 class Terms:
-    """Annotation that makes a mapping field a few optional quantities, each with a unit of its own.
+    """Annotation that makes a mapping field a set of optional quantities, each with its own unit.
 
     Attributes
     ----------
     of : Mapping[str, Quantity]
-        Name -> quantity.
+        Name of a term -> its annotation.
     """
 
     of: Mapping[str, Quantity]
@@ -187,37 +187,37 @@ class Terms:
 
 
 Angle = Annotated[float, Quantity(units.ANGLE)]
-"""Radians."""
+"""Angle, in radians."""
 Length = Annotated[float, Quantity(units.LENGTH, largest="1000 km")]
-"""Metres."""
+"""Length, in metres."""
 PositiveLength = Annotated[float, Quantity(units.LENGTH, above_zero=True, largest="1000 m")]
-"""Metres, greater than zero."""
+"""Length greater than zero, in metres."""
 Wavelength = Annotated[float, Quantity(units.LENGTH, smallest="100 nm", largest="100 um")]
-"""Metres."""
+"""Wavelength, in metres."""
 AngleSigma = Annotated[float, Quantity(units.ANGLE, smallest="0 arcsec", largest="1 deg")]
-"""A standard deviation, radians."""
+"""Standard deviation of an angle, in radians."""
 AngleSigmas = Annotated[tuple[float, float, float], Vector(Quantity(units.ANGLE, smallest="0 arcsec", largest="1 deg"))]
-"""Standard deviations about three axes, radians."""
+"""Standard deviations of the angles about three axes, in radians."""
 LengthSigma = Annotated[float, Quantity(units.LENGTH, smallest="0 um", largest="5 mm")]
-"""A standard deviation, metres."""
+"""Standard deviation of a length, in metres."""
 Scale = Annotated[float, Quantity(units.SCALE)]
-"""A relative change, dimensionless: 1e-6 for 1 ppm."""
+"""Relative change, dimensionless: 1e-6 for 1 ppm."""
 Time = Annotated[float, Quantity(units.TIME)]
-"""Seconds."""
+"""Time, in seconds."""
 Temperature = Annotated[float, Quantity(units.TEMPERATURE, smallest="0 K")]
-"""Kelvin, absolute."""
+"""Absolute temperature, in kelvin."""
 
 
 @dataclass(frozen=True)
 class RadiusQuantity(Quantity):
-    """A radius of curvature: a length, or ``flat`` for a plane, whose radius is infinite."""
+    """Radius of curvature: a length, or ``flat`` for a plane, whose radius is infinite."""
 
     def parse(self, text: object) -> float:
-        """The SI value of the text, as ``Quantity``."""
+        """Return the SI value of a text, as ``Quantity.parse`` does; infinity for ``flat``."""
         return math.inf if text == FLAT else super().parse(text)
 
     def format(self, value: float) -> str:
-        """Text that `parse` reads back to exactly this value."""
+        """Return text that `parse` reads back to exactly this value."""
         return FLAT if math.isinf(value) else super().format(value)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -227,12 +227,12 @@ class RadiusQuantity(Quantity):
 
 FLAT = "flat"
 Radius = Annotated[float, RadiusQuantity(units.LENGTH, largest="1000 km")]
-"""A radius of curvature, metres; infinite for a plane."""
+"""Radius of curvature, in metres; infinite for a plane."""
 AsphereTerms = Annotated[
     Mapping[str, float], Terms({f"A{n}": Quantity(units.power_of_length(1 - n)) for n in range(4, 22, 2)})
 ]
-"""Terms of an even asphere's sag A4 r^4 + A6 r^6 + ... + A20 r^20, 1/m^3, 1/m^5, ...; those that are not written are
-not there.
+"""Coefficients of an even asphere's sag A4 r^4 + A6 r^6 + ... + A20 r^20, in 1/m^3, 1/m^5, ...; terms that are not
+written are zero.
 """
 Vector2 = Annotated[tuple[float, float], Vector(Quantity(units.LENGTH, largest="100 m"), 2)]
 """Two lengths, metres."""
@@ -241,17 +241,18 @@ Vector3 = Annotated[tuple[float, float, float], Vector(Quantity(units.LENGTH, la
 
 
 class SagTerms:
-    """Annotation of a mapping from names of ``SAG_TERMS`` to their numbers, those that are registered when the file is
-    read; in the model the terms themselves.
+    """Annotation of a mapping from names in ``SAG_TERMS`` to their coefficients; the model holds the terms themselves.
+
+    The names are those registered when the file is read.
     """
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Read by ``_read``, written as it was read."""
+        """Return a schema that reads by ``_read`` and writes the terms in the form of the file."""
         as_text = core_schema.plain_serializer_function_ser_schema(self._written, when_used="json-unless-none")
         return core_schema.no_info_plain_validator_function(self._read, serialization=as_text)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """The kinds at this moment with their numbers."""
+        """Return the schema of the terms registered at this moment, with their coefficients."""
 
         def value(power: int) -> JsonSchemaValue:
             if not power:
@@ -266,10 +267,10 @@ class SagTerms:
 
     def _read(self, value: object) -> FrozenMap[str, SagTerm]:
         terms = {}
-        for name, given in _mapping(value, SAG_TERMS, "no such term of a sag").items():
+        for name, coefficients in _mapping(value, SAG_TERMS, "no such term of a sag").items():
             kind = SAG_TERMS[name]
             units = kind.POWERS
-            numbers = _mapping(given, units, "unknown key", (name,))
+            numbers = _mapping(coefficients, units, "unknown key", (name,))
             terms[name] = kind(**{key: _number(numbers[key], units[key], (name, key)) for key in numbers})
         return FrozenMap(terms)
 
@@ -285,7 +286,7 @@ class SagTerms:
 
 
 def _mapping(value: object, names: Mapping[str, Any], problem: str, within: KeyPath = ()) -> dict[str, Any]:
-    """A mapping with no other keys than these."""
+    """Return a mapping that has no other keys than `names`; raise `Problem` otherwise."""
     if not isinstance(value, Mapping):
         raise Problem("not a mapping", shown(value), f"a mapping with keys {names_text(names)}", within=within)
     for name in value:
@@ -295,7 +296,7 @@ def _mapping(value: object, names: Mapping[str, Any], problem: str, within: KeyP
 
 
 def _number(value: object, power: int, within: KeyPath) -> float:
-    """A quantity in metres to a power, or a plain number."""
+    """Return the value of a quantity in metres to a power, or of a plain number for the power 0."""
     try:
         if power:
             return units.parse_quantity(value, units.power_of_length(power))
@@ -358,11 +359,11 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "y": ("0.15 deg",),
     "z": ("-2 m",),
 }
-"""Key, or two of them, -> how its quantity may be written; the first that the key's own limits allow is shown."""
+"""Key, or its last two parts -> examples of its quantity; the first one within the key's limits is shown."""
 
 
 def example_of(quantity: Quantity, key: KeyPath) -> str:
-    """How a quantity may be written at a key, within its limits."""
+    """Return an example of a quantity at a key, within its limits."""
     limits = (text for text in (quantity.smallest, quantity.largest) if text is not None)
     known = (text for n in (2, 1) for text in EXAMPLES.get(key_text(key[-n:]), ()))
     for text in (*known, quantity.kind.example, *limits):
@@ -375,14 +376,14 @@ def example_of(quantity: Quantity, key: KeyPath) -> str:
 
 
 def written(metadata: Iterable[Any], key: KeyPath) -> str | None:
-    """How the value of a field may be written, if it is a quantity or a row of them.
+    """Return an example of the value of a field, if it is a quantity or a row of them.
 
     Parameters
     ----------
     metadata : Iterable[Any]
         Annotations of the field.
     key : KeyPath
-        Where it stands in the file.
+        Key path of the value in the file.
     """
     for item in metadata:
         if isinstance(item, Quantity):
@@ -393,7 +394,7 @@ def written(metadata: Iterable[Any], key: KeyPath) -> str | None:
 
 
 def allowed_at(metadata: Iterable[Any], key: KeyPath, allowed: str | None) -> str | None:
-    """What may stand at a key, as the quantity's reader said it, with the key's own example in it."""
+    """Return the text of what is allowed at a key, with an example for this key instead of that of the kind."""
     for item in metadata:
         quantity = item.of if isinstance(item, Vector) else item
         if isinstance(quantity, Quantity) and allowed == quantity.kind.allowed:
@@ -402,11 +403,11 @@ def allowed_at(metadata: Iterable[Any], key: KeyPath, allowed: str | None) -> st
 
 
 TimeScale = Literal["UTC", "GPS", "TAI", "TT", "GAL", "QZS", "BDT"]
-"""What a clock shows."""
+"""Time scale of a clock."""
 
 
 def _reading(value: Any) -> str:
-    """What a clock read at 0 s; its form is checked where it is used."""
+    """Check that a value looks like a date and time; its form is checked where it is used."""
     if not isinstance(value, str) or not 10 < len(value) < 40:
         allowed = "a date and time such as '2011-03-05T03:05:00', in the file's time scale"
         raise Problem("not a date and time", repr(value), allowed)
@@ -414,3 +415,4 @@ def _reading(value: Any) -> str:
 
 
 ClockReading = Annotated[str, BeforeValidator(_reading)]
+"""Date and time at 0 s of a table, in the file's time scale."""

@@ -1,8 +1,8 @@
-"""Quantities as users write them, `2 arcsec`, and as the twin computes with them, SI floats.
+"""Conversion between quantities as users write them, `2 arcsec`, and SI floats.
 
-Every quantity carries its unit; a bare number is an error, even 0. The number is read by a strict pattern and only the
-unit is given to pint, which looks names up and never evaluates an expression. Conversion is done in decimal arithmetic
-with one rounding at the end, so `20 um` is exactly the float 20e-6, and `format_quantity` gives text that reads back to
+Every quantity carries its unit; a bare number is an error, even 0. A strict pattern reads the number, and only the unit
+is passed to pint, which looks up names and never evaluates an expression. The conversion uses decimal arithmetic with a
+single rounding at the end, so `20 um` is exactly the float 20e-6, and `format_quantity` writes text that reads back to
 the same bits.
 """
 
@@ -27,25 +27,25 @@ _COMMA = re.compile(r"(?<![0-9.,])([-+]?[0-9]{1,30}),([0-9]{1,30})(?![0-9]*[.,])
 _NOT_FINITE = re.compile(r"[-+]?\.?(nan|inf|infinity)\b.*", re.IGNORECASE | re.DOTALL)
 LONGEST_TEXT = 100
 OTHER_MINUS = tuple("\u2212\u2010\u2011\u2012\u2013\u2014\ufe63\uff0d")
-"""Signs that text processors put where a minus was typed; they look like it and are none."""
+"""Characters that word processors substitute for the minus sign; they look like it, but no parser reads them as one."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of quantity.
+    """Kind of physical quantity.
 
     Attributes
     ----------
     name : str
-        With its article, as it appears in messages: "an angle".
+        Name with its article, as used in messages: "an angle".
     si : str
-        The SI unit that values of this kind have inside the program.
+        SI unit of values of this kind inside the program.
     units : tuple[str, ...]
-        Units to suggest. Others that pint knows are read as well if they measure the same thing.
+        Units that messages suggest. Any other unit of the same dimension that pint knows is read as well.
     example : str
-        a number with unit.
+        A number with its unit, as an example for messages.
     writes : tuple[str, ...]
-        Units to write in, the preferred one first; empty for the SI unit.
+        Units used for output, the preferred one first; empty for the SI unit.
     """
 
     name: str
@@ -56,11 +56,11 @@ class Kind:
 
     @property
     def allowed(self) -> str:
-        """What may be written for it, for messages."""
+        """Description of what may be written for such a quantity, for messages."""
         return self.asked(self.example)
 
     def asked(self, example: str) -> str:
-        """What may be written for it, with an example of one's own."""
+        """Return the description of what may be written for such a quantity, with another example."""
         return f"{self.name} with its unit ({names_text(self.units)}), e.g. '{example}'"
 
 
@@ -69,11 +69,11 @@ ANGLE = Kind(
 )
 LENGTH = Kind("a length", "m", ("um", "mm", "m", "nm", "pm"), "20 um", ("um", "mm", "m", "nm"))
 DISTANCE = Kind("a length", "m", ("km", "m", "mm"), "500 km", ("km", "m"))
-"""How far away something is, as against the size of a part: kilometres come first."""
+"""Distance of an object, in contrast to the size of a part: kilometres come first."""
 SCALE = Kind("a relative change", "", ("ppm", "percent", "um/m"), "10 ppm", ("ppm", "percent"))
 TIME = Kind("a time", "s", ("ms", "s", "us"), "10 ms", ("ms", "s"))
 MOMENT = Kind("a time", "s", ("min", "h", "s"), "12 min", ("min", "h", "s"))
-"""When something is, as against how long it takes: minutes and hours come first."""
+"""Instant of an event, in contrast to a duration: minutes and hours come first."""
 SPEED = Kind("a speed", "m/s", ("m/s", "km/s", "mm/s"), "7.6 km/s", ("m/s", "km/s", "mm/s"))
 POWER = Kind("a power", "W", ("mW", "W", "uW", "nW"), "1 mW", ("mW", "W"))
 MASS = Kind("a mass", "kg", ("kg", "g"), "20 kg", ("kg", "g"))
@@ -88,7 +88,7 @@ FREQUENCY = Kind("a frequency", "Hz", ("Hz", "mHz", "kHz"), "0.65 Hz", ("Hz", "m
 ANGLE_SPECTRUM = Kind(
     "a spectral density of an angle", "rad^2/Hz", ("arcsec^2/Hz", "rad^2/Hz"), "0.01 arcsec^2/Hz", ("arcsec^2/Hz",)
 )
-"""Mean square of an angle per frequency, one-sided."""
+"""One-sided spectral density: mean square of an angle per unit of frequency."""
 EXPANSION = Kind("a thermal expansion", "1/K", ("ppm/K", "1/K"), "7.1 ppm/K", ("ppm/K", "1/K"))
 KINDS = (
     *(ANGLE, LENGTH, SCALE, TIME, SPEED, POWER, MASS, TEMPERATURE, TEMPERATURE_GRADIENT, EXPANSION),
@@ -154,13 +154,13 @@ _KNOWN: dict[str, tuple[Decimal, str]] = {
     "1/m^7": (Decimal(1), "1/m**7"),
     "1/mm^7": (Decimal("1e21"), "1/m**7"),
 }
-"""The units that are suggested, as `_look_up` gives them: to ask pint for one takes it half a second to start."""
+"""Suggested units with the result of `_look_up`, so that pint, which takes half a second to start, is rarely needed."""
 _ALIASES = ("µm", "μm", "µrad", "μrad", "%", "hour", "day")
-"""Further names that editors take."""
+"""Further spellings of units that the patterns for editors accept."""
 
 
 def power_of_length(metre: int) -> Kind:
-    """What has the unit m^``metre``, the power not being 0."""
+    """Return the kind of a quantity in m^``metre``, with ``metre`` an integer other than 0."""
     known = {1: LENGTH, -1: PER_LENGTH, -3: PER_LENGTH3, -5: PER_LENGTH5, -7: PER_LENGTH7}
     if metre in known:
         return known[metre]
@@ -174,19 +174,20 @@ _ZERO_CELSIUS = Decimal("273.15")
 
 
 def parse_quantity(text: object, kind: Kind) -> float:
-    """The SI value of a quantity written as number and unit.
+    """Return the SI value of a quantity written as number and unit.
 
     Parameters
     ----------
     text : object
-        For instance "-1.5 arcsec"; anything but text is refused.
+        Text such as "-1.5 arcsec"; anything but text is refused.
     kind : Kind
-        What it must measure.
+        Kind of quantity that the text must have.
 
     Raises
     ------
     Problem
-        No unit, no number, not finite, unknown unit (with the nearest known one), or a unit of something else.
+        The text has no unit or no number, the number is not finite, the unit is unknown (the nearest known one is
+        suggested), or it is a unit of another kind.
     """
     if not isinstance(text, str):
         _refuse_untyped(text, kind)
@@ -209,41 +210,45 @@ def parse_quantity(text: object, kind: Kind) -> float:
 
 
 def decimal_comma(text: str) -> Problem | None:
-    """What is wrong with a text whose numbers have a decimal comma, and how it is written; None for any other text."""
-    if len(text) > LONGEST_TEXT or not (found := _COMMA.findall(text)):
+    """Return the problem of a text whose numbers have a decimal comma; None for other text.
+
+    The problem has the correct spelling.
+    """
+    if len(text) > LONGEST_TEXT or not (numbers := _COMMA.findall(text)):
         return None
     point, without = _COMMA.sub(r"\1.\2", text), _COMMA.sub(r"\1\2", text)
-    if not all(_QUANTITY.fullmatch(one) or _BARE.fullmatch(one.split()[0]) for one in (point, without) if one):
+    if not all(_QUANTITY.fullmatch(form) or _BARE.fullmatch(form.split()[0]) for form in (point, without) if form):
         return None
-    thousands = f", or {without} if thousands are meant" if all(len(digits) == 3 for _, digits in found) else ""
+    thousands = f", or {without} if thousands are meant" if all(len(digits) == 3 for _, digits in numbers) else ""
     return Problem("a number with a decimal comma", shown(text), f"write {point}{thousands}")
 
 
 def foreign_minus(text: str) -> Problem:
-    """What is wrong with a number that begins with one of `OTHER_MINUS`."""
+    """Return the problem of a number that begins with one of `OTHER_MINUS`."""
     sign = text[0]
     remedy = f"the minus sign of the keyboard, '-': -{text[1:].lstrip()}"
     return Problem(f"a number with the sign U+{ord(sign):04X} ({unicodedata.name(sign).lower()})", shown(text), remedy)
 
 
 def format_quantity(value: float, kind: Kind, within: float = 0.0) -> str:
-    """Text for an SI value that `parse_quantity` reads back to exactly the same float.
+    """Return text for an SI value that `parse_quantity` reads back to exactly the same float.
 
-    A unit that makes the number lie between 1 and 1000 is preferred, then one with few digits, then the earlier one.
+    A unit in which the number lies between 1 and 1000 is preferred, then one with few digits, then the earlier one.
 
     Parameters
     ----------
     value : float
-        SI.
+        Value in the SI unit.
     kind : Kind
-        What it measures.
+        Kind of the quantity.
     within : float
-        By how much the text may differ, SI: of a computed value what its rounding has left in the last digits.
+        Largest allowed difference between text and value, in the SI unit: rounding errors of a computed value need not
+        be written.
 
     Raises
     ------
     ValueError
-        Not finite.
+        The value is not finite.
     """
     if not math.isfinite(value):
         raise ValueError(f"{value} has no text")
@@ -258,7 +263,7 @@ def format_quantity(value: float, kind: Kind, within: float = 0.0) -> str:
 
 
 def split_quantity(text: object) -> tuple[float, str] | None:
-    """Number and unit of a quantity, without asking what it measures; None for anything that is not a quantity."""
+    """Return number and unit of a quantity of any kind; None for text that is not a quantity."""
     match = _QUANTITY.fullmatch(text.strip()) if isinstance(text, str) and len(text) <= LONGEST_TEXT else None
     if match is None or _look_up(match[2] or match[3]) is None:
         return None
@@ -266,7 +271,7 @@ def split_quantity(text: object) -> tuple[float, str] | None:
 
 
 def split_row(text: str, length: int) -> list[str] | None:
-    """The quantities of a row of numbers with one unit after the last, `0 0 3 um`; None for anything else."""
+    """Return the quantities of a row of numbers with one unit after the last, `0 0 3 um`; None for other text."""
     words = text.split() if len(text) <= length * LONGEST_TEXT else []
     numbers, unit = words[:length], " ".join(words[length:])
     if len(numbers) == length and unit and all(_BARE.fullmatch(number) for number in numbers):
@@ -275,12 +280,13 @@ def split_row(text: str, length: int) -> list[str] | None:
 
 
 def pattern(kind: Kind, length: int = 1) -> str:
-    """Regular expression of a quantity of a kind, for editors; of a row of numbers with one unit for ``length`` > 1.
+    """Return the regular expression of a quantity of a kind, for editors.
 
-    It knows the usual units of that kind. The reader takes those that only pint knows as well.
+    For ``length`` > 1 it matches a row of numbers with one unit. It knows the usual units of the kind; the reader also
+    accepts those that only pint knows.
     """
     looked_up = {unit: _look_up(unit) for unit in (*_KNOWN, *_ALIASES, *kind.units)}
-    units = [unit for unit, found in looked_up.items() if found is not None and found[1] == _base(kind)]
+    units = [unit for unit, match in looked_up.items() if match is not None and match[1] == _base(kind)]
     units += [unit for unit in _CELSIUS if kind == TEMPERATURE and unit not in units]
     row = rf"(?:{_NUMBER}\s+){{{length - 1}}}{_NUMBER}" if length > 1 else _NUMBER
     joined = "|".join(re.escape(unit).replace(r"\/", "/") for unit in units)
@@ -288,29 +294,27 @@ def pattern(kind: Kind, length: int = 1) -> str:
 
 
 def with_unit(value: float, unit: str) -> str:
-    """The quantity of a computed number, with its sign: as a difference it is meant as it stands."""
+    """Return a computed number as a quantity with an explicit sign, so that it is read as a difference."""
     return f"{value:+} {unit}"
 
 
 def unit_ratio(unit: str, other: str) -> float:
-    """What a number in ``unit`` is multiplied by to be one in ``other``; degrees Celsius are differences here.
+    """Return the factor that converts a number in ``unit`` to one in ``other``; degrees Celsius are differences here.
 
     Raises
     ------
     Problem
-        The two units measure different things, or one is not known.
+        The units measure different kinds of quantity, or one of them is unknown.
     """
-    one, two = _look_up(unit), _look_up(other)
-    if one is None or two is None or one[1] != two[1]:
+    first, second = _look_up(unit), _look_up(other)
+    if first is None or second is None or first[1] != second[1]:
         raise Problem(f"{unit} and {other} do not measure the same", unit, f"the unit {other}, or a multiple of it")
     with localcontext(prec=50):
-        return float(one[0] / two[0])
+        return float(first[0] / second[0])
 
 
 def _shortest_number(value: float, unit: str, kind: Kind, within: float) -> str | None:
-    """The shortest number that, in this unit, reads back to `value`, or to within so much; None if there is none of 17
-    digits.
-    """
+    """Return the shortest number that reads back to `value` within `within` in this unit; None beyond 17 digits."""
     with localcontext(prec=50):
         if value == 0.0 and unit not in _CELSIUS:
             return "-0" if math.copysign(1.0, value) < 0.0 else "0"
@@ -325,6 +329,7 @@ def _shortest_number(value: float, unit: str, kind: Kind, within: float) -> str 
 
 
 def _refuse_untyped(value: object, kind: Kind) -> None:
+    """Raise the problem of a value that is not text."""
     if isinstance(value, float) and not math.isfinite(value):
         raise Problem("not a finite number", str(value), kind.allowed)
     if isinstance(value, int | float) and not isinstance(value, bool):
@@ -339,21 +344,21 @@ def _to_si(number: str, unit: str, kind: Kind) -> float:
 
 
 def _in_si(number: Decimal, unit: str, factor: Decimal) -> float:
-    """The value of a number of a unit, which is worth ``factor``."""
+    """Return the SI value of a number in a unit whose factor to the SI unit is ``factor``."""
     return float(number + _ZERO_CELSIUS if unit in _CELSIUS else number * factor)
 
 
 def _look_up_checked(unit: str, kind: Kind) -> tuple[Decimal, str]:
-    """Look a unit up as `_look_up` does; a unit that is unknown or measures something else raises Problem."""
-    found = _look_up(unit)
-    if found is None:
+    """Return `_look_up` of a unit; raise `Problem` if it is unknown or measures another kind of quantity."""
+    match = _look_up(unit)
+    if match is None:
         raise _unknown(unit, kind)
-    if found[1] != _base(kind) or (unit in _CELSIUS and kind != TEMPERATURE):
-        other = "a temperature" if unit in _CELSIUS else _measured(found[1])
+    if match[1] != _base(kind) or (unit in _CELSIUS and kind != TEMPERATURE):
+        other = "a temperature" if unit in _CELSIUS else _measured(match[1])
         raise Problem(
             f"{unit!r} is a unit of {other}, not of {kind.name}", unit, kind.allowed, nearest(unit, kind.units)
         )
-    return found
+    return match
 
 
 def _unknown(unit: str, kind: Kind) -> Problem:
@@ -361,7 +366,7 @@ def _unknown(unit: str, kind: Kind) -> Problem:
 
 
 def _measured(base: str) -> str:
-    """What a unit measures, given what `_look_up` says of it, for messages."""
+    """Return the name of the kind of quantity with these base units, for messages."""
     for kind in KINDS:
         if _base(kind) == base:
             return kind.name
@@ -376,7 +381,7 @@ def _base(kind: Kind) -> str:
 
 @cache
 def _registry() -> Any:
-    # Importing pint and reading its table of units takes half a second, so it waits until a rare unit is read.
+    # Importing pint and reading its table of units takes half a second, so it is done only when a rare unit is read.
     import pint
 
     return pint.UnitRegistry(non_int_type=Decimal, cache_folder=None)
@@ -384,7 +389,7 @@ def _registry() -> Any:
 
 @cache
 def _look_up(unit: str) -> tuple[Decimal, str] | None:
-    """(factor to SI base units, base units as text), or None for an unknown unit.
+    """Return the factor to SI base units and the base units as text, or None for an unknown unit.
 
     Angles and pure numbers have the same dimension; they differ in base units, where angles keep their radian.
     """
@@ -392,11 +397,11 @@ def _look_up(unit: str) -> tuple[Decimal, str] | None:
         return Decimal(1), ""
     if unit in _CELSIUS:
         return Decimal(1), "K"
-    return _KNOWN.get(unit) or _asked(unit)
+    return _KNOWN.get(unit) or _look_up_by_pint(unit)
 
 
-def _asked(unit: str) -> tuple[Decimal, str] | None:
-    """`_look_up` of a unit by pint."""
+def _look_up_by_pint(unit: str) -> tuple[Decimal, str] | None:
+    """Return `_look_up` of a unit that is not in `_KNOWN`, by pint."""
     import pint
 
     registry = _registry()

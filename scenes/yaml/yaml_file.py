@@ -1,9 +1,9 @@
-"""YAML in and out: plain data with line numbers from files that nobody has vetted.
+"""Reader and writer of YAML: plain data with line numbers from untrusted files.
 
-Only the part of YAML that the twin's files need is read: one document of mappings, lists and scalars. Anchors, aliases
-and merge keys (a few lines of which can unfold to gigabytes), tags (which can name types to construct), duplicate keys
-(of which most readers silently keep the last) are refused with the line where they stand. The data are built from the
-parser's events, so a refusal comes before anything is unfolded.
+Only the subset of YAML that the twin's files need is read: one document of mappings, lists and scalars. Anchors,
+aliases and merge keys (a few lines of which can unfold to gigabytes), tags (which can name types to construct) and
+duplicate keys (of which most readers silently keep the last) are refused with their line. The data are built from the
+parser's events, so that a refusal comes before anything is unfolded.
 """
 
 import io
@@ -23,10 +23,10 @@ from scenes.yaml.units import OTHER_MINUS, foreign_minus
 
 LARGEST_BYTES = 1_000_000
 MOST_VALUES = 100_000
-"""Keys and values, which take some seconds to read."""
-KEPT, LONGEST_KEPT = 64, 50_000
-"""How many texts read last are kept, of how many characters each at most: a command reads a camera for each place in
-which it stands, and a script or a study the same files of the library again and again.
+"""Largest number of keys and values of a file, which take some seconds to read."""
+CACHED, LONGEST_CACHED = 64, 50_000
+"""Number of recently read texts in the cache, and largest number of characters of each: a command reads a camera once
+for each of its uses, and a script or a study reads the same library files again and again.
 """
 SPACES = "spaces, for each level two more"
 _READ_APART = re.compile(
@@ -34,9 +34,9 @@ _READ_APART = re.compile(
     r"|^(--- )? *[|>]|[|>][-+0-9]* *(#|\n *$)|[?]([\s,\]}]|\Z)",
     re.M,
 )
-"""What the two parsers may take in different ways: tabs, line ends other than that of Unix, directives, the end of a
-document, keys after a question mark; a text in a block that is all there is, begins with an empty line or has a comment
-in its head.
+"""Constructs that the two parsers may read differently: tabs, line ends other than that of Unix, directives, the end of
+a document, keys after a question mark, and a block text that is the whole document, begins with an empty line or has
+a comment in its head.
 """
 
 _INTEGER = re.compile(r"[-+]?[0-9]{1,30}")
@@ -51,18 +51,18 @@ _WORDS: dict[str, bool | None] = {
 
 @dataclass(frozen=True)
 class YamlFile:
-    """The contents of one YAML file.
+    """Contents of a YAML file.
 
     Attributes
     ----------
     file : str
-        Path as the user gave it.
+        Path as the user wrote it.
     data : Any
         Dict, list and scalars. Keys are always text.
     lines : Mapping[KeyPath, int]
         Key path -> line, counted from 1; for a mapping's entry the line of its key.
     prefix : KeyPath
-        Key path of the data, where they are a part of the file.
+        Key path of the data, if they are a part of the file.
     """
 
     file: str
@@ -71,7 +71,7 @@ class YamlFile:
     prefix: KeyPath = ()
 
     def part(self, *key: str | int) -> "YamlFile":
-        """Return what stands at a key, which is there; faults in it are told at their lines of the whole file."""
+        """Return the part of the file at an existing key; its faults are reported at their lines of the whole file."""
         data = self.data
         for name in key:
             data = data[name]
@@ -84,24 +84,24 @@ def read_yaml(path: str | Path) -> YamlFile:
     Raises
     ------
     InputError
-        No such file, not a regular file, unreadable, larger than 1 MB, not UTF-8, empty, not YAML, several documents,
-        nested deeper than 32, with more than 100 000 keys and values, or with duplicate keys, anchors, aliases, merge
-        keys or tags.
+        The file is missing, not a regular file, unreadable, larger than 1 MB, not UTF-8, empty, not YAML, has several
+        documents, is nested deeper than 32 levels, has more than 100 000 keys and values, or has duplicate keys,
+        anchors, aliases, merge keys or tags.
     """
     return parse_yaml(read_text(path, "a YAML file", LARGEST_BYTES, (".yaml", ".yml")), str(path))
 
 
 def parse_yaml(text: str, file: str = "") -> YamlFile:
-    """Read YAML from text; `file` is what error messages call it. Raises InputError as `read_yaml` does."""
-    data, lines = (_read_last if len(text) <= LONGEST_KEPT else _read)(text, file)
+    """Read YAML from text; `file` is its name in error messages. Raises InputError as `read_yaml` does."""
+    data, lines = (_read_cached if len(text) <= LONGEST_CACHED else _read)(text, file)
     return YamlFile(file, _copied(data), dict(lines))
 
 
 def _read(text: str, file: str) -> tuple[Any, dict[KeyPath, int]]:
-    """Data and lines as of `YamlFile`.
+    """Return data and lines as in `YamlFile`.
 
-    libyaml takes a tenth of the time. Whatever it or the builder refuses is read once more by the parser in Python,
-    which knows YAML 1.2 and has the words and lines of messages.
+    libyaml takes a tenth of the time. A text that it or the builder refuses is read again by the parser in Python,
+    which knows YAML 1.2 and gives the texts and lines of the messages.
     """
     if not _READ_APART.search(text):
         with suppress(yaml.YAMLError, InputError):
@@ -124,7 +124,7 @@ def _read(text: str, file: str) -> tuple[Any, dict[KeyPath, int]]:
 
 
 def _built(parsed: Iterable[Any], file: str) -> tuple[Any, dict[KeyPath, int]]:
-    """Data and lines of the events of either parser."""
+    """Return data and lines from the events of either parser."""
     builder = _Builder(file)
     for event in parsed:
         builder.take(event)
@@ -133,18 +133,18 @@ def _built(parsed: Iterable[Any], file: str) -> tuple[Any, dict[KeyPath, int]]:
     return builder.root, builder.lines
 
 
-_read_last = lru_cache(maxsize=KEPT)(_read)
+_read_cached = lru_cache(maxsize=CACHED)(_read)
 
 
 def _copied(value: Any) -> Any:
-    """Data that whoever reads them may change."""
+    """Return a copy that the caller may change."""
     if isinstance(value, dict):
-        return {key: _copied(one) for key, one in value.items()}
-    return [_copied(one) for one in value] if isinstance(value, list) else value
+        return {key: _copied(item) for key, item in value.items()}
+    return [_copied(item) for item in value] if isinstance(value, list) else value
 
 
 def _line_with_tab(text: str, last: int, column: int) -> int | None:
-    """Number of the line, counted from 1, whose TAB the parser stumbled over at a line and column counted from 0."""
+    """Return the line, counted from 1, of the TAB at which the parser stopped; line and column count from 0."""
     lines = text.splitlines()[: last + 1]
     if len(lines) > last and "\t" in lines[-1][: column + 1]:
         return len(lines)
@@ -153,8 +153,7 @@ def _line_with_tab(text: str, last: int, column: int) -> int | None:
 
 
 def dump_yaml(data: Any) -> str:
-    """Plain data (dict, list, text, numbers, None) as YAML text, in the order given; `read_yaml` gives the same data
-    back.
+    """Return plain data (dict, list, text, numbers, None) as YAML text that `read_yaml` reads back, in the same order.
 
     Lists of scalars are written on one line, everything else in blocks.
     """
@@ -180,20 +179,20 @@ def _styled(value: Any) -> Any:
         if not any(isinstance(item, dict | list) for item in items):
             items.fa.set_flow_style()
         return items
-    # Text that would be read as a number or a word such as null has to stand in quotes; `[M?]`, too, for readers of
-    # YAML 1.1, to which ? means a key.
+    # Text that would be read as a number or a word such as null needs quotes; so does `[M?]`, for readers of YAML 1.1,
+    # where ? marks a key.
     if isinstance(value, str) and (value in _WORDS or "?" in value or not isinstance(_number_or_text(value), str)):
         return DoubleQuotedScalarString(value)
     return value
 
 
 UNWRITABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\ud800-\udfff\ufffe\uffff]")
-"""What a quoted text can name by its code and no table, page or data file can hold."""
+"""Characters that a quoted text can contain by their codes, but that no table, page or data file can store."""
 NO_TEXT, WRITABLE = "a control character, or half a character, in a text", "characters that can be printed"
 
 
 class _Builder:
-    """Builds plain data from parser events and refuses what the twin's files do not need."""
+    """Builder of plain data from parser events, which refuses what the twin's files do not need."""
 
     def __init__(self, file: str) -> None:
         self.root: Any = None
@@ -201,13 +200,12 @@ class _Builder:
         self._file = file
         self._documents = 0
         self._values = 0
-        # Open collections from the root down, each with its key path and, for a mapping, the key whose value comes
-        # next.
+        # Open collections from the root down, each with its key path; for a mapping also the key of the next value.
         self._open: list[tuple[dict[str, Any] | list[Any], KeyPath]] = []
         self._key: list[str | None] = []
 
     def take(self, event: Any) -> None:
-        """Take the next event of a parser; both call them by the same names."""
+        """Process the next event of a parser; both parsers use the same class names for events."""
         line = event.start_mark.line + 1
         kind = type(event).__name__
         if kind == "DocumentStartEvent":
@@ -265,7 +263,7 @@ class _Builder:
         return plain_scalar(text) if event.implicit[0] else text
 
     def _here(self) -> KeyPath:
-        """Where the next value will stand."""
+        """Return the key path of the next value."""
         if not self._open:
             return ()
         container, path = self._open[-1]
@@ -297,21 +295,21 @@ class _Builder:
             self._key[-1] = None
             return (*path, key)
         container.append(value)
-        own = (*path, len(container) - 1)
-        self.lines[own] = line
-        return own
+        item_path = (*path, len(container) - 1)
+        self.lines[item_path] = line
+        return item_path
 
     def _refuse(self, problem: str, line: int, allowed: str | None = None, key: KeyPath = ()) -> None:
         raise InputError(Issue(problem, self._file, line, key, allowed=allowed))
 
 
 def plain_scalar(text: str) -> Any:
-    """The value of an unquoted scalar by the core schema of YAML 1.2.
+    """Return the value of an unquoted scalar by the core schema of YAML 1.2.
 
     Parameters
     ----------
     text : str
-        Without spaces around it.
+        Text without surrounding spaces.
     """
     return _WORDS[text] if text in _WORDS else _number_or_text(text)
 

@@ -93,7 +93,7 @@ def test_a_linear_table_is_the_linear_temperature(silica, tmp_path, body) -> Non
         # numbers of 17 digits, least squares of some 1e4 places: 1e-13 of 1 K and 1e-5 m
         for name in ("rotate", "shift", "index_gradient"):
             np.testing.assert_allclose(getattr(by_table[path], name), getattr(motion, name), rtol=1e-9, atol=1e-17)
-        assert by_table[path].stretch == pytest.approx(motion.stretch, rel=1e-9)
+        assert by_table[path].expansion == pytest.approx(motion.expansion, rel=1e-9)
         assert by_table[path].index == pytest.approx(motion.index, rel=1e-9, abs=1e-18)
         assert {j: by_table[path].figure.get(j, 0.0) for j in motion.figure} == pytest.approx(
             dict(motion.figure), rel=1e-9, abs=1e-17
@@ -107,7 +107,7 @@ def test_numbers_beside_a_table_are_added(silica, tmp_path) -> None:
     both = job(tmp_path, M1, "{table: heat.csv, change: 0.2 K, gradient: [1 K/m, 0 K/m, 0 K/m]}")
     number = "{change: 0.7 K, gradient: [1.25 K/m, -0.5 K/m, 0.75 K/m]}"
     state, expected = job_state(both, silica), job_state(job(tmp_path, M1, number), silica)
-    assert state[M1].stretch == pytest.approx(expected[M1].stretch, rel=1e-9)
+    assert state[M1].expansion == pytest.approx(expected[M1].expansion, rel=1e-9)
     np.testing.assert_allclose(state[M1].rotate, expected[M1].rotate, rtol=1e-9)
 
 
@@ -310,7 +310,7 @@ def test_a_mesh_whose_reader_does_not_end_is_refused(tmp_path, monkeypatch) -> N
     (tmp_path / "m1.vtu").touch()
     monkeypatch.setattr(node_table, "LONGEST_READING", 0.01)
     monkeypatch.setattr(meshlane, "read", lambda *_, **__: time.sleep(0.5))
-    with pytest.raises(InputError, match="meshlane does not come to an end with this mesh"):
+    with pytest.raises(InputError, match="meshlane does not finish reading this mesh"):
         read_nodes(tmp_path / "m1.vtu", unit="mm")
 
 
@@ -613,8 +613,8 @@ def test_no_change_is_a_temperature_of_its_own(own: str, one_material, tmp_path)
     fields = held.fields()
     assert one_material.fields(fields)["base/forward/M1"] == Temperature()
     state = one_material.state(fields)
-    assert state["base/forward"].stretch != 0.0
-    assert "base/forward/M1" not in state or state["base/forward/M1"].stretch == 0.0
+    assert state["base/forward"].expansion != 0.0
+    assert "base/forward/M1" not in state or state["base/forward/M1"].expansion == 0.0
     # it is what a change that is nearly none comes to, and not what a body comes to of which nothing is said
     barely = one_material.state({**fields, "base/forward/M1": Temperature(1e-9)})
     silent = one_material.state(load_job(written(tmp_path, HEAD + nodes + "{shift: [0 um, 0 um, 0 um]}\n")).fields())

@@ -1,1 +1,1 @@
-"""Tests in orbit: Earth, orbit and attitude, payloads, what their lines see, and each test with all it refers to."""
+"""Input files of tests in orbit: Earth, orbit and attitude, payloads, scenes, and each test with its references."""

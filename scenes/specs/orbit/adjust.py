@@ -1,7 +1,7 @@
-"""Adjustment of a block of line images with everything that is known of its passes, as a file in scenes/orbit gives it.
+"""Bundle adjustment of a block of line images with all sensors of its passes, as in a file of scenes/orbit.
 
-The block is simulated from stated laws: the readings of orbit and attitude have errors that follow `truth` where it is
-given, and what the adjustment is told of them in any case.
+The block is simulated from stated laws: the errors of the orbit and attitude readings follow `truth` if it is given,
+else `errors`; the adjustment always assumes `errors`.
 """
 
 from __future__ import annotations
@@ -41,24 +41,24 @@ PointCount = Annotated[Whole, Field(ge=0, le=1_000_000)]
 
 
 class LawSpec(Spec):
-    """How an error of readings behaves in time.
+    """Time law of an error of readings.
 
     Attributes
     ----------
     law : LawKind
-        Constant; rate, of even growth from the middle of what shares it; white, readings independent of one another
-        that a cubic spline joins; walk, a random walk that is zero in the middle; slow, a stationary process that
-        forgets itself over `time`; orbital, cosine and sine of the period `time`; jitter, an oscillation of `frequency`
-        whose amplitude and phase forget themselves over `time`.
+        Law: constant; rate, a linear growth from the middle of its validity; white, independent readings that a cubic
+        spline interpolates; walk, a random walk that is zero in the middle; slow, a stationary process with the
+        correlation time `time`; orbital, cosine and sine of the period `time`; jitter, an oscillation of `frequency`
+        whose amplitude and phase have the correlation time `time`.
     shared_by : Literal['pass', 'tracker', 'block']
-        What has one draw of it: each pass, all passes of a star tracker, or the block.
+        Validity of one random draw: each pass, all passes of a star tracker, or the whole block.
     interval : Interval
-        Between independent readings of `white`; between the values of `walk`, of `slow` and of the amplitudes of
-        `jitter` that are solved for, seconds.
+        Interval between independent readings of `white`, or between the estimated values of `walk`, of `slow` and of
+        the amplitudes of `jitter`, in seconds.
     time : Period | None
-        Correlation time of `slow` and of the amplitudes of `jitter`, period of `orbital`, seconds.
+        Correlation time of `slow` and of the amplitudes of `jitter`, or period of `orbital`, in seconds.
     frequency : Frequency | None
-        Of `jitter`, hertz.
+        Frequency of `jitter`, in hertz.
     """
 
     law: LawKind
@@ -80,59 +80,40 @@ class LawSpec(Spec):
 
 
 class AttitudeLawSpec(LawSpec):
-    """A law of errors of the attitude.
+    """Time law of an error of the attitude.
 
     Attributes
     ----------
-    law
-        How it behaves in time.
-    shared_by
-        What has one draw of it.
-    interval
-        Between independent readings, or between values that are solved for, seconds.
-    time
-        Correlation time or period, seconds.
-    frequency
-        Of `jitter`, hertz.
     sigma : AngleSigmas
-        Standard deviation about body X, Y and Z, radians: of a constant, a reading, an amplitude, of jitter as a root
-        mean square; of a rate in each second; of what a walk gains in a second.
+        Standard deviation about body X, Y and Z, in radians: of a constant, a reading or an amplitude; of jitter as a
+        root mean square; of a rate per second; of the increment of a walk in a second.
     """
 
     sigma: AngleSigmas
 
 
 class OrbitLawSpec(LawSpec):
-    """A law of errors of the orbit.
+    """Time law of an error of the orbit.
 
     Attributes
     ----------
-    law
-        How it behaves in time.
-    shared_by
-        What has one draw of it.
-    interval
-        Between independent readings, or between values that are solved for, seconds.
-    time
-        Correlation time or period, seconds.
-    frequency
-        Of `jitter`, hertz.
     sigma : Sigmas
-        Standard deviation along body X, Y and Z of the middle of the pass, metres, as for the attitude.
+        Standard deviation along body X, Y and Z at the middle of the pass, in metres; its meaning by law is as for the
+        attitude.
     """
 
     sigma: Sigmas
 
 
 class ReadingLawsSpec(Spec):
-    """Laws of the errors of the readings, by names that reports show.
+    """Time laws of the errors of orbit and attitude readings; reports show their names.
 
     Attributes
     ----------
     attitude : Named[AttitudeLawSpec]
-        Of the star trackers with their mounting.
+        Name -> law of the star trackers including their mounting.
     orbit : Named[OrbitLawSpec]
-        Of the positions.
+        Name -> law of the positions.
     """
 
     attitude: Annotated[Named[AttitudeLawSpec], not_empty("no laws of the attitude", "at least one")]
@@ -146,14 +127,14 @@ class ReadingLawsSpec(Spec):
 
 
 class TrackerAngleSpec(Spec):
-    """A measured angle between two star trackers: the difference of what is constant in their errors.
+    """Measured angle between two star trackers: the difference of their constant errors.
 
     Attributes
     ----------
     between : tuple[Name, Name]
-        The two.
+        Names of the two star trackers.
     sigma : tuple[float, float, float]
-        About body X, Y and Z, radians.
+        Standard deviation about body X, Y and Z, in radians.
     """
 
     between: tuple[Name, Name]
@@ -161,20 +142,20 @@ class TrackerAngleSpec(Spec):
 
 
 class BlockPassSpec(Spec):
-    """A pass over the block.
+    """Pass over the block.
 
     Attributes
     ----------
     epoch : UtcTime
-        UTC at which it passes vertically above a place.
+        UTC at which the satellite is vertically above the place below.
     longitude, latitude : Longitude | None
-        Of this place, radians; of the area's middle where not given.
+        Geodetic coordinate of this place, in radians; by default that of the area's centre.
     direction : Literal['descending', 'ascending']
-        To the south or to the north.
+        Direction of flight: descending to the south, ascending to the north.
     roll : float
-        Of the satellite about body X, radians; positive looks to the left of the track, toward -Y.
+        Roll of the satellite about body X, in radians; positive looks to the left of the track, toward -Y.
     tracker : Name
-        Star tracker that gives its attitude.
+        Name of the star tracker that measures the attitude.
     """
 
     epoch: UtcTime
@@ -186,18 +167,18 @@ class BlockPassSpec(Spec):
 
 
 class AreaSpec(Spec):
-    """Where the points lie.
+    """Area in which the points lie.
 
     Attributes
     ----------
     longitude, latitude : Longitude
-        Of its middle, radians.
+        Geodetic coordinate of the area's centre, in radians.
     height : TerrainHeight
-        Mean of the ground above the ellipsoid, metres.
+        Mean height of the ground above the ellipsoid, in metres.
     relief : Relief
-        Heights lie evenly within this on either side of the mean, metres.
+        Half range of the heights, which are uniformly distributed about the mean, in metres.
     east, north : FieldLength
-        Its lengths, metres.
+        Size in this direction, in metres.
     """
 
     longitude: Longitude
@@ -209,24 +190,24 @@ class AreaSpec(Spec):
 
 
 class BlockPointsSpec(Spec):
-    """Points of the block at random places of the area; every scene that sees one observes it.
+    """Points of the block at random positions in the area. Every scene that covers a point observes it.
 
     Attributes
     ----------
     control : PointCount
-        Points with known coordinates.
+        Number of control points, whose coordinates are known.
     tie : PointCount
-        Points without.
+        Number of tie points, whose coordinates are unknown.
     check : Whole
-        Tie points whose coordinates are compared with the truth afterwards.
+        Number of tie points whose adjusted coordinates are compared with the truth.
     image : Number
-        Standard deviation of an image point in x and in y, pixels.
+        Standard deviation of an image point in x and in y, in pixels.
     control_sigma : tuple[float, float]
-        Of each axis in plan, and of the height, of control points, metres.
+        Standard deviations of control points, [each axis in plan, height], in metres.
     gross : Number
-        Share of the tie points' image points that are wrong.
+        Share of the tie points' image points with gross errors.
     gross_size : Number
-        How far these are off, pixels.
+        Size of the gross errors, in pixels.
     """
 
     control: PointCount = 10
@@ -242,18 +223,18 @@ class BlockPointsSpec(Spec):
 
 
 class LaserSpec(Spec):
-    """A laser altimeter that looks along body Z.
+    """Laser altimeter along body Z.
 
     Attributes
     ----------
     footprints : Whole
-        Of each pass, evenly spaced over the area; the images see them, too.
+        Number of footprints in each pass, evenly spaced over the area; they are also observed in the images.
     range : Positive
-        Standard deviation of a range, metres.
+        Standard deviation of a range, in metres.
     pointing : float
-        Of the beam about body X and Y, radians.
+        Standard deviation of the beam's direction about body X and Y, in radians.
     beam : float
-        Full angle of the beam, radians; where in it the range is taken is not known.
+        Full divergence of the beam, in radians; the position in it to which the range belongs is unknown.
     """
 
     footprints: Annotated[Whole, Field(ge=1, le=1000)] = 5
@@ -263,14 +244,14 @@ class LaserSpec(Spec):
 
 
 class TerrainModelSpec(Spec):
-    """A terrain model as weak control of the heights of tie points.
+    """Terrain model as weak control of the heights of tie points.
 
     Attributes
     ----------
     sigma : Positive
-        Of a height, independent from point to point, metres.
+        Standard deviation of a height, independent from point to point, in metres.
     common : float
-        Of an error that all heights share, metres.
+        Standard deviation of an error that all heights share, in metres.
     """
 
     sigma: Positive = 4.0
@@ -278,16 +259,16 @@ class TerrainModelSpec(Spec):
 
 
 class CameraChangeSpec(Spec):
-    """How a line camera may have changed since its calibration, one standard deviation.
+    """Change of a line camera since its calibration, as standard deviations.
 
     Attributes
     ----------
     lasting : CameraDriftSpec
-        The same in all passes.
+        Change that is the same in all passes.
     each_pass : CameraDriftSpec
-        Of each pass by itself.
+        Change that is independent in each pass.
     walk : CameraDriftSpec
-        What it gains in a day, as a random walk from the first pass on.
+        Increment in a day of a random walk from the first pass on.
     """
 
     lasting: CameraDriftSpec = CameraDriftSpec.model_construct()
@@ -308,14 +289,14 @@ class CameraChangeSpec(Spec):
 
 
 class MonitorRecordSpec(Spec):
-    """A record of `twin.operate`, whose estimate says how the cameras stand in every pass.
+    """Record of `twin.operate`, whose estimate gives the state of the cameras in every pass.
 
     Attributes
     ----------
     record : Reference
-        Its folder, or the URL of its database.
+        Folder of the record, or URL of its database.
     plan : Reference | None
-        File of the plan of operation under which it is followed; None for the plan that the record keeps.
+        File of the plan of operation for the estimate; by default the plan stored in the record.
     """
 
     record: Reference
@@ -323,66 +304,61 @@ class MonitorRecordSpec(Spec):
 
 
 def one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None:
-    """Refuse two monitors."""
+    """Raise `Problem` if both a monitor and a record of one are given."""
     if monitor is not None and record is not None:
         raise Problem("`monitor` and `monitor_record` are both given", None, "one of them", within=("monitor_record",))
 
 
 class OrbitAdjustSpec(PayloadTestSpec):
-    """A block of scenes, adjusted at once.
+    """Bundle adjustment of a block of scenes.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
-    camera
-        Name in scenes/library/payloads or path of a file.
     lines : tuple[Name, ...]
-        Of the camera that take part; each is a scene of each pass.
+        Lines of the camera that take part; each one gives a scene in each pass.
     earth : EarthSpec
-        Its rotation.
+        Earth rotation.
     altitude : Altitude
-        Of the sun-synchronous orbit, metres.
+        Altitude of the sun-synchronous orbit, in metres.
     span : float
-        How long the orbit is followed before and after each pass' epoch, seconds.
+        Half duration of the orbit data about each pass' epoch, in seconds.
     line_time : LineTime
-        From one image line to the next, seconds.
+        Time from one image line to the next, in seconds.
     attitude : AttitudeSpec
-        True attitude, without the roll of the passes.
+        True attitude without the roll of the passes.
     area : AreaSpec
-        Where the points lie.
+        Area in which the points lie.
     passes : Named[BlockPassSpec]
-        By name.
+        Name -> pass.
     points : BlockPointsSpec
-        And how well they are measured.
+        Points and their accuracies.
     errors : ReadingLawsSpec
-        What is stated of the readings.
+        Time laws of the reading errors that the adjustment assumes.
     truth : ReadingLawsSpec | None
-        What the readings' errors follow in truth; None where they follow what is stated.
+        Time laws of the true reading errors; by default those of `errors`.
     angles : tuple[TrackerAngleSpec, ...]
-        Between star trackers.
+        Measured angles between star trackers.
     changes : Named[CameraChangeSpec]
-        Line -> how its camera may have changed.
+        Line -> change of its camera since the calibration.
     monitor : MonitorReadingSpec | None
-        How well an on-board monitor reads these changes in each pass; None for no monitor.
+        Accuracy of an on-board monitor that measures these changes in each pass; by default there is no monitor.
     monitor_record : MonitorRecordSpec | None
-        What a record of `twin.operate` says of them, in place of `monitor`; the true cameras are drawn from that.
+        Record of `twin.operate` with an estimate of these changes, in place of `monitor`; the true cameras are drawn
+        from the estimate.
     laser : LaserSpec | None
-        An altimeter; None for none.
+        Laser altimeter; by default there is none.
     terrain : TerrainModelSpec | None
-        a terrain model; None for none.
+        Terrain model; by default there is none.
     without : tuple[Sensor, ...]
-        Sensors that are there and are not used.
+        Sensors that the file has but the adjustment does not use.
     robust : Flag
-        Whether gross errors are looked for.
+        True to detect gross errors.
     components : tuple[Name, ...]
-        Laws and groups of measurements whose variances are estimated.
+        Names of laws and groups of measurements whose variance components are estimated.
     datum : tuple[float, float, float]
-        By which control points are given too far east, north and up, unknown to the analysis, metres.
+        Common error of the control points to the east, north and up, unknown to the analysis, in metres.
     seed : Seed
-        Of every random number.
+        Seed of all random numbers.
     """
 
     lines: tuple[Name, ...] = ("forward", "nadir", "backward")
@@ -444,7 +420,7 @@ class OrbitAdjustSpec(PayloadTestSpec):
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Those of `SENSORS` that the block has."""
+        """Sensors of `SENSORS` that the block has."""
         has = {
             "ties": self.points.tie > 0,
             "control": self.points.control > 0,
@@ -457,14 +433,14 @@ class OrbitAdjustSpec(PayloadTestSpec):
 
 
 class CameraReadingSpec(Spec):
-    """What a monitor reads of a line camera in a pass, against the state of its calibration.
+    """Monitor reading of a line camera in a pass, relative to the state of its calibration.
 
     Attributes
     ----------
     angles : AngleErrors
-        d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), radians.
+        Rotations d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), in radians.
     principal_distance : float
-        d_f, metres.
+        Change d_f of the principal distance, in metres.
     """
 
     angles: AngleErrors
@@ -472,59 +448,47 @@ class CameraReadingSpec(Spec):
 
 
 class MonitoredSpec(MonitorReadingSpec):
-    """Readings of an on-board monitor, one of every line camera in every pass that it watched.
+    """Readings of an on-board monitor, one for every line camera and pass that it covers.
 
     Attributes
     ----------
     angles
-        Standard deviation of d_alpha, d_beta and d_gamma, radians.
+        Standard deviations of d_alpha, d_beta and d_gamma, in radians.
     principal_distance
-        Of d_f, metres.
+        Standard deviation of d_f, in metres.
     readings : Named[Named[CameraReadingSpec]]
-        Pass -> line -> what it read.
+        Pass -> line -> reading.
     """
 
     readings: Annotated[Named[Named[CameraReadingSpec]], not_empty("no readings", "at least one pass")]
 
 
 class MeasuredAdjustSpec(MeasuredTestSpec):
-    """A block of measured passes, adjusted at once.
+    """Bundle adjustment of a block of measured passes.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     camera
-        Name in scenes/library/payloads or path of a file: the camera as it was calibrated.
-    data
-        Folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
-    conventions
-        Of all tables.
-    passes
-        By name.
-    effects
-        On the light, that are in the image points; `corrected` takes them out.
+        Payload as calibrated: a name in scenes/library/payloads, or the path of your file.
     names : Literal['shared', 'own']
-        Whether one name of a point in the tables of two passes is one point on the ground (shared), or names count
-        within their pass (own).
+        Meaning of point names: `shared`, one name in the tables of two passes is one point on the ground; `own`, a name
+        is valid within its pass.
     errors : ReadingLawsSpec
-        Laws of the errors of orbit and attitude.
+        Time laws of the errors of orbit and attitude.
     trackers : Named[Name]
-        Pass -> star tracker that gave its attitude; "tracker" where not said.
+        Pass -> star tracker that measured its attitude; by default "tracker".
     changes : Named[CameraChangeSpec]
-        Line -> how its camera may have changed since the calibration.
+        Line -> change of its camera since the calibration.
     monitor : MonitoredSpec | None
-        Readings of these changes; None for no monitor.
+        Readings of these changes by an on-board monitor; by default there is no monitor.
     monitor_record : MonitorRecordSpec | None
-        What a record of `twin.operate` says of them, in place of `monitor`.
+        Record of `twin.operate` with an estimate of these changes, in place of `monitor`.
     without : tuple[Literal['ties', 'control', 'monitor'], ...]
-        Sensors that are there and are not used.
+        Sensors that the data have but the adjustment does not use.
     robust : Flag
-        Whether gross errors are looked for.
+        True to detect gross errors.
     components : tuple[Name, ...]
-        Laws and groups of measurements whose variances are estimated.
+        Names of laws and groups of measurements whose variance components are estimated.
     """
 
     names: Literal["shared", "own"]
@@ -550,6 +514,6 @@ class MeasuredAdjustSpec(MeasuredTestSpec):
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """What can be left out; whether there are points of a role is known when the tables are read."""
+        """Sensors that can be excluded; whether the tables have points of a role is known only when they are read."""
         watched = self.monitor is not None or self.monitor_record is not None
         return ("ties", "control", "monitor") if watched else ("ties", "control")

@@ -1,4 +1,4 @@
-"""The intersection angle in orbit from ground points (paper 000), as a file in scenes/orbit gives it."""
+"""Measurement of intersection angles in orbit from ground points (paper 000), as in a file of scenes/orbit."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated
@@ -26,7 +26,7 @@ Passes = Annotated[Whole, Field(ge=2, le=5000)]
 
 
 Change = Annotated[PlainPerturbationSpec, short_for("rotate", list)]
-"""A perturbation; `[1 arcsec, 4 arcsec, -3 arcsec]` means a rotation."""
+"""Perturbation; `[1 arcsec, 4 arcsec, -3 arcsec]` means a rotation."""
 
 
 def _angles(angles: Mapping[str, tuple[str, str]] | None) -> Mapping[str, tuple[str, str]] | None:
@@ -43,32 +43,32 @@ Angles = Annotated[Named[tuple[Name, Name]] | None, AfterValidator(_angles)]
 
 
 def usual_angles(lines: Sequence[str]) -> Mapping[str, tuple[str, str]] | None:
-    """Angles of a camera whose test names none: those of three lines, or that of a camera of two; None for others."""
+    """Return the default angles of a camera: those of three lines, or that of two lines; None for other cameras."""
     if set(LINES) <= set(lines):
         return {"alpha": LINES[:2], "beta": LINES[1:]}
     return {"alpha": (lines[0], lines[1])} if len(lines) == 2 else None
 
 
 def check_ends(first: float, last: float, problem: str) -> None:
-    """Refuse a piece of a line, from one pixel to another, that has no length."""
+    """Raise `Problem` for a part of a line, from one pixel to another, without length."""
     if not first < last:
         raise Problem(problem, f"first {first:g}, last {last:g}", "a last pixel after the first", within=("last",))
 
 
 class StripsSpec(Spec):
-    """Ground points on what each line sees at the moment of exposure, evenly spaced along the line.
+    """Strips of ground points on the footprint of each line at the moment of exposure, evenly spaced along the line.
 
-    Places are pixels, counted from 0, of the camera's usual line: one with the payload's own number of pixels, or an
-    instrument's first line. On a line with more or fewer pixels they stand at the same share of its length.
+    Positions are pixels, counted from 0, of the camera's standard line: one with the payload's number of pixels, or an
+    instrument's first line. On a line with more or fewer pixels they are scaled to its length.
 
     Attributes
     ----------
     points : Points
-        On each strip, three or more.
+        Number of points on each strip, at least three.
     first : Number
-        Place of the first point on the line.
+        Position of the first point on the line, in pixels.
     last : Number
-        Place of the last point.
+        Position of the last point on the line, in pixels.
     """
 
     points: Points
@@ -92,11 +92,11 @@ class TerrainSpec(Spec):
     Attributes
     ----------
     height : TerrainHeight
-        Mean, metres.
+        Mean height, in metres.
     relief : Relief
-        Standard deviation about it, metres.
+        Standard deviation of the heights about the mean, in metres.
     length : float
-        Along the strip over which heights are alike (correlation exp(-(distance/length)^2/2)), metres.
+        Correlation length of the heights along the strip, exp(-(distance/length)^2/2), in metres.
     """
 
     height: TerrainHeight = 0.0
@@ -105,18 +105,18 @@ class TerrainSpec(Spec):
 
 
 class LightEffectsSpec(Spec):
-    """What happens to the light between ground and camera.
+    """Effects on the light path between ground and camera.
 
     Attributes
     ----------
     light_time : Flag
-        The Earth turns while the light is under way.
+        True to include the Earth's rotation during the light travel time.
     aberration : Flag
-        The satellite's velocity tilts what it sees.
+        True to include aberration by the satellite's velocity.
     refraction : Flag
-        The standard atmosphere bends the light.
+        True to include refraction by the standard atmosphere.
     wavelength : Wavelength
-        In vacuum, for the refraction, metres.
+        Vacuum wavelength for the refraction, in metres.
     """
 
     light_time: Flag = True
@@ -126,36 +126,28 @@ class LightEffectsSpec(Spec):
 
 
 class EffectsSpec(LightEffectsSpec):
-    """What happens to the light between ground and camera.
+    """Effects on the light path between ground and camera, and their correction in the analysis.
 
     Attributes
     ----------
-    light_time
-        The Earth turns while the light is under way.
-    aberration
-        The satellite's velocity tilts what it sees.
-    refraction
-        The standard atmosphere bends the light.
-    wavelength
-        In vacuum, for the refraction, metres.
     corrected : Flag
-        The analysis takes the effects that are on out of the ground points, by its models of them.
+        True if the analysis corrects the included effects by its models of them.
     """
 
     corrected: Flag = True
 
 
 class AngleErrorsSpec(Spec):
-    """Errors of what is measured.
+    """Measurement errors of the station and the ground points.
 
     Attributes
     ----------
     station : GroundSigma
-        Standard deviation of each coordinate of the measured orbit, metres.
+        Standard deviation of each coordinate of the measured orbit, in metres.
     points : GroundSigma
-        Standard deviation of each coordinate of a ground point, matching and aerial triangulation together, metres.
+        Standard deviation of each coordinate of a ground point, matching and aerial triangulation together, in metres.
     datum : DatumShift
-        Shift that all ground points share, east, north and up, unknown to the analysis, metres.
+        Common shift of all ground points to the east, north and up, unknown to the analysis, in metres.
     """
 
     station: GroundSigma = 0.5
@@ -164,43 +156,39 @@ class AngleErrorsSpec(Spec):
 
 
 class OrbitAngleSpec(PayloadTestSpec):
-    """The intersection angles of a camera of two or more lines from one moment's ground points.
+    """Measurement of the intersection angles of a camera with two or more lines from ground points of one moment.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     camera
-        Name in scenes/library/payloads or scenes/library/instruments, or path of a file of either sort. The lines of a
-        payload are ideal projections, those of an instrument are traced, one for each of its cameras.
+        Name in scenes/library/payloads or scenes/library/instruments, or path of such a file. The lines of a payload
+        are ideal projections; those of an instrument are ray-traced, one for each of its cameras.
     angles : Angles
-        Name -> the two lines that the angle lies between; None for alpha [forward, nadir] and beta [nadir, backward]
-        where the camera has these lines, or alpha between the lines of a camera that has two.
+        Name -> the two lines between which the angle lies; by default alpha [forward, nadir] and beta [nadir, backward]
+        if the camera has these lines, or alpha between the lines of a camera with two.
     perturb : Paths[Change]
-        What has changed since the laboratory; the analysis does not know it. For a payload line -> rotation vector in
-        body axes, for an instrument node path -> perturbation as in a job.
+        Change since the laboratory, unknown to the analysis: for a payload line -> rotation vector in body axes, for an
+        instrument node path -> perturbation as in a job.
     earth : EarthSpec
-        Its rotation.
+        Earth rotation.
     orbit : OrbitSpec
         True orbit.
     attitude : AttitudeSpec
         True attitude.
     time : Moment
-        Moment of exposure, seconds from the orbit's epoch.
+        Time of exposure from the orbit's epoch, in seconds.
     strips : StripsSpec
-        Where the points lie.
+        Positions of the ground points on the lines.
     terrain : TerrainSpec
-        Their heights.
+        Heights of the ground points.
     effects : EffectsSpec
-        On the light.
+        Effects on the light path.
     errors : AngleErrorsSpec
-        Of the measured station and points.
+        Measurement errors of the station and the ground points.
     passes : Passes
-        How often the measurement is repeated with errors drawn anew, for the scatter.
+        Number of repetitions with new random errors, from which the scatter is computed.
     seed : Seed
-        Of every random number.
+        Seed of all random numbers.
     """
 
     angles: Angles = None

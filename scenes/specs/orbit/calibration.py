@@ -1,4 +1,4 @@
-"""In-orbit calibration of a three-line camera over test fields, with cameras that may drift, as its file gives it."""
+"""In-orbit calibration of a three-line camera over test fields, with cameras that may drift."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated
@@ -9,23 +9,24 @@ from scenes.specs.orbit.angle import LINES, DatumShift, EffectsSpec, GroundSigma
 from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec, InteriorChangeSpec, LineTime, Side
 from scenes.yaml.errors import Problem, names_text, unknown
-from scenes.yaml.spec import Flag, Name, Named, Number, Ref, Seed, Spec, TitledSpec, Whole, not_empty, one_given
+from scenes.yaml.spec import Flag, Name, Named, Number, Ref, Seed, Spec, TitledSpec, Whole, not_empty, require_one
 from scenes.yaml.unit_fields import AngleSigmas, LengthSigma, Quantity, Vector
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT
 
 LEAST_TIES = 20
-"""Tie points of a strip. Fewer leave most readings of the attitude without a point near them."""
+"""Smallest number of tie points of a strip; with fewer most attitude readings would have no point near them."""
 
 
 class CameraDriftSpec(Spec):
-    """How much a line camera changes from field to field, one standard deviation.
+    """Change of a line camera from field to field, as standard deviations.
 
     Attributes
     ----------
     angles : AngleSigmas
-        d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), radians.
+        Standard deviations of d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight),
+        in radians.
     principal_distance : LengthSigma
-        d_f, metres.
+        Standard deviation of d_f, in metres.
     """
 
     angles: AngleSigmas = (0.0, 0.0, 0.0)
@@ -33,14 +34,14 @@ class CameraDriftSpec(Spec):
 
 
 class MonitorReadingSpec(Spec):
-    """Standard deviation of what the on-board monitor reads of each line camera in each pass.
+    """Accuracy of an on-board monitor's reading of each line camera in each pass.
 
     Attributes
     ----------
     angles : tuple[float, float, float]
-        Of d_alpha, d_beta and d_gamma, radians.
+        Standard deviations of d_alpha, d_beta and d_gamma, in radians.
     principal_distance : float
-        Of d_f, metres.
+        Standard deviation of d_f, in metres.
     """
 
     angles: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, above_zero=True, largest="1 deg"))]
@@ -48,14 +49,14 @@ class MonitorReadingSpec(Spec):
 
 
 class StripSpec(Spec):
-    """Every pass is adjusted on its tie points before check points are intersected.
+    """Strip adjustment of every pass on its tie points before check points are intersected.
 
     Attributes
     ----------
     ties : Whole
-        How many tie points are drawn; measured points of images are used as they come.
+        Number of simulated tie points; for images all measured ones are used.
     length : float
-        Of the strip along the track on which they lie, around the field, metres.
+        Length along the track, around the field, of the strip with the tie points, in metres.
     """
 
     ties: Annotated[Whole, Field(le=5000)] = 500
@@ -79,11 +80,12 @@ CameraDrifts = Annotated[Named[CameraDriftSpec], AfterValidator(_of_lines)]
 
 
 LEAST_POINTS = 6
-"""Control points of a field. Three points in three lines give 18 conditions for 12 unknowns, but on a field of a few
-points one wrong one cannot be told."""
+"""Smallest number of control points of a field. Three points in three lines give 18 conditions for 12 unknowns, but
+with so few points a gross error could not be detected.
+"""
 
 LEAST_PATCHES = 2
-"""Patches of a field. One has no width, and the principal distance is open."""
+"""Smallest number of patches of a field; a single one has no width, so that the principal distance is undetermined."""
 
 FieldLength = Annotated[float, Quantity(DISTANCE, smallest="1 km", largest="500 km")]
 Count = Annotated[Whole, Field(le=5000)]
@@ -91,18 +93,18 @@ Repeats = Annotated[Whole, Field(ge=0, le=1000)]
 
 
 class FieldSpec(Spec):
-    """A test field and the pass over it.
+    """Test field and the pass over it.
 
     Attributes
     ----------
     latitude, longitude : Latitude
-        Of its middle, which the satellite passes at the epoch, radians.
+        Geodetic coordinate of the field's centre, over which the satellite passes at the epoch, in radians.
     epoch : UtcTime
         UTC of the pass.
     height : TerrainHeight
-        Mean of the ground above the ellipsoid, metres.
+        Mean height of the ground above the ellipsoid, in metres.
     relief : Relief
-        Heights lie evenly within this on either side of the mean, metres.
+        Half range of the heights, which are uniformly distributed about the mean, in metres.
     """
 
     latitude: Latitude
@@ -113,18 +115,18 @@ class FieldSpec(Spec):
 
 
 class PointsSpec(Spec):
-    """Ground points of every field, at random places of the nadir line's image; all three lines see each of them.
+    """Ground points of every field at random positions in the nadir line's image. All three lines observe each of them.
 
     Attributes
     ----------
     control : Count
-        Points that are used for the calibration.
+        Number of control points, which are used for the calibration.
     check : Count
-        Points that only test it.
+        Number of check points, which only test the calibration.
     first, last : Number
-        Ends of the part of the nadir line that they lie on, pixels from 0.
+        First or last pixel of the part of the nadir line on which the points lie, counted from 0.
     length : FieldLength
-        Of the field along the track, metres.
+        Length of the field along the track, in metres.
     """
 
     control: Count = 60
@@ -143,14 +145,14 @@ class PointsSpec(Spec):
 
 
 class PatchPlaceSpec(Spec):
-    """Where a patch of ground lies.
+    """Position of a patch of ground.
 
     Attributes
     ----------
     pixel : Number
-        Of the nadir line that sees its middle.
+        Pixel of the nadir line that images the patch's centre.
     track : float
-        Of its middle from the field's middle, metres along the flight.
+        Distance of the patch's centre from the field's centre along the flight, in metres.
     """
 
     pixel: Number
@@ -158,22 +160,22 @@ class PatchPlaceSpec(Spec):
 
 
 class CalibrationImagesSpec(Spec):
-    """Patches of every field whose images are rendered and measured, instead of drawn image points.
+    """Patches of every field whose images are rendered and measured, in place of simulated image points.
 
     Attributes
     ----------
     patches : tuple[PatchPlaceSpec, ...]
-        Of every field.
+        Positions of the patches of every field.
     lines, pixels : Side
-        Size of every image.
+        Size of every image in this direction, in pixels.
     ground : GroundSpec
-        What is there. The terrain's height is the field's; a real terrain is another part of the model in each patch.
+        True ground. Its mean height is that of the field; a real terrain is another part of the model in each patch.
     control : ControlSpec
         Orthophoto and elevation model. Their errors are drawn for each patch; a shift is common to all.
     points : ImagePointsSpec
-        Of every patch. What its `control` and `height_sigma` say is taken for the accuracy of the reference.
+        Points of every patch. Their `control` and `height_sigma` are used as the accuracy of the reference.
     oversampling : Whole
-        Samples of the ground along each side of a pixel.
+        Number of ground samples along each side of a pixel.
     """
 
     patches: tuple[PatchPlaceSpec, ...]
@@ -199,24 +201,21 @@ class CalibrationImagesSpec(Spec):
 
 
 class CalibrationErrorsSpec(ErrorsSpec):
-    """Errors of what is measured. The star trackers' bias is the change of the angle between them and the cameras since
-    the laboratory.
+    """Measurement errors of a calibration.
+
+    The star trackers' bias is the change, since the laboratory, of the angle between them and the cameras.
 
     Attributes
     ----------
-    gps
-        Of the orbit.
-    star_tracker
-        Of the attitude.
     season : AngleSigmas
-        Standard deviation of a further constant bias of each field about body X, Y, Z, radians.
+        Standard deviation of a further constant bias of each field about body X, Y, Z, in radians.
     image : Number
-        Standard deviation of an image point in x and in y, pixels.
+        Standard deviation of an image point in x and in y, in pixels.
     control : GroundSigma
-        Standard deviation of each coordinate of a control point, metres.
+        Standard deviation of each coordinate of a control point, in metres.
     datum : DatumShift
-        Shift that the coordinates of all control points share, east, north and up, unknown to the analysis, metres.
-        Check points are given in the right datum.
+        Common shift of the coordinates of all control points to the east, north and up, unknown to the analysis, in
+        metres. Check points are in the correct datum.
     switched_on : Flag
         False for exact image points, control points and orbit, and an attitude with its biases only.
     """
@@ -229,16 +228,18 @@ class CalibrationErrorsSpec(ErrorsSpec):
 
 
 class LaunchSpec(Spec):
-    """How much a launch may change, one standard deviation. The adjustment uses it for what the points tell less well,
-    and for nothing else; an estimate far beyond it is a sign of wrong ground coordinates or of a wrong camera file,
-    which the fit alone does not show.
+    """Prior of the change by the launch, as standard deviations.
+
+    The adjustment uses it only for parameters that the points determine less well. An estimate far beyond it indicates
+    wrong ground coordinates or a wrong camera file, which the fit alone does not show.
 
     Attributes
     ----------
     bias : AngleSigmas
-        Angle between star trackers and cameras about body X, Y, Z, radians; 0 where nothing is known of it.
+        Standard deviations of the angle between star trackers and cameras about body X, Y, Z, in radians; 0 if nothing
+        is known of it.
     interior : float
-        Principal distances and principal points, metres.
+        Standard deviation of principal distances and principal points, in metres.
     """
 
     bias: AngleSigmas = (2e-4, 2e-4, 2e-4)
@@ -246,14 +247,14 @@ class LaunchSpec(Spec):
 
 
 class MapLimitsSpec(Spec):
-    """Largest RMS errors without ground control that a map at a scale of 1:50 000 allows.
+    """Largest RMS errors without ground control, for the verdict; the defaults are those of a map at 1:50 000.
 
     Attributes
     ----------
     plan : float
-        Both axes together, metres; 25 m is 0.5 mm on the map.
+        Largest error in plan, both axes together, in metres; 25 m is 0.5 mm on the map.
     height : float
-        metres.
+        Largest error in height, in metres.
     """
 
     plan: Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 km")] = 25.0
@@ -261,7 +262,7 @@ class MapLimitsSpec(Spec):
 
 
 def checked_schemes(schemes: Sequence[Sequence[str]], fields: Mapping[str, object]) -> None:
-    """Raises Problem unless there are schemes, and each names some of the fields once."""
+    """Raise `Problem` unless there are schemes and each lists some of the fields once."""
     if not schemes:
         raise Problem("no schemes", "an empty list", "at least one list of fields", within=("schemes",))
     for scheme in schemes:
@@ -274,56 +275,54 @@ def checked_schemes(schemes: Sequence[Sequence[str]], fields: Mapping[str, objec
 
 
 class OrbitCalibrationSpec(TitledSpec):
-    """A calibration over several fields, tested on all of them without ground control.
+    """In-orbit calibration over several fields, tested on all of them without ground control.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     camera : Ref
-        Name in scenes/library/payloads or path of a file, with lines forward, nadir and backward.
+        Payload with lines forward, nadir and backward: a name in scenes/library/payloads, or the path of your file.
     perturb : Named[InteriorChangeSpec]
-        Line -> how its interior has changed since the laboratory. The nadir line's principal point is the gauge and
-        does not change: it cannot be told from a turn of the whole camera, `errors.star_tracker.bias`.
+        Line -> true change of its interior orientation since the laboratory. The nadir line's principal point is the
+        gauge and does not change: it cannot be separated from a rotation of the whole camera,
+        `errors.star_tracker.bias`.
     earth : EarthSpec
-        Its rotation.
+        Earth rotation.
     altitude : Altitude
-        Of the descending sun-synchronous orbit over each field, metres.
+        Altitude of the descending sun-synchronous orbit over each field, in metres.
     span : float
-        How long the orbit is followed before and after the field's middle, seconds.
+        Half duration of the orbit data about the field's centre, in seconds.
     line_time : LineTime
-        From one image line to the next, seconds.
+        Time from one image line to the next, in seconds.
     attitude : AttitudeSpec
         True attitude.
     fields : Named[FieldSpec]
-        By name.
+        Name -> test field.
     schemes : tuple[tuple[Name, ...], ...]
-        Scheme -> fields whose parameters are averaged for it. One more, by the next number, lets each field use its
-        own.
+        Schemes: each is a list of fields whose parameters are averaged. The program adds a scheme in which each field
+        uses its own parameters.
     points : PointsSpec | None
-        Of every field, drawn; None where images are measured.
+        Simulated points of every field; omitted if images are measured.
     images : CalibrationImagesSpec | None
-        Rendered and measured instead of drawn points.
+        Rendered and measured images in place of simulated points.
     effects : EffectsSpec
-        On the light.
+        Effects on the light path.
     errors : CalibrationErrorsSpec
-        Of what is measured.
+        Measurement errors.
     drift : CameraDrifts
-        Line -> how its camera changes from field to field.
+        Line -> change of its camera from field to field.
     monitor : MonitorReadingSpec | None
-        How well an on-board monitor reads these changes in each pass; None for no monitor.
+        Accuracy of an on-board monitor that measures these changes in each pass; by default there is no monitor.
     strip : StripSpec | None
-        Tie points for an adjustment of every pass; None for none.
+        Strip adjustment of every pass on tie points; by default there is none.
     launch : LaunchSpec
-        How much of a change is no surprise.
+        Prior of the change by the launch.
     limits : MapLimitsSpec
-        For the verdict.
+        Largest RMS errors for the verdict.
     repeats : Repeats
-        Campaigns over the same fields with everything drawn anew, for what differs from one to the next.
+        Number of further campaigns over the same fields with new random numbers, which show the scatter between
+        campaigns.
     seed : Seed
-        Of every random number.
+        Seed of all random numbers.
     """
 
     camera: Ref
@@ -350,7 +349,7 @@ class OrbitCalibrationSpec(TitledSpec):
     @model_validator(mode="after")
     def _has_points(self) -> "OrbitCalibrationSpec":
         problem = "points are drawn or measured in images"
-        one_given(self, ("points", "images"), problem, "`points:` or `images:`", ("points",))
+        require_one(self, ("points", "images"), problem, "`points:` or `images:`", ("points",))
         if self.images is not None and self.repeats:
             problem = "campaigns from images are not repeated, for each is rendered anew"
             raise Problem(problem, str(self.repeats), "0", within=("repeats",))

@@ -1,9 +1,7 @@
-"""Instants in UTC, Earth, orbit, attitude and their errors, as files in scenes/orbit give them.
+"""Instants in UTC, Earth rotation, orbit, attitude with its jitter, and their measurement errors.
 
 Body axes are those of a base: X forward, Z toward the scene (down), Y = Z x X (right). Components along body or orbital
-axes are written in this order.
-
-Jitter of a satellite's attitude as files in scenes/orbit state it: lines and bands of its spectrum.
+axes are written in this order. Jitter is described by lines and bands of its spectrum.
 """
 
 import re
@@ -13,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
 from scenes.yaml.errors import Problem, shown
-from scenes.yaml.spec import Number, Ref, Spec, TitledSpec, one_given
+from scenes.yaml.spec import Number, Ref, Spec, TitledSpec, require_one
 from scenes.yaml.unit_fields import AngleSigmas, Quantity, Vector
 from scenes.yaml.units import ANGLE, ANGLE_SPECTRUM, DISTANCE, FREQUENCY, LENGTH, MOMENT, SPEED, TIME, format_quantity
 
@@ -26,16 +24,16 @@ Levels = Annotated[
 
 
 class JitterLineSpec(Spec):
-    """An oscillation: amplitude x sin(2 pi frequency x time + phase) about each axis of the body.
+    """Oscillation of the attitude: amplitude x sin(2 pi frequency x time + phase) about each body axis.
 
     Attributes
     ----------
     frequency : Frequency
-        In hertz.
+        Frequency, in hertz.
     amplitude : Amplitudes
-        About body X, Y and Z (roll, pitch, yaw), half of what it swings from end to end, radians.
+        Amplitudes (half of peak to peak) about body X, Y and Z (roll, pitch, yaw), in radians.
     phase : Phases | None
-        About each axis, or one for all, radians, time counting from the orbit's epoch; None for random ones.
+        Phases about the three axes, or one for all, in radians, for time from the orbit's epoch; random by default.
     """
 
     frequency: Frequency
@@ -44,14 +42,14 @@ class JitterLineSpec(Spec):
 
 
 class JitterBandSpec(Spec):
-    """A random motion with an even spectrum between two frequencies, Gaussian at every time.
+    """Gaussian random motion of the attitude with a constant spectral density between two frequencies.
 
     Attributes
     ----------
     first, last : Frequency
-        Ends of the band, hertz.
+        Lower (first) or upper (last) end of the band, in hertz.
     level : Levels
-        One-sided spectral density about body X, Y and Z, rad^2/Hz; level x (last - first) is the variance.
+        One-sided spectral density about body X, Y and Z, in rad^2/Hz; level x (last - first) is the variance.
     """
 
     first: Frequency
@@ -67,14 +65,14 @@ class JitterBandSpec(Spec):
 
 
 class JitterSpec(Spec):
-    """Small fast turns of the body about its own axes, after all else that the attitude says; nothing by default.
+    """Jitter: small, fast rotations of the body about its axes, added to the rest of the attitude.
 
     Attributes
     ----------
     lines : tuple[JitterLineSpec, ...]
-        oscillations.
+        Oscillations; none by default.
     bands : tuple[JitterBandSpec, ...]
-        Of noise.
+        Bands of noise; none by default.
     """
 
     lines: tuple[JitterLineSpec, ...] = Field(default=(), max_length=100)
@@ -82,7 +80,7 @@ class JitterSpec(Spec):
 
     @property
     def stated(self) -> bool:
-        """Whether there is any."""
+        """True if there is any jitter."""
         return any(any(line.amplitude) for line in self.lines) or any(any(band.level) for band in self.bands)
 
 
@@ -93,13 +91,12 @@ PATTERN = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}(:[0-9]{2}(\.[0-9]{1,6}
 
 
 def parse_utc(text: Any) -> str:
-    """Check the text of an instant; a value that is written another way than the pattern is refused, also a leap
-    second.
+    """Return the text of an instant after checking it; other formats and leap seconds are refused.
 
     Raises
     ------
     Problem
-        No text, another form, without its zone, or no such instant.
+        The value is not text, has another format or no time zone, or there is no such instant.
     """
     if not isinstance(text, str):
         raise Problem("not a date and time", shown(text), ALLOWED)
@@ -124,7 +121,7 @@ UtcTime = Annotated[
         {"type": "string", "pattern": PATTERN, "description": ALLOWED, "examples": ["2011-03-05T03:05:00Z"]}
     ),
 ]
-"""An instant in UTC, ISO 8601 text ending in Z."""
+"""Instant in UTC, ISO 8601 text ending in Z."""
 
 
 Latitude = Annotated[float, Quantity(ANGLE, largest="90 deg")]
@@ -143,14 +140,14 @@ _ZERO = (0.0, 0.0, 0.0)
 
 
 class EarthSpec(Spec):
-    """What is not predicted of the Earth's rotation (IERS bulletins).
+    """Earth rotation parameters that cannot be predicted, from IERS bulletins.
 
     Attributes
     ----------
     ut1_utc : float
-        UT1 - UTC at the epoch, seconds.
+        UT1 - UTC at the epoch, in seconds.
     polar_motion : tuple[float, float]
-        x and y of the pole, radians (x toward Greenwich, y toward 90 degrees west).
+        Coordinates x and y of the pole, in radians (x toward Greenwich, y toward 90 degrees west).
     """
 
     ut1_utc: Annotated[float, Quantity(TIME, largest="0.9 s")] = 0.0
@@ -158,18 +155,18 @@ class EarthSpec(Spec):
 
 
 class PassingSpec(Spec):
-    """An orbit that passes a place at the epoch; the osculating orbit is a circle there.
+    """Orbit that passes over a place at the epoch, where the osculating orbit is a circle.
 
     Attributes
     ----------
     longitude, latitude : Longitude
-        Geodetic, of the place vertically below the satellite, radians.
+        Geodetic coordinate of the place vertically below the satellite, in radians.
     altitude : Altitude
-        Of the satellite above the ellipsoid there, metres.
+        Altitude of the satellite above the ellipsoid there, in metres.
     direction : Literal['descending', 'ascending']
-        Of the pass, to the south or to the north.
+        Direction of flight: descending to the south, ascending to the north.
     inclination : Inclination | None
-        Osculating, radians; without it the orbit is sun-synchronous.
+        Osculating inclination, in radians; by default that of a sun-synchronous orbit.
     """
 
     longitude: Longitude
@@ -180,24 +177,24 @@ class PassingSpec(Spec):
 
 
 class ElementsSpec(Spec):
-    """Osculating elements at the epoch, against the true equator of the epoch.
+    """Osculating elements at the epoch, relative to the true equator of the epoch.
 
     Attributes
     ----------
     altitude : Altitude
-        Semi-major axis less the equatorial radius, metres.
+        Semi-major axis minus the equatorial radius, in metres.
     eccentricity : Number
-        At most 0.1.
+        Eccentricity, at most 0.1.
     inclination : Inclination | None
-        Radians; without it the orbit is sun-synchronous.
+        Inclination, in radians; by default that of a sun-synchronous orbit.
     node : Longitude | None
-        Right ascension of the ascending node from the celestial intermediate origin, radians.
+        Right ascension of the ascending node from the celestial intermediate origin, in radians.
     node_local_time : float | None
-        Local mean solar time of the descending node instead of `node`, seconds of the day.
+        Local mean solar time of the descending node, 0 h to 24 h, in place of `node`, in seconds.
     perigee : Longitude
-        Argument of the perigee, radians.
+        Argument of the perigee, in radians.
     argument : Longitude
-        Argument of latitude (perigee + true anomaly) at the epoch, radians.
+        Argument of latitude (perigee + true anomaly) at the epoch, in radians.
     """
 
     altitude: Altitude
@@ -224,9 +221,9 @@ class StateSpec(Spec):
     Attributes
     ----------
     position : Position
-        In the GCRS, metres.
+        Position in the GCRS, in metres.
     velocity : Velocity
-        In the GCRS, m/s.
+        Velocity in the GCRS, in m/s.
     """
 
     position: Position
@@ -234,20 +231,20 @@ class StateSpec(Spec):
 
 
 class OrbitSpec(Spec):
-    """An orbit: exactly one of `passing`, `elements` and `state`.
+    """Orbit, defined by exactly one of `passing`, `elements` and `state`.
 
     Attributes
     ----------
     epoch : UtcTime
-        UTC; all times of the orbit are seconds from it.
+        UTC epoch, from which all times of the orbit are counted.
     before, after : Span
-        How long the orbit is followed to either side of the epoch, seconds.
+        Duration of the orbit data before or after the epoch, in seconds.
     passing : PassingSpec | None
-        a place that it passes.
+        Place over which the orbit passes at the epoch.
     elements : ElementsSpec | None
-        Its osculating elements.
+        Osculating elements.
     state : StateSpec | None
-        a state vector.
+        State vector.
     """
 
     epoch: UtcTime
@@ -260,14 +257,14 @@ class OrbitSpec(Spec):
     @model_validator(mode="after")
     def _is_one_orbit(self) -> "OrbitSpec":
         names = ("passing", "elements", "state")
-        one_given(self, names, "the orbit is not given once", "one of passing, elements, state")
+        require_one(self, names, "the orbit is not given once", "one of passing, elements, state")
         if self.before + self.after == 0.0:
             found = f"before and after are {format_quantity(0.0, MOMENT)}"
             raise Problem("the orbit has no length", found, "a time before or after the epoch", within=("after",))
         return self
 
     def misses(self, time: float) -> Problem | None:
-        """What is wrong with a moment, seconds from the epoch, that lies outside the orbit; None within it."""
+        """Return the problem of a time, in seconds from the epoch, outside the orbit data; None within them."""
         first, last = (format_quantity(end, MOMENT) for end in (-self.before, self.after))
         if -self.before < time < self.after:
             return None
@@ -276,19 +273,19 @@ class OrbitSpec(Spec):
 
 
 class AttitudeSpec(Spec):
-    """How the satellite holds itself.
+    """Nominal attitude of the satellite, and its jitter.
 
     Attributes
     ----------
     nadir : Literal['geodetic', 'geocentric']
-        Z points along the ellipsoid's normal (geodetic) or to the Earth's centre (geocentric).
+        Direction of Z: along the ellipsoid's normal (geodetic) or to the Earth's centre (geocentric).
     steering : Literal['none', 'yaw']
-        X lies along the inertial velocity (none), or along the track on the turning Earth (yaw), so that the image at
-        nadir does not drift along the line.
+        Direction of X: along the inertial velocity (none), or along the track on the rotating Earth (yaw), so that the
+        image at nadir does not drift along the line.
     offset : tuple[float, float, float]
-        Rotation vector of the body against the orbital frame, radians (roll, pitch, yaw).
+        Rotation vector of the body relative to the orbital frame (roll, pitch, yaw), in radians.
     jitter : JitterSpec | None
-        Small fast turns about the body's own axes; None for none.
+        Small, fast rotations about the body's axes; none by default.
     """
 
     nadir: Literal["geodetic", "geocentric"] = "geodetic"
@@ -298,20 +295,20 @@ class AttitudeSpec(Spec):
 
 
 class GpsErrorsSpec(Spec):
-    """Errors of the measured orbit, along X, Y and Z of the orbital frame.
+    """Errors of the measured orbit along X, Y and Z of the orbital frame.
 
     Attributes
     ----------
     interval : Interval
-        Between fixes, seconds.
+        Interval between fixes, in seconds.
     noise : LengthSigmas
-        Standard deviation of a fix, independent from fix to fix, metres.
+        Standard deviation of a fix, independent from fix to fix, in metres.
     drift : LengthSigmas
-        Standard deviation of what changes slowly, metres.
+        Standard deviation of a slowly varying error, in metres.
     correlation_time : float
-        Over which `drift` falls to 1/e in its correlation, seconds.
+        Correlation time of `drift`, at which its correlation has fallen to 1/e, in seconds.
     velocity : SpeedSigmas
-        Standard deviation of a fix's velocity, independent from fix to fix, m/s.
+        Standard deviation of a fix's velocity, independent from fix to fix, in m/s.
     """
 
     interval: Interval = 1.0
@@ -322,15 +319,16 @@ class GpsErrorsSpec(Spec):
 
 
 class ThermalDriftSpec(Spec):
-    """Angle between star trackers and cameras that changes with the satellite's temperature along the orbit:
-    amplitude x sin(latitude - reference).
+    """Change of the angle between star trackers and cameras with the satellite's temperature along the orbit.
+
+    The angle is amplitude x sin(latitude - reference).
 
     Attributes
     ----------
     amplitude : AngleErrors
-        Rotation vector about body X, Y and Z, radians.
+        Rotation vector about body X, Y and Z, in radians; it is multiplied by sin(latitude - reference).
     reference : Latitude
-        Geodetic latitude at which it vanishes, radians.
+        Geodetic latitude at which the change is zero, in radians.
     """
 
     amplitude: AngleErrors = _ZERO
@@ -338,15 +336,14 @@ class ThermalDriftSpec(Spec):
 
 
 class SlowErrorsSpec(Spec):
-    """Errors of the attitude that last for many readings and change within a pass: a cubic spline through independent
-    values.
+    """Slow errors of the attitude within a pass: a cubic spline through independent values.
 
     Attributes
     ----------
     noise : AngleSigmas
-        Standard deviation of a value about body X, Y and Z, radians.
+        Standard deviation of a value about body X, Y and Z, in radians.
     interval : Interval
-        Between values, seconds.
+        Interval between the values, in seconds; it covers many readings.
     """
 
     noise: AngleSigmas = _ZERO
@@ -354,24 +351,24 @@ class SlowErrorsSpec(Spec):
 
 
 class StarTrackerErrorsSpec(Spec):
-    """Errors of the measured attitude, rotations about body X, Y and Z: measured after true.
+    """Errors of the measured attitude: rotations about body X, Y and Z from the true to the measured attitude.
 
     Attributes
     ----------
     interval : Interval
-        Between readings, seconds.
+        Interval between readings, in seconds.
     noise : AngleSigmas
-        Standard deviation of a reading, independent from reading to reading, radians.
+        Standard deviation of a reading, independent from reading to reading, in radians.
     bias : AngleErrors
-        Constant, radians.
+        Constant error, in radians.
     thermal : ThermalDriftSpec
-        Changes with latitude.
+        Error that depends on the latitude.
     slow : SlowErrorsSpec
-        Changes within a pass.
+        Error that changes within a pass.
     drift : AngleSigmas
-        Standard deviation of a rate that each pass has, by what it changes in a second, radians.
+        Standard deviation of a constant rate in each pass, as the change in a second, in radians.
     walk : AngleSigmas
-        Standard deviation of what a random walk gains in a second, radians.
+        Standard deviation of the increment of a random walk in a second, in radians.
     """
 
     interval: Interval = 0.125
@@ -384,14 +381,14 @@ class StarTrackerErrorsSpec(Spec):
 
 
 class ErrorsSpec(Spec):
-    """Errors of what the satellite measures of itself; all zero unless given.
+    """Errors of the satellite's orbit and attitude measurements; zero by default.
 
     Attributes
     ----------
     gps : GpsErrorsSpec
-        Of the orbit.
+        Errors of the orbit.
     star_tracker : StarTrackerErrorsSpec
-        Of the attitude.
+        Errors of the attitude.
     """
 
     gps: GpsErrorsSpec = GpsErrorsSpec.model_construct()
@@ -399,16 +396,12 @@ class ErrorsSpec(Spec):
 
 
 class PayloadTestSpec(TitledSpec):
-    """A test of a payload.
+    """Test of a payload.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     camera : Ref
-        Name in scenes/library/payloads or path of a file.
+        Payload: a name in scenes/library/payloads, or the path of your file.
     """
 
     camera: Ref

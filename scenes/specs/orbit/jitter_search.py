@@ -1,5 +1,6 @@
-"""A search for jitter in what the lines of a camera saw one after the other, simulated, as files in scenes/orbit give
-it.
+"""Search for jitter in a simulated pass.
+
+Several lines of a camera image the same ground one after the other; jitter shows in the differences of their images.
 """
 
 from typing import Annotated, Literal
@@ -37,14 +38,14 @@ SomeLines = Annotated[tuple[Name, ...] | None, AfterValidator(_some_lines)]
 
 
 class SplineSpec(Spec):
-    """The attitude over time as a cubic spline, for jitter that is no lines.
+    """Attitude over time as a cubic spline, for jitter without spectral lines.
 
     Attributes
     ----------
     interval : float
-        Of its knots, seconds.
+        Interval of the knots, in seconds.
     sigma : AngleSigma
-        Standard deviation of a coefficient before the observations, radians.
+        Prior standard deviation of a coefficient, in radians.
     """
 
     interval: Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
@@ -52,26 +53,26 @@ class SplineSpec(Spec):
 
 
 class JitterSearchSpec(Spec):
-    """How jitter is sought.
+    """Settings of the search for jitter.
 
     Attributes
     ----------
     lowest, highest : Frequency
-        Frequencies, hertz.
+        Lowest or highest frequency of the search, in hertz.
     axes : Axes
-        Of the body about which it is sought.
+        Body axes about which jitter is searched.
     false_alarm : Number
-        Probability of finding any where there is none, over all frequencies together.
+        Probability of reporting jitter if there is none, over all frequencies together.
     trend : Whole
-        Degree in time of what changes slowly, of each line by itself.
+        Degree of the polynomial in time that represents slow changes, for each line separately.
     interior : Whole
-        Degree along each line of what is wrong with its interior orientation.
+        Degree of the polynomial along each line that represents errors of its interior orientation.
     height : TerrainHeight
-        Of tie points, above the ellipsoid, metres.
+        Height of tie points above the ellipsoid, in metres.
     height_sigma : HeightSigma
-        How wrong that may be, metres.
+        Standard deviation of that height, in metres.
     spline : SplineSpec | None
-        None for none.
+        Attitude as a spline; by default there is none.
     """
 
     lowest: Frequency = 0.1
@@ -96,28 +97,28 @@ PointNoise = Annotated[Number, Field(gt=0.0, le=10.0)]
 
 
 class BandPointsSpec(Spec):
-    """Places that all lines see.
+    """Ground points that all lines observe.
 
     Attributes
     ----------
     count : Whole
-        How many.
+        Number of points.
     duration : float
-        Of the strip that they are spread over, seconds of flight.
+        Duration of the flight over the strip with the points, in seconds.
     noise : PointNoise
-        Standard deviation of an image coordinate, pixels, independent from line to line.
+        Standard deviation of an image coordinate, independent from line to line, in pixels.
     line_noise : dict[Name, PointNoise]
-        Line -> its standard deviation where it differs from `noise`, which the measurements state of all.
+        Line -> true standard deviation where it differs from `noise`, which the measurements state for all lines.
     rows : float | None
-        Interval of the rows that the places lie on, seconds of flight; None for places anywhere.
+        Time of flight between the rows on which the points lie, in seconds; by default they lie anywhere.
     row_spread : float
-        Standard deviation of a place's moment about its row, seconds.
+        Standard deviation of a point's time about its row, in seconds.
     height : TerrainHeight
-        Mean height of the ground, metres.
+        Mean height of the ground, in metres.
     relief : float
-        Heights are even between height - relief and height + relief, metres.
+        Half range of the heights, which are uniformly distributed about the mean, in metres.
     wrong : Number
-        Share of image points that lie somewhere else within 20 pixels.
+        Share of image points with gross errors of up to 20 pixels.
     """
 
     count: Annotated[Whole, Field(ge=30, le=20_000)] = 1000
@@ -132,38 +133,32 @@ class BandPointsSpec(Spec):
 
 
 class OrbitJitterSpec(PayloadTestSpec):
-    """A pass whose jitter is sought in places that several lines saw.
+    """Search for jitter in a simulated pass, by ground points that several lines observed.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
-    camera
-        Name in scenes/library/payloads or path of a file.
     lines : SomeLines
-        That are used, by name; None for all.
+        Names of the lines that are used; by default all.
     earth : EarthSpec
-        Its rotation.
+        Earth rotation.
     orbit : OrbitSpec
         True orbit.
     attitude : AttitudeSpec
-        True attitude, with its jitter.
+        True attitude with its jitter.
     effects : LightEffectsSpec
-        What happens to the light between ground and camera.
+        Effects on the light path between ground and camera.
     line_time : LineTime
-        From one image line to the next, seconds.
+        Time from one image line to the next, in seconds.
     time : Moment
-        Middle of the strip, seconds from the orbit's epoch.
+        Time of the strip's middle from the orbit's epoch, in seconds.
     points : BandPointsSpec
-        That are measured.
+        Points that are measured.
     errors : ErrorsSpec
-        Of what the satellite measures of itself.
+        Errors of the satellite's orbit and attitude measurements.
     search : JitterSearchSpec
-        How jitter is sought.
+        Settings of the search.
     seed : Seed
-        Of every random number.
+        Seed of all random numbers.
     """
 
     lines: SomeLines = None

@@ -1,7 +1,7 @@
-"""Measurements of passes as files give them, with every convention stated, and the tests that run on them.
+"""Measurements of passes in files with explicit conventions, and the tests that use them.
 
-Files of other people's formats stand here with what they themselves do not say of their numbers. Nothing has a default
-where two readings are usual: a file that does not say which one it means is refused.
+For files in other formats, this specification adds the conventions that they do not contain. A convention with several
+common choices has no default: a specification that does not state it is refused.
 """
 
 from __future__ import annotations
@@ -33,11 +33,14 @@ _TOWARD: Mapping[str, tuple[int, int, int]] = {
     "down": (0, 0, 1),
     "up": (0, 0, -1),
 }
-"""In the project's body axes: X forward, Y right, Z down."""
+"""Direction -> unit vector in the project's body axes: X forward, Y right, Z down."""
 
 
 def body_axes_matrix(axes: tuple[str, str, str]) -> tuple[tuple[int, int, int], ...]:
-    """Rows: the file's body x, y and z in the project's body axes, so that v_file = matrix @ v_project."""
+    """Return the matrix with v_file = matrix @ v_project.
+
+    Its rows are the file's body x, y and z in the project's body axes.
+    """
     return tuple(_TOWARD[axis] for axis in axes)
 
 
@@ -61,25 +64,26 @@ AngleSigma = Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="10 d
 
 
 class OrbitFileSpec(Spec):
-    """An orbit in a file: SP3-c or d, CCSDS OEM, DIMAP, or CSV. What a file says itself may be left out here; else both
-    agree.
+    """Orbit in a file: SP3-c or d, CCSDS OEM, DIMAP, or CSV.
+
+    Keys that the file itself contains may be omitted; otherwise both must agree.
 
     Attributes
     ----------
     file : Reference
-        path.
+        Path of the file.
     satellite : Satellite | None
-        Which of the file's, where there are several.
+        Satellite, if the file has several.
     frame : OrbitFrame | None
-        Axes of positions and velocities; inertial ones need Earth orientation.
+        Reference frame of positions and velocities; inertial ones need Earth orientation.
     time_scale : TimeScale | None
-        What the clock shows.
+        Time scale of the clock.
     epoch : ClockReading | None
         Reading of that clock at 0 s, for tables with `time [s]`.
     leap_seconds : Literal['counted', 'skipped'] | None
-        Whether `time [s]` of a UTC clock counts those since its epoch; asked for where there are some.
+        Treatment of leap seconds since the epoch in `time [s]` of a UTC clock; required if there are any.
     offset : ClockOffset
-        Seconds to be added to the times.
+        Time to be added to the times, in seconds.
     """
 
     file: Reference
@@ -92,34 +96,34 @@ class OrbitFileSpec(Spec):
 
 
 class AttitudeFileSpec(Spec):
-    """An attitude in a file: CCSDS AEM, DIMAP, or CSV of quaternions or of roll, pitch and yaw.
+    """Attitude in a file: CCSDS AEM, DIMAP, or CSV of quaternions or of roll, pitch and yaw.
 
     Attributes
     ----------
     file : Reference
-        path.
+        Path of the file.
     satellite : Satellite | None
-        Which of the file's, where there are several.
+        Satellite, if the file has several.
     frame : TurnFrame | None
-        That the body is turned against; `orbital` has X forward, Z down, Y = Z x X.
+        Reference frame of the attitude; `orbital` has X forward, Z down, Y = Z x X.
     time_scale : TimeScale | None
-        What the clock shows.
+        Time scale of the clock.
     epoch : ClockReading | None
         Reading of that clock at 0 s, for tables with `time [s]`.
     leap_seconds : Literal['counted', 'skipped'] | None
-        Whether `time [s]` of a UTC clock counts those since its epoch; asked for where there are some.
+        Treatment of leap seconds since the epoch in `time [s]` of a UTC clock; required if there are any.
     offset : ClockOffset
-        Seconds to be added to the times.
+        Time to be added to the times, in seconds.
     scalar : Literal['last', 'first'] | None
-        Where a quaternion's scalar part stands, the cosine of half the turn.
+        Position of a quaternion's scalar part, the cosine of half the rotation angle.
     turns : Literal['body_to_frame', 'frame_to_body'] | None
-        What the quaternion does to the components of a vector, v' = q v q*.
+        Sense of the quaternion: transformation of the components of a vector by v' = q v q*.
     body_axes : BodyAxes
-        What x, y and z of the file's body point to in flight, as [forward, right, down].
+        Directions of the file's body x, y and z in flight, as [forward, right, down].
     sequence : Sequence | None
-        Of roll about x, pitch about y, yaw about z: `xyz` means v_frame = Rx(roll) Ry(pitch) Rz(yaw) v_body.
+        Sequence of roll about x, pitch about y, yaw about z: `xyz` means v_frame = Rx(roll) Ry(pitch) Rz(yaw) v_body.
     nadir, steering : Literal['geodetic', 'geocentric'] | None
-        Of the orbital frame, as in `attitude` of a simulated pass.
+        Definition of the orbital frame, as in `attitude` of a simulated pass.
     """
 
     file: Reference
@@ -143,13 +147,13 @@ class PlatformFilesSpec(Spec):
     Attributes
     ----------
     orbit : OrbitFileSpec
-        Its file.
+        File of the orbit.
     attitude : AttitudeFileSpec
-        Its file.
+        File of the attitude.
     earth_orientation : Reference | None
-        Table of the IERS (finals2000A, C04) or CSV; for inertial frames.
+        Table of the IERS (finals2000A, C04) or CSV, for inertial frames.
     earth : EarthSpec | None
-        What takes its place, of one moment.
+        Earth rotation parameters of one moment, in place of that table.
     """
 
     orbit: OrbitFileSpec
@@ -166,7 +170,7 @@ class PlatformFilesSpec(Spec):
 
 
 class _HeightsFileSpec(Spec):
-    """A file with heights, and what they are above."""
+    """File with heights and their reference surface."""
 
     file: Reference
     crs: Text | None = None
@@ -187,17 +191,18 @@ class GroundFileSpec(_HeightsFileSpec):
     Attributes
     ----------
     file
-        path.
+        Path of the file.
     crs
-        Of the coordinates, as PROJ knows it: EPSG:4979 and EPSG:4978 say all, EPSG:4326 and EPSG:32650 need `heights`.
+        Coordinate reference system, in PROJ's notation: EPSG:4979 and EPSG:4978 are complete, EPSG:4326 and EPSG:32650
+        also need `heights`.
     heights
-        Above the ellipsoid, or above the geoid of `geoid`.
+        Reference surface of the heights: the ellipsoid, or the geoid of `geoid`.
     geoid
-        Grid of heights of the geoid above the ellipsoid, GeoTIFF or GTX.
+        Grid of geoid heights above the ellipsoid, GeoTIFF or GTX.
     sigma : tuple[PointSigma, PointSigma] | None
-        Of points that the file gives none for: east and north, and up, metres.
+        Standard deviations [east and north, up] of points for which the file has none, in metres.
     sigma_axes : Literal['xyz', 'enu']
-        Of the three sigmas of a .gcp: Earth-fixed x, y, z as that program takes them, or east, north, up.
+        Axes of the three sigmas of a .gcp: Earth-fixed x, y, z as that program uses them, or east, north, up.
     """
 
     sigma: tuple[PointSigma, PointSigma] | None = None
@@ -205,51 +210,51 @@ class GroundFileSpec(_HeightsFileSpec):
 
 
 class RasterFileSpec(_HeightsFileSpec):
-    """An orthophoto or an elevation model as GeoTIFF.
+    """Orthophoto or elevation model as GeoTIFF.
 
     Attributes
     ----------
     file
-        path.
+        Path of the file.
     crs
-        Of a file that does not say it.
+        Coordinate reference system, for a file that does not contain it.
     heights
-        Of an elevation model, above the ellipsoid, or above the geoid of `geoid`.
+        Reference surface of an elevation model: the ellipsoid, or the geoid of `geoid`.
     geoid
-        As for ground points.
+        Grid of geoid heights above the ellipsoid, GeoTIFF or GTX.
     band : Whole
-        Of the file that is read, counted from 1.
+        Band of the file that is read, counted from 1.
     """
 
     band: Annotated[Whole, Field(ge=1, le=1000)] = 1
 
 
 _FILE_NAMES = ("file", "geoid", "earth_orientation")
-"""Keys that name files of other people's formats."""
+"""Keys of files in other formats."""
 FILE_KEYS = ("platform", "orbit", "attitude", "lines", "ground", "image_points", "tie_points")
-"""Keys of a pass that name its tables."""
+"""Keys of a pass for its tables."""
 
 
 def with_absolute_files(
     spec: SpecType, folder: Path | None = None, owner: Spec | None = None, key: KeyPath = ()
 ) -> SpecType:
-    """Make the paths of all files of measurements that a specification names absolute.
+    """Return a specification with absolute paths of all measurement files.
 
     Parameters
     ----------
     spec : SpecType
-        As it was read.
+        Specification as read.
     folder : Path | None
-        That relative paths start from; None for that of the file it was read from.
+        Folder from which relative paths start; None for that of the specification's file.
     owner : Spec | None
-        In which it stands, if the files have to be there.
+        Specification that contains it, if the files must exist.
     key : KeyPath
-        Where it stands there.
+        Key path of the specification in the owner.
 
     Raises
     ------
     InputError
-        a file that has to be there is not, told at the owner's key.
+        A file that must exist is missing; reported at the owner's key.
     """
     place = Path(spec.source.file).parent if folder is None else folder
     changes: dict[str, Any] = {}
@@ -268,15 +273,15 @@ def with_absolute_files(
 
 
 class QuaternionSpec(Spec):
-    """What the four numbers q1, q2, q3, q4 of an attitude mean.
+    """Meaning of the four numbers q1, q2, q3, q4 of an attitude.
 
     Attributes
     ----------
     scalar : Literal['first', 'last']
-        Whether the scalar part (the cosine of half the turn) is the first or the last of the four.
+        Position of the scalar part (the cosine of half the rotation angle) among the four.
     turns : Literal['body_to_frame', 'frame_to_body']
-        What the quaternion does to the components of a vector, v' = q v q*: from body axes into those of the frame, or
-        the other way.
+        Sense of the quaternion: v' = q v q* transforms the components of a vector from body axes to the frame, or from
+        the frame to body axes.
     """
 
     scalar: Literal["first", "last"]
@@ -284,28 +289,27 @@ class QuaternionSpec(Spec):
 
 
 class ConventionsSpec(Spec):
-    """How the numbers of the tables are to be read. All must be said; quaternion and body axes where a table
-    holds quaternions.
+    """Conventions of the tables. All are required; quaternion and body axes only if a table has quaternions.
 
     Attributes
     ----------
     frame : Literal['itrs']
-        Axes of positions, velocities and quaternions; velocities are those against these axes. itrs is Earth-fixed (WGS
-        84, CGCS2000 and ITRF agree with it to some centimetres).
+        Reference frame of positions, velocities and quaternions; velocities are relative to it. itrs is Earth-fixed
+        (WGS 84, CGCS2000 and ITRF agree with it to some centimetres).
     quaternion : QuaternionSpec | None
-        Order and sense; of tables.
+        Order and sense of the quaternions in tables.
     body_axes : BodyAxes | None
-        What x, y and z of the quaternions' body point to in flight, as [forward, right, down].
+        Directions of the quaternions' body x, y and z in flight, as [forward, right, down].
     time_scale : Literal['utc']
-        In which the epochs of the passes are written. Times in tables are SI seconds from them.
+        Time scale of the epochs of the passes. Times in tables are SI seconds from them.
     line_moment : Literal['start', 'middle', 'end']
-        Which moment of its exposure the time of a line is.
+        Moment of a line's exposure to which its time refers.
     centre : Literal['integer', 'half']
-        Image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
+        Image coordinate of the centre of pixel (or line) n: n, or n + 0.5.
     first_pixel : int
         Number of the first pixel of a line.
     first_pixel_sees : Literal['right', 'left']
-        To which side of the track the first pixel looks.
+        Side of the track that the first pixel images.
     """
 
     frame: Literal["itrs"]
@@ -319,27 +323,27 @@ class ConventionsSpec(Spec):
 
 
 class PassFilesSpec(Spec):
-    """The tables of a pass, CSV; paths are relative to the file that names them.
+    """Tables of a pass, CSV files with paths relative to the file that lists them.
 
     Attributes
     ----------
     epoch : UtcTime
-        Of the times in all tables.
+        Epoch of the times in all tables.
     platform : Reference | PlatformFilesSpec | None
-        Orbit and attitude in one table, or files of other formats (SP3, OEM, AEM ...) with what they do not say
-        themselves; or each in its own table:
+        Orbit and attitude in one table, or files of other formats (SP3, OEM, AEM ...) with the conventions that they do
+        not contain; alternatively `orbit` and `attitude`.
     orbit : Reference | None
-        Time, x, y, z and perhaps vx, vy, vz.
+        Table of time, x, y, z and optionally vx, vy, vz.
     attitude : Reference | None
-        Time, q1, q2, q3, q4.
+        Table of time, q1, q2, q3, q4.
     lines : Reference
-        When the lines of each line camera were exposed.
+        Exposure times of the lines of each line camera.
     ground : Reference
-        Points on the ground, with coordinates, sigmas and roles.
+        Ground points with coordinates, sigmas and roles.
     image_points : Reference
-        Where the line cameras see them.
+        Image coordinates of the ground points in the line cameras.
     tie_points : Reference | None
-        Likewise, of points without known coordinates; None for none.
+        Image coordinates of points without known coordinates; by default there are none.
     """
 
     epoch: UtcTime
@@ -362,7 +366,7 @@ class PassFilesSpec(Spec):
 
     @property
     def files(self) -> dict[str, str]:
-        """Key -> what it names, for all that are given; without files of other formats."""
+        """Key -> path of every table; without files of other formats."""
         found = {name: getattr(self, name) for name in FILE_KEYS}
         return {name: file for name, file in found.items() if isinstance(file, str)}
 
@@ -376,9 +380,9 @@ class OrbitDataSpec(Spec):
     Attributes
     ----------
     conventions : ConventionsSpec
-        Of all tables.
+        Conventions of all tables.
     passes : Passes
-        By name, of the pass or of the field that it passes.
+        Name of the pass, or of the field over which it leads -> its tables.
     """
 
     conventions: ConventionsSpec
@@ -386,16 +390,16 @@ class OrbitDataSpec(Spec):
 
 
 class OrbitReadingsSpec(Spec):
-    """What is known of the errors of the orbit's readings, along X, Y and Z of the orbital frame.
+    """Accuracy of the orbit readings along X, Y and Z of the orbital frame.
 
     Attributes
     ----------
     noise : LengthSigmas
-        Standard deviation of a reading, independent from reading to reading, metres.
+        Standard deviation of a reading, independent from reading to reading, in metres.
     drift : LengthSigmas
-        Standard deviation of what the whole pass has in common, metres.
+        Standard deviation of an error common to the whole pass, in metres.
     interval : Interval | None
-        Between readings that are independent, seconds; None for the median of the table.
+        Interval between independent readings, in seconds; by default the median interval of the table.
     """
 
     noise: LengthSigmas
@@ -404,21 +408,21 @@ class OrbitReadingsSpec(Spec):
 
 
 class AttitudeReadingsSpec(Spec):
-    """What is known of the errors of the attitude's readings, about X, Y and Z of the body. Biases are solved for.
+    """Accuracy of the attitude readings about body X, Y and Z. Biases are estimated.
 
     Attributes
     ----------
     noise : AngleSigmas
-        Standard deviation of a reading, independent from reading to reading, radians.
+        Standard deviation of a reading, independent from reading to reading, in radians.
     slow : SlowErrorsSpec
-        What changes within a pass.
+        Errors that change within a pass.
     drift : AngleSigmas | None
-        Standard deviation of the rate of each pass, by what it changes in a second, radians; zeros where there is none,
-        None where nobody knows.
+        Standard deviation of a constant rate in each pass, as the change in a second, in radians; zeros for no rate,
+        and by default unknown.
     walk : AngleSigmas
-        Standard deviation of what a random walk gains in a second, radians.
+        Standard deviation of the increment of a random walk in a second, in radians.
     interval : Interval | None
-        Between readings that are independent, seconds; None for the median of the table.
+        Interval between independent readings, in seconds; by default the median interval of the table.
     """
 
     noise: AngleSigmas
@@ -429,16 +433,17 @@ class AttitudeReadingsSpec(Spec):
 
 
 class ReadingErrorsSpec(Spec):
-    """Standard deviations of the readings; those of points stand in their tables.
+    """Standard deviations of the orbit and attitude readings; those of points are in their tables.
 
     Attributes
     ----------
     gps : OrbitReadingsSpec
-        Of the orbit.
+        Accuracy of the orbit.
     star_tracker : AttitudeReadingsSpec
-        Of the attitude.
+        Accuracy of the attitude.
     season : AngleSigmas
-        By how much biases may differ from pass to pass about body X, Y, Z, radians; used for warnings only.
+        Standard deviation of the change of biases from pass to pass about body X, Y, Z, in radians; used for warnings
+        only.
     """
 
     gps: OrbitReadingsSpec
@@ -447,43 +452,40 @@ class ReadingErrorsSpec(Spec):
 
     @property
     def switched_on(self) -> bool:
-        """Measurements have errors."""
+        """True: measurements have errors."""
         return True
 
     @property
     def datum(self) -> tuple[float, float, float]:
-        """A wrong datum of which the analysis knew would not be one."""
+        """Known datum shift: zero, since the analysis would correct a known one."""
         return (0.0, 0.0, 0.0)
 
 
 class FixedTestSpec(PayloadTestSpec):
-    """A test of a payload in which nothing is drawn."""
+    """Test of a payload without random numbers."""
 
     @property
     def seed(self) -> int:
-        """Any: nothing is drawn."""
+        """Seed, without effect."""
         return 0
 
 
 class MeasuredTestSpec(FixedTestSpec):
-    """What all tests on measurements say.
+    """Base of all tests on measurements.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     camera
-        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+        Payload as calibrated in the laboratory: a name in scenes/library/payloads, or the path of your file.
     data : Reference | None
-        Folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
+        Folder with a ``data.yaml``, or the path of such a file; alternatively `conventions` and `passes` are given
+        here.
     conventions : ConventionsSpec | None
-        Of all tables.
+        Conventions of all tables.
     passes : Passes | None
-        By name.
+        Name -> tables of a pass.
     effects : EffectsSpec
-        On the light, that are in the image points; `corrected` takes them out.
+        Effects on the light path that the image points contain; `corrected` makes the analysis correct them.
     """
 
     data: Reference | None = None
@@ -504,38 +506,26 @@ class MeasuredTestSpec(FixedTestSpec):
 
 
 class MeasuredCalibrationSpec(MeasuredTestSpec):
-    """A calibration on measured passes.
+    """In-orbit calibration from measured passes.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
-    camera
-        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
-    data
-        Folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
-    conventions
-        Of all tables.
-    passes
-        By name.
-    effects
-        On the light, that are in the image points; `corrected` takes them out.
     schemes : tuple[tuple[Name, ...], ...]
-        Passes whose parameters are averaged; each by itself is added.
+        Schemes: each is a list of passes whose parameters are averaged; the program adds a scheme in which each pass
+        uses its own parameters.
     errors : ReadingErrorsSpec
-        Of the readings of orbit and attitude.
+        Accuracy of the readings of orbit and attitude.
     screening : Literal['robust', 'none']
-        Whether image points are given robust weights and those with gross errors left out.
+        Treatment of image points: `robust` weights with rejection of gross errors, or `none`.
     ties : Literal['with_control', 'apart']
-        Whether tie points calibrate together with the control points, or are kept apart for the strips.
+        Use of tie points: `with_control`, they calibrate together with the control points; `apart`, they only serve the
+        strip adjustment.
     strip : Flag
-        Whether every pass is adjusted on its tie points before check points are intersected.
+        True to adjust every pass on its tie points before check points are intersected.
     launch : LaunchSpec
-        How much of a change is no surprise.
+        Prior of the change by the launch.
     limits : MapLimitsSpec
-        For the verdict.
+        Largest RMS errors for the verdict.
     """
 
     schemes: tuple[tuple[Name, ...], ...]
@@ -548,30 +538,17 @@ class MeasuredCalibrationSpec(MeasuredTestSpec):
 
 
 class MeasuredAngleSpec(MeasuredTestSpec):
-    """Intersection angles from the ground points that the lines of one moment see.
+    """Intersection angles from measured ground points that the lines image at one moment.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
-    camera
-        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
-    data
-        Folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
-    conventions
-        Of all tables.
-    passes
-        By name.
-    effects
-        On the light, that are in the image points; `corrected` takes them out.
     angles : Angles
-        Name -> the two lines that the angle lies between; None for the usual ones.
+        Name -> the two lines between which the angle lies; by default alpha [forward, nadir] and beta [nadir, backward]
+        if the camera has these lines, or alpha between the lines of a camera with two.
     time : Moment | None
-        The moment, seconds from the pass's epoch; None for the middle of the image points of each line.
+        Time from the pass's epoch, in seconds; by default the middle of the image points of each line.
     errors : ReadingErrorsSpec
-        Of the readings of orbit and attitude.
+        Accuracy of the readings of orbit and attitude.
     """
 
     angles: Angles = None
@@ -588,28 +565,14 @@ class MeasuredAngleSpec(MeasuredTestSpec):
 
 
 class MeasuredJitterSpec(MeasuredTestSpec):
-    """A search for jitter in points that several lines of a pass saw.
+    """Search for jitter by measured points that several lines of a pass observed.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
-    camera
-        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
-    data
-        Folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
-    conventions
-        Of all tables.
-    passes
-        By name.
-    effects
-        On the light, that are in the image points; `corrected` takes them out.
     lines : SomeLines
-        That are used, by name; None for all that have points.
+        Names of the lines that are used; by default all that have points.
     search : JitterSearchSpec
-        How jitter is sought.
+        Settings of the search.
     """
 
     lines: SomeLines = None
@@ -617,19 +580,19 @@ class MeasuredJitterSpec(MeasuredTestSpec):
 
 
 class LineTimesFileSpec(Spec):
-    """When lines were exposed: a table of camera, line and time.
+    """Exposure times of lines: a table of camera, line and time.
 
     Attributes
     ----------
     file : Reference
-        Path, CSV with columns `camera`, `line` and `time [s]` or `date_time`; or the DIMAP file of a scene, for a
-        camera of one line.
+        Path of a CSV file with columns `camera`, `line` and `time [s]` or `date_time`; or of the DIMAP file of a scene,
+        for a camera of one line.
     time_scale : TimeScale
-        Of the clock.
+        Time scale of the clock.
     epoch : ClockReading | None
         Reading of that clock at 0 s, for tables with `time [s]`.
     moment : Literal['start', 'middle', 'end']
-        Which moment of its exposure a line's time is.
+        Moment of a line's exposure to which its time refers.
     """
 
     file: Reference
@@ -639,20 +602,20 @@ class LineTimesFileSpec(Spec):
 
 
 class ImagePointsFileSpec(Spec):
-    """Where lines see ground points: a table of point, camera, line, pixel and their sigmas.
+    """Image coordinates of ground points: a table of point, camera, line, pixel and their sigmas.
 
     Attributes
     ----------
     file : Reference
-        Path, CSV with columns `point`, `camera`, `line`, `pixel`, `line_sigma`, `pixel_sigma` and perhaps
-        `correlation`; or the .gcp of the Ames Stereo Pipeline that is the file of the ground points, with images that
-        are called as the lines, `nadir.tif`.
+        Path of a CSV file with columns `point`, `camera`, `line`, `pixel`, `line_sigma`, `pixel_sigma` and optionally
+        `correlation`; or of the .gcp of the Ames Stereo Pipeline with the ground points, whose images are named as the
+        lines, `nadir.tif`.
     centre : Literal['integer', 'half']
-        Image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
+        Image coordinate of the centre of pixel (or line) n: n, or n + 0.5.
     first_pixel : Whole
         Number of the first pixel of a line.
     first_pixel_sees : Literal['right', 'left']
-        To which side of the track the first pixel looks.
+        Side of the track that the first pixel images.
     """
 
     file: Reference
@@ -662,20 +625,20 @@ class ImagePointsFileSpec(Spec):
 
 
 class UncertaintySpec(Spec):
-    """How wrong camera and platform may be, standard deviations: what hides a convention, if it is large enough.
+    """Uncertainty of camera and platform, as standard deviations; a large one can hide a wrong convention.
 
     Attributes
     ----------
     attitude : AngleSigma
-        Of the measured attitude with the camera's mounting, about each axis.
+        Standard deviation of the measured attitude including the camera's mounting, about each axis, in radians.
     position : PointSigma
-        Of the orbit, along each axis.
+        Standard deviation of the orbit along each axis, in metres.
     interior : Number
-        Of each line's place in the focal plane, pixels along and across it.
+        Standard deviation of each line's position in the focal plane, along and across the line, in pixels.
     scale : Number
-        Of each line's principal distance, relative.
+        Relative standard deviation of each line's principal distance.
     time : float
-        Of the line times against those of orbit and attitude.
+        Standard deviation of the line times relative to those of orbit and attitude, in seconds.
     """
 
     attitude: AngleSigma = 3e-4
@@ -686,32 +649,28 @@ class UncertaintySpec(Spec):
 
 
 class OrbitCheckSpec(FixedTestSpec):
-    """A check of the conventions of a pass in files.
+    """Check of the conventions of a pass in files.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     camera
-        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+        Payload as calibrated in the laboratory: a name in scenes/library/payloads, or the path of your file.
     platform : PlatformFilesSpec
-        Orbit and attitude.
+        Files of orbit and attitude.
     lines : LineTimesFileSpec
-        Times of the lines.
+        File of the exposure times of the lines.
     ground : GroundFileSpec
-        Points on the ground.
+        File of the ground points.
     image_points : ImagePointsFileSpec
-        Where the lines see them.
+        File of their image coordinates.
     effects : LightEffectsSpec
-        What happens to the light between ground and camera.
+        Effects on the light path between ground and camera.
     uncertainty : UncertaintySpec
-        How wrong camera and platform may be.
+        Uncertainty of camera and platform.
     points : Whole
-        Most of each line that are used.
+        Largest number of points of each line that are used.
     shown : Whole
-        Places of points that are printed for each reading.
+        Number of points whose computed position is shown for each combination of conventions.
     """
 
     platform: PlatformFilesSpec
@@ -725,14 +684,14 @@ class OrbitCheckSpec(FixedTestSpec):
 
 
 class ImageWindowSpec(Spec):
-    """A part of an image.
+    """Window of an image.
 
     Attributes
     ----------
     row, column : Whole
-        Of the file, of its first pixel, counted from 0.
+        Row or column in the file of the window's first pixel, counted from 0.
     rows, columns : Whole
-        Its size.
+        Size of the window in this direction, in pixels.
     """
 
     row: Annotated[Whole, Field(ge=0)]
@@ -742,22 +701,22 @@ class ImageWindowSpec(Spec):
 
 
 class LineImageFileSpec(Spec):
-    """A line's image in a file.
+    """Image of a line in a file.
 
     Attributes
     ----------
     file : Reference
-        Path, TIFF; a georeference in it is not used.
+        Path of a TIFF; a georeference in it is not used.
     band : Whole
-        That is read, counted from 1.
+        Band that is read, counted from 1.
     first_line : Whole
         Number, in the table of times, of the image's first row.
     first_pixel : Whole
         Pixel of the line, counted from 0, of the image's first column.
     first_pixel_sees : str
-        To which side of the track the first column looks.
+        Side of the track that the first column images: right or left.
     window : ImageWindowSpec | None
-        Part that is matched; None for all.
+        Window that is matched; by default the whole image.
     """
 
     file: Reference
@@ -769,32 +728,30 @@ class LineImageFileSpec(Spec):
 
 
 class OrbitMatchSpec(FixedTestSpec):
-    """Points of an orthophoto, and tie points, sought in line images.
+    """Measurement of points of an orthophoto, and of tie points, in line images by matching.
 
     Attributes
     ----------
     name
-        As the file is called; also of the pass in what is exported.
-    description
-        For people.
+        Name of the test, and of the pass in exported files.
     camera
-        Name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+        Payload as calibrated in the laboratory: a name in scenes/library/payloads, or the path of your file.
     platform : PlatformFilesSpec
-        Orbit and attitude.
+        Files of orbit and attitude.
     lines : LineTimesFileSpec
-        Times of the lines.
+        File of the exposure times of the lines.
     images : Named[LineImageFileSpec]
         Line -> its image.
     orthophoto : RasterFileSpec
-        Of the ground.
+        Orthophoto of the ground.
     dem : RasterFileSpec
-        Of the ground.
+        Elevation model of the ground.
     control_sigma : tuple[PointSigma, PointSigma]
-        Of places of the orthophoto with their heights: in plan, each axis, and in height, metres.
+        Standard deviations of points of the orthophoto with their heights, [each axis in plan, height], in metres.
     effects : LightEffectsSpec
-        What happens to the light between ground and camera.
+        Effects on the light path between ground and camera.
     points : ImagePointsSpec
-        How many, and how they are matched.
+        Number of points and settings of the matching.
     """
 
     platform: PlatformFilesSpec

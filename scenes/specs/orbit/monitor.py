@@ -1,6 +1,7 @@
-"""On-board monitoring and what it buys on the ground (papers 001, 000, 003), as files in scenes/orbit: a stereo pair
-whose cameras move along an orbit, monitored at an interval or in a loop with mechanisms; points intersected without
-control.
+"""On-board monitoring and its benefit on the ground (papers 001, 000, 003).
+
+The cameras of a stereo pair move along an orbit; they are monitored at an interval, or in a closed loop with
+mechanisms; ground points are intersected without control.
 """
 
 import math
@@ -10,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from optics.numerics.array_math import number_of
+from optics.numerics.array_math import index_of_value
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment, no_such_time
 from scenes.specs.disturbances import JobDisturbances, component_named
@@ -27,11 +28,11 @@ from scenes.yaml.unit_fields import Quantity
 from scenes.yaml.units import ANGLE, LENGTH, MOMENT, Kind, parse_quantity
 
 _EVEN = 1e-6
-"""Seconds; steps between times that differ by less are equal."""
+"""Largest difference of time steps that count as equal, in seconds."""
 _WHOLE = 1e-9
-"""Share of a step by which a range is rounded to whole ones."""
+"""Tolerance, as a share of a step, for rounding a range to whole steps."""
 _KINDS: dict[str, Kind] = {"rotate": ANGLE, "shift": LENGTH}
-"""Kind of a mechanism's motion -> what its steps measure."""
+"""Kind of a mechanism's motion -> kind of quantity of its steps."""
 _QUANTITIES: dict[str, Kind] = {"d_alpha": ANGLE, "d_beta": ANGLE, "d_gamma": ANGLE, "d_f": LENGTH, "defocus": LENGTH}
 
 Span = Annotated[float, Quantity(MOMENT, smallest="0 s", largest="100000 h")]
@@ -40,7 +41,7 @@ Frames = Annotated[Whole, Field(ge=1, le=1000)]
 Repeats = Annotated[Whole, Field(ge=8, le=500)]
 Parameter = Literal["d_alpha", "d_beta", "d_gamma", "d_f"]
 PARAMETERS: tuple[Parameter, ...] = ("d_alpha", "d_beta", "d_gamma", "d_f")
-"""Changes of a camera that the monitor gives."""
+"""Changes of a camera that the monitor measures."""
 
 
 def _once(names: tuple[Parameter, ...]) -> tuple[Parameter, ...]:
@@ -50,22 +51,23 @@ def _once(names: tuple[Parameter, ...]) -> tuple[Parameter, ...]:
 
 
 class MotionSpec(Spec):
-    """How a body moves along the orbit: what mounts do and temperatures of this model do not say.
+    """Motion of a body along the orbit from other causes than the temperatures of the model, such as its mounts.
 
     Attributes
     ----------
     rotate : Rotation
-        Rotation vector in the body's own frame about the pivot, radians; comes before the shift.
+        Rotation vector in the body's frame about the pivot, in radians; the rotation precedes the shift.
     shift : Shift
-        In the body's own frame, metres.
+        Shift in the body's frame, in metres.
     pivot : Name
         Name of the body's point that the rotation leaves in place.
     begin : Moment
-        When it begins, seconds.
+        Start time, in seconds.
     duration : Span
-        Over which it grows evenly to `rotate` and `shift`, where it stays, seconds; 0 for a step.
+        Duration of the linear growth to `rotate` and `shift`, in seconds; 0 for a step.
     period : Interval | None
-        Instead of `duration`, of a swing `rotate` x sin(2 pi (t - begin)/period), seconds, which lasts always.
+        Period of an oscillation `rotate` x sin(2 pi (t - begin)/period) at all times, in place of `duration`, in
+        seconds.
     """
 
     rotate: Rotation = (0.0, 0.0, 0.0)
@@ -84,7 +86,7 @@ class MotionSpec(Spec):
         return self
 
     def share(self, time: float) -> float:
-        """Share of `rotate` and `shift` that is there at a time in seconds."""
+        """Return the share of `rotate` and `shift` at a time in seconds."""
         passed = time - self.begin
         if self.period is not None:
             return math.sin(2.0 * math.pi * passed / self.period)
@@ -94,26 +96,27 @@ class MotionSpec(Spec):
 
     @property
     def furthest(self) -> PlainPerturbationSpec:
-        """The whole of the motion as a perturbation."""
+        """Full motion as a perturbation."""
         return PlainPerturbationSpec.model_construct(rotate=self.rotate, shift=self.shift, pivot=self.pivot)
 
 
 class GroundSpec(Spec):
-    """Check points at every time of the course, at random places that both lines see; their means lie where the two
-    views are at equal times before and after.
+    """Check points at every time of the course, at random positions that both lines image.
+
+    They are centred where the two views are at equal times before and after.
 
     Attributes
     ----------
     points : Count
-        At every time.
+        Number of points at every time.
     first, last : Number
-        Ends of the part of the second camera's line that they lie on, pixels from 0.
+        First or last pixel of the part of the second camera's line on which the points lie, counted from 0.
     length : FieldLength
-        Of the piece of the strip along the track, metres.
+        Length of the area along the track, in metres.
     height : TerrainHeight
-        Mean above the ellipsoid, metres.
+        Mean height above the ellipsoid, in metres.
     relief : Relief
-        Heights lie evenly within this on either side of the mean, metres.
+        Half range of the heights, which are uniformly distributed about the mean, in metres.
     """
 
     points: Annotated[Count, Field(ge=2)] = 60
@@ -130,18 +133,16 @@ class GroundSpec(Spec):
 
 
 class MonitorErrorsSpec(ErrorsSpec):
-    """Errors of what is measured; orbit and attitude are exact unless given.
+    """Measurement errors; orbit and attitude are exact by default.
+
+    The monitor does not detect attitude errors that both cameras share.
 
     Attributes
     ----------
-    gps
-        Of the orbit.
-    star_tracker
-        Of the attitude. What both cameras share of it the monitor does not see.
     image : Number
-        Standard deviation of an image point along and across the line, pixels.
+        Standard deviation of an image point along and across the line, in pixels.
     monitor : Flag
-        Noise of the monitor's frames; false for expected images without noise or rounding.
+        True for noise in the monitor's frames; false for expected images without noise or rounding.
     switched_on : Flag
         False for exact image points, orbit and attitude, and monitor frames without noise.
     """
@@ -152,32 +153,32 @@ class MonitorErrorsSpec(ErrorsSpec):
 
 
 class CorrectionSpec(Spec):
-    """A correction of one quantity of the posterior.
+    """Correction of one quantity of the posterior estimate.
 
-    With every reading the command changes by `gain` times what the posterior says is left of the quantity, over what
-    the mechanism does to it.
+    At every reading the command changes by `gain` times the estimated remaining error of the quantity, divided by the
+    response of the quantity to the mechanism.
 
     Attributes
     ----------
     camera : Name
-        Whose quantity it is.
+        Camera to which the quantity belongs.
     quantity : Literal['d_alpha', 'd_beta', 'd_gamma', 'd_f', 'defocus']
-        `d_alpha`, `d_beta`, `d_gamma`, `d_f`, or `defocus`, best focus less line CCD.
+        Quantity: `d_alpha`, `d_beta`, `d_gamma`, `d_f`, or `defocus`, best focus minus line CCD.
     mechanism : Text | None
-        The motion of a body that corrects it, in words without amount: `forward/focal_plane shift z`; by default the
-        line of sight is corrected in the processing of the images on the ground, and no body moves.
+        Motion of a body that corrects the quantity, as text without amount: `forward/focal_plane shift z`. By default
+        the line of sight is corrected in the image processing on the ground, and no body moves.
     gain : Number
-        Share of what is left that one reading corrects.
+        Share of the remaining error that one reading corrects.
     delay : Whole
-        Readings after which a command has its effect; 0 for at once, before the images of that moment.
+        Number of readings until a command takes effect; 0 for immediately, before the images of that time.
     step : Text | None
-        The mechanism moves by whole steps, with unit; by default it moves by any amount.
+        Step of the mechanism, with unit; by default any amount is possible.
     range : Text | None
-        To either side of where it stands at the beginning, with unit; none by default.
+        Range of the mechanism to either side of its initial position, with unit; unlimited by default.
     dead_band : Text | None
-        What is left and is smaller is left alone, in the quantity's unit.
+        Dead band: smaller remaining errors are not corrected; in the quantity's unit. Zero by default.
     response : Number
-        What the mechanism does over what it is known to do; the estimate does not know it.
+        True response of the mechanism relative to the nominal one; the estimate does not know it.
     """
 
     camera: Name
@@ -237,32 +238,32 @@ class CorrectionSpec(Spec):
 
     @property
     def smallest(self) -> float | None:
-        """The step, rad or m."""
+        """Step, in rad or m."""
         return self._size("step")
 
     @property
     def largest(self) -> float | None:
-        """The range to either side, rad or m; of a mechanism of steps that of its whole steps."""
+        """Range to either side, in rad or m; for a mechanism with steps a whole number of them."""
         reach, step = self._size("range"), self._size("step")
         return reach if reach is None or step is None else step * math.floor(reach / step + _WHOLE)
 
     @property
     def band(self) -> float:
-        """The dead band, rad or m of the quantity."""
+        """Dead band, in rad or m of the quantity."""
         return self._size("dead_band") or 0.0
 
 
 class ReadingsSpec(Spec):
-    """When the spots are read, and images are taken just after.
+    """Times at which the spots are read; images are taken immediately after.
 
     Attributes
     ----------
     begin : Moment
-        Of the first, seconds from the orbit's epoch.
+        Time of the first reading from the orbit's epoch, in seconds.
     every : Interval
-        From one to the next.
+        Interval between readings, in seconds.
     count : Whole
-        How many.
+        Number of readings.
     """
 
     begin: Moment = 0.0
@@ -271,7 +272,7 @@ class ReadingsSpec(Spec):
 
     @property
     def times(self) -> tuple[float, ...]:
-        """Seconds from the orbit's epoch."""
+        """Times of the readings from the orbit's epoch, in seconds."""
         return tuple(self.begin + self.every * k for k in range(self.count))
 
 
@@ -281,13 +282,13 @@ class LoopImagesSpec(Spec):
     Attributes
     ----------
     times : tuple[Moment, ...]
-        Of these readings, seconds from the orbit's epoch.
+        Times of these readings from the orbit's epoch, in seconds.
     side : Side
-        Lines and pixels of every image.
+        Number of lines and of pixels of every image.
     ground : SceneGroundSpec
-        What is there.
+        True ground.
     points : ImagePointsSpec
-        How points of the second camera's image are sought in the first one's; `tie` says how many.
+        Settings of matching points of the second camera's image in the first one's; `tie` is their number.
     """
 
     times: Annotated[tuple[Moment, ...], Field(min_length=1, max_length=20)]
@@ -303,17 +304,17 @@ class LoopImagesSpec(Spec):
 
 
 class MechanismsSpec(Spec):
-    """Mechanisms that point and refocus by what the monitor's readings say, beside the same pair left alone.
+    """Closed loop: mechanisms point and refocus by the monitor's readings. The results are compared with the open loop.
 
     Attributes
     ----------
     readings : ReadingsSpec | None
-        When the spots are read where the file has no course: amounts of what is stated to move are then drawn by its
-        laws in time. With a course they are read at each of its times.
+        Times of the readings, if the file has no course: the motions are then drawn from the disturbances and their
+        time laws. With a course the spots are read at each of its times.
     corrections : Named[CorrectionSpec]
-        Name -> what acts on what the readings say.
+        Name -> correction by the readings.
     images : LoopImagesSpec | None
-        Pairs of line images; none without this section.
+        Pairs of line images; by default there are none.
     """
 
     readings: ReadingsSpec | None = None
@@ -322,61 +323,58 @@ class MechanismsSpec(Spec):
 
 
 class OrbitMonitorSpec(TitledSpec):
-    """Height errors along an orbit with and without on-board monitoring, or with mechanisms that act on its readings.
+    """Height errors along an orbit with and without on-board monitoring, or with mechanisms controlled by its readings.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     instrument : Ref
-        Name in scenes/library/instruments or path of a file; two cameras with monitors.
+        Instrument with two or more cameras and their monitors: a name in scenes/library/instruments, or the path of
+        your file.
     cameras : tuple[Name, ...] | None
-        The two that make the stereo pair; the first is turned against the second. All of the instrument's when it has
-        two.
+        Two cameras of the stereo pair; the rotation of the first is relative to the second. By default those of an
+        instrument with two.
     perturb : Paths[PlainPerturbationSpec]
-        Node -> a constant perturbation against the nominal instrument, as in a job.
+        Node -> constant perturbation relative to the nominal instrument, as in a job.
     course : CourseSpec | None
-        Evenly spaced times from the orbit's epoch, with temperatures. Mechanisms have `readings` in its place where
-        amounts are drawn.
+        Evenly spaced times from the orbit's epoch, with temperatures. Tests with `mechanisms.readings` have no course.
     motion : Paths[MotionSpec]
-        Node -> how it moves, which no estimate knows.
+        Node -> true motion, unknown to the estimates.
     reference : Moment | None
-        One of the times, at which the cameras were calibrated and the monitor's reference images were taken.
+        Time of the course at which the cameras were calibrated and the monitor's reference images were taken, in
+        seconds.
     disturbances : JobDisturbances | None
-        What is expected to move, and how it goes on in time, as in a job: the monitor's values and their sigmas rest on
-        it. The instrument's by default.
+        Expected disturbances with their time laws, as in a job, on which the monitor's values and their sigmas are
+        based; by default the instrument's.
     interval : Interval | None
-        From one measurement of the monitor to the next, a multiple of the course's step; between them what it says is
-        interpolated linearly, before the first and after the last it is held. Where disturbances are stated, all
-        measurements are smoothed together, too.
+        Interval between measurements of the monitor, in seconds, a multiple of the course's step. The values are
+        interpolated linearly between them and held constant before the first and after the last. With disturbances all
+        measurements are also smoothed together.
     intervals : tuple[Interval, ...] | None
-        That are compared; by default all that divide the course.
+        Intervals that are compared, in seconds; by default all that divide the course.
     apply : tuple[Parameter, ...]
-        Which of the monitor's values correct the cameras.
+        Monitor values that correct the cameras.
     mechanisms : MechanismsSpec | None
-        In place of `reference` and `interval`: the loop is closed, and every reading is acted upon.
+        Closed loop that acts on every reading, in place of `reference` and `interval`.
     frames : Frames | None
-        Of one measurement; as many as the instrument's monitor takes by default.
+        Number of frames of a measurement; by default that of the instrument's monitor.
     analysis : AnalysisSpec
-        How the monitor's images are analysed.
+        Analysis of the monitor's images.
     repeats : Repeats
-        How often a measurement is repeated with noise drawn anew, for the scatter.
+        Number of repetitions of a measurement with new noise, from which the scatter is computed.
     earth : EarthSpec
-        Its rotation.
+        Earth rotation.
     orbit : OrbitSpec
-        True orbit, over all times and a minute more at either end.
+        True orbit; it must cover all times and one more minute at either end.
     attitude : AttitudeSpec
         True attitude.
     line_time : LineTime
-        From one image line to the next, seconds.
+        Time from one image line to the next, in seconds.
     ground : GroundSpec
         Check points.
     errors : MonitorErrorsSpec
-        Of what is measured.
+        Measurement errors.
     seed : Seed
-        Of every random number.
+        Seed of all random numbers.
     """
 
     instrument: Ref
@@ -413,20 +411,20 @@ class OrbitMonitorSpec(TitledSpec):
             if wrong := self.orbit.misses(time):
                 raise wrong.below(*self.times_key, *(() if self.course is None else ("times", k)))
         if self.mechanisms is None:
-            if number_of(self.reference_time, self.times) is None:
+            if index_of_value(self.reference_time, self.times) is None:
                 raise no_such_time(self.reference_time, self.times, "one of course.times").below("reference")
             self._check_interval(self.every, ("interval",))
             for k, interval in enumerate(self.intervals or ()):
                 self._check_interval(interval, ("intervals", k))
         elif self.mechanisms.images is not None:
             for k, time in enumerate(self.mechanisms.images.times):
-                if number_of(time, self.times) is None:
+                if index_of_value(time, self.times) is None:
                     wrong = no_such_time(time, self.times, "the time of a reading")
                     raise wrong.below("mechanisms", "images", "times", k)
         return self
 
     def _require_keys(self) -> None:
-        """Problem unless the file has either what monitoring needs, or what a loop needs."""
+        """Raise `Problem` unless the file has the keys that either monitoring or a closed loop needs."""
         loop = self.mechanisms
         for key in ("course", "reference", "interval"):
             if loop is None and getattr(self, key) is None:
@@ -446,7 +444,7 @@ class OrbitMonitorSpec(TitledSpec):
             raise Problem("the times of the readings", found, allowed, within=("mechanisms",))
 
     def _check_course(self, course: CourseSpec) -> None:
-        """Problem unless its times are evenly spaced, and all that moves stands under the test's own motion."""
+        """Raise `Problem` unless the times are evenly spaced and all motions are in the test's `motion`."""
         if course.motion or course.table is not None:
             name = "motion" if course.motion else "table"
             allowed = "times and temperature under course; motions under the test's own motion"
@@ -458,7 +456,7 @@ class OrbitMonitorSpec(TitledSpec):
                 raise Problem("the times are not evenly spaced", found, "equal steps", None, ("course", "times", k + 1))
 
     def _check_interval(self, interval: float, key: KeyPath) -> None:
-        """Problem unless the interval is a multiple of the step and not longer than the course."""
+        """Raise `Problem` unless the interval is a multiple of the step and not longer than the course."""
         step, span = self.step, self.times[-1] - self.times[0]
         if interval > span + _EVEN:
             raise Problem("longer than the course", moment(interval), f"at most {moment(span)}", within=key)
@@ -470,13 +468,13 @@ class OrbitMonitorSpec(TitledSpec):
 
     @property
     def loop(self) -> MechanismsSpec:
-        """The mechanisms of a test that has some."""
+        """Mechanisms of a test with a closed loop."""
         assert self.mechanisms is not None
         return self.mechanisms
 
     @property
     def times(self) -> tuple[float, ...]:
-        """Times of the course, or of the readings of a loop without one, seconds from the orbit's epoch."""
+        """Times of the course, or of the readings of a loop without one, from the orbit's epoch, in seconds."""
         if self.course is not None:
             return self.course.times
         assert self.loop.readings is not None
@@ -484,17 +482,17 @@ class OrbitMonitorSpec(TitledSpec):
 
     @property
     def times_key(self) -> KeyPath:
-        """Where the file has its times."""
+        """Key of the times in the file."""
         return ("mechanisms", "readings") if self.course is None else ("course",)
 
     @property
     def step(self) -> float:
-        """Between the times, seconds."""
+        """Step between the times, in seconds."""
         return self.times[1] - self.times[0]
 
     @property
     def every(self) -> float:
-        """From one measurement of the monitor to the next, seconds."""
+        """Interval between measurements of the monitor, in seconds."""
         assert self.interval is not None
         return self.interval
 
@@ -508,25 +506,25 @@ class OrbitMonitorSpec(TitledSpec):
 
     @property
     def referred(self) -> int:
-        """Number of the reference time, from 0."""
-        number = number_of(self.reference_time, self.times)
+        """Number of the reference time, counted from 0."""
+        number = index_of_value(self.reference_time, self.times)
         assert number is not None
         return number
 
     @property
     def reference_time(self) -> float:
-        """Time at which the cameras were calibrated, seconds."""
+        """Time at which the cameras were calibrated, in seconds."""
         assert self.reference is not None
         return self.reference
 
     def measured(self, interval: float) -> list[int]:
-        """Numbers of the times at which the monitor measures at this interval: from the reference on, to both sides."""
+        """Return the numbers of the measured times at this interval, counted from the reference to both sides."""
         every = round(interval / self.step)
         return [k for k in range(len(self.times)) if (k - self.referred) % every == 0]
 
     @property
     def job(self) -> JobSpec:
-        """The job of the monitor's images without `motion`; what is wrong with it is told at this file's lines."""
+        """Job of the monitor's images without `motion`; its issues are reported at the lines of this file."""
         frames = RenderSpec.model_construct(
             images=("spots",), targets=None, stray=None, frames=self.frames, seed=self.seed
         )
@@ -541,7 +539,7 @@ class OrbitMonitorSpec(TitledSpec):
         return job.with_source(self.source)
 
     def check_nodes(self, nodes: Mapping[str, NodeInfo]) -> None:
-        """InputError unless every node exists and allows what is done to it."""
+        """Raise `InputError` unless every node exists and allows its perturbation and motion."""
         checked_nodes(self.job, nodes)
         issues = [
             issue

@@ -1,7 +1,4 @@
-"""What a line camera in orbit sees, what is known of it, and which points are measured in its images.
-
-Images of a patch of ground by every line of a camera in orbit, as a file in scenes/orbit gives them.
-"""
+"""Imaging of a patch of ground by every line of a camera in orbit: true ground, control, and points in the images."""
 
 import math
 from typing import Annotated, Literal
@@ -58,7 +55,7 @@ _SMALLEST = 1e-9
 
 
 def _apart(outlines: tuple[tuple[Corner, ...], ...]) -> tuple[tuple[Corner, ...], ...]:
-    """Every polygon by itself, and some of the pupil left."""
+    """Raise `Problem` if polygons overlap or leave less than a tenth of the pupil."""
     shapes = [np.array(outline, float)[None] for outline in outlines]
     shapes = [shape if area(shape)[0] > 0.0 else shape[:, ::-1] for shape in shapes]
     for k, one in enumerate(shapes):
@@ -73,27 +70,27 @@ def _apart(outlines: tuple[tuple[Corner, ...], ...]) -> tuple[tuple[Corner, ...]
 
 
 class LineImageSpec(Spec):
-    """How a line forms and records its image.
+    """Image formation and recording of a line.
 
     Attributes
     ----------
     f_number : Number
-        Of the lens, whose pupil is round and evenly lit.
+        F-number of the lens, whose pupil is circular and uniformly illuminated.
     transmission : Number
-        Of the lens, mean over the spectrum.
+        Transmission of the lens, mean over the spectrum.
     wavefront : dict[EvenTerm, TermSize]
-        Error by even Zernike terms (Noll, unit rms), metres.
+        Even Zernike term (Noll, unit rms) -> wavefront error, in metres.
     obstruction : tuple[Outline, ...]
-        Outlines of what stands before the lens, convex polygons that do not overlap, corners (along the line, along the
-        track) in units of the pupil's radius.
+        Outlines of obstructions before the lens: convex polygons that do not overlap, corners (along the line, along
+        the track) in units of the pupil's radius.
     spectrum : WavelengthRange
-        First and last wavelength, metres; the light is the Sun's between them.
+        Shortest and longest wavelength, in metres; the light between them is the Sun's.
     detector : Ref
-        Data sheet, by name or path.
+        Data sheet of the detector, by name or path.
     diffusion : Diffusion
-        Rms spread of charge between pixels, metres.
+        Charge diffusion between pixels, rms, in metres.
     tdi : TdiSpec
-        How the line collects light; its line time is that of the image.
+        Time delay and integration; its line time is replaced by that of the image.
     """
 
     f_number: Annotated[Number, Field(ge=1.0, le=100.0)]
@@ -120,20 +117,21 @@ class TerrainSpec(Spec):
     Attributes
     ----------
     kind : Literal['real', 'fractal']
-        `real`: the elevation model that comes with matplotlib (Jacksboro fault, Tennessee, 3 arc seconds), mirrored
-        beyond its edges of 30 km x 32 km; `fractal`: drawn.
+        Source of the heights: `real`, the elevation model that comes with matplotlib (Jacksboro fault, Tennessee, 3 arc
+        seconds), mirrored beyond its edges of 30 km x 32 km; `fractal`, random.
     height : TerrainHeight
-        Mean height, metres.
+        Mean height, in metres.
     relief : float | None
-        Rms of the heights about their mean, metres; for `real` none keeps the heights' own, 121 m.
+        Rms of the heights about their mean, in metres; required for `fractal`, for `real` by default that of the model,
+        121 m.
     exponent : Number
-        Of a fractal's amplitude spectrum over frequency; larger is smoother.
+        Exponent of a fractal's amplitude spectrum; a larger one is smoother.
     post : Spacing
-        Of a fractal's posts, metres; between posts the terrain is a cubic spline.
+        Spacing of a fractal's posts, in metres; between them the terrain is a cubic spline.
     longest : GroundLength
-        Wavelength above which a fractal has no more relief, metres.
+        Longest wavelength of a fractal's relief, in metres.
     offset : tuple[float, float]
-        East and north of the patch's centre from the real model's middle, metres.
+        Position of the patch's centre to the east and north of the real model's centre, in metres.
     """
 
     kind: Literal["real", "fractal"] = "real"
@@ -159,17 +157,18 @@ class TextureSpec(Spec):
     Attributes
     ----------
     spacing : Spacing
-        Of the reflectance's cells, metres; the field is a cubic B-spline of them and holds nothing finer.
+        Spacing of the cells of reflectance, in metres; the reflectance is a cubic B-spline of them without finer
+        detail.
     mean : Number
-        reflectance.
+        Mean reflectance.
     contrast : Number
-        Rms of the reflectance over its mean.
+        Rms of the reflectance relative to its mean.
     parcels : Share
-        Share of the ground that is fields of crops; the rest varies as a fractal.
+        Share of the ground covered by fields of crops; the rest varies as a fractal.
     parcel_size : GroundLength
-        Side of such a field of mean area, metres.
+        Side of a field of crops of mean area, in metres.
     roads : GroundLength
-        Metres from one road to the next.
+        Distance between roads, in metres.
     """
 
     spacing: Spacing = 2.0
@@ -181,20 +180,20 @@ class TextureSpec(Spec):
 
 
 class LightSpec(Spec):
-    """The Sun and the air.
+    """Illumination by the Sun and the sky, and the atmosphere.
 
     Attributes
     ----------
     elevation : Elevation
-        Of the Sun, radians.
+        Elevation of the Sun, in radians.
     azimuth : float
-        Of the Sun, from north over east, radians.
+        Azimuth of the Sun, from north over east, in radians.
     transmission : Number
-        Of the air, down and up together.
+        Transmission of the atmosphere, down and up together.
     sky : Share
-        Share of the light on level ground that comes evenly from the sky.
+        Share of the illumination of level ground that is diffuse light of the sky.
     path : Number
-        Light scattered by the air into the camera, as the reflectance that would give it.
+        Path radiance: light scattered by the atmosphere into the camera, as an equivalent reflectance.
     """
 
     elevation: Elevation = math.radians(50.0)
@@ -205,16 +204,16 @@ class LightSpec(Spec):
 
 
 class GroundSpec(Spec):
-    """The true ground, on the day of the pass.
+    """True ground on the day of the pass.
 
     Attributes
     ----------
     terrain : TerrainSpec
-        heights.
+        Heights.
     texture : TextureSpec
-        reflectance.
+        Reflectance.
     light : LightSpec
-        Sun and air.
+        Illumination and atmosphere.
     """
 
     terrain: TerrainSpec = TerrainSpec.model_construct()
@@ -223,16 +222,16 @@ class GroundSpec(Spec):
 
 
 class DemSpec(Spec):
-    """A reference elevation model.
+    """Reference elevation model.
 
     Attributes
     ----------
     post : Spacing
-        Distance of its posts, metres.
+        Spacing of the posts, in metres.
     sigma : GroundSigma
-        Standard deviation of a height, metres.
+        Standard deviation of a height, in metres.
     correlation : GroundLength
-        Distance over which the heights' errors are alike, metres.
+        Correlation length of the height errors, in metres.
     """
 
     post: Spacing = 25.0
@@ -241,26 +240,26 @@ class DemSpec(Spec):
 
 
 class ControlSpec(Spec):
-    """The control source: an orthophoto of another date with a reference elevation model; both share one error in plan.
+    """Control source: an orthophoto of another date with a reference elevation model; both share one error in plan.
 
     Attributes
     ----------
     spacing : Spacing
-        Ground sample distance of the orthophoto, metres.
+        Ground sample distance of the orthophoto, in metres.
     mtf : Number
-        Of the orthophoto at its Nyquist frequency.
+        MTF of the orthophoto at its Nyquist frequency.
     noise : Number
-        Of the orthophoto, rms, in reflectance.
+        Noise of the orthophoto, rms, in reflectance.
     changed : Share
-        Share of the fields that look different on its date.
+        Share of the fields of crops that look different on the orthophoto's date.
     light : LightSpec
-        Of its date.
+        Illumination on the orthophoto's date.
     shift : tuple[float, float]
-        Constant error in plan, east and north, metres.
+        Constant error in plan, east and north, in metres.
     sigma : GroundSigma
-        Standard deviation of a smooth error in plan, each axis, metres.
+        Standard deviation of a smooth error in plan, each axis, in metres.
     correlation : GroundLength
-        Distance over which that error changes, metres.
+        Correlation length of the smooth error, in metres.
     dem : DemSpec
         Elevation model.
     """
@@ -277,7 +276,7 @@ class ControlSpec(Spec):
 
 
 LEAST_TEMPLATE = 13
-"""Pixels: a margin of 3 on either side leaves least squares matching 7."""
+"""Smallest side of a template, in pixels: a margin of 3 on either side leaves 7 for least squares matching."""
 
 
 def _is_odd(side: int) -> int:
@@ -287,31 +286,31 @@ def _is_odd(side: int) -> int:
 
 
 class ImagePointsSpec(Spec):
-    """Points measured in images.
+    """Points measured in images by least squares matching.
 
     Attributes
     ----------
     control : Whole
-        Points of the orthophoto that are sought in every line.
+        Number of control points: points of the orthophoto that are matched in every line.
     check : Whole
-        More of them, kept apart to test with.
+        Number of further points of the orthophoto, which only test the result.
     tie : Whole
-        Points of the nadir line's image that are sought in the others.
+        Number of tie points: points of the nadir line's image that are matched in the others.
     reach : Whole
-        How far the predicted place may be off, pixels and lines.
+        Search radius about the predicted position, in pixels and lines.
     template : Whole
-        Its side, pixels.
+        Side of a template, in pixels.
     least_correlation : Number
-        Of image and template after the fit.
+        Smallest correlation of image and template after the fit.
     largest_sigma : Number
-        Of a place along its worst direction, pixels.
+        Largest standard deviation of a matched position along its worst direction, in pixels.
     height_sigma : GroundSigma
-        Of the reference heights, as their producer states it, metres.
+        Standard deviation of the reference heights, as their producer states it, in metres.
     roughness : Number
-        Rms by which noise of the attitude bends the displacement over a patch, pixels: neighbours within it do not
-        contradict each other.
+        Rms of the displacement over a patch by attitude noise, in pixels; smaller differences between neighbours are
+        consistent.
     false_alarm : Number
-        Share of right matches that consensus may take for wrong.
+        Share of correct matches that the consensus test may reject.
     """
 
     control: Annotated[Whole, Field(ge=0, le=2000)] = 60
@@ -343,14 +342,14 @@ LineTime = Annotated[float, Quantity(TIME, above_zero=True, largest="1 s")]
 
 
 class InteriorChangeSpec(Spec):
-    """How the interior orientation of a line has changed since the laboratory.
+    """Change of the interior orientation of a line since the laboratory.
 
     Attributes
     ----------
     principal_distance : float
-        Change of the principal distance, metres.
+        Change of the principal distance, in metres.
     principal_point : tuple[float, float]
-        Change of x (flight) and y (along the line), metres.
+        Change of the principal point, x (flight) and y (along the line), in metres.
     """
 
     principal_distance: Annotated[float, Quantity(LENGTH, largest="5 mm")] = 0.0
@@ -358,18 +357,18 @@ class InteriorChangeSpec(Spec):
 
 
 class PatchSpec(Spec):
-    """The patch of ground that is imaged; its middle lies on what one line sees at a moment.
+    """Patch of ground that is imaged, centred on the footprint of a pixel of one line at one time.
 
     Attributes
     ----------
     line : Name
-        Of the camera, by name.
+        Name of this line.
     pixel : Number
-        Of that line that sees the middle.
+        Pixel of this line that images the patch's centre.
     time : Moment
-        At which it does, seconds from the orbit's epoch.
+        Time at which it does, from the orbit's epoch, in seconds.
     lines, pixels : Side
-        Size of every image.
+        Size of every image in this direction, in pixels.
     """
 
     line: Name = "nadir"
@@ -380,44 +379,40 @@ class PatchSpec(Spec):
 
 
 class OrbitSimulateSpec(PayloadTestSpec):
-    """A pass over a patch of ground.
+    """Simulation of line images of a patch of ground.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     camera
-        Name in scenes/library/payloads or path of a file; it needs a section `image`.
+        Payload with a section `image`: a name in scenes/library/payloads, or the path of your file.
     lines : tuple[Name, ...]
-        Those that are rendered, by name.
+        Names of the lines that are rendered.
     perturb : Named[InteriorChangeSpec]
-        Line -> how its interior has changed since the laboratory.
+        Line -> true change of its interior orientation since the laboratory.
     earth : EarthSpec
-        Its rotation.
+        Earth rotation.
     orbit : OrbitSpec
         True orbit.
     attitude : AttitudeSpec
         True attitude.
     effects : LightEffectsSpec
-        What happens to the light between ground and camera.
+        Effects on the light path between ground and camera.
     line_time : LineTime
-        From one image line to the next, seconds.
+        Time from one image line to the next, in seconds.
     patch : PatchSpec
-        Where and how large.
+        Position and size of the patch.
     ground : GroundSpec
-        What is there.
+        True ground.
     control : ControlSpec
-        What is known of the ground.
+        Orthophoto and elevation model of the ground.
     points : ImagePointsSpec | None
-        That are measured in the images; none without this section.
+        Points that are measured in the images; by default there are none.
     errors : ErrorsSpec
-        Of what the satellite measures of itself.
+        Errors of the satellite's orbit and attitude measurements.
     oversampling : Whole
-        Samples of the ground along each side of a pixel.
+        Number of ground samples along each side of a pixel.
     seed : Seed
-        Of every random number.
+        Seed of all random numbers.
     """
 
     lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "backward")

@@ -1,4 +1,4 @@
-"""A test in orbit together with everything it refers to: simulated, or on measurements and nothing drawn."""
+"""Tests in orbit with the content of all their references: simulated, or on measurements without random numbers."""
 
 from __future__ import annotations
 
@@ -32,13 +32,14 @@ from scenes.yaml.yaml_file import read_yaml
 
 
 def load_three_line_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> ThreeLineCameraSpec:
-    """Read a three-line payload; arguments and errors as `load_instrument`."""
+    """Read a three-line payload; arguments and errors as in `load_instrument`."""
     return load.load_named(ThreeLineCameraSpec, load.PAYLOADS, reference, owner, key)
 
 
 def _line_detectors(camera: ThreeLineCameraSpec) -> FrozenMap[str, DetectorSpec]:
-    """Data sheets of a payload's line CCDs, by the name that the image sections give. Raises InputError as
-    `load_instrument`.
+    """Return the data sheets of a payload's line CCDs by the references of its image sections.
+
+    Errors as in `load_instrument`.
     """
     sections: list[tuple[KeyPath, LineImageSpec | None]] = [(("image",), camera.image)]
     sections += [(("lines", name, "image"), line.image) for name, line in camera.lines.items()]
@@ -52,16 +53,16 @@ def _line_detectors(camera: ThreeLineCameraSpec) -> FrozenMap[str, DetectorSpec]
 
 
 class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
-    """An intersection-angle test with its camera: a payload, or an instrument with the cameras that it names.
+    """Intersection-angle test with its camera: a payload, or an instrument with its cameras.
 
     Attributes
     ----------
     camera : ThreeLineCameraSpec | None
-        The payload, None for an instrument.
+        The payload; None for an instrument.
     instrument : InstrumentSpec | None
-        The instrument, None for a payload.
+        The instrument; None for a payload.
     cameras : Paths[CameraSpec]
-        What `instrument.cameras.<name>.camera` says -> prescription; empty for a payload.
+        Reference in `instrument.cameras.<name>.camera` -> prescription; empty for a payload.
     """
 
     FOLDER = load.ORBIT
@@ -88,7 +89,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @property
     def pixels(self) -> Mapping[str, int]:
-        """Line -> how many pixels it has, in the order of the file."""
+        """Line -> number of its pixels, in the order of the file."""
         if self.instrument is not None:
             return {name: self.cameras[m.camera].line.pixels for name, m in self.instrument.cameras.items()}
         assert self.camera is not None
@@ -96,7 +97,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @property
     def usual_pixels(self) -> int:
-        """Number of pixels of the line in whose pixels the test gives places."""
+        """Number of pixels of the standard line, in whose pixels the test has its positions."""
         return self.camera.pixels if self.camera is not None else next(iter(self.pixels.values()))
 
     @property
@@ -106,11 +107,11 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @property
     def angles(self) -> Mapping[str, tuple[str, str]]:
-        """Angle -> its two lines; reading has filled in the usual ones."""
+        """Angle -> its two lines, including the defaults."""
         return self.test.angles or {}
 
     def checked(self) -> Self:
-        """Fill in the angles, and check that angles, changes and strips fit the camera's lines."""
+        """Return the set-up with default angles, after a check that angles, changes and strips fit the lines."""
         if (self.camera is None) == (self.instrument is None):
             found = "neither" if self.camera is None else "both"
             raise self.error("one camera is tested", ("camera",), found=found, allowed="`camera:` or `instrument:`")
@@ -141,7 +142,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
 
 class PayloadSetup(ExperimentSetup[TestType], Generic[TestType]):
-    """A test of a payload.
+    """Test of a payload with the payload.
 
     Attributes
     ----------
@@ -155,25 +156,25 @@ class PayloadSetup(ExperimentSetup[TestType], Generic[TestType]):
 
     @classmethod
     def parts(cls, test: Any) -> dict[str, Any]:
-        """Return the payload, and the test with paths of files that hold from anywhere."""
+        """Return the payload, and the test with absolute paths."""
         camera = load_three_line_camera(test.camera, test, ("camera",))
         return {"test": _placed(test), "camera": camera}
 
 
 class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
-    """An in-orbit calibration with its camera.
+    """In-orbit calibration with its camera.
 
     Attributes
     ----------
     detectors : Paths[DetectorSpec]
-        Data sheets of its line CCDs where images are rendered.
+        Data sheets of the camera's line CCDs, if images are rendered.
     """
 
     detectors: Paths[DetectorSpec] = Field(default_factory=FrozenMap)
 
     @classmethod
     def parts(cls, test: OrbitCalibrationSpec) -> dict[str, Any]:
-        """Return also the detectors."""
+        """Return the payload, and the data sheets of its line CCDs if images are rendered."""
         parts = super().parts(test)
         return parts if test.images is None else {**parts, "detectors": _line_detectors(parts["camera"])}
 
@@ -207,20 +208,20 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
 
 
 class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
-    """A stereo pair along its orbit, monitored, with its instrument.
+    """Monitored stereo pair along its orbit with its instrument.
 
     Attributes
     ----------
     instrument : InstrumentSpec
         Cameras and monitors on their base.
     cameras : Paths[CameraSpec]
-        What the instrument's cameras are called -> prescription.
+        Reference in the instrument -> prescription.
     detector : DetectorSpec
         Data sheet of the monitor's area CCDs.
     disturbances : DisturbancesSpec | None
-        What is stated to move, None for nothing.
+        Expected disturbances; None for none.
     line_detectors : Paths[DetectorSpec] | None
-        As cameras -> data sheet of the line CCD that images; None where no line images are rendered.
+        Reference of a camera -> data sheet of its line CCD; None if no line images are rendered.
     """
 
     FOLDER = load.ORBIT
@@ -233,7 +234,7 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
 
     @classmethod
     def parts(cls, test: OrbitMonitorSpec) -> dict[str, Any]:
-        """Return the instrument with all that belongs to it."""
+        """Return the instrument with its cameras, data sheets and disturbances."""
         job = resolve_job(test.job)
         parts = {key: getattr(job, key) for key in ("instrument", "cameras", "detector", "disturbances")}
         if test.mechanisms is not None and test.mechanisms.images is not None:
@@ -242,7 +243,7 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
         return parts
 
     def checked(self) -> Self:
-        """Check that test and instrument fit, and that something is stated to move that mechanisms could act on."""
+        """Check that test and instrument fit together, and that there are disturbances for mechanisms to correct."""
         _require_pair(self.test, self.instrument, self.cameras)
         if self.test.mechanisms is not None:
             _require_mechanisms(self, self.test.mechanisms)
@@ -250,7 +251,7 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
 
     @property
     def resolved(self) -> ResolvedJob:
-        """The job of the monitor's images, with all that it refers to."""
+        """Job of the monitor's images with the content of its references."""
         return ResolvedJob.model_construct(
             job=self.test.job,
             instrument=self.instrument,
@@ -262,30 +263,30 @@ class MonitorSetup(ExperimentSetup[OrbitMonitorSpec]):
 
     @property
     def pair(self) -> tuple[str, str]:
-        """The two cameras."""
+        """Names of the two cameras."""
         first, second = self.test.cameras or tuple(self.instrument.cameras)
         return first, second
 
 
 class SimulateSetup(PayloadSetup[OrbitSimulateSpec]):
-    """A pass over a patch of ground with its camera.
+    """Simulation of images of a patch of ground with its camera.
 
     Attributes
     ----------
     detectors : Paths[DetectorSpec]
-        Data sheets of its line CCDs, by the name that the image sections give.
+        Reference of an image section -> data sheet of a line CCD.
     """
 
     detectors: Paths[DetectorSpec]
 
     @classmethod
     def parts(cls, test: OrbitSimulateSpec) -> dict[str, Any]:
-        """Return also the detectors."""
+        """Return the payload and the data sheets of its line CCDs."""
         parts = super().parts(test)
         return {**parts, "detectors": _line_detectors(parts["camera"])}
 
     def checked(self) -> Self:
-        """Check that the lines that are named exist and can be rendered, and that the patch lies on one of them."""
+        """Check that the lines exist and can be rendered, and that the patch lies on one of them."""
         test, camera = self.test, self.camera
         names = tuple(camera.lines)
         named = [(("patch", "line"), test.patch.line), *((("perturb", name), name) for name in test.perturb)]
@@ -304,7 +305,7 @@ class SimulateSetup(PayloadSetup[OrbitSimulateSpec]):
 
 
 class JitterSetup(PayloadSetup[OrbitJitterSpec]):
-    """A pass whose jitter is sought, with its camera."""
+    """Search for jitter in a simulated pass with its camera."""
 
     def checked(self) -> Self:
         """Check that the camera has the lines."""
@@ -314,10 +315,10 @@ class JitterSetup(PayloadSetup[OrbitJitterSpec]):
 
 
 class AdjustSetup(PayloadSetup[OrbitAdjustSpec]):
-    """A block with its camera."""
+    """Block with its camera."""
 
     def checked(self) -> Self:
-        """Check that the camera has the lines, and the block the sensors that are to be left out."""
+        """Check that the camera has the lines, and the block the excluded sensors."""
         for k, name in enumerate(self.test.lines):
             if name not in self.camera.lines:
                 raise self.test.error(unknown("no such line", name, self.camera.lines), ("lines", k))
@@ -326,11 +327,11 @@ class AdjustSetup(PayloadSetup[OrbitAdjustSpec]):
 
 
 class CheckSetup(PayloadSetup[measurements.OrbitCheckSpec]):
-    """A check of a pass in files with its camera."""
+    """Check of the conventions of a pass with its camera."""
 
 
 class MatchSetup(PayloadSetup[measurements.OrbitMatchSpec]):
-    """Points in a user's images with the camera."""
+    """Matching of points in a user's images with the camera."""
 
     def checked(self) -> Self:
         """Check that the camera has the lines."""
@@ -339,32 +340,32 @@ class MatchSetup(PayloadSetup[measurements.OrbitMatchSpec]):
 
 
 class MeasuredPassesSetup(PayloadSetup[TestType], Generic[TestType]):
-    """A test on measurements with its camera.
+    """Test on measurements with its camera.
 
     Attributes
     ----------
     data : measurements.OrbitDataSpec
-        The passes, with paths that hold from anywhere.
+        Passes with absolute paths.
     """
 
     data: measurements.OrbitDataSpec
 
     @classmethod
     def measured_by(cls, keys: Mapping[str, Any]) -> bool:
-        """Return whether these are the keys of such a test; `passes` of a simulation are a number."""
+        """Return whether a file with these keys is such a test; `passes` of a simulation is a number."""
         return "data" in keys or "conventions" in keys or isinstance(keys.get("passes"), dict)
 
     @classmethod
     def parts(cls, test: Any) -> dict[str, Any]:
-        """Return also the passes."""
+        """Return the payload and the passes."""
         return {**super().parts(test), "data": data_of(test)}
 
 
 class MeasuredCalibrationSetup(MeasuredPassesSetup[measurements.MeasuredCalibrationSpec]):
-    """A calibration on measurements, with its camera."""
+    """In-orbit calibration on measurements with its camera."""
 
     def checked(self) -> Self:
-        """Check that the schemes name passes."""
+        """Check that the schemes refer to existing passes."""
         try:
             checked_schemes(self.test.schemes, self.data.passes)
         except Problem as problem:
@@ -373,11 +374,11 @@ class MeasuredCalibrationSetup(MeasuredPassesSetup[measurements.MeasuredCalibrat
 
 
 class MeasuredAngleSetup(MeasuredPassesSetup[measurements.MeasuredAngleSpec]):
-    """Intersection angles on measurements, with the camera."""
+    """Intersection angles on measurements with the camera."""
 
 
 class MeasuredJitterSetup(MeasuredPassesSetup[measurements.MeasuredJitterSpec]):
-    """A search for jitter on measurements, with the camera."""
+    """Search for jitter on measurements with the camera."""
 
     def checked(self) -> Self:
         """Check that the camera has the lines."""
@@ -386,15 +387,15 @@ class MeasuredJitterSetup(MeasuredPassesSetup[measurements.MeasuredJitterSpec]):
 
 
 class MeasuredAdjustSetup(MeasuredPassesSetup[MeasuredAdjustSpec]):
-    """A block of measured passes with its camera."""
+    """Block of measured passes with its camera."""
 
     @classmethod
     def measured_by(cls, keys: Mapping[str, Any]) -> bool:
-        """Return whether these are the keys of such a block; a simulated one has a mapping of passes, too."""
+        """Return whether a file with these keys is such a block; a simulated one also has a mapping of passes."""
         return "data" in keys or "conventions" in keys
 
     def checked(self) -> Self:
-        """Check that there is every pass, line and sensor that is named."""
+        """Check that all passes, lines and sensors in the test exist."""
         test, passes = self.test, self.data.passes
         _require_known("pass", test, ("trackers",), test.trackers, passes)
         _require_known("line", test, ("changes",), test.changes, self.camera.lines)
@@ -410,11 +411,11 @@ AnyAdjust = AdjustSetup | MeasuredAdjustSetup
 AnyAngle = AngleSetup | MeasuredAngleSetup
 AnyCalibration = CalibrationSetup | MeasuredCalibrationSetup
 AnyJitter = JitterSetup | MeasuredJitterSetup
-"""Simulated, or on measurements."""
+"""Set-up of a simulated test or of one on measurements."""
 
 
 def _placed(test: Any) -> Any:
-    """The test with paths of its files and of its record that hold from anywhere; the URL of a database stays."""
+    """Return the test with absolute paths of its files and of its record; the URL of a database is unchanged."""
     if isinstance(test, measurements.OrbitCheckSpec | measurements.OrbitMatchSpec):
         return measurements.with_absolute_files(test)
     one = getattr(test, "monitor_record", None)
@@ -427,17 +428,16 @@ def _placed(test: Any) -> Any:
 
 
 DATA_FILE = "data.yaml"
-"""Name of the file that says what a folder of measurements holds."""
+"""Name of the file that describes a folder of measurements."""
 
 
 def data_of(test: measurements.MeasuredTestSpec) -> measurements.OrbitDataSpec:
-    """The passes of a test, with paths that hold from anywhere.
+    """Return the passes of a test with absolute paths.
 
     Raises
     ------
     InputError
-        There is no such folder, its file is not valid, a file is not there, or nothing says how a table of an attitude
-        is to be read.
+        The folder or a file is missing or invalid, or the conventions of an attitude table are missing.
     """
     file = Path(test.source.file)
     if test.data is None:
@@ -460,14 +460,14 @@ def data_of(test: measurements.MeasuredTestSpec) -> measurements.OrbitDataSpec:
 
 
 def without_sensors(setup: AnyAdjust, names: Sequence[str]) -> AnyAdjust:
-    """The block adjusted without further sensors.
+    """Return a block that is adjusted without further sensors.
 
     Parameters
     ----------
     setup : AnyAdjust
         The block.
     names : Sequence[str]
-        Of sensors.
+        Names of the sensors.
 
     Raises
     ------
@@ -483,22 +483,23 @@ def without_sensors(setup: AnyAdjust, names: Sequence[str]) -> AnyAdjust:
 
 
 def _require_known(what: str, test: Spec, key: KeyPath, names: Iterable[str], known: Iterable[str]) -> None:
-    """InputError at the first of the names below a key that is not known."""
+    """Raise `InputError` at the first unknown name below a key."""
     for name in names:
         if name not in known:
             raise test.error(unknown(f"no such {what}", name, known), (*key, name))
 
 
 def _require_sensors(test: OrbitAdjustSpec | MeasuredAdjustSpec) -> None:
-    """InputError for a sensor that is to be left out and is not there."""
+    """Raise `InputError` for an excluded sensor that the block does not have."""
     for name in test.without:
         if name not in test.sensors:
             raise test.error(unknown("the block has no such sensor", name, test.sensors), ("without",))
 
 
 def _require_turns(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
-    """InputError unless every change turns one of a payload's lines. What an instrument's nodes allow is told when it
-    is built.
+    """Raise `InputError` unless every change rotates one of a payload's lines.
+
+    For an instrument, the actions of its nodes are checked when it is built.
     """
     _require_known("line", test, ("perturb",), test.perturb, lines)
     for name, change in test.perturb.items():
@@ -514,7 +515,7 @@ def _require_turns(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
 
 
 def _require_mechanisms(setup: MonitorSetup, loop: MechanismsSpec) -> None:
-    """InputError unless something is stated to move, mechanisms act on the pair, and its images have data sheets."""
+    """Raise `InputError` unless there are disturbances, mechanisms act on the pair, and its images have data sheets."""
     test = setup.test
     if setup.disturbances is None:
         problem = "nothing is stated to move, so that spots say nothing of what to correct"
@@ -532,7 +533,7 @@ def _require_mechanisms(setup: MonitorSetup, loop: MechanismsSpec) -> None:
 
 
 def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: Paths[CameraSpec]) -> None:
-    """InputError unless the pair has monitors and looks two ways, and the points lie on the second line."""
+    """Raise `InputError` unless the pair has monitors and two look angles, and the points lie on the second line."""
     names = tuple(instrument.cameras)
     for name in names:
         mounted = instrument.cameras[name].camera
@@ -556,11 +557,11 @@ def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: P
 
 
 _LEAST_ANGLE = 0.0174
-"""Radians between the cameras of a stereo pair."""
+"""Smallest angle between the cameras of a stereo pair, in radians."""
 
 
 def _require_several(test: Spec, named: tuple[str, ...] | None, camera: ThreeLineCameraSpec) -> None:
-    """InputError unless all lines that are named exist, and there are two or more."""
+    """Raise `InputError` unless all lines exist and there are two or more."""
     names = tuple(camera.lines)
     for k, name in enumerate(named or ()):
         if name not in names:
@@ -575,7 +576,7 @@ _THREE_LINES = "a camera with lines forward, nadir and backward"
 
 
 def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraSpec) -> None:
-    """InputError for a change of a line that is known by looks and not by places."""
+    """Raise `InputError` for a change of a line that is defined by look angles."""
     for name in changes:
         if name in camera.lines and camera.lines[name].by_look_angles:
             problem = f"{name} of {camera.name} is known by look angles, which say nothing of a changed lens"
@@ -583,7 +584,7 @@ def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraS
 
 
 def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec) -> None:
-    """InputError unless the camera says of each line how it forms its image."""
+    """Raise `InputError` unless the camera defines the image formation of each line."""
     for name in lines:
         if camera.image_of(name) is None:
             problem = f"{camera.name} does not say how its line {name} forms an image"
@@ -593,7 +594,7 @@ def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCamera
 def _require_detectors(
     setup: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec, detectors: Mapping[str, DetectorSpec]
 ) -> None:
-    """InputError unless the data sheets of all these lines are there."""
+    """Raise `InputError` unless the data sheets of all these lines are present."""
     for name in lines:
         image = camera.image_of(name)
         if image is not None:
@@ -602,13 +603,16 @@ def _require_detectors(
 
 
 def _require_ends(test: Spec, section: str, ends: tuple[float, float], pixels: int, line: str) -> None:
-    """InputError unless ``first`` and ``last`` of a section lie on a line of so many pixels."""
+    """Raise `InputError` unless ``first`` and ``last`` of a section lie on a line with this number of pixels."""
     for key, pixel in zip(("first", "last"), ends, strict=True):
         _require_pixel(test, (section, key), pixel, pixels, line)
 
 
 def _require_pixel(test: Spec, key: KeyPath, pixel: float, pixels: int, line: str) -> None:
-    """InputError unless a place lies on a line of so many pixels, which is told as the text says."""
+    """Raise `InputError` unless a position lies on a line with this number of pixels.
+
+    ``line`` is the line's name in messages.
+    """
     last = pixels - 0.5
     if not -0.5 <= pixel <= last:
         allowed = f"-0.5 to {last:g}, the ends of {line}"

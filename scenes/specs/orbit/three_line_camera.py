@@ -1,8 +1,7 @@
-"""A three-line camera of refractive lenses: one ideal projection with distortion for each line, as a file in
-scenes/library/payloads gives it.
+"""Three-line camera with refractive lenses: an ideal projection with distortion for each line.
 
-No prescription is needed: a line is known by its interior orientation (principal point, principal distance, radial
-distortion) and by how it is mounted on the base.
+No prescription is needed: a line is defined by its interior orientation (principal point, principal distance, radial
+distortion) and by its mounting on the base. The files are in scenes/library/payloads.
 """
 
 from typing import Annotated
@@ -26,25 +25,26 @@ LongestLine = Annotated[Whole, Field(ge=2, le=1_000_000)]
 
 
 class CcdSpec(Spec):
-    """What is known of one CCD of a line that is made of several: where it lies, or where its pixels look.
+    """Position or look angles of one CCD of a line that consists of several.
 
-    A place, ``shift`` and ``rotate``, is against that of the same pixels on a straight line of the payload's pitch.
-    Look angles, ``psi_x`` and ``psi_y``, are coefficients c0, c1, ... of c0 + c1 s + c2 s^2 + ... of the pixel's number
-    s, counted from 0 on the whole line; the look is along (tan psi_x, tan psi_y, 1) in the camera's axes. They hold for
-    the line's principal_distance and principal_point, whose changes are counted from there, and contain the distortion.
+    The position, ``shift`` and ``rotate``, is relative to that of the same pixels on a straight line with the payload's
+    pitch. Look angles, ``psi_x`` and ``psi_y``, are coefficients c0, c1, ... of c0 + c1 s + c2 s^2 + ... of the pixel's
+    number s, counted from 0 on the whole line; the look is along (tan psi_x, tan psi_y, 1) in the camera's axes. They
+    hold for the line's principal_distance and principal_point, relative to which changes are counted, and include the
+    distortion.
 
     Attributes
     ----------
     first, last : Whole
-        Its pixels, both included.
+        First or last pixel of the CCD, both inclusive.
     shift : tuple[float, float]
-        x (flight) and y (along the line) in the focal plane, metres.
+        Shift x (flight) and y (along the line) in the focal plane, in metres.
     rotate : float
-        About the line of sight, from +x toward +y, about the CCD's middle, radians.
+        Rotation about the line of sight, from +x toward +y, about the CCD's centre, in radians.
     psi_x : LookAngles | None
-        Forward, radians; per pixel, pixel^2, ... after the first.
+        Coefficients of the forward look angle, in radians, radians per pixel, per pixel^2, ...
     psi_y : LookAngles | None
-        To the right, likewise.
+        Coefficients of the look angle to the right, in radians, radians per pixel, per pixel^2, ...
     """
 
     first: Annotated[Whole, Field(ge=0)]
@@ -66,7 +66,7 @@ class CcdSpec(Spec):
 
 
 class LineCameraSpec(Spec):
-    """One line camera: its interior orientation and how it stands on the base.
+    """Line camera: its interior orientation and its mounting on the base.
 
     The image is the real one, behind the lens: a point of the line at +y sees the scene at -Y. Its look in the camera's
     axes is along (-(x - x0)(1 + d), -(y - y0)(1 + d), f) with d = k1 r^2 + k2 r^4, r from the principal point. Positive
@@ -76,27 +76,29 @@ class LineCameraSpec(Spec):
     Attributes
     ----------
     look : LookAngle
-        Angle of the camera's Z from the base's +Z, about the base's Y, positive forward (toward +X), radians.
+        Look angle: angle of the camera's Z from the base's +Z about the base's Y, positive forward (toward +X), in
+        radians.
     rotate : Rotation
-        Misalignment, a rotation vector in the camera's own axes after the look, radians.
+        Misalignment: rotation vector in the camera's axes after the look angle, in radians.
     position : Vector3
-        Of the projection centre in the base frame, metres.
+        Position of the projection centre in the base frame, in metres.
     principal_distance : PositiveLength
-        f, metres.
+        Principal distance f, in metres.
     principal_point : Vector2
-        Where the camera's Z meets the focal plane, x (flight) and y (along the line) from the line's centre, metres.
+        Principal point, where the camera's Z meets the focal plane: x (flight) and y (along the line) from the line's
+        centre, in metres.
     k1 : float
-        Radial distortion of third order, 1/m^2.
+        Radial distortion of third order, in 1/m^2.
     k2 : float
-        Radial distortion of fifth order, 1/m^4.
+        Radial distortion of fifth order, in 1/m^4.
     pixels : LongestLine | None
-        How many; None for as many as the payload says.
+        Number of pixels; by default that of the payload.
     pitch : PixelPitch | None
-        Of its pixels, metres; None for the payload's.
+        Pixel pitch, in metres; by default that of the payload.
     image : LineImageSpec | None
-        How it forms and records its image; None for the payload's.
+        Image formation and recording; by default that of the payload.
     ccds : tuple[CcdSpec, ...]
-        Of which it is made, from pixel 0 on; empty for one straight line.
+        CCDs of the line, from pixel 0 on; by default a single straight line.
     """
 
     look: LookAngle
@@ -113,7 +115,7 @@ class LineCameraSpec(Spec):
 
     @property
     def by_look_angles(self) -> bool:
-        """Whether a CCD of it is known by the looks of its pixels."""
+        """True if a CCD of the line is defined by look angles."""
         return any(ccd.psi_x is not None for ccd in self.ccds)
 
     @model_validator(mode="after")
@@ -125,23 +127,19 @@ class LineCameraSpec(Spec):
 
 
 class ThreeLineCameraSpec(TitledSpec):
-    """The payload of a three-line mapping satellite.
+    """Payload of a three-line mapping satellite.
 
     Attributes
     ----------
-    name
-        As the file is called.
-    description
-        For people.
     pixels : LongestLine
-        Of each line that does not say its own; pixel 0 is at its -y end.
+        Number of pixels of each line without an entry; pixel 0 is at the line's -y end.
     pitch : PixelPitch
-        Of their pixels, metres.
+        Pixel pitch of each line without an entry, in metres.
     lines : Named[LineCameraSpec]
-        By name; normally forward, nadir and backward, in the order in which they see a point on the ground, then others
-        such as a high-resolution and a multispectral one.
+        Name -> line camera; usually forward, nadir and backward, in the order in which they image a point on the
+        ground, then others such as a high-resolution and a multispectral one.
     image : LineImageSpec | None
-        How lines that do not say it themselves form and record their images; only rendering needs it.
+        Image formation and recording of each line without an entry; only needed for rendering.
     """
 
     pixels: LongestLine
@@ -167,13 +165,13 @@ class ThreeLineCameraSpec(TitledSpec):
         return self
 
     def pixels_of(self, line: str) -> int:
-        """How many pixels a line has. KeyError if there is no such line."""
+        """Return the number of pixels of a line. Raises KeyError if there is no such line."""
         return self.lines[line].pixels or self.pixels
 
     def pitch_of(self, line: str) -> float:
-        """Pitch of a line's pixels, metres. KeyError if there is no such line."""
+        """Return the pixel pitch of a line, in metres. Raises KeyError if there is no such line."""
         return self.lines[line].pitch or self.pitch
 
     def image_of(self, line: str) -> LineImageSpec | None:
-        """How a line forms its image; None if neither it nor the payload says so. KeyError if there is no such line."""
+        """Return the image formation of a line; None if it is not defined. Raises KeyError if there is no such line."""
         return self.lines[line].image or self.image
