@@ -1,1 +1,1 @@
-"""Adjustment of a block of line images of one or many passes: what is observed, what is known of it, what results."""
+"""Adjustment of a block of line images from one or many passes: observations, priors and results."""

@@ -1,16 +1,14 @@
-"""Normal equations of a three-line calibration, the ground points and the noise that image points share eliminated.
+"""Normal equations of a three-line calibration, with ground points and shared noise eliminated.
 
-Rows are whitened by the covariance of their image point: image measurement plus what independent noise of attitude and
-station does in the image. Noise that image points share enters as unknowns z with a prior (`SharedNoise`). A ground
-point meets only its own rays and its control coordinates, so that its (3, 3) block is inverted alone and the equations
-of the rest are N_yy - N_yp N_pp^-1 N_py (Schur complement). The block of z is sparse then, too; it is factorised and
-eliminated in the same way, and what is left are the equations of the unknowns x.
+Equations are whitened by the covariance of their image point: image measurement plus the effect of independent noise of
+attitude and station in the image. Noise that image points share enters as unknowns z with a prior (`SharedNoise`). A
+ground point occurs only in its own rays and control coordinates, so that its (3, 3) block is inverted alone and the
+equations of the rest are N_yy - N_yp N_pp^-1 N_py (Schur complement). The block of z is then sparse, too; it is
+factorised and eliminated in the same way, which leaves the equations of the unknowns x.
 
-Noise of measured attitude and station that image points of a pass share, by the laws of its readings.
-
-Points exposed within a few readings have errors in common. The unknowns of the laws
-(`analysis.block.error_processes`) are unknowns of an adjustment with a sparse prior, and the correlation of any two
-image points is exact.
+**Shared noise.** Points exposed within a few readings of attitude or station share their errors. The unknowns of the
+readings' error models (`analysis.block.error_processes`) are unknowns of the adjustment with a sparse prior, and the
+correlation of any two image points is exact.
 """
 
 from __future__ import annotations
@@ -45,20 +43,20 @@ from analysis.orbit.three_line_model import LineModel, Partials, Rays, misclosur
 
 @dataclass(frozen=True, eq=False)
 class SharedNoise:
-    """The laws of all fields, and how the rays meet their unknowns.
+    """Error models of the readings of all fields, and the dependence of the rays on their unknowns.
 
     Attributes
     ----------
-    parts : Mapping[str, tuple[Part, ...]]
-        Field -> its laws. Station and offsets of it are along the axes of the ITRS.
-    met : Mapping[tuple[str, str], Corrections]
-        (field, line) -> the corrections of its rays; lines without times have none.
-    spans : tuple[tuple[int, int], ...]
+    parts : mapping of str to tuple of Part
+        Error models of each field. Station corrections are along the axes of the ITRS.
+    met : mapping of (str, str) to Corrections
+        Corrections of the rays of each (field, line); lines without times have none.
+    spans : tuple of (int, int)
         First and last + 1 unknown of each field.
-    groups : Mapping[str, NDArray[np.intp]]
-        Variance group -> its unknowns.
-    precision : sparse.csr_matrix
-        (K, K) sparse, of all unknowns.
+    groups : mapping of str to ndarray of int
+        Unknowns of each variance group.
+    precision : (K, K) csr_matrix
+        A-priori precision of all unknowns.
     """
 
     parts: Mapping[str, tuple[Part, ...]]
@@ -69,77 +67,77 @@ class SharedNoise:
 
     @classmethod
     def of(cls, fields: Sequence[CalibrationField], noise: Noise) -> SharedNoise:
-        """What the rays with times share; no unknowns where there are no times or no intervals."""
+        """Return the shared noise of all rays with times; it is empty without times or without intervals."""
         parts: dict[str, tuple[Part, ...]] = {}
         met: dict[tuple[str, str], Corrections] = {}
         spans, blocks, column = [], [], 0
         groups: dict[str, list[NDArray[np.intp]]] = {}
-        for one in fields:
-            times = {line: r.time for line, r in one.rays.items() if r.time is not None and r.point.size}
-            begin, mine = column, []
+        for site in fields:
+            times = {line: r.time for line, r in site.rays.items() if r.time is not None and r.point.size}
+            begin, field_parts = column, []
             for term in noise.terms if times else ():
                 if term.interval is None:
                     continue
                 support = Support.of(_law(term, term.interval), np.concatenate(list(times.values())))
-                mine.append(Part(term.kind == "attitude", column, support))
+                field_parts.append(Part(term.kind == "attitude", column, support))
                 blocks.append(sparse.kron(support.precision, sparse.eye(3)))
                 groups.setdefault(term.group, []).append(np.arange(column, column + support.size))
                 column += support.size
-            parts[one.name] = tuple(mine)
-            met |= {(one.name, line): Corrections(tuple(mine), np.eye(3), time) for line, time in times.items()}
+            parts[site.name] = tuple(field_parts)
+            met |= {(site.name, line): Corrections(tuple(field_parts), np.eye(3), time) for line, time in times.items()}
             spans.append((begin, column))
         precision = sparse.csr_matrix(sparse.block_diag(blocks)) if blocks else sparse.csr_matrix((0, 0))
         return cls(parts, met, tuple(spans), {k: np.concatenate(v) for k, v in groups.items()}, precision)
 
     @property
     def size(self) -> int:
-        """K, unknowns."""
+        """Number of unknowns, K."""
         return self.precision.shape[0]
 
     def corrected(self, name: str, line: str, rays: Rays, shared: Array) -> Rays:
-        """Rays of a line of a field with the corrections (K,) applied.
+        """Return the rays of a line of a field with corrected attitude and station.
 
         Parameters
         ----------
         name : str
-            Of the field.
+            Name of the field.
         line : str
-            Of the camera.
+            Name of the line camera.
         rays : Rays
-            Of that line.
-        shared : Array
-            Corrections of the noise that points share, (K,).
+            Rays of that line.
+        shared : (K,) ndarray
+            Unknowns of the shared noise.
         """
         return _moved(rays, self.met.get((name, line)), shared)
 
     def corrected_at(self, name: str, rays: Rays, shared: Array) -> Rays:
-        """Other rays of a field, with times.
+        """Return other rays of a field with corrected attitude and station.
 
         Parameters
         ----------
         name : str
-            Of the field.
+            Name of the field.
         rays : Rays
-            With times.
-        shared : Array
-            Corrections of the noise that points share, (K,).
+            Rays with times.
+        shared : (K,) ndarray
+            Unknowns of the shared noise.
         """
         assert rays.time is not None
         return _moved(rays, Corrections(self.parts[name], np.eye(3), rays.time), shared)
 
     def rows(self, name: str, line: str, white: Array, by: Partials) -> sparse.csr_matrix:
-        """Whitened rows (2n, K) of the rays of a line of a field.
+        """Return the whitened equations (2n, K) of the rays of a line of a field.
 
         Parameters
         ----------
         name : str
-            Of the field.
+            Name of the field.
         line : str
-            Of the camera.
-        white : Array
-            (n, 2, 2) whitens the misclosures of n rays.
+            Name of the line camera.
+        white : (n, 2, 2) ndarray
+            Matrices that whiten the misclosures of n rays.
         by : Partials
-            Their derivatives.
+            Derivatives of the misclosures.
         """
         count, met = len(white), self.met.get((name, line))
         if met is None:
@@ -151,24 +149,34 @@ class SharedNoise:
 
 
 def _law(term: NoiseTerm, interval: float) -> Law:
+    """Return the error model of a noise term."""
     return Law(term.group, "walk" if term.walks else "white", (term.sigma,) * 3, interval)
 
 
 def _moved(rays: Rays, met: Corrections | None, shared: Array) -> Rays:
+    """Return rays with corrected attitude and station."""
     if met is None or not met.parts:
         return rays
-    turn, shift = met.at(shared)
-    turns = Rotation.from_rotvec(turn).as_matrix()
-    return replace(rays, attitude=rays.attitude @ turns, station=rays.station + shift @ met.axes.T)
+    rotation, shift = met.at(shared)
+    rotations = Rotation.from_rotvec(rotation).as_matrix()
+    return replace(rays, attitude=rays.attitude @ rotations, station=rays.station + shift @ met.axes.T)
 
 
 _CHUNK = 512
-"""Points or image points whose covariances are made at once."""
+"""Number of points or image points whose covariances are computed at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """image: (M,) robust weights of the image points, 0 to 1. factor: group -> variance factor (1: as given)."""
+    """Weights of the observations.
+
+    Attributes
+    ----------
+    image : (M,) ndarray
+        Robust weights of the image points, 0 to 1.
+    factor : mapping of str to float
+        Variance factor of each group; 1 for the a-priori sigmas.
+    """
 
     image: Array
     factor: Mapping[str, float]
@@ -176,9 +184,16 @@ class Weights:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where an iteration stands.
+    """State of an iteration.
 
-    values: (P,) unknowns. grounds: points (m, 3) of each field. shared: (S,) unknowns of the shared noise.
+    Attributes
+    ----------
+    values : (P,) ndarray
+        Unknowns.
+    grounds : tuple of (m, 3) ndarray
+        Points of each field.
+    shared : (S,) ndarray
+        Unknowns of the shared noise.
     """
 
     values: Array
@@ -186,7 +201,7 @@ class State:
     shared: Array
 
     def moved(self, equations: Equations, step: Array) -> State:
-        """After a step (P,) of the unknowns, all else following."""
+        """Return the state after a step (P,) of the unknowns and the corresponding steps of points and noise."""
         cuts = np.cumsum([len(g) for g in self.grounds])[:-1]
         points = np.split(equations.point_step(step), cuts)
         grounds = tuple(g + d for g, d in zip(self.grounds, points, strict=True))
@@ -195,9 +210,18 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals of the observations, whitened by the a-priori covariances: image (M, 2), control (m, 3), prior (K,).
+    """Residuals of the observations, whitened by the a-priori covariances.
 
-    shared: group -> sum of squares of its readings' corrections.
+    Attributes
+    ----------
+    image : (M, 2) ndarray
+        Residuals of the image points.
+    control : (m, 3) ndarray
+        Residuals of the control coordinates.
+    prior : (K,) ndarray
+        Residuals of the priors.
+    shared : mapping of str to float
+        Sum of squares of the readings' corrections of each group.
     """
 
     image: Array
@@ -212,30 +236,47 @@ class Equations:
 
     Attributes
     ----------
-    design : sparse.csr_matrix
-        (2M, P) sparse by x, design_shared: (2M, S) by z, design_point: (2M, 3m) by p; whitened, not weighted.
-    row_weight : Array
-        (2M,) weight of each row.
-    design_prior : Array
-        (K, P) whitened. prior_weight: (K,).
-    control_weight : sparse.csr_matrix
-        (3m, 3m) sparse, weights of the control coordinates with the factor; 0 for tie points.
+    design : (2M, P) csr_matrix
+        Whitened, unweighted derivatives with respect to x.
+    design_shared : (2M, S) csr_matrix
+        Derivatives with respect to z.
+    design_point : (2M, 3m) csr_matrix
+        Derivatives with respect to p.
+    row_weight : (2M,) ndarray
+        Weight of each row.
+    design_prior : (K, P) ndarray
+        Whitened design of the priors.
+    prior_weight : (K,) ndarray
+        Weights of the priors.
+    control_weight : (3m, 3m) csr_matrix
+        Weights of the control coordinates with the variance factor; 0 for tie points.
     residuals : Residuals
-        At this state.
-    reduced : Array
-        (P, P) normal matrix with z and p eliminated. right: (P,) its negative right side.
-    length : Array
-        (P,) root of the diagonal, of the image points alone and before anything was eliminated.
+        Residuals at this state.
+    reduced : (P, P) ndarray
+        Normal matrix with z and p eliminated.
+    right : (P,) ndarray
+        Negative right side of the reduced equations.
+    length : (P,) ndarray
+        Square root of the diagonal of the normal matrix from the image points alone, before elimination.
     shared : SharedNoise
-        What z stands for. shared_weight: (S, S) sparse, their prior with the factors. shared_normal: (S, S) sparse,
-        their normal matrix with p eliminated.
-    follow : Array
-        (S, P) change of z with x. shared_start: (S,) change of z where x stays.
-    point_inverse : sparse.bsr_matrix
-        (3m, 3m) sparse block inverse. cross: (3m, P + S) N_py. right_point: (3m,).
-    movable : NDArray[np.bool_]
-        (m,) points that are unknown.
-    row_spans, point_spans : tuple[tuple[int, int], ...]
+        Shared noise that z describes.
+    shared_weight : (S, S) csr_matrix
+        Precision of the prior of z with the variance factors.
+    shared_normal : (S, S) csr_matrix
+        Normal matrix of z with p eliminated.
+    follow : (S, P) ndarray
+        Derivatives of z with respect to x.
+    shared_start : (S,) ndarray
+        Step of z for unchanged x.
+    point_inverse : (3m, 3m) bsr_matrix
+        Inverse of the points' normal blocks.
+    cross : (3m, P + S) csr_matrix
+        Normal block N_py.
+    right_point : (3m,) ndarray
+        Right side of the points.
+    movable : (m,) ndarray of bool
+        True for points that are unknown.
+    row_spans, point_spans : tuple of (int, int)
         First and last + 1 row (of 2M) and coordinate (of 3m) of each field.
     """
 
@@ -263,40 +304,40 @@ class Equations:
     point_spans: tuple[tuple[int, int], ...]
 
     def shared_step(self, step: Array) -> Array:
-        """(S,) change of the shared noise that goes with a change (P,) of the unknowns."""
+        """Return the (S,) step of the shared noise for a step (P,) of the unknowns."""
         return np.asarray(self.shared_start + self.follow @ step)
 
     def point_step(self, step: Array) -> Array:
-        """(m, 3) change of the ground points that goes with a change (P,) of the unknowns."""
+        """Return the (m, 3) step of the ground points for a step (P,) of the unknowns."""
         change = np.concatenate([step, self.shared_step(step)])
         return np.asarray(-self.point_inverse @ (self.right_point + self.cross @ change)).reshape(-1, 3)
 
     def through_points(self) -> Array:
-        """(2M, P) change of the rows with the unknowns when shared noise and ground points follow."""
+        """Return the (2M, P) derivatives by the unknowns with shared noise and ground points eliminated."""
         by_x, by_z = self._carried
         fixed = (self.design - self.design_point @ by_x).toarray()
         return np.asarray(fixed + (self.design_shared - self.design_point @ by_z) @ self.follow)
 
     @cached_property
     def shared_inverse(self) -> tuple[Array, ...]:
-        """Covariance (s, s) of the z of each field at known x."""
+        """Covariance (s, s) of the z of each field for known x."""
         return tuple(_inverse(self.shared_normal[a:b, a:b].toarray()) for a, b in self.shared.spans)
 
     def image_cofactors(self, covariance: Array) -> Array:
-        """(M, 2, 2) covariance of the adjusted, whitened image points, from that (P, P) of the unknowns."""
-        followed = self.through_points().reshape(len(self.row_weight) // 2, 2, covariance.shape[0])
-        found = followed @ covariance @ np.swapaxes(followed, 1, 2)
-        found += _products((self.design_point @ self.point_inverse).tocsr(), self.design_point, 2)
+        """Return the (M, 2, 2) covariance of the adjusted, whitened image points, given that (P, P) of the unknowns."""
+        derivatives = self.through_points().reshape(len(self.row_weight) // 2, 2, covariance.shape[0])
+        cofactors = derivatives @ covariance @ np.swapaxes(derivatives, 1, 2)
+        cofactors += _products((self.design_point @ self.point_inverse).tocsr(), self.design_point, 2)
         if self.shared.size:
             rows = (self.design_shared - self.design_point @ self._carried[1]).tocsr()
-            found += self._of_shared(rows, self.row_spans, 2)
-        return np.asarray(found)
+            cofactors += self._of_shared(rows, self.row_spans, 2)
+        return np.asarray(cofactors)
 
     def point_covariance(self, covariance: Array) -> Array:
-        """(m, 3, 3) of the adjusted ground points, zero for those that are held."""
+        """Return the (m, 3, 3) covariance of the adjusted ground points, zero for fixed points."""
         by_x, by_z = self._carried
-        moved = np.asarray(by_x.toarray() + by_z @ self.follow).reshape(len(self.movable), 3, len(covariance))
-        total = self.point_inverse.data + moved @ covariance @ np.swapaxes(moved, 1, 2)
+        derivatives = np.asarray(by_x.toarray() + by_z @ self.follow).reshape(len(self.movable), 3, len(covariance))
+        total = self.point_inverse.data + derivatives @ covariance @ np.swapaxes(derivatives, 1, 2)
         if self.shared.size:
             total = total + self._of_shared(by_z, self.point_spans, 3)
         return np.where(self.movable[:, None, None], total, 0.0)
@@ -304,64 +345,71 @@ class Equations:
     def tests(
         self, covariance: Array, cofactors: Array, weights: Weights, priors: Sequence[Prior]
     ) -> dict[str, GroupTest]:
-        """Variance groups after an adjustment.
+        """Return the tests of the variance groups after an adjustment.
 
         Parameters
         ----------
-        covariance : Array
-            Of the P unknowns, (P, P), SI.
-        cofactors : Array
-            Of the adjusted image points, (M, 2, 2), whitened.
+        covariance : (P, P) ndarray
+            Covariance of the unknowns, SI units.
+        cofactors : (M, 2, 2) ndarray
+            Cofactors of the adjusted image points, whitened.
         weights : Weights
-            Of the observations.
-        priors : Sequence[Prior]
-            Further observations of the unknowns.
+            Weights of the observations.
+        priors : sequence of Prior
+            Pseudo-observations of the unknowns.
         """
         residuals, factor = self.residuals, weights.factor
         squares = weights.image * np.sum(residuals.image**2, axis=1) / factor["image"]
         adjusted = weights.image * np.trace(cofactors, axis1=1, axis2=2) / factor["image"]
         rows: dict[str, tuple[float, float, float]] = {}
         rows["image"] = (2.0 * np.sum(weights.image > 0), np.sum(adjusted), np.sum(squares))
-        # control_weight is block diagonal: the sum of products is the trace with the points' own blocks
-        given = self.control_weight.tobsr((3, 3))
-        own = self.point_covariance(covariance)[given.indices]
+        # control_weight is block diagonal: the sum of products is the trace with the points' covariance blocks
+        control_blocks = self.control_weight.tobsr((3, 3))
+        point_blocks = self.point_covariance(covariance)[control_blocks.indices]
         control = np.sum(residuals.control**2) / factor["control"]
-        rows["control"] = (np.sum(self.control_weight.diagonal() > 0), np.sum(given.data * own), control)
-        told = self.prior_weight * np.einsum("kp,pq,kq->k", self.design_prior, covariance, self.design_prior)
+        rows["control"] = (
+            np.sum(self.control_weight.diagonal() > 0),
+            np.sum(control_blocks.data * point_blocks),
+            control,
+        )
+        determined = self.prior_weight * np.einsum("kp,pq,kq->k", self.design_prior, covariance, self.design_prior)
         square = self.prior_weight * residuals.prior**2
         for group in dict.fromkeys(p.group for p in priors):
             member = np.array([p.group == group for p in priors])
-            rows[group] = (np.sum(member), np.sum(told[member]), np.sum(square[member]))
-        for group, taken in self._taken(covariance).items():
-            rows[group] = (len(self.shared.groups[group]), taken, residuals.shared[group] / factor[group])
+            rows[group] = (np.sum(member), np.sum(determined[member]), np.sum(square[member]))
+        for group, unchecked in self._taken(covariance).items():
+            rows[group] = (len(self.shared.groups[group]), unchecked, residuals.shared[group] / factor[group])
         return {g: GroupTest(int(n), float(n - t), float(v), float(factor[g])) for g, (n, t, v) in rows.items()}
 
     def _taken(self, covariance: Array) -> dict[str, float]:
-        """Group of the shared noise -> how many of its readings the image points do not check."""
-        taken = np.zeros(self.shared.size)
+        """Return the number of readings of each shared-noise group that the image points do not check."""
+        unchecked = np.zeros(self.shared.size)
         for (a, b), inverse in zip(self.shared.spans, self.shared_inverse, strict=True):
-            found = inverse + self.follow[a:b] @ covariance @ self.follow[a:b].T
-            taken[a:b] = np.asarray(self.shared_weight[a:b, a:b].multiply(found).sum(axis=1)).ravel()
-        return {g: float(np.sum(taken[c])) for g, c in self.shared.groups.items()}
+            posterior = inverse + self.follow[a:b] @ covariance @ self.follow[a:b].T
+            unchecked[a:b] = np.asarray(self.shared_weight[a:b, a:b].multiply(posterior).sum(axis=1)).ravel()
+        return {g: float(np.sum(unchecked[c])) for g, c in self.shared.groups.items()}
 
     @cached_property
     def _carried(self) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-        """(3m, P) and (3m, S): the points move by their negative with x and z."""
+        """Negative derivatives (3m, P) and (3m, S) of the points with respect to x and z."""
         both, count = (self.point_inverse @ self.cross).tocsc(), self.design.shape[1]
         return both[:, :count].tocsr(), both[:, count:].tocsr()
 
     def _of_shared(self, rows: sparse.csr_matrix, spans: Sequence[tuple[int, int]], size: int) -> Array:
-        """Diagonal blocks (n, size, size) of rows (n size, S) times the covariance of z at known x times rows'."""
-        found = np.zeros((rows.shape[0] // size, size, size))
+        """Return the diagonal blocks (n, size, size) of A C A' for rows A (n size, S), C the covariance of z.
+
+        C holds at known x.
+        """
+        blocks = np.zeros((rows.shape[0] // size, size, size))
         for (first, last), (a, b), inverse in zip(spans, self.shared.spans, self.shared_inverse, strict=True):
             if b == a:
                 continue
             values, columns = _padded(rows[first:last, a:b].tocoo(), size)
             for begin in range(0, len(values), _CHUNK):
-                some, where = values[begin : begin + _CHUNK], columns[begin : begin + _CHUNK]
-                spread = inverse[where[:, :, None], where[:, None, :]]
-                found[first // size + begin :][: len(some)] = some @ spread @ np.swapaxes(some, 1, 2)
-        return found
+                chunk, columns_of_chunk = values[begin : begin + _CHUNK], columns[begin : begin + _CHUNK]
+                spread = inverse[columns_of_chunk[:, :, None], columns_of_chunk[:, None, :]]
+                blocks[first // size + begin :][: len(chunk)] = chunk @ spread @ np.swapaxes(chunk, 1, 2)
+        return blocks
 
 
 def assemble(
@@ -373,75 +421,75 @@ def assemble(
     priors: Sequence[Prior],
     weights: Weights,
     shared: SharedNoise,
-    hidden: Hidden | None = None,
+    omitted: OmittedTermsModel | None = None,
 ) -> Equations:
-    """Linearise at a state.
+    """Return the equations linearised at a state.
 
-    Image rows run by field, line and ray, x before y; points and shared unknowns by field. `hidden` terms, zero at this
-    state, are unknowns after those of the parameters.
+    Image rows are ordered by field, line and ray, x before y; points and shared unknowns by field. Omitted terms
+    `omitted`, zero at this state, are unknowns after those of the parameters.
     """
-    known = len(state.values)
-    count = known + (0 if hidden is None else hidden.size)
-    rows, points, misses, places, shares = [], [], [], [], []
+    parameter_count = len(state.values)
+    count = parameter_count + (0 if omitted is None else omitted.size)
+    rows, points, misses, point_indices, shared_rows = [], [], [], [], []
     spans: list[list[tuple[int, int]]] = [[], []]
     first = row = 0
-    for one, ground in zip(fields, state.grounds, strict=True):
-        axes, begin = one.axes, row
-        for line, measured in one.rays.items():
-            rays = shared.corrected(one.name, line, measured, state.shared)
-            rays = parameters.turned(state.values, one.name, line, rays)
-            camera, bias, offset = parameters.parts(state.values, one.name, line, cameras[line])
-            shown, moved = ground[rays.point], axes @ offset
-            by = partials(camera, rays, shown, bias, moved)
+    for site, ground in zip(fields, state.grounds, strict=True):
+        axes, begin = site.axes, row
+        for line, measured in site.rays.items():
+            rays = shared.corrected(site.name, line, measured, state.shared)
+            rays = parameters.turned(state.values, site.name, line, rays)
+            camera, bias, offset = parameters.parts(state.values, site.name, line, cameras[line])
+            shown, shift = ground[rays.point], axes @ offset
+            by = partials(camera, rays, shown, bias, shift)
             white = np.linalg.inv(np.linalg.cholesky(ray_covariance(noise, rays, by, shared=False)))
             block = np.zeros((len(rays.point), 2, count))
-            since = parameters.since_middle(one.name, rays)[:, None, None]
+            since = parameters.since_middle(site.name, rays)[:, None, None]
             parts = (by.interior, by.bias, -by.ground @ axes, by.drift, by.attitude * since)
-            for where, part in zip(parameters.columns[one.name, line], parts, strict=True):
-                if where[0] >= 0:
-                    block[:, :, where] = part
-            if hidden is not None:
-                block[:, :, known:] = hidden.columns(one, line, rays, by)
+            for indices, part in zip(parameters.columns[site.name, line], parts, strict=True):
+                if indices[0] >= 0:
+                    block[:, :, indices] = part
+            if omitted is not None:
+                block[:, :, parameter_count:] = omitted.columns(site, line, rays, by)
             rows.append(sparse.csr_matrix((white @ block).reshape(2 * len(block), count)))
-            shares.append(shared.rows(one.name, line, white, by))
+            shared_rows.append(shared.rows(site.name, line, white, by))
             points.append(white @ by.ground)
-            misses.append(np.einsum("nij,nj->ni", white, misclosure(camera, rays, shown, bias, moved)))
-            places.append(first + rays.point)
+            misses.append(np.einsum("nij,nj->ni", white, misclosure(camera, rays, shown, bias, shift)))
+            point_indices.append(first + rays.point)
             row += 2 * len(rays.point)
         spans[0].append((begin, row))
         spans[1].append((3 * first, 3 * (first + len(ground))))
         first += len(ground)
-    found = _Rows(
+    image_rows = _Rows(
         sparse.vstack(rows).tocsr(),
-        sparse.vstack(shares).tocsr(),
+        sparse.vstack(shared_rows).tocsr(),
         np.concatenate(points),
         np.concatenate(misses),
-        np.concatenate(places),
+        np.concatenate(point_indices),
         (tuple(spans[0]), tuple(spans[1])),
     )
     design, residual, weight = _priors(parameters, state.values, priors, weights)
-    design = np.pad(design, ((0, 0), (0, count - known)))
-    return _reduce(fields, state, found, (design, residual, weight), weights, shared)
+    design = np.pad(design, ((0, 0), (0, count - parameter_count)))
+    return _reduce(fields, state, image_rows, (design, residual, weight), weights, shared)
 
 
-class Hidden(Protocol):
-    """Terms that the model leaves out."""
+class OmittedTermsModel(Protocol):
+    """Interface of terms that are omitted from the model."""
 
     @property
     def size(self) -> int:
         """Number of terms."""
 
     def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
-        """(n, 2, size) change of the misclosures with each of them.
+        """Return the (n, 2, size) derivatives of the misclosures with respect to the terms.
 
         Parameters
         ----------
         field : CalibrationField
-            The pass.
+            Pass over a test field.
         line : str
-            Of the camera.
+            Name of the line camera.
         rays : Rays
-            n image points of it.
+            Image points of the line, n of them.
         by : Partials
             Derivatives of their misclosures.
         """
@@ -449,7 +497,23 @@ class Hidden(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Whitened rows: by x (2M, P), z (2M, S) and the point (M, 2, 3); misclosures (M, 2); which point (M,); spans."""
+    """Whitened equations of all image points.
+
+    Attributes
+    ----------
+    design : (2M, P) csr_matrix
+        Derivatives with respect to x.
+    design_shared : (2M, S) csr_matrix
+        Derivatives with respect to z.
+    point : (M, 2, 3) ndarray
+        Derivatives with respect to the ground point.
+    miss : (M, 2) ndarray
+        Misclosures.
+    place : (M,) ndarray of int
+        Index of the ground point.
+    spans : tuple
+        Row and coordinate ranges of each field.
+    """
 
     design: sparse.csr_matrix
     design_shared: sparse.csr_matrix
@@ -467,6 +531,7 @@ def _reduce(
     weights: Weights,
     shared: SharedNoise,
 ) -> Equations:
+    """Eliminate ground points and shared noise from the whitened equations."""
     exact = np.concatenate([f.control & ~np.any(f.covariance, axis=(1, 2)) for f in fields])
     control = np.concatenate([f.control for f in fields]) & ~exact
     total, count = len(exact), rows.design.shape[1]
@@ -479,17 +544,20 @@ def _reduce(
     inverse[control] = np.linalg.inv(np.concatenate([f.covariance for f in fields])[control])
     departure = np.concatenate([g - f.ground for g, f in zip(state.grounds, fields, strict=True)])
     control_residual = np.einsum("nji,nj->ni", _root(inverse, control), departure)
-    held = _blocks(inverse * (1.0 / weights.factor.get("control", 1.0)))
-    every = sparse.hstack([rows.design, rows.design_shared]).tocsr()
-    weighted = (sparse.diags(row_weight) @ every).tocsr()
+    control_precision = _blocks(inverse * (1.0 / weights.factor.get("control", 1.0)))
+    full_design = sparse.hstack([rows.design, rows.design_shared]).tocsr()
+    weighted = (sparse.diags(row_weight) @ full_design).tocsr()
     cross = (design_point.T @ weighted).tocsr()
-    own_blocks = _point_blocks(point, rows.place, weights.image / weights.factor.get("image", 1.0), total) + held.data
-    # of what was given up no ray has any weight
-    own_blocks[exact | ~np.any(own_blocks, axis=(1, 2))] = np.eye(3)
-    point_inverse = _blocks(np.asarray(np.linalg.inv(own_blocks), np.float64))
+    normal_blocks = (
+        _point_blocks(point, rows.place, weights.image / weights.factor.get("image", 1.0), total)
+        + control_precision.data
+    )
+    # rejected points have no ray with weight
+    normal_blocks[exact | ~np.any(normal_blocks, axis=(1, 2))] = np.eye(3)
+    point_inverse = _blocks(np.asarray(np.linalg.inv(normal_blocks), np.float64))
     miss = rows.miss.ravel()
-    right_point = np.asarray(design_point.T @ (row_weight * miss) + held @ departure.ravel())
-    normal = (every.T @ weighted - cross.T @ (point_inverse @ cross)).tocsc()
+    right_point = np.asarray(design_point.T @ (row_weight * miss) + control_precision @ departure.ravel())
+    normal = (full_design.T @ weighted - cross.T @ (point_inverse @ cross)).tocsc()
     right = np.asarray(weighted.T @ miss - cross.T @ (point_inverse @ right_point))
     design_prior, prior_residual, prior_weight = prior
     reduced = normal[:count, :count].toarray() + design_prior.T @ (prior_weight[:, None] * design_prior)
@@ -498,16 +566,16 @@ def _reduce(
     for group, columns in shared.groups.items():
         scale[columns] = 1.0 / weights.factor.get(group, 1.0)
     prior_shared = (sparse.diags(scale) @ shared.precision).tocsr()
-    departed = shared.precision @ state.shared
+    weighted_shared = shared.precision @ state.shared
     normal_shared = (normal[count:, count:] + prior_shared).tocsc()
     follow, shared_start = np.zeros((0, count)), np.zeros(0)
     if shared.size:
         mixed = normal[count:, :count].toarray()
         factor = splu(normal_shared, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        shared_start = -factor.solve(right[count:] + scale * departed)
+        shared_start = -factor.solve(right[count:] + scale * weighted_shared)
         follow = -factor.solve(mixed) if count else np.zeros((shared.size, 0))
         reduced, right_x = reduced + mixed.T @ follow, right_x + mixed.T @ shared_start
-    seen = weighted[:, :count].multiply(rows.design)
+    squares = weighted[:, :count].multiply(rows.design)
     return Equations(
         design=rows.design,
         design_shared=rows.design_shared,
@@ -515,16 +583,16 @@ def _reduce(
         row_weight=row_weight,
         design_prior=design_prior,
         prior_weight=prior_weight,
-        control_weight=held.tocsr(),
+        control_weight=control_precision.tocsr(),
         residuals=Residuals(
             rows.miss,
             control_residual,
             prior_residual,
-            {g: float(state.shared[c] @ departed[c]) for g, c in shared.groups.items()},
+            {g: float(state.shared[c] @ weighted_shared[c]) for g, c in shared.groups.items()},
         ),
         reduced=0.5 * (reduced + reduced.T),
         right=right_x,
-        length=np.sqrt(np.asarray(seen.sum(axis=0)).ravel()),
+        length=np.sqrt(np.asarray(squares.sum(axis=0)).ravel()),
         shared=shared,
         shared_weight=prior_shared,
         shared_normal=normal_shared.tocsr(),
@@ -542,7 +610,7 @@ def _reduce(
 def _priors(
     parameters: Parameters, values: Array, priors: Sequence[Prior], weights: Weights
 ) -> tuple[Array, Array, Array]:
-    """Whitened rows (K, P), residuals (K,) and weights (K,) of the pseudo-observations."""
+    """Return whitened rows (K, P), residuals (K,) and weights (K,) of the pseudo-observations."""
     rows = np.zeros((len(priors), len(values)))
     for row, prior in zip(rows, priors, strict=True):
         if not (np.isfinite(prior.value) and np.isfinite(prior.sigma) and prior.sigma > 0):
@@ -555,55 +623,55 @@ def _priors(
 
 
 def _root(inverse: Array, used: NDArray[np.bool_]) -> Array:
-    """(m, 3, 3) lower Cholesky factors of weights, zero where not used."""
+    """Return the (m, 3, 3) lower Cholesky factors of weights, zero where unused."""
     root = np.zeros_like(inverse)
     root[used] = np.linalg.cholesky(inverse[used])
     return root
 
 
 def _blocks(blocks: Array) -> sparse.bsr_matrix:
-    """Block diagonal (3m, 3m)."""
+    """Return a block diagonal matrix (3m, 3m) from blocks (m, 3, 3)."""
     count = len(blocks)
     return sparse.bsr_matrix((blocks, np.arange(count), np.arange(count + 1)), shape=(3 * count, 3 * count))
 
 
 def _inverse(matrix: Array) -> Array:
-    """Inverse of a positive definite matrix."""
+    """Return the inverse of a positive definite matrix."""
     if not len(matrix):
         return matrix
     root, failed = dpotrf(matrix, lower=1, clean=1)
     half, wrong = dpotri(root, lower=1)  # zero above the diagonal, as the root is
     if failed or wrong:
-        raise CalibrationError("calibration: the shared noise cannot be solved for; are its sigmas of the right size?")
+        raise CalibrationError("calibration: the shared noise cannot be estimated; are its sigmas of the right size?")
     half[np.diag_indices(len(half))] *= 0.5
     return np.asarray(half + half.T)
 
 
 def _point_blocks(point: Array, place: NDArray[np.intp], weight: Array, count: int) -> Array:
-    """(m, 3, 3) normal matrices of the points from the (M, 2, 3) blocks of their image points."""
+    """Return the (m, 3, 3) normal matrices of the points from the (M, 2, 3) blocks of their image points."""
     blocks = np.zeros((count, 3, 3))
     np.add.at(blocks, place, weight[:, None, None] * (np.swapaxes(point, 1, 2) @ point))
     return blocks
 
 
 def _padded(rows: sparse.coo_matrix, size: int) -> tuple[Array, NDArray[np.intp]]:
-    """Sparse rows (n size, K), taken by `size`: values (n, size, w) of the columns (n, w) that any of them meets."""
+    """Return sparse rows (n size, K), grouped by `size`, as dense values (n, size, w) with their columns (n, w)."""
     count, width = rows.shape[0] // size, rows.shape[1]
     key = (rows.row // size).astype(np.int64) * width + rows.col
     used, slot = np.unique(key, return_inverse=True)
     group = used // width
-    place = np.arange(len(used)) - np.searchsorted(group, group)
-    most = int(place.max(initial=0)) + 1
-    values, columns = np.zeros((count, size, most)), np.zeros((count, most), np.intp)
-    values[rows.row // size, rows.row % size, place[slot]] = rows.data
-    columns[group, place] = used % width
+    slot_of_column = np.arange(len(used)) - np.searchsorted(group, group)
+    width_needed = int(slot_of_column.max(initial=0)) + 1
+    values, columns = np.zeros((count, size, width_needed)), np.zeros((count, width_needed), np.intp)
+    values[rows.row // size, rows.row % size, slot_of_column[slot]] = rows.data
+    columns[group, slot_of_column] = used % width
     return values, columns
 
 
 def _products(left: sparse.csr_matrix, right: sparse.csr_matrix, size: int) -> Array:
-    """Diagonal blocks (n, size, size) of left right', both (n size, K)."""
-    found = np.empty((left.shape[0] // size, size, size))
+    """Return the diagonal blocks (n, size, size) of left right', both (n size, K)."""
+    blocks = np.empty((left.shape[0] // size, size, size))
     for i in range(size):
         for j in range(size):
-            found[:, i, j] = np.asarray(left[i::size].multiply(right[j::size]).sum(axis=1)).ravel()
-    return found
+            blocks[:, i, j] = np.asarray(left[i::size].multiply(right[j::size]).sum(axis=1)).ravel()
+    return blocks

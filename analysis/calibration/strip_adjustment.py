@@ -1,29 +1,29 @@
-"""Adjustment of the measured attitude and station within one pass, without ground control (paper 003's check flow).
+"""Strip adjustment of attitude and station within one pass without ground control; stepwise calibration.
 
-Points that several lines see (tie points, with the check points among them) tie the attitudes of different exposures
-together: rays that do not meet show errors of the attitude. Unknowns are the errors of the readings, with their given
-sigmas as priors, and the points; cameras and attitude bias come from a calibration.
+**Strip adjustment** (paper 003's check flow). Points that several lines see (tie points, including the check points)
+connect the attitudes of different exposures: rays that do not intersect reveal attitude errors. The unknowns are the
+errors of the readings, with their a-priori sigmas as priors, and the points; cameras and attitude bias come from a
+calibration.
 
-What no tie point can tell is the datum. With lines that look forward and backward by a, which see a place T seconds
-before and after the nadir line, all rays still meet when
+Tie points do not determine the datum. With lines that look forward and backward by a, which see a point T seconds
+before and after the nadir line, all rays still intersect when
 
 - the whole pass rolls: the scene shifts with it;
-- it rolls at a constant rate and is yawed by rate * T / tan a: the scene turns with it;
-- roll repeats itself with the period T: all three lines see a place with one roll.
+- it rolls at a constant rate and is yawed by rate * T / tan a: the scene rotates with it;
+- roll repeats itself with the period T: all three lines see a point with the same roll.
 
-Pitch shifts nadir rays by tan^2 a (0.22 at 25 deg) less than outer ones, so it is told that weakly. What all rays of a
-place have in common thus keeps its prior error: the priors alone close it, and `StripAdjustment.datum` says how much
-the ties added. It also bounds the gain. Forward intersection takes the mean over three exposures anyway, and noise that
-is independent from one reading to the next has its largest part in this mean: ties hardly reduce it. Errors that last
-for many readings and change within the pass are reduced a lot.
+Pitch shifts nadir rays by tan^2 a (0.22 at 25 deg) less than outer ones, so it is weakly determined. What all rays of a
+point have in common thus keeps its a-priori error: only the priors fix it, and `StripAdjustment.datum` reports how much
+the ties added. This also bounds the gain. Forward intersection averages over three exposures anyway, and noise that is
+independent from one reading to the next has its largest part in this mean: ties hardly reduce it. Errors that last for
+many readings and vary within the pass are reduced considerably.
 
-Stepwise solution of a three-line calibration, as paper 003 does it: attitude bias with the interior fixed, then the
-interior with the bias fixed, iterated.
-
-It walks down the same sum of squares as the simultaneous adjustment, one block of unknowns at a time, and each round
-leaves the fraction rho^2 of the error, with rho the largest correlation between a combination of one block and a
-combination of the other (block Gauss-Seidel). It needs no gauge, because each block alone is determined; a combination
-of both that the points leave open then keeps whatever the start values and the order of the steps made of it.
+**Stepwise calibration** as in paper 003: attitude bias with the interior orientation fixed, then the interior
+orientation with the bias fixed, iterated. It minimises the same sum of squares as the simultaneous adjustment, one
+block of unknowns at a time, and each round leaves the fraction rho^2 of the error, with rho the largest correlation
+between a combination of one block and a combination of the other (block Gauss-Seidel). It needs no gauge, because each
+block alone is determined; a combination of both blocks that the points leave undetermined then depends on the start
+values and the order of the steps.
 """
 
 from __future__ import annotations
@@ -54,14 +54,23 @@ from analysis.orbit.three_line_model import BIAS, LineModel, Rays, bias_rotation
 
 _NAME = "strip"
 _STEPS = 10
-_CONVERGED = 1e-6  # metres, as in forward intersection
+"""Largest number of Gauss-Newton steps."""
+_CONVERGED = 1e-6
+"""Largest step of a converged iteration, in metres, as in forward intersection."""
 
 
 @dataclass(frozen=True)
 class Datum:
-    """Sigma of a turn that the whole pass has in common, before and after the adjustment.
+    """Sigma of a rotation that the whole pass has in common, before and after the adjustment.
 
-    name: "roll", "pitch", "yaw" (radians, at the middle of the pass) or "roll rate" and so on (rad/s).
+    Attributes
+    ----------
+    name : str
+        "roll", "pitch", "yaw" (radians, at the middle of the pass), or "roll rate" and so on (rad/s).
+    before : float
+        A-priori sigma.
+    after : float
+        Sigma after the adjustment.
     """
 
     name: str
@@ -75,14 +84,16 @@ class StripAdjustment:
 
     Attributes
     ----------
-    ground : Array
-        (m, 3) points, ITRS, metres; NaN where fewer than two rays see one.
-    covariance : Array
-        (m, 3, 3), with the errors of attitude and station that are left.
-    datum : tuple[Datum, ...]
-        Common turns and their rates, from all rays.
-    chi_square, degrees_of_freedom : float
-        Of the rays that meet others, and of the readings' corrections.
+    ground : (m, 3) ndarray
+        Points, ITRS, in metres; NaN where fewer than two rays see one.
+    covariance : (m, 3, 3) ndarray
+        Covariance of the points, including the remaining errors of attitude and station, in m^2.
+    datum : tuple of Datum
+        Common rotations and their rates, from all rays.
+    chi_square : float
+        Chi-square of the rays of tie points and of the readings' corrections.
+    degrees_of_freedom : int
+        Degrees of freedom of the chi-square.
     """
 
     ground: Array
@@ -96,21 +107,23 @@ class StripAdjustment:
 
     @property
     def p_value(self) -> float:
-        """Chance of such a chi-square or a larger one, if the sigmas are right."""
+        """p-value of the chi-square, if the sigmas are right."""
         return statistics.p_value(self.chi_square, self.degrees_of_freedom)
 
     def corrected(self, rays: Rays) -> Rays:
-        """Any rays of the pass, with times, with corrected attitude and station.
+        """Return any rays of the pass, with times, with corrected attitude and station.
 
         Raises
         ------
         CalibrationError
-            No times.
+            The rays have no times.
         """
         if rays.time is None:
             raise CalibrationError("strip adjustment: these rays have no times")
-        found = self._shared.corrected_at(_NAME, replace(rays, attitude=rays.attitude @ self._turn), self._values)
-        return replace(found, attitude=found.attitude @ self._turn.T)
+        corrected_rays = self._shared.corrected_at(
+            _NAME, replace(rays, attitude=rays.attitude @ self._turn), self._values
+        )
+        return replace(corrected_rays, attitude=corrected_rays.attitude @ self._turn.T)
 
 
 def adjust_strip(
@@ -118,69 +131,69 @@ def adjust_strip(
 ) -> StripAdjustment:
     """Adjust one pass on its tie points.
 
-    Time goes with the number of points, memory with the square of that of readings near rays: 800 readings of the
-    attitude take 50 MB.
+    Time is linear in the number of points, memory quadratic in the number of readings near rays: 800 attitude readings
+    take 50 MB.
 
     Parameters
     ----------
-    rays : Mapping[str, Rays]
-        Line -> its image points, with times.
-    cameras : Mapping[str, LineModel]
-        Line -> calibrated camera, in its state during this pass.
+    rays : mapping of str to Rays
+        Image points of each line, with times.
+    cameras : mapping of str to LineModel
+        Calibrated cameras in their state during this pass, by line.
     noise : Noise
-        Of image, attitude and station, with at least one interval.
-    bias : ArrayLike
-        (3,) calibrated roll, pitch, yaw, radians.
+        Standard deviations of image, attitude and station, with at least one interval.
+    bias : (3,) array_like
+        Calibrated roll, pitch, yaw, in radians.
 
     Raises
     ------
     CalibrationError
-        Rays without times or a noise without intervals, no point with two rays, no convergence.
+        Rays have no times, the noise has no intervals, no point has two rays, or the iteration does not converge.
     """
     noise.check()
     if any(r.time is None for r in rays.values()) or all(t.interval is None for t in noise.terms):
         raise CalibrationError("strip adjustment: needs the times of all rays and the intervals of the readings")
     first = intersect(rays, cameras, noise, bias=bias)
-    good = np.flatnonzero(first.rays >= 2)
-    place = np.full(len(first.rays), -1)
-    place[good] = np.arange(len(good))
-    turn, kept = bias_rotation(bias), {}
+    intersected = np.flatnonzero(first.rays >= 2)
+    number = np.full(len(first.rays), -1)
+    number[intersected] = np.arange(len(intersected))
+    bias_matrix, tie_rays = bias_rotation(bias), {}
     for line, row in rays.items():
-        some = row.taken(place[row.point] >= 0)
-        if some.point.size:
-            kept[line] = replace(some, point=place[some.point], attitude=some.attitude @ turn)
-    size = len(good)
-    one = CalibrationField(_NAME, kept, first.ground[good], np.zeros((size, 3, 3)), np.zeros(size, bool))
-    shared = SharedNoise.of([one], noise)
-    state, equations = _solved(one, cameras, noise, shared)
-    ground, covariance = np.full((len(place), 3), np.nan), np.full((len(place), 3, 3), np.nan)
-    ground[good], covariance[good] = state.grounds[0], equations.point_covariance(np.zeros((0, 0)))
-    left = equations.residuals
+        selected = row.taken(number[row.point] >= 0)
+        if selected.point.size:
+            tie_rays[line] = replace(selected, point=number[selected.point], attitude=selected.attitude @ bias_matrix)
+    size = len(intersected)
+    site = CalibrationField(_NAME, tie_rays, first.ground[intersected], np.zeros((size, 3, 3)), np.zeros(size, bool))
+    shared = SharedNoise.of([site], noise)
+    state, equations = _solved(site, cameras, noise, shared)
+    ground, covariance = np.full((len(number), 3), np.nan), np.full((len(number), 3, 3), np.nan)
+    ground[intersected], covariance[intersected] = state.grounds[0], equations.point_covariance(np.zeros((0, 0)))
+    residuals = equations.residuals
     return StripAdjustment(
         ground=ground,
         covariance=covariance,
-        datum=_datum(kept, shared, equations.shared_inverse[0]),
-        chi_square=float(np.sum(left.image**2)) + sum(left.shared.values()),
-        degrees_of_freedom=left.image.size - 3 * size,
+        datum=_datum(tie_rays, shared, equations.shared_inverse[0]),
+        chi_square=float(np.sum(residuals.image**2)) + sum(residuals.shared.values()),
+        degrees_of_freedom=residuals.image.size - 3 * size,
         _shared=shared,
         _values=state.shared,
-        _turn=turn,
+        _turn=bias_matrix,
     )
 
 
 def _solved(
-    one: CalibrationField, cameras: Mapping[str, LineModel], noise: Noise, shared: SharedNoise
+    site: CalibrationField, cameras: Mapping[str, LineModel], noise: Noise, shared: SharedNoise
 ) -> tuple[State, Equations]:
-    """Readings and points."""
-    held = (np.array([-1]),) * 5
-    parameters = Parameters((), np.zeros(0), np.zeros(0), {(_NAME, k): held for k in one.rays})
-    state = State(np.zeros(0), (one.ground,), np.zeros(shared.size))
+    """Return the converged state of readings and points, and the equations."""
+    fixed = (np.array([-1]),) * 5
+    parameters = Parameters((), np.zeros(0), np.zeros(0), {(_NAME, k): fixed for k in site.rays})
+    state = State(np.zeros(0), (site.ground,), np.zeros(shared.size))
     factor = dict.fromkeys(("image", "control", *shared.groups), 1.0)
-    weights = Weights(np.ones(sum(len(r.point) for r in one.rays.values())), factor)
-    equations = assemble([one], cameras, parameters, state, noise, (), weights, shared)
+    weights = Weights(np.ones(sum(len(r.point) for r in site.rays.values())), factor)
+    equations = assemble([site], cameras, parameters, state, noise, (), weights, shared)
     for _ in range(_STEPS):
         before, state = state, state.moved(equations, np.zeros(0))
-        equations = assemble([one], cameras, parameters, state, noise, (), weights, shared)
+        equations = assemble([site], cameras, parameters, state, noise, (), weights, shared)
         step = float(np.abs(state.grounds[0] - before.grounds[0]).max())
         if step < _CONVERGED:
             return state, equations
@@ -188,7 +201,7 @@ def _solved(
 
 
 def _datum(rays: Mapping[str, Rays], shared: SharedNoise, inverse: Array) -> tuple[Datum, ...]:
-    """Constant and slope of the attitude's errors over all rays, by least squares."""
+    """Return sigmas of the constant and the slope of the attitude's errors over all rays, fitted by least squares."""
     if not any(part.turns for part in shared.parts[_NAME]):
         return ()
     time = np.concatenate([r.time for r in rays.values() if r.time is not None])
@@ -203,9 +216,10 @@ def _datum(rays: Mapping[str, Rays], shared: SharedNoise, inverse: Array) -> tup
     return tuple(Datum(n, float(b), float(a)) for n, b, a in zip(names, np.sqrt(before), np.sqrt(after), strict=True))
 
 
-# A combination of both blocks that keeps more than this of its error in a round is open: it needs a million rounds.
 _OPEN = 1.0 - 1e-6
+"""Squared correlation above which a combination of both blocks is undetermined: it would need a million rounds."""
 _RELINEARISED = 3
+"""Number of first rounds that are linearised again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,13 +228,16 @@ class Stepwise:
 
     Attributes
     ----------
-    names : tuple[str, ...]
-        Of the unknowns. values: (P,) at the end.
+    names : tuple of str
+        Names of the P unknowns.
+    values : (P,) ndarray
+        Final values.
     converged : bool
-        Whether the steps fell below the tolerance. steps: (rounds,) largest change of any unknown in each round, in
-        conditional sigmas.
+        True if the steps fell below the tolerance.
+    steps : (rounds,) ndarray
+        Largest change of any unknown in each round, in conditional sigmas.
     rate : float
-        Fraction of the slowest error that a round leaves by theory, open combinations apart.
+        Theoretical fraction of the slowest error that remains after a round, without undetermined combinations.
     """
 
     names: tuple[str, ...]
@@ -247,25 +264,48 @@ def stepwise(
     tolerance: float = 1e-3,
     rounds: int = 100_000,
 ) -> Stepwise:
-    """Alternate until both steps are below `tolerance` of their conditional sigmas.
+    """Alternate between both blocks until all steps are below `tolerance` of their conditional sigmas.
 
-    held: unknowns that keep their start values. rounds: at most. The error that is left is about the last step times
-    rate / (1 - rate). The first rounds are linearised anew, later ones only after all steps have become small.
+    The remaining error is about the last step times rate / (1 - rate). The first rounds are linearised again, later
+    ones only after all steps have become small.
+
+    Parameters
+    ----------
+    fields : sequence of CalibrationField
+        Passes over test fields.
+    cameras : mapping of str to LineModel
+        Cameras by line.
+    noise : Noise
+        Standard deviations of image, attitude and station.
+    unknowns : Unknowns, optional
+        Unknowns beside the interior orientation and one bias for each field.
+    start : mapping of str to float, optional
+        Start values by name.
+    priors : sequence of Prior
+        Pseudo-observations.
+    held : sequence of str
+        Unknowns that are fixed at their start values.
+    tolerance : float
+        Largest step at convergence, in conditional sigmas.
+    rounds : int
+        Largest number of rounds.
 
     Raises
     ------
     RankError
-        a block that is open on its own.
+        A block alone is undetermined.
     CalibrationError
-        Only one block is to be solved for; other bad input.
+        Only one block is to be estimated, or other input is invalid.
     """
     parameters = Parameters.of(fields, cameras, unknowns or Unknowns(), start)
     names, scale = parameters.names, parameters.scale
     inside = {n for f in fields for line in f.rays for n in np.array(names)[_used(parameters, f.name, line)]}
     free = np.array([n not in held for n in names])
-    blocks = [np.flatnonzero(free & np.array([(n in inside) == which for n in names])) for which in (False, True)]
+    blocks = [
+        np.flatnonzero(free & np.array([(n in inside) == is_interior for n in names])) for is_interior in (False, True)
+    ]
     if not all(len(b) for b in blocks):
-        raise CalibrationError("stepwise calibration: needs unknowns of the attitude and of the interior")
+        raise CalibrationError("stepwise calibration: needs unknowns of both the attitude and the interior orientation")
     weights = Weights(np.ones(sum(len(r.point) for f in fields for r in f.rays.values())), {"image": 1.0})
     noise.check()
     common = SharedNoise.of(fields, noise)
@@ -280,11 +320,11 @@ def stepwise(
     converged = False
     while not converged and len(sizes) < rounds:
         most = 1 if len(sizes) < _RELINEARISED else rounds - len(sizes)
-        step, taken = _alternate(equations.reduced, equations.right, blocks, sigma, tolerance, most)
-        sizes += taken
+        step, new_sizes = _alternate(equations.reduced, equations.right, blocks, sigma, tolerance, most)
+        sizes += new_sizes
         state = state.moved(equations, step)
         equations = assemble(fields, cameras, parameters, state, noise, priors, weights, common)
-        converged = len(taken) == 1 and taken[0] < tolerance
+        converged = len(new_sizes) == 1 and new_sizes[0] < tolerance
     shared = _canonical_squares(equations.reduced, *blocks)
     return Stepwise(
         names=names,
@@ -296,14 +336,21 @@ def stepwise(
 
 
 def _used(parameters: Parameters, name: str, line: str) -> Array:
-    inner = parameters.columns[name, line][0]
-    return inner[inner >= 0]
+    """Return the columns of the interior orientation of a line that are unknowns."""
+    columns = parameters.columns[name, line][0]
+    return columns[columns >= 0]
 
 
 def _alternate(
     normal: Array, right: Array, blocks: Sequence[NDArray[np.intp]], sigma: Array, tolerance: float, most: int
 ) -> tuple[Array, list[float]]:
-    """Rounds on linear equations until one is below the tolerance: total step (P,), largest step of each round."""
+    """Iterate rounds on linear equations until one is below the tolerance.
+
+    Returns
+    -------
+    tuple of ((P,) ndarray, list of float)
+        Total step, and largest step of each round.
+    """
     inverses = [solved(normal[np.ix_(b, b)], np.eye(len(b))) for b in blocks]
     total, gradient = np.zeros(len(normal)), right.copy()
     sizes: list[float] = []
@@ -321,7 +368,7 @@ def _alternate(
 
 
 def _canonical_squares(normal: Array, first: NDArray[np.intp], second: NDArray[np.intp]) -> Array:
-    """Squares of the canonical correlations of two blocks of a normal matrix."""
+    """Return the squared canonical correlations of two blocks of a normal matrix."""
     roots = [np.linalg.cholesky(normal[np.ix_(b, b)]) for b in (first, second)]
     mixed = np.linalg.solve(roots[0], np.linalg.solve(roots[1], normal[np.ix_(second, first)]).T)
     return np.asarray(np.linalg.svd(mixed, compute_uv=False) ** 2)

@@ -230,7 +230,7 @@ class MatchOptions:
                 raise ValueError(f"match options: {name} must not exceed 1, found {getattr(self, name)}")
         if self.margin < 2 or self.largest_move > self.margin - 0.5:
             raise ValueError(
-                f"match options: a margin of {self.margin} px is too small for a largest move of {self.largest_move:g} px: "
+                f"match options: a margin of {self.margin} px is too small for a move of {self.largest_move:g} px: "
                 "take at least 2 px, and half a pixel more than the move"
             )
 

@@ -1,8 +1,8 @@
-"""Interpolating B-splines: patches of an image at any places, and stacks of templates with their derivatives.
+"""Interpolating B-splines: patches of an image at any positions, and stacks of templates with their derivatives.
 
 Splines by prefilter and basis (Unser, IEEE Signal Processing Magazine 16(6), 1999), of degree 5: the error at a quarter
-of the sampling frequency is 0.1 per cent of the amplitude against 1 per cent of a cubic one, and white noise passes
-more evenly over the sub-pixel phase.
+of the sampling frequency is 0.1 % of the amplitude against 1 % of a cubic one, and white noise passes more evenly over
+the sub-pixel phase.
 """
 
 from __future__ import annotations
@@ -16,41 +16,44 @@ from analysis.arrays import Array
 from analysis.matching.correlation import checked_image
 
 _DEGREE = 5
-# Pixels beyond a patch that its spline sees: the prefilter decays by 0.43 a pixel, so the rest is 1e-8.
+"""Degree of the splines."""
 _HALO = 22
-# Knots that a spline weighs directly, at each side.
+"""Pixels around a patch that its spline uses: the prefilter decays by 0.43 per pixel, so the rest is 1e-8."""
 _SUPPORT = 3
-# Rim about a template that continues it with its slope: a plain mirror has a kink that the prefilter spreads inwards.
+"""Number of knots at each side that a spline value depends on directly."""
 _RIM = 10
+"""Width of a rim about a template that continues its slope, in pixels: a plain mirror has a kink that the prefilter
+spreads inwards.
+"""
 
 
 def resampled(image: ArrayLike, rows: ArrayLike, columns: ArrayLike, *, smoothing: float = 0.0) -> Array:
-    """Grey values of an image at any places by quintic splines.
+    """Return the grey values of an image at any positions by quintic splines.
 
-    An image of finer pixels than the grid must be low-passed first, or its detail aliases: smoothing about 0.3 to 0.5
-    times the ratio of the pixels makes up for pixel and optics of the coarser one.
+    An image with finer pixels than the grid must be low-passed first to avoid aliasing: a smoothing of about 0.3 to 0.5
+    times the ratio of the pixel sizes corresponds to pixel and optics of the coarser one.
 
     Parameters
     ----------
-    image : ArrayLike
-        (H, W), any real type; NaN marks missing pixels.
-    rows : ArrayLike
-        (..., k, l) rows of the samples; each (k, l) is one patch, and is cut out with a halo, so that only the patches
-        and not the image are filtered.
-    columns : ArrayLike
-        (..., k, l).
+    image : (H, W) array_like
+        Image of any real type; NaN marks missing pixels.
+    rows : (..., k, l) array_like
+        Rows of the samples. Each (k, l) is one patch and is cut out with a halo, so that only the patches and not the
+        image are filtered.
+    columns : (..., k, l) array_like
+        Columns of the samples.
     smoothing : float
-        Standard deviation of a Gaussian low pass in pixels of the image; 0 for none.
+        Standard deviation of a Gaussian low-pass in pixels of the image; 0 for none.
 
     Returns
     -------
-    Array
-        (..., k, l) float64; NaN outside of the image and next to missing pixels.
+    (..., k, l) ndarray of float64
+        Grey values; NaN outside the image and next to missing pixels.
 
     Raises
     ------
     ValueError
-        Image not a plane, rows and columns of different shapes or without patches, smoothing negative.
+        The image is not a plane, rows and columns have different shapes or no patches, or smoothing is negative.
     """
     plane = checked_image(image, "resampling")
     row, column = np.asarray(rows, np.float64), np.asarray(columns, np.float64)
@@ -68,6 +71,7 @@ def resampled(image: ArrayLike, rows: ArrayLike, columns: ArrayLike, *, smoothin
 
 
 def _fill(sample: Array, image: NDArray[np.generic], row: Array, column: Array, smoothing: float) -> None:
+    """Fill one patch with the grey values of an image at rows and columns."""
     height, width = image.shape
     # NaN compares false
     inside = (row >= 0) & (row <= height - 1) & (column >= 0) & (column <= width - 1)
@@ -77,7 +81,7 @@ def _fill(sample: Array, image: NDArray[np.generic], row: Array, column: Array, 
     top, left = (max(int(x[inside].min()) - halo, 0) for x in (row, column))
     bottom, right = (int(x[inside].max()) + halo + 2 for x in (row, column))
     crop = np.asarray(image[top:bottom, left:right], np.float64)
-    at = np.stack([row[inside] - top, column[inside] - left])
+    positions = np.stack([row[inside] - top, column[inside] - left])
     missing = ~np.isfinite(crop)
     if missing.all():
         return
@@ -85,16 +89,16 @@ def _fill(sample: Array, image: NDArray[np.generic], row: Array, column: Array, 
         crop = np.where(missing, crop[~missing].mean(), crop)
     if smoothing:
         crop = ndimage.gaussian_filter(crop, smoothing, mode="mirror", truncate=5.0)
-    value = ndimage.map_coordinates(crop, at, order=_DEGREE, mode="mirror")
+    value = ndimage.map_coordinates(crop, positions, order=_DEGREE, mode="mirror")
     if missing.any():
         reach = _SUPPORT + int(np.ceil(3.0 * smoothing))
         near = ndimage.binary_dilation(missing, np.ones((2 * reach + 1, 2 * reach + 1)))
-        value[near[tuple(np.rint(at).astype(np.intp))]] = np.nan
+        value[near[tuple(np.rint(positions).astype(np.intp))]] = np.nan
     sample[inside] = value
 
 
 def low_passed(templates: Array, smoothing: float) -> Array:
-    """Templates (n, k, k) after a Gaussian of rms smoothing, px; beyond their rim they go on with their slope."""
+    """Return templates (n, k, k) after a Gaussian of RMS radius `smoothing`, in pixels; the rim continues the slope."""
     if not smoothing:
         return templates
     reach = int(np.ceil(4.0 * smoothing))
@@ -104,10 +108,7 @@ def low_passed(templates: Array, smoothing: float) -> Array:
 
 
 class SplineStack:
-    """Quintic splines through n templates (n, k, k), evaluated at other places in each.
-
-    The templates must be finite.
-    """
+    """Quintic splines through n finite templates (n, k, k), evaluated at separate positions in each."""
 
     def __init__(self, templates: Array) -> None:
         count, self.size = templates.shape[0], templates.shape[1]
@@ -119,31 +120,31 @@ class SplineStack:
         self._first = np.arange(count) * self._stride**2
 
     def __call__(self, row: Array, column: Array, which: NDArray[np.intp], *, order: int) -> Array:
-        """Values and derivatives.
+        """Return values and derivatives at positions in the templates.
 
         Parameters
         ----------
-        row : Array
-            (m, p) in pixels of the template; clipped to it.
-        column : Array
-            (m, p).
-        which : NDArray[np.intp]
-            (m,) template of each row of places.
+        row : (m, p) ndarray
+            Rows in pixels of the template; clipped to it.
+        column : (m, p) ndarray
+            Columns in pixels of the template; clipped to it.
+        which : (m,) ndarray of int
+            Template of each row of positions.
         order : int
             Highest derivative, 1 to 4.
 
         Returns
         -------
-        Array
-            (3, 6, 10 or 15, m, p): value; by row, column; by row row, row column, column column; by row row row, row
-            row column, row column column, column column column; and so on.
+        (3, 6, 10 or 15, m, p) ndarray
+            Value; derivatives by row, column; by row row, row column, column column; by row row row, row row column,
+            row column column, column column column; and so on.
         """
         weights, base = [], np.broadcast_to(self._first[which][:, None], row.shape)
-        for place, step in ((row, self._stride), (column, 1)):
-            place = np.clip(place, 0.0, self.size - 1.0)
-            whole = np.minimum(np.floor(place), self.size - 2.0)
-            base = base + (whole.astype(np.intp) + _RIM - _DEGREE // 2) * step
-            weights.append(_weights(place - whole, order))
+        for position, step in ((row, self._stride), (column, 1)):
+            position = np.clip(position, 0.0, self.size - 1.0)
+            knot = np.minimum(np.floor(position), self.size - 2.0)
+            base = base + (knot.astype(np.intp) + _RIM - _DEGREE // 2) * step
+            weights.append(_weights(position - knot, order))
         down, across = weights
         kinds = [(total - k, k) for total in range(order + 1) for k in range(total + 1)]
         out = np.zeros((len(kinds), *row.shape))
@@ -158,7 +159,7 @@ class SplineStack:
 
 
 def _weights(fraction: Array, orders: int) -> Array:
-    """(orders + 1, 6, ...) weights of the knots from -2 to +3 about a place, and their derivatives by it."""
+    """Return the (orders + 1, 6, ...) weights of the knots from -2 to +3 about a position, and their derivatives."""
     powers = np.ones((_DEGREE + 1, *fraction.shape))
     for k in range(_DEGREE):
         np.multiply(powers[k], fraction, out=powers[k + 1])
@@ -168,15 +169,16 @@ def _weights(fraction: Array, orders: int) -> Array:
 
 
 def _pieces() -> Array:
-    """(5, 6, 6) coefficients of the basis and its derivatives: order, knot, power."""
+    """Return the (5, 6, 6) coefficients of the basis and its derivatives: order, knot, power."""
     basis = PPoly.from_spline(BSpline.basis_element(np.arange(_DEGREE + 2.0), extrapolate=False))
     table = np.zeros((5, _DEGREE + 1, _DEGREE + 1))
     start = np.searchsorted(basis.x, np.arange(_DEGREE + 1.0), side="right") - 1
     for order in range(5):
-        # highest power first; knot j + m about place j + f meets the piece (degree + 1) / 2 - m
+        # highest power first; at position j + f, knot j + m uses the piece (degree + 1) / 2 - m
         rising = basis.derivative(order).c[::-1][:, start[::-1]] if order else basis.c[::-1][:, start[::-1]]
         table[order, :, : len(rising)] = rising.T
     return table
 
 
 _PIECES = _pieces()
+"""Coefficients of the spline basis and its derivatives, from `_pieces`."""

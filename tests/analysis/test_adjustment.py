@@ -225,7 +225,7 @@ def test_bad_input_is_told():
         (CalibrationError, "robust must be", [field], LABORATORY, NOISE, hold | {"robust": "tukey"}),
     ):
         refuses(error, said, adjust, fields, lines, noise, **options)
-    refuses(CalibrationError, "attitude and of the interior", stepwise, [field], LABORATORY, NOISE, held=bias)
+    refuses(CalibrationError, "attitude and the interior", stepwise, [field], LABORATORY, NOISE, held=bias)
     assert not stepwise([field], LABORATORY, NOISE, rounds=3).converged
     refuses(CalibrationError, "rate must be", Unknowns, rate="fields")
     refuses(ValueError, "huber, igg or accept", robust_weights, np.zeros((2, 2)), "tukey")

@@ -121,7 +121,7 @@ def test_a_wrong_law_is_told_and_a_right_one_is_not(stated, true):
             assert np.sign(test.excess) == (1 if stated is WHITE else -1)
         if stated is WHITE and true is WALK:
             assert test.p_value < 1e-6
-            assert "not that of the readings" in str(test)
+            assert "does not fit the readings" in str(test)
 
 
 @pytest.mark.second

@@ -97,6 +97,6 @@ def test_what_points_do_not_determine() -> None:
     for count, kind, message in ((0, "shift", "too few"), (2, "affine", "3 or more")):
         refuses(ValueError, message, image_correction, place[:count], place[:count], spread[:count], kind)
     line = np.stack([np.linspace(0.0, 1e4, 8), np.linspace(5.0, 2e4, 8)], axis=-1)
-    refuses(ValueError, "one line", image_correction, line, line, spread, "affine")
+    refuses(ValueError, "one straight line", image_correction, line, line, spread, "affine")
     refuses(ValueError, "not finite", image_correction, place, np.where(place > 1e4, np.nan, place), spread, "shift")
-    refuses(ValueError, "not above zero", image_correction, place, place, np.zeros((8, 2, 2)), "shift")
+    refuses(ValueError, "not positive definite", image_correction, place, place, np.zeros((8, 2, 2)), "shift")

@@ -157,8 +157,8 @@ def test_bad_input_is_told():
     with pytest.raises(ValueError, match=r"one band.*|plane of real grey values"):
         least_squares(np.zeros((5, 5, 3)), patch, np.zeros((3, 2)))
     refuses(ValueError, r"k odd.*\(3, 14, 14\)", least_squares, image, np.zeros((3, 14, 14)), np.zeros((3, 2)))
-    refuses(ValueError, r"need \(3, 2\) places.*\(2, 2\)", least_squares, image, patch, np.zeros((2, 2)))
+    refuses(ValueError, r"need \(3, 2\) positions.*\(2, 2\)", least_squares, image, patch, np.zeros((2, 2)))
     refuses(ValueError, "take 17 px or more", least_squares, image, patch, np.zeros((3, 2)), MatchOptions(margin=5))
     refuses(ValueError, "largest_sigma must be positive", MatchOptions, largest_sigma=0.0)
-    refuses(ValueError, "does not hold", MatchOptions, largest_move=3.0)
+    refuses(ValueError, "is too small for a move", MatchOptions, largest_move=3.0)
     refuses(ValueError, r"grids of one shape", resampled, image, np.zeros((3, 3)), np.zeros((3, 4)))

@@ -83,7 +83,7 @@ def test_height_takes_parallax():
     assert (~with_height.accepted & ~bad).sum() <= 4
     without = consensus(place, found)
     assert without.scatter > 0.3
-    refuses(ValueError, "heights exactly if", with_height.field, place)
+    refuses(ValueError, "heights if, and only if", with_height.field, place)
 
 
 def test_nothing_agrees():

@@ -58,7 +58,7 @@ def test_the_effect_of_a_rate_is_that_of_a_pass_that_drifts():
         for f in (measured(VIEW), turned(measured(VIEW), lambda t: t[:, None] * rate))
     )
     # the unknown goes from the measured attitude to the true one
-    change = still.rates.moved @ -rate
+    change = still.rates.bias @ -rate
     sigma = np.sqrt(np.diag(still.covariance))
     free = sigma > 0
     assert np.abs(change / np.where(free, sigma, 1.0)).max() > 0.5
@@ -86,7 +86,7 @@ def test_a_random_walk_shows_in_the_residuals_and_stated_it_is_in_the_sigmas():
     for _ in range(10):
         field = turned(measured(VIEW, rng), random_walk(rng, 1.0 * ARCSEC))
         blind, told = (adjust([field], LABORATORY, n, gauge=HOLD_XY) for n in (NOISE, noise))
-        assert min(blind.courses.p_value, blind.rates.p_value) < FALSE_ALARM
+        assert min(blind.slow_variations.p_value, blind.rates.p_value) < FALSE_ALARM
         inner = [k for k, n in enumerate(told.names) if n not in HOLD_XY.held and "Beijing" not in n]
         for found in (blind, told):
             error, spread = (found.values - truth(found.names))[inner], found.covariance[np.ix_(inner, inner)]
@@ -116,7 +116,7 @@ def test_a_step_between_chips_is_estimated_with_its_threshold():
     found = adjust(
         [replace(field, rays=field.rays | {"nadir": replace(nadir, image=image)})], LABORATORY, NOISE, gauge=HOLD_XY
     )
-    steps = found.unseen(Steps((("nadir", 0.0),)))
+    steps = found.omitted_terms_test(Steps((("nadir", 0.0),)))
     assert 0.2 * PITCH < steps.sigma[1] < PITCH
     assert steps.estimate[1] == pytest.approx(8e-6, abs=5 * steps.sigma[1])
     assert steps.estimate[0] == pytest.approx(0.0, abs=5 * steps.sigma[0])

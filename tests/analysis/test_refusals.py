@@ -107,7 +107,7 @@ def test_normal_equations_that_cannot_be_solved(monkeypatch):
     refuses(BlockError, "singular", block_adjustment._Factor, indefinite)
     monkeypatch.setattr(block_adjustment, "_DENSE", 0)
     refuses(BlockError, "singular", block_adjustment._Factor(indefinite).inverse)
-    refuses(CalibrationError, "cannot be solved for", normal_equations._inverse, indefinite.toarray())
+    refuses(CalibrationError, "cannot be estimated", normal_equations._inverse, indefinite.toarray())
 
 
 @pytest.mark.second

@@ -305,7 +305,7 @@ def test_bad_input_is_told():
         ("finite and f positive", LineModel.of, eye, [0.65, np.nan, 0]),
         ("finite and f positive", LineModel.of, eye, [0.65, 0, 0], [np.inf, 0, 0]),
         ("finite and f positive", LineModel.of, eye, [0.65, 0, 0], still, np.nan),
-        ("not below zero", partial(LineModel.of, half_length=-1.0), eye, [0.65, 0, 0]),
+        ("must not be negative", partial(LineModel.of, half_length=-1.0), eye, [0.65, 0, 0]),
         ("behind a camera", nadir.seen, -nadir.axes[:, 2:], rays.image[:1]),
         ("behind a camera", partials, nadir, rays, 2 * rays.station, still, still),
         ("behind a camera", partials, LineModel.of(eye, [0.65, 0, 0]), level, beside, still, still),

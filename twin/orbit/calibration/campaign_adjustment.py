@@ -132,7 +132,7 @@ def with_detected_drift(campaign: Campaign, rates: tuple[Prior, ...] = ()) -> Ca
     """
     adjustment = simultaneous(campaign, rates)
     rate_p_value = 1.0 if adjustment.rates is None else adjustment.rates.p_value
-    if min(rate_p_value, adjustment.courses.p_value) >= FALSE_ALARM:
+    if min(rate_p_value, adjustment.slow_variations.p_value) >= FALSE_ALARM:
         return campaign
     sigma = np.zeros(3)
     if adjustment.rates is not None:
@@ -146,7 +146,7 @@ def with_detected_drift(campaign: Campaign, rates: tuple[Prior, ...] = ()) -> Ca
     factor = simultaneous(walking, rates, components=("attitude walk",)).factors["attitude walk"]
     walk = float(trial * np.sqrt(factor))
     roll, pitch, yaw = sigma.tolist()
-    drifts = DetectedDrift((roll, pitch, yaw), walk, rate_p_value, adjustment.courses.p_value)
+    drifts = DetectedDrift((roll, pitch, yaw), walk, rate_p_value, adjustment.slow_variations.p_value)
     return replace(walking, noise=replace(walking.noise, attitude_walk=walk), drifts=drifts)
 
 
@@ -305,7 +305,7 @@ def rate_priors(campaign: Campaign, fits: tuple[LatitudeFit, ...]) -> tuple[Prio
 def _sine_rate(field_pass: FieldPass, reference: float) -> float:
     """Return the rate of sin(latitude - reference) at a pass's middle, from the measured orbit, in 1/s."""
     path, middle, step = field_pass.measured, field_pass.middle, np.array([-1.0, 1.0])
-    known = path.known(middle + step)[:, None]
+    known = path.covers(middle + step)[:, None]
     # by the velocity where a second farther there are no readings
     on = path.position(middle) + step[:, None] * path.velocity(middle)
     ends = np.where(known, path.position(middle + np.where(known[:, 0], step, 0.0)), on)

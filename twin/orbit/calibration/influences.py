@@ -344,17 +344,17 @@ class AttitudeDrift:
         if adjustment.rates is not None and seconds > 0.0:
             assert isinstance(adjustment.rates.terms, Rates)
             sigma = np.array([adjustment.sigma[n] for n in adjustment.names])
-            change = np.linalg.norm(adjustment.rates.moved, axis=1) * ARCSEC / seconds
+            change = np.linalg.norm(adjustment.rates.bias, axis=1) * ARCSEC / seconds
             effect = {n: float(c / s) for n, c, s in zip(adjustment.names, change, sigma, strict=True) if s > 0.0}
             # of a test of all rates together, each alone
             power = np.sqrt(chi2.isf(FALSE_ALARM, max(adjustment.rates.degrees_of_freedom, 1)))
             alone = adjustment.rates.sigma_alone.reshape(-1, 3)
             detectable = power * np.sqrt(1.0 / np.mean(alone**-2.0, axis=0) / len(alone)) * seconds
             limit = np.where(np.isfinite(alone), alone, 0.0).ravel() * power
-            wrong = np.abs(adjustment.rates.moved) * limit
+            wrong = np.abs(adjustment.rates.bias) * limit
             undetected = float(np.max(wrong[sigma > 0.0] / sigma[sigma > 0.0][:, None], initial=0.0))
             rate_p_value = adjustment.rates.p_value
-        course, drifts = adjustment.courses.p_value, campaign.drifts
+        course, drifts = adjustment.slow_variations.p_value, campaign.drifts
         if drifts is not None:
             rate_p_value, course = drifts.rate_p_value, drifts.course_p_value
         return cls(seconds, effect, detectable, undetected, rate_p_value, course, drifts)
@@ -428,7 +428,7 @@ class ChipStep:
     def of(cls, campaign: Campaign, together: Adjustment) -> tuple[Self, ...]:
         """Return the tests of the steps of all lines of a campaign, from the adjustment of all fields."""
         steps = Steps(_joints(campaign))
-        test = together.unseen(steps)
+        test = together.omitted_terms_test(steps)
         limit = float(norm.isf(0.5 * _STEP_ALARM / max(steps.size, 1)))
         chip_steps = []
         for k, (value, sigma) in enumerate(zip(test.estimate.tolist(), test.sigma.tolist(), strict=True)):
