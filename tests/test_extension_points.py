@@ -36,7 +36,7 @@ from analysis.monitor.parameters import CameraCalibration, Parameter
 from analysis.spots.centroid import gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
 from optics.geometry.aperture import Circle
-from optics.geometry.sag_terms import SAG_TERMS, grown
+from optics.geometry.sag_terms import SAG_TERMS, scaled_term
 from optics.geometry.tree import Motion, State
 from optics.numerics.backend import load_backend
 from optics.numerics.extension_table import PREFIX, EntryPointError, ExtensionTable, entries
@@ -407,7 +407,7 @@ def test_a_surface(backend: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     schema = json_schema("camera")["$defs"]["MirrorSpec"]["properties"]["sag"]["anyOf"][0]["properties"]
     assert schema["cylinder"]["properties"]["step"] == {"type": "number"}
 
-    # the sequential trace meets the surface of a mirror that has grown; rounding of metres
+    # the sequential trace meets the surface of a mirror that has scaled_term; rounding of metres
     surface, state = surface_of(mirror), {"mirror": Motion(scale=2e-3)}
     np.testing.assert_allclose(surface.sag(0.1, PLACES), astigmatic(0.1, PLACES), rtol=0, atol=1e-15)
     systems = assemble(path_figure.bench(surface, Circle(0.2)), ["all"], [state])
@@ -449,7 +449,7 @@ def check_term(term: Any, backend: Any) -> None:
     for nothing in type(term)().height(backend.Float(x), backend.Float(y)):
         assert np.all(np.array(nothing) == 0.0)
     # rounding, also of sums that cancel
-    np.testing.assert_allclose(grown(term, 3.0).sag(3.0 * x, 3.0 * y), 3.0 * term.sag(x, y), rtol=1e-13, atol=1e-16)
+    np.testing.assert_allclose(scaled_term(term, 3.0).sag(3.0 * x, 3.0 * y), 3.0 * term.sag(x, y), rtol=1e-13, atol=1e-16)
 
 
 # --- reflectors of the monitor ----------------------------------------------------------------------------------------
@@ -904,6 +904,6 @@ def test_help_and_messages_with_an_entry_that_cannot_be_used(tmp_path: Path) -> 
     )
     refused = run_with(path, "-m", "twin.lab", "level", "level.yaml", "--out", tmp_path / "run")
     assert refused.returncode == 1
-    assert "(ModuleNotFoundError: No module named 'no_such_module'); mend or update it" in refused.stderr
+    assert "(ModuleNotFoundError: No module named 'no_such_module'); repair or update it" in refused.stderr
     told = run_with(path, "-m", "twin.render", tmp_path / "bad.yaml")
     assert (told.returncode, "bad.yaml:2: no_such_key: unknown key" in told.stderr) == (2, True)

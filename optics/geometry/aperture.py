@@ -1,10 +1,10 @@
-"""Clear apertures of surfaces and edges that cut light, in the surface's own x, y.
+"""Clear apertures and light-blocking edges of surfaces, in the surface's own x, y frame.
 
-Whether a point lies inside is decided here for all: by the methods ``contains`` of the numbers that an aperture
-consists of, which work on floats, NumPy arrays and in kernels.
+Every test of a point against an aperture uses the ``contains`` methods of the numbers classes here, which work on
+floats, NumPy arrays and Dr.Jit arrays in kernels.
 
-A surface may have several; light comes through where all let it. Numbers are NumPy arrays: edges are looked at where
-traced rays have met their surface, and no kernel knows them.
+A surface may have several edges; light passes where all of them let it. ``Edge`` is evaluated with NumPy only, at the
+points where traced rays meet the surface; kernels do not use it.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class DiskNumbers:
-    """A disk about (x, y), metres, with the square of its radius, m^2."""
+    """Disk about (x, y), in metres, with the square of its radius, in m^2."""
 
     x: Any
     y: Any
     radius_squared: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Mask of points inside, the edge included."""
+        """Return the mask of points inside, the edge included."""
         dx, dy = x - self.x, y - self.y
         return dx * dx + dy * dy <= self.radius_squared
 
 
 @dataclass(frozen=True, eq=False)
 class RingNumbers:
-    """A disk with a concentric hole, whose radius squared is ``hole_squared``, m^2."""
+    """Disk with a concentric hole, whose squared radius is ``hole_squared``, in m^2."""
 
     x: Any
     y: Any
@@ -40,7 +40,7 @@ class RingNumbers:
     hole_squared: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Mask of points inside, both edges included."""
+        """Return the mask of points inside, both edges included."""
         dx, dy = x - self.x, y - self.y
         r2 = dx * dx + dy * dy
         return (r2 <= self.radius_squared) & (r2 >= self.hole_squared)
@@ -48,7 +48,7 @@ class RingNumbers:
 
 @dataclass(frozen=True, eq=False)
 class RectangleNumbers:
-    """A rectangle about (x, y) with its half-widths, metres."""
+    """Rectangle about (x, y) with its half-widths, in metres."""
 
     x: Any
     y: Any
@@ -56,13 +56,13 @@ class RectangleNumbers:
     half_y: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Mask of points inside, the edge included."""
+        """Return the mask of points inside, the edge included."""
         return (abs(x - self.x) <= self.half_x) & (abs(y - self.y) <= self.half_y)
 
 
 @dataclass(frozen=True, eq=False)
 class EllipseNumbers:
-    """An ellipse about (x, y) with its half axes, metres."""
+    """Ellipse about (x, y) with its semi-axes, in metres."""
 
     x: Any
     y: Any
@@ -70,7 +70,7 @@ class EllipseNumbers:
     half_y: Any
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Mask of points inside, the edge included."""
+        """Return the mask of points inside, the edge included."""
         u, v = (x - self.x) / self.half_x, (y - self.y) / self.half_y
         return u * u + v * v <= 1.0
 
@@ -92,43 +92,43 @@ class Circle:
             raise ValueError(f"a circular aperture needs 0 <= inner < radius, found {self.inner} and {self.radius}")
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Mask of points inside; NumPy or Dr.Jit arrays."""
+        """Return the mask of points inside; x and y are NumPy or Dr.Jit arrays, in metres."""
         return self.numbers().contains(x, y)
 
     def numbers(self, size: Any = 1.0) -> DiskNumbers | RingNumbers:
-        """What decides on a body of that size (1 is the nominal one, or an array)."""
+        """Return the numbers of the test, for a body scaled by ``size`` (1 is nominal; may be an array)."""
         x, y, square = size * self.centre[0], size * self.centre[1], (size * self.radius) ** 2
         return RingNumbers(x, y, square, (size * self.inner) ** 2) if self.inner else DiskNumbers(x, y, square)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """x_min, x_max, y_min, y_max, metres."""
+        """Bounding box (x_min, x_max, y_min, y_max), in metres."""
         (cx, cy), r = self.centre, self.radius
         return cx - r, cx + r, cy - r, cy + r
 
     @property
     def inscribed(self) -> float:
-        """Radius of the largest disk about the centre that lies inside the outer edge, metres."""
+        """Radius of the largest disk about the centre that lies inside the outer edge, in metres."""
         return self.radius
 
     @property
     def enclosing(self) -> Circle:
-        """Smallest circle that holds the shape: its outer edge."""
+        """Smallest circle that encloses the shape: its outer edge."""
         return Circle(self.radius, self.centre)
 
-    def grown(self, size: float) -> Circle:
-        """Return this shape on a body that has grown to another size, 1 being the nominal one."""
+    def scaled(self, size: float) -> Circle:
+        """Return this shape on a body scaled by ``size`` (1 is nominal)."""
         return Circle(size * self.radius, (size * self.centre[0], size * self.centre[1]), size * self.inner)
 
     def outline(self, points: int = 96) -> np.ndarray:
-        """Closed outline, shape (points, 2), metres."""
+        """Return a closed outline of the outer edge, shape (points, 2), in metres."""
         t = np.linspace(0.0, 2.0 * np.pi, points)
         return np.stack([self.centre[0] + self.radius * np.cos(t), self.centre[1] + self.radius * np.sin(t)], axis=-1)
 
 
 @dataclass(frozen=True)
-class _TwoHalves:
-    """What has two half sizes, ``half_x`` and ``half_y``, about ``centre`` (metres)."""
+class _HalfSizeShape:
+    """Shape with two half-sizes, ``half_x`` and ``half_y``, about ``centre`` (metres)."""
 
     half_x: float
     half_y: float
@@ -136,17 +136,17 @@ class _TwoHalves:
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """x_min, x_max, y_min, y_max, metres."""
+        """Bounding box (x_min, x_max, y_min, y_max), in metres."""
         (cx, cy) = self.centre
         return cx - self.half_x, cx + self.half_x, cy - self.half_y, cy + self.half_y
 
     @property
     def inscribed(self) -> float:
-        """Radius of the largest disk about the centre that lies inside, metres."""
+        """Radius of the largest disk about the centre that lies inside, in metres."""
         return min(self.half_x, self.half_y)
 
-    def grown(self, size: float) -> Self:
-        """Return this shape on a body that has grown to another size, 1 being the nominal one."""
+    def scaled(self, size: float) -> Self:
+        """Return this shape on a body scaled by ``size`` (1 is nominal)."""
         return type(self)(*self._scaled(size), (size * self.centre[0], size * self.centre[1]))
 
     def _scaled(self, size: Any) -> tuple[Any, Any]:
@@ -154,7 +154,7 @@ class _TwoHalves:
 
 
 @dataclass(frozen=True)
-class Rectangle(_TwoHalves):
+class Rectangle(_HalfSizeShape):
     """Rectangle of half-widths ``half_x``, ``half_y`` about ``centre`` (metres)."""
 
     def __post_init__(self) -> None:
@@ -166,19 +166,19 @@ class Rectangle(_TwoHalves):
 
     @property
     def enclosing(self) -> Circle:
-        """Smallest circle that holds the shape: through its corners."""
+        """Smallest circle that encloses the shape, through its corners."""
         return Circle(float(np.hypot(self.half_x, self.half_y)), self.centre)
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Mask of points inside; NumPy or Dr.Jit arrays."""
+        """Return the mask of points inside; x and y are NumPy or Dr.Jit arrays, in metres."""
         return self.numbers().contains(x, y)
 
     def numbers(self, size: Any = 1.0) -> RectangleNumbers:
-        """What decides on a body of that size (1 is the nominal one, or an array)."""
+        """Return the numbers of the test, for a body scaled by ``size`` (1 is nominal; may be an array)."""
         return RectangleNumbers(size * self.centre[0], size * self.centre[1], *self._scaled(size))
 
     def outline(self, points: int = 96) -> np.ndarray:
-        """Closed outline, shape (n, 2), metres."""
+        """Return a closed outline, shape (n, 2), in metres."""
         x0, x1, y0, y1 = self.bounds
         n = max(points // 4, 1)
         s = np.linspace(0.0, 1.0, n, endpoint=False)
@@ -188,8 +188,8 @@ class Rectangle(_TwoHalves):
 
 
 @dataclass(frozen=True)
-class Ellipse(_TwoHalves):
-    """Ellipse of half axes ``half_x``, ``half_y`` about ``centre`` (metres): a round beam on a slanted face."""
+class Ellipse(_HalfSizeShape):
+    """Ellipse of semi-axes ``half_x``, ``half_y`` about ``centre`` (metres), such as a round beam's footprint."""
 
     def __post_init__(self) -> None:
         """Check the sizes."""
@@ -198,19 +198,19 @@ class Ellipse(_TwoHalves):
 
     @property
     def enclosing(self) -> Circle:
-        """Smallest circle that holds the shape: about its longer axis."""
+        """Smallest circle that encloses the shape, of the longer semi-axis."""
         return Circle(max(self.half_x, self.half_y), self.centre)
 
     def contains(self, x: Any, y: Any) -> Any:
-        """Mask of points inside; NumPy or Dr.Jit arrays."""
+        """Return the mask of points inside; x and y are NumPy or Dr.Jit arrays, in metres."""
         return self.numbers().contains(x, y)
 
     def numbers(self, size: Any = 1.0) -> EllipseNumbers:
-        """What decides on a body of that size (1 is the nominal one, or an array)."""
+        """Return the numbers of the test, for a body scaled by ``size`` (1 is nominal; may be an array)."""
         return EllipseNumbers(size * self.centre[0], size * self.centre[1], *self._scaled(size))
 
     def outline(self, points: int = 96) -> np.ndarray:
-        """Closed outline, shape (points, 2), metres."""
+        """Return a closed outline, shape (points, 2), in metres."""
         t = np.linspace(0.0, 2.0 * np.pi, points)
         x, y = self.centre
         return np.stack([x + self.half_x * np.cos(t), y + self.half_y * np.sin(t)], axis=-1)
@@ -221,39 +221,39 @@ Aperture = Circle | Rectangle | Ellipse
 
 @dataclass(frozen=True)
 class Ray:
-    """A strip of a width that begins at a point and runs without end along +x: the vane of a spider.
+    """Half-infinite strip along +x: one vane of a spider.
 
     Attributes
     ----------
     width : float
-        metres.
-    centre : tuple[float, float]
-        Middle of its beginning, metres.
+        Width of the strip, metres.
+    centre : tuple of float
+        (x, y) of the middle of the strip's end, metres.
     """
 
     width: float
     centre: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check the size."""
+        """Check the width."""
         if not self.width > 0.0:
             raise ValueError(f"a vane needs a width, found {self.width}")
 
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Mask of points inside, the edge included."""
+        """Return the mask of points inside, the edge included."""
         return np.asarray((x >= self.centre[0]) & (np.abs(y - self.centre[1]) <= 0.5 * self.width))
 
 
 @dataclass(frozen=True)
 class Polygon:
-    """A polygon whose sides do not cross.
+    """Polygon whose sides do not cross.
 
     Attributes
     ----------
-    corners : tuple[tuple[float, float], ...]
-        (x, y) one after the other, metres; the last is joined to the first.
-    centre : tuple[float, float]
-        About which it may be turned.
+    corners : tuple of (float, float)
+        Corners (x, y) in order, metres; the last is joined to the first.
+    centre : tuple of float
+        (x, y) of the point about which an edge rotates the polygon, metres.
     """
 
     corners: tuple[tuple[float, float], ...]
@@ -265,14 +265,14 @@ class Polygon:
             raise ValueError(f"a polygon needs three corners or more, found {len(self.corners)}")
 
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Mask of points inside, by how often a way along x crosses the sides."""
+        """Return the mask of points inside, by the parity of the sides that a line along x crosses."""
         inside = np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)), dtype=bool)
         last_x, last_y = self.corners[-1]
         for next_x, next_y in self.corners:
             crosses = (last_y > y) != (next_y > y)
             with np.errstate(divide="ignore", invalid="ignore"):
-                at = last_x + (y - last_y) * (next_x - last_x) / (next_y - last_y)
-            inside ^= crosses & (x < at)
+                crossing_x = last_x + (y - last_y) * (next_x - last_x) / (next_y - last_y)
+            inside ^= crosses & (x < crossing_x)
             last_x, last_y = next_x, next_y
         return inside
 
@@ -282,51 +282,54 @@ EdgeShape = Circle | Rectangle | Ellipse | Ray | Polygon
 
 @dataclass(frozen=True)
 class Edge:
-    """What lets light through inside of a shape, or stops it there.
+    """Edge of a surface that passes or blocks the light inside a shape.
 
     Attributes
     ----------
-    shape : EdgeShape
-        Before its turn.
+    shape : Circle, Rectangle, Ellipse, Ray or Polygon
+        The shape before it is rotated.
     blocks : bool
-        Light is stopped inside of it; else outside.
-    turn : float
-        Of the shape about its own centre, right-handed about the surface's z, radians.
+        True when light is blocked inside the shape; False when it is blocked outside.
+    rotation : float
+        Rotation of the shape about its own centre, right-handed about the surface's z, radians.
     """
 
     shape: EdgeShape
     blocks: bool = False
-    turn: float = 0.0
+    rotation: float = 0.0
 
     def passes(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Whether light comes through at points of the surface, of their shape.
+        """Return the mask of points of the surface at which light passes.
 
         Parameters
         ----------
-        x : np.ndarray
-            Of the points in the surface's own frame, metres.
-        y : np.ndarray
-            Likewise, of the same shape.
+        x, y : ndarray
+            Coordinates of the points in the surface's own frame, metres, of one shape.
+
+        Returns
+        -------
+        ndarray of bool
+            Mask of the shape of ``x``.
         """
-        if self.turn:
+        if self.rotation:
             cx, cy = self.shape.centre
-            c, s = np.cos(self.turn), np.sin(self.turn)
+            c, s = np.cos(self.rotation), np.sin(self.rotation)
             x, y = cx + c * (x - cx) + s * (y - cy), cy - s * (x - cx) + c * (y - cy)
         return np.asarray(self.shape.contains(x, y)) != self.blocks
 
 
 def outer_edge(aperture: Aperture | None, edges: Sequence[Edge]) -> Aperture | None:
-    """Return the smallest outer edge, but a polygon, that is stated of a surface, else its aperture."""
+    """Return the smallest outer edge given for a surface (polygons excluded), else its aperture."""
     stated = [edge.shape for edge in edges if not edge.blocks and isinstance(edge.shape, Aperture)]
     return min(stated, key=lambda shape: shape.enclosing.radius, default=aperture)
 
 
-def turned_over(edge: Edge) -> Edge:
-    """Tell the edge in a frame that is turned about its x by half a turn: y becomes -y."""
+def flipped_y(edge: Edge) -> Edge:
+    """Return the edge in a frame rotated by 180 deg about its x axis: y becomes -y."""
     shape = edge.shape
     (x, y) = shape.centre
     if isinstance(shape, Polygon):
-        over: EdgeShape = Polygon(tuple((a, -b) for a, b in shape.corners), (x, -y))
+        flipped: EdgeShape = Polygon(tuple((a, -b) for a, b in shape.corners), (x, -y))
     else:
-        over = replace(shape, centre=(x, -y))
-    return Edge(over, edge.blocks, -edge.turn)
+        flipped = replace(shape, centre=(x, -y))
+    return Edge(flipped, edge.blocks, -edge.rotation)

@@ -1,7 +1,8 @@
-"""Convex polygons in batches: hulls, cuts, differences, and quadrature over them.
+"""Batched operations on convex polygons: hulls, clipping, differences, and quadrature over them.
 
-A batch holds N polygons of V corners, (N, V, D): the first two of D numbers are the place in the plane, others ride
-along (the corner in space, say). A polygon of fewer corners repeats one; a polygon without area is empty.
+A batch holds N polygons of V corners, an array (N, V, D). The first two of the D columns are the coordinates x, y in
+the plane; the others are interpolated along with them (such as the corner's position in space). A polygon of fewer
+corners repeats one; a polygon without area is empty.
 """
 
 from __future__ import annotations
@@ -14,103 +15,109 @@ import numpy as np
 from optics.numerics.quadrature import gauss
 
 _NO_LIMIT = 1e30
-"""Limit that a side without length gets: finite, so that it can be multiplied."""
+"""Limit of the half-plane of a side without length: finite, so that it can be multiplied."""
 
-_AT_ONCE = 2**13
-"""Nodes on boundaries worked on together: their polynomials stay in the cache."""
+_BLOCK_NODES = 2**13
+"""Number of boundary nodes processed in one block: their polynomials stay in the processor's cache."""
 
-_SAME = 1e-13
-"""Distance below which two corners are one."""
+_COINCIDENT = 1e-13
+"""Distance below which two corners coincide."""
 
 
 def area(polygons: np.ndarray) -> np.ndarray:
-    """Areas, positive counterclockwise, (...), of polygons (..., V, D)."""
+    """Return the signed areas (...), positive counterclockwise, of polygons (..., V, D)."""
     x, y = polygons[..., 0] - polygons[..., :1, 0], polygons[..., 1] - polygons[..., :1, 1]
     return np.asarray(0.5 * np.sum(x[..., :-1] * y[..., 1:] - x[..., 1:] * y[..., :-1], axis=-1))
 
 
 def area_in_disk(polygons: np.ndarray) -> np.ndarray:
-    """Areas within the unit disk, positive counterclockwise, (...), of polygons (..., V, D).
+    """Return the signed areas (...) inside the unit disk, positive counterclockwise, of polygons (..., V, D).
 
-    It is the sum over the sides of what lies between each and the middle: a triangle where the side runs within the
-    disk, a sector where it runs outside.
+    The area is the sum, over the sides, of the area between the side and the centre: a triangle where the side runs
+    inside the disk, a sector where it runs outside.
     """
     start = polygons[..., 0] + 1j * polygons[..., 1]
     end = np.roll(start, -1, axis=-1)
-    way = end - start
-    size = np.abs(way)
-    unit = way / np.where(size > _SAME, size, 1.0)
-    along = (np.conj(unit) * start).real  # of the start, from the foot of the middle's perpendicular on the side
+    side = end - start
+    length = np.abs(side)
+    unit = side / np.where(length > _COINCIDENT, length, 1.0)
+    along = (
+        np.conj(unit) * start
+    ).real  # position of the start along the side, from the foot of the centre's perpendicular
     half = np.sqrt(np.maximum(1.0 - np.abs(start - along * unit) ** 2, 0.0))
-    first, second = (start + (np.clip(place, along, along + size) - along) * unit for place in (-half, half))
+    first, second = (start + (np.clip(position, along, along + length) - along) * unit for position in (-half, half))
     sectors = np.angle(np.conj(start) * first) + np.angle(np.conj(second) * end)
     return np.asarray(0.5 * np.sum((np.conj(first) * second).imag + sectors, axis=-1))
 
 
 def covered(polygons: np.ndarray, points: np.ndarray, smallest: float = 0.0) -> np.ndarray:
-    """Which points (N, 2) lie in any of the convex counterclockwise polygons (B, K, V, 2), (B, N).
+    """Return the mask (B, N) of points that lie in any of the convex counterclockwise polygons of each batch.
 
     Parameters
     ----------
-    polygons : np.ndarray
-        Some may be empty, all their corners alike.
-    points : np.ndarray
-        The same for all B.
+    polygons : (B, K, V, 2) ndarray
+        Polygons of B batches; those whose corners all coincide are empty.
+    points : (N, 2) ndarray
+        Points, common to all batches.
     smallest : float
-        Area up to which a polygon is nothing.
+        Area up to which a polygon counts as empty.
     """
     out = np.zeros((len(polygons), len(points)), bool)
     full = area(polygons) > smallest
     for k in range(polygons.shape[1]):
         corner = polygons[:, k]
-        way = np.roll(corner, -1, axis=1) - corner
-        way[np.hypot(way[..., 0], way[..., 1]) <= _SAME] = 0.0  # the direction of such a side is rounding
+        side = np.roll(corner, -1, axis=1) - corner
+        side[np.hypot(side[..., 0], side[..., 1]) <= _COINCIDENT] = (
+            0.0  # a side without length has a direction of rounding errors
+        )
         within = np.repeat(full[:, k, None], len(points), axis=1)
         for v in range(corner.shape[1]):
             x, y = (points[:, i] - corner[:, v, i, None] for i in (0, 1))
-            within &= way[:, v, 0, None] * y - way[:, v, 1, None] * x >= 0.0
+            within &= side[:, v, 0, None] * y - side[:, v, 1, None] * x >= 0.0
         out |= within
     return out
 
 
 def hull(points: np.ndarray) -> np.ndarray:
-    """Convex hulls of N sets of P points, (N, P, D), counterclockwise, (N, V, D)."""
+    """Return the convex hulls (N, V, D), counterclockwise, of N sets of P points (N, P, D)."""
     x, y = points[..., 0], points[..., 1]
     rows = np.arange(len(points))
     start = np.lexsort((y, x), axis=-1)[:, 0]
-    order, here, done = [start], start, np.zeros(len(points), bool)
-    way = np.broadcast_to([0.0, -1.0], (len(points), 2))
+    order, current, done = [start], start, np.zeros(len(points), bool)
+    direction = np.broadcast_to([0.0, -1.0], (len(points), 2))
     for _ in range(points.shape[1] - 1):
-        dx, dy = x - x[rows, here][:, None], y - y[rows, here][:, None]
-        turn = np.arctan2(way[:, :1] * dy - way[:, 1:] * dx, way[:, :1] * dx + way[:, 1:] * dy)
-        turn[turn < -0.5 * np.pi] = np.pi  # points of the side before, but for rounding
-        turn[(dx == 0.0) & (dy == 0.0)] = np.inf
-        best = np.argmin(turn, axis=-1)
-        done |= (best == start) | np.isinf(turn[rows, best])
-        here = np.where(done, here, best)
+        dx, dy = x - x[rows, current][:, None], y - y[rows, current][:, None]
+        angle = np.arctan2(direction[:, :1] * dy - direction[:, 1:] * dx, direction[:, :1] * dx + direction[:, 1:] * dy)
+        angle[angle < -0.5 * np.pi] = np.pi  # points on the previous side, to rounding
+        angle[(dx == 0.0) & (dy == 0.0)] = np.inf
+        best = np.argmin(angle, axis=-1)
+        done |= (best == start) | np.isinf(angle[rows, best])
+        current = np.where(done, current, best)
         if np.all(done):
             break
-        way = np.stack([dx[rows, best], dy[rows, best]], axis=-1)
-        order.append(here)
+        direction = np.stack([dx[rows, best], dy[rows, best]], axis=-1)
+        order.append(current)
     return np.asarray(points[rows[:, None], np.stack(order, axis=-1)])
 
 
 def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """The part of each polygon where normal . (x, y) <= limit (Sutherland and Hodgman, Commun. ACM 17, 32 (1974)).
+    """Return the part of each polygon where normal . (x, y) <= limit.
+
+    The algorithm is that of Sutherland and Hodgman, Commun. ACM 17, 32 (1974).
 
     Parameters
     ----------
-    polygons : np.ndarray
-        (N, V, D).
-    normal : np.ndarray
-        (N, 2).
-    limit : np.ndarray
-        (N,).
+    polygons : (N, V, D) ndarray
+        Convex polygons.
+    normal : (N, 2) ndarray
+        Normals of the clipping lines.
+    limit : (N,) ndarray
+        Limits along the normals.
 
     Returns
     -------
-    np.ndarray
-        (N, W, D), corners in the order they had.
+    (N, W, D) ndarray
+        Clipped polygons, with corners in the original order.
     """
     depth = limit[:, None] - polygons[..., 0] * normal[:, :1] - polygons[..., 1] * normal[:, 1:]
     inside = depth >= 0.0
@@ -120,15 +127,15 @@ def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndar
     crossing = inside != inside_after
     share = depth / np.where(crossing, depth - depth_after, 1.0)
     count, corners, numbers = polygons.shape
-    both = np.empty((count, 2 * corners, numbers))
-    both[:, 0::2], both[:, 1::2] = polygons, polygons + share[..., None] * (after - polygons)
-    kept = np.empty((count, 2 * corners), bool)
-    kept[:, 0::2], kept[:, 1::2] = inside, crossing
-    return _packed(both, kept)
+    candidates = np.empty((count, 2 * corners, numbers))
+    candidates[:, 0::2], candidates[:, 1::2] = polygons, polygons + share[..., None] * (after - polygons)
+    selected = np.empty((count, 2 * corners), bool)
+    selected[:, 0::2], selected[:, 1::2] = inside, crossing
+    return _packed(candidates, selected)
 
 
-def widened(polygons: np.ndarray, corners: int) -> np.ndarray:
-    """Polygons (N, V, D) with corners repeated so that each has at least ``corners``."""
+def padded(polygons: np.ndarray, corners: int) -> np.ndarray:
+    """Return polygons (N, V, D) padded with repeated corners to at least ``corners`` each."""
     missing = corners - polygons.shape[1]
     if missing <= 0:
         return polygons
@@ -136,77 +143,83 @@ def widened(polygons: np.ndarray, corners: int) -> np.ndarray:
 
 
 def compact(polygons: np.ndarray) -> np.ndarray:
-    """Polygons (N, V, D) without corners that repeat the one before them but for rounding."""
+    """Return polygons (N, V, D) without corners that coincide with the one before them, to rounding."""
     step = polygons[..., :2] - np.roll(polygons[..., :2], 1, axis=1)
-    kept = np.hypot(step[..., 0], step[..., 1]) > _SAME
-    return _packed(polygons, kept)
+    selected = np.hypot(step[..., 0], step[..., 1]) > _COINCIDENT
+    return _packed(polygons, selected)
 
 
-def _packed(corners: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Those of the corners (N, V, D) that are kept, (N, V), in polygons of as few corners as all allow; of a polygon
-    that keeps none the first corner stays.
+def _packed(corners: np.ndarray, selected: np.ndarray) -> np.ndarray:
+    """Return the corners (N, V, D) selected by a mask (N, V), in polygons of as few corners as possible.
+
+    A polygon without a selected corner keeps its first corner.
     """
-    many = np.maximum(np.sum(kept, axis=1), 1)
-    order = np.argsort(~kept, axis=1, kind="stable")
-    which = np.take_along_axis(order, np.minimum(np.arange(np.max(many, initial=1)), many[:, None] - 1), axis=1)
-    return np.take_along_axis(corners, which[..., None], axis=1)
+    many = np.maximum(np.sum(selected, axis=1), 1)
+    order = np.argsort(~selected, axis=1, kind="stable")
+    index = np.take_along_axis(order, np.minimum(np.arange(np.max(many, initial=1)), many[:, None] - 1), axis=1)
+    return np.take_along_axis(corners, index[..., None], axis=1)
 
 
 def sides(windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Outward unit normals (N, W, 2) and limits (N, W) of counterclockwise polygons. A side without length, the
-    direction of which is rounding, has none.
+    """Return outward unit normals (N, W, 2) and limits (N, W) of the sides of counterclockwise polygons.
+
+    A side without length, whose direction would be rounding error, gets no limit.
     """
     step = np.roll(windows[..., :2], -1, axis=1) - windows[..., :2]
     length = np.hypot(step[..., 0], step[..., 1])
-    normal = np.stack([step[..., 1], -step[..., 0]], axis=-1) / np.where(length > _SAME, length, 1.0)[..., None]
-    limit = np.where(length > _SAME, np.sum(normal * windows[..., :2], axis=-1), _NO_LIMIT)
+    normal = np.stack([step[..., 1], -step[..., 0]], axis=-1) / np.where(length > _COINCIDENT, length, 1.0)[..., None]
+    limit = np.where(length > _COINCIDENT, np.sum(normal * windows[..., :2], axis=-1), _NO_LIMIT)
     return normal, limit
 
 
 def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """Cut each polygon by W half-planes.
+    """Clip each polygon by W half-planes.
 
     Parameters
     ----------
-    polygons : np.ndarray
-        (N, V, D).
-    normal : np.ndarray
-        (N, W, 2).
-    limit : np.ndarray
-        (N, W).
+    polygons : (N, V, D) ndarray
+        Convex polygons.
+    normal : (N, W, 2) ndarray
+        Outward normals of the half-planes.
+    limit : (N, W) ndarray
+        Limits along the normals.
 
     Returns
     -------
-    np.ndarray
-        (N, U, D).
+    (N, U, D) ndarray
+        The clipped polygons.
     """
     height = np.einsum("nvx,nwx->nwv", polygons[..., :2], normal)
     beyond = np.sum(height > limit[..., None], axis=-1)
-    # of each polygon first what leaves it the fewest corners
+    # for each polygon, first the half-plane that leaves it the fewest corners
     order = np.argsort(-beyond, axis=1, kind="stable")[:, : np.max(np.count_nonzero(beyond, axis=1), initial=0)]
     for column in order.T:
-        some = np.flatnonzero(np.take_along_axis(beyond, column[:, None], axis=1)[:, 0])
-        cut = clip(polygons[some], normal[some, column[some]], limit[some, column[some]])
-        if len(some) == len(polygons):
+        rows = np.flatnonzero(np.take_along_axis(beyond, column[:, None], axis=1)[:, 0])
+        cut = clip(polygons[rows], normal[rows, column[rows]], limit[rows, column[rows]])
+        if len(rows) == len(polygons):
             polygons = cut
         else:
-            polygons = widened(polygons, cut.shape[1]).copy()
-            polygons[some] = widened(cut, polygons.shape[1])
+            polygons = padded(polygons, cut.shape[1]).copy()
+            polygons[rows] = padded(cut, polygons.shape[1])
     return polygons
 
 
 def difference(polygons: np.ndarray, holes: np.ndarray, order: Iterable[int] | None = None) -> list[np.ndarray]:
-    """What is left of each convex polygon (N, V, D) outside of a counterclockwise convex one (N, W, D): some convex
-    pieces, (N, ., D) each, many of them empty.
+    """Return the parts of convex polygons (N, V, D) outside counterclockwise convex holes (N, W, D), as convex pieces.
 
     Parameters
     ----------
-    polygons : np.ndarray
-        convex.
-    holes : np.ndarray
-        Counterclockwise, convex.
-    order : Iterable[int] | None
-        In which the holes' sides are cut along, one piece for each; from the first to the last if not given.
+    polygons : (N, V, D) ndarray
+        Convex polygons.
+    holes : (N, W, D) ndarray
+        Holes, counterclockwise and convex.
+    order : iterable of int, optional
+        Order in which the sides of the holes are used for clipping, one piece for each; first to last by default.
+
+    Returns
+    -------
+    list of (N, ., D) ndarray
+        Convex pieces, many of them empty.
     """
     normal, limit = sides(holes)
     out = []
@@ -217,82 +230,82 @@ def difference(polygons: np.ndarray, holes: np.ndarray, order: Iterable[int] | N
 
 
 def quadrature(polygons: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes that integrate polynomials of degree below ``count`` in x and in y exactly over each polygon.
+    """Return nodes that integrate polynomials of degree below ``count`` in x and in y exactly over each polygon.
 
-    They are Gauss' in the polygon's bounding box; the weights are the integrals of Lagrange's polynomials, by Green's
-    theorem along the sides.
+    The nodes are Gauss points of the polygon's bounding box; the weights are the integrals of the Lagrange polynomials,
+    by Green's theorem along the sides.
 
     Parameters
     ----------
-    polygons : np.ndarray
-        (N, V, D), of either sense.
+    polygons : (N, V, D) ndarray
+        Polygons of either orientation.
     count : int
-        Nodes along each side of the box.
+        Number of nodes along each side of the box.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray]
-        Points x + iy and weights of the area, (N, count^2) each.
+    points : (N, count^2) ndarray
+        Nodes x + iy.
+    weights : (N, count^2) ndarray
+        Area weights.
     """
-    place = polygons[..., :2]
-    step = np.roll(place, -1, axis=1) - place
+    xy = polygons[..., :2]
+    step = np.roll(xy, -1, axis=1) - xy
     points, weights = gauss(count)
-    on = place[:, :, None] + step[:, :, None] * (0.5 * (points + 1.0))[:, None]
+    nodes = xy[:, :, None] + step[:, :, None] * (0.5 * (points + 1.0))[:, None]
     rise = 0.5 * weights * step[..., 1:]
     corners = polygons.shape[1] * count
-    on, rise = on.reshape(len(on), corners, 2), rise.reshape(len(rise), corners)
-    return from_boundary(on, rise, place.min(axis=1), place.max(axis=1), count)
+    nodes, rise = nodes.reshape(len(nodes), corners, 2), rise.reshape(len(rise), corners)
+    return from_boundary(nodes, rise, xy.min(axis=1), xy.max(axis=1), count)
 
 
 def from_boundary(
-    place: np.ndarray, rise: np.ndarray, low: np.ndarray, high: np.ndarray, count: int
+    nodes: np.ndarray, rise: np.ndarray, low: np.ndarray, high: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``quadrature`` over regions whose boundary is given by nodes of integrals along it.
+    """Return ``quadrature`` over regions whose boundaries are given by nodes of integrals along them.
 
     Parameters
     ----------
-    place : np.ndarray
-        Nodes on the boundary, (N, P, 2).
-    rise : np.ndarray
-        Their weights in integrals over dy, (N, P).
-    low : np.ndarray
-        Corners of boxes about the regions, (N, 2).
-    high : np.ndarray
-        The opposite ones.
+    nodes : (N, P, 2) ndarray
+        Nodes on the boundaries.
+    rise : (N, P) ndarray
+        Weights of the nodes in integrals over dy.
+    low, high : (N, 2) ndarray
+        Opposite corners of boxes about the regions.
     count : int
-        Nodes along each side of the box.
+        Number of nodes along each side of the box.
     """
-    rows = len(place)
+    rows = len(nodes)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     half = np.where(half > 0.0, half, 1.0)
-    # Nodes lie in the box but for rounding. Of a sliver, whose box has no height to speak of, this rounding is many
-    # times the box, and polynomials make any weight of it.
-    at = np.clip((place - middle[:, None]) / half[:, None], -1.0, 1.0)
+    # Nodes lie in the box to rounding. A sliver's box has almost no height, so that this rounding is many times the
+    # box, and the polynomials would amplify it to arbitrary weights.
+    local = np.clip((nodes - middle[:, None]) / half[:, None], -1.0, 1.0)
     rise = rise / half[:, 1:]
-    step = max(1, _AT_ONCE // max(place.shape[1], 1))
-    some = [slice(k, k + step) for k in range(0, rows, step)]
-    moments = np.concatenate([np.zeros((0, count, count)), *(_moments(at[s], rise[s], count) for s in some)])
+    step = max(1, _BLOCK_NODES // max(nodes.shape[1], 1))
+    blocks = [slice(k, k + step) for k in range(0, rows, step)]
+    moments = np.concatenate([np.zeros((0, count, count)), *(_moments(local[s], rise[s], count) for s in blocks)])
     moments *= (np.sign(moments[:, 0, 0]) * half[:, 0] * half[:, 1])[:, None, None]
-    own, to_weights = gauss(count)[0], _lagrange(count)
+    unit, to_weights = gauss(count)[0], _lagrange(count)
     weights = to_weights @ moments @ to_weights.T
-    points = (middle[:, :1] + half[:, :1] * own)[:, :, None] + 1j * (middle[:, 1:] + half[:, 1:] * own)[:, None]
+    points = (middle[:, :1] + half[:, :1] * unit)[:, :, None] + 1j * (middle[:, 1:] + half[:, 1:] * unit)[:, None]
     return points.reshape(rows, count**2), weights.reshape(rows, count**2)
 
 
-def _moments(at: np.ndarray, rise: np.ndarray, count: int) -> np.ndarray:
-    """Integrals of Legendre's P_i(x) P_j(y) over N regions with nodes (N, P, 2) on their boundaries, (N, count, count).
+def _moments(nodes: np.ndarray, rise: np.ndarray, count: int) -> np.ndarray:
+    """Return the integrals (N, count, count) of Legendre products P_i(x) P_j(y) over N regions.
 
     Parameters
     ----------
-    at : np.ndarray
-        The nodes.
-    rise : np.ndarray
-        Their weights in integrals over dy, (N, P).
+    nodes : (N, P, 2) ndarray
+        Nodes on the boundaries.
+    rise : (N, P) ndarray
+        Weights of the nodes in integrals over dy.
     count : int
-        Of polynomials.
+        Number of polynomials along each axis.
     """
-    x, y = _legendre(at[..., 0], count + 1), _legendre(at[..., 1], count)
-    primitive = np.empty((count, *rise.shape))  # of P_0, P_1, ... along x
+    x, y = _legendre(nodes[..., 0], count + 1), _legendre(nodes[..., 1], count)
+    primitive = np.empty((count, *rise.shape))  # integrals of P_0, P_1, ... along x
     primitive[0] = x[1]
     np.subtract(x[2:], x[:-2], out=primitive[1:])
     primitive[1:] /= (2 * np.arange(1, count) + 1)[:, None, None]
@@ -302,7 +315,7 @@ def _moments(at: np.ndarray, rise: np.ndarray, count: int) -> np.ndarray:
 
 @cache
 def _lagrange(count: int) -> np.ndarray:
-    """From integrals of Legendre's polynomials to weights of Gauss' points, (count, count)."""
+    """Return the matrix (count, count) from integrals of Legendre polynomials to weights of Gauss points."""
     points, weights = gauss(count)
     out = np.asarray(weights[:, None] * _legendre(points, count).T * (np.arange(count) + 0.5))
     out.setflags(write=False)
@@ -310,7 +323,7 @@ def _lagrange(count: int) -> np.ndarray:
 
 
 def _legendre(x: np.ndarray, count: int) -> np.ndarray:
-    """P_0 .. P_(count - 1) at x, (count, ...)."""
+    """Return the Legendre polynomials P_0 .. P_(count - 1) at x, shape (count, ...)."""
     out = np.empty((count, *x.shape))
     out[0] = 1.0
     if count > 1:

@@ -7,25 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from optics.numerics.array_math import product, turned
+from optics.numerics.array_math import matvec, product
 
 _SERIES_LIMIT = 0.25  # |angle|^2 below which the power series is exact to rounding with the terms used
 _SERIES_TERMS = 12
 
 
 def rotation_matrix(vector: Any) -> np.ndarray:
-    """Matrix of a rotation vector (right-hand rule), Rodrigues' formula.
+    """Return the matrix of a rotation vector (right-hand rule), by Rodrigues' formula.
 
     Parameters
     ----------
-    vector : Any
-        Rotation vectors, radians, shape (..., 3); complex input is differentiated analytically, so that a complex step
-        gives exact derivatives (no conjugation or modulus is taken).
+    vector : (..., 3) array_like
+        Rotation vectors, radians. Complex input is differentiated analytically, so that a complex step gives exact
+        derivatives (no conjugate or modulus is taken).
 
     Returns
     -------
-    np.ndarray
-        Shape (..., 3, 3).
+    (..., 3, 3) ndarray
+        Rotation matrices.
     """
     v = np.asarray(vector)
     v = v.astype(np.result_type(v.dtype, np.float64))
@@ -42,7 +42,7 @@ def rotation_matrix(vector: Any) -> np.ndarray:
 
 
 def _ratios(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return sin(a)/a and (1-cos a)/a^2 for a^2 given, entire functions of a^2."""
+    """Return sin(a)/a and (1 - cos a)/a^2 from a^2; both are entire functions of a^2."""
     sine = np.zeros_like(square)
     cosine = np.zeros_like(square)
     for n in range(_SERIES_TERMS, 0, -1):
@@ -58,7 +58,7 @@ def _ratios(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rotation_vector(matrix: Any) -> np.ndarray:
-    """Rotation vector of a rotation matrix, |angle| < pi; shape (..., 3, 3) -> (..., 3), radians."""
+    """Return the rotation vectors (..., 3), radians, of rotation matrices (..., 3, 3); the angle is below pi."""
     m = np.asarray(matrix, dtype=np.float64)
     axis = 0.5 * np.stack(
         [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], axis=-1
@@ -71,22 +71,24 @@ def rotation_vector(matrix: Any) -> np.ndarray:
 
 
 def about_axis(axis: int, angle: float) -> np.ndarray:
-    """Rotation by ``angle`` radians about coordinate axis 0, 1 or 2 (right-hand rule); shape (3, 3)."""
+    """Return the (3, 3) rotation by ``angle`` radians about coordinate axis 0, 1 or 2 (right-hand rule)."""
     vector = np.zeros(3)
     vector[axis] = angle
     return rotation_matrix(vector)
 
 
 def triple(vector: Any) -> tuple[float, float, float]:
-    """A vector (3,) as plain numbers, for immutable values that are compared."""
+    """Return a vector (3,) as a tuple of floats, for immutable values that are compared."""
     x, y, z = vector
     return (float(x), float(y), float(z))
 
 
 _UNIT = np.eye(3)
-_ROUNDING = 1e-12 + 1e-5 * _UNIT
-"""How far a rotation times its transpose may be off the unit matrix: axes are square to each other to rounding, and
-their lengths are those of a matrix that a file gives in a few digits."""
+_ORTHOGONALITY_TOLERANCE = 1e-12 + 1e-5 * _UNIT
+"""Tolerance of a rotation times its transpose about the unit matrix.
+
+Axes must be perpendicular to rounding; their lengths may have the error of a matrix that a file gives in a few digits.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +97,10 @@ class Pose:
 
     Attributes
     ----------
-    rotation : np.ndarray
-        Shape (3, 3), proper orthogonal.
-    translation : np.ndarray
-        Shape (3,), metres.
+    rotation : (3, 3) ndarray
+        Proper orthogonal matrix.
+    translation : (3,) ndarray
+        Origin of the body in the parent's frame, metres.
     """
 
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
@@ -110,7 +112,7 @@ class Pose:
         translation = np.array(self.translation, dtype=np.float64)
         if rotation.shape != (3, 3) or translation.shape != (3,):
             raise ValueError(f"a pose needs shapes (3, 3) and (3,), found {rotation.shape} and {translation.shape}")
-        if not np.all(np.abs(rotation @ rotation.T - _UNIT) <= _ROUNDING) or np.linalg.det(rotation) < 0:
+        if not np.all(np.abs(rotation @ rotation.T - _UNIT) <= _ORTHOGONALITY_TOLERANCE) or np.linalg.det(rotation) < 0:
             raise ValueError("a pose's rotation must be a proper orthogonal matrix")
         rotation.setflags(write=False)
         translation.setflags(write=False)
@@ -118,7 +120,7 @@ class Pose:
         object.__setattr__(self, "translation", translation)
 
     def __eq__(self, other: object) -> bool:
-        """Equal when both arrays are bit-equal."""
+        """Return True when both arrays are bit-equal."""
         return self is other or (
             isinstance(other, Pose)
             and self.rotation.tobytes() == other.rotation.tobytes()
@@ -126,16 +128,16 @@ class Pose:
         )
 
     def __hash__(self) -> int:
-        """Hash of the array bytes."""
+        """Return the hash of the array bytes."""
         return hash((self.rotation.tobytes(), self.translation.tobytes()))
 
     def apply(self, points: Any) -> np.ndarray:
         """Map points (..., 3) from the body's frame to the parent's, metres."""
-        return turned(self.rotation, np.asarray(points)) + self.translation
+        return matvec(self.rotation, np.asarray(points)) + self.translation
 
     def inverse(self) -> Pose:
-        """The transform back from the parent's frame to the body's."""
-        return Pose(self.rotation.T, -turned(self.rotation.T, self.translation))
+        """Return the transform from the parent's frame to the body's."""
+        return Pose(self.rotation.T, -matvec(self.rotation.T, self.translation))
 
     def __matmul__(self, other: Pose) -> Pose:
         """Compose: (a @ b).apply(x) == a.apply(b.apply(x))."""

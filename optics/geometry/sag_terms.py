@@ -1,8 +1,8 @@
-"""Terms of a surface's sag beyond a conic with even powers of the radius, kind by kind.
+"""Kinds of sag terms added to a conic with even powers of the radius.
 
-A kind is one frozen dataclass, whose fields are numbers: floats in a ``Surface``, arrays over systems in a batch,
-Dr.Jit arrays in a kernel. They are 0 by default, and a term of zeros adds nothing, exactly: surfaces of one batch or
-one scene share the code of all their terms.
+A kind is a frozen dataclass whose fields are numbers: floats in a ``Surface``, arrays over systems in a batch, Dr.Jit
+arrays in a kernel. They are 0 by default, and a term of zeros adds exactly nothing, so that all surfaces of a batch or
+scene share the code of all their terms.
 """
 
 from __future__ import annotations
@@ -20,48 +20,49 @@ from optics.numerics.number_tree import FrozenMap
 
 @runtime_checkable
 class SagTerm(Protocol):
-    """What a kind has to be, beside a frozen dataclass of numbers without a ``__post_init__``.
+    """Protocol of a kind of sag term: a frozen dataclass of numbers, without a ``__post_init__``.
 
     Attributes
     ----------
-    POWERS : Mapping[str, int]
-        Name of each field, in their order -> power of the metre of its unit, -3 for 1/m^3. Files are read by it, and a
-        body that grows takes the number along.
+    POWERS : mapping of str to int
+        Name of each field, in field order, to the power of the metre in its unit (-3 for 1/m^3). Files are read by it,
+        and a scaled body scales the number by it.
     """
 
     POWERS: ClassVar[Mapping[str, int]]
 
     def sag(self, x: Any, y: Any) -> Any:
-        """Height at x, y, metres, NumPy arrays (...) -> (...); NaN where it ends."""
+        """Return the height at x, y in metres, NumPy arrays (...) -> (...); NaN outside the term's domain."""
         ...
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Height (metres) and its derivatives by x and y, Dr.Jit arrays; some finite number where ``sag`` ends."""
+        """Return height (metres) and slopes by x and y, Dr.Jit arrays; finite also outside the domain of ``sag``."""
         ...
 
 
-def grown(term: SagTerm, scale: Any) -> SagTerm:
-    """A term on a body that is larger by a factor; the factor and with it the numbers may be arrays, complex ones,
-    too.
-    """
+def scaled_term(term: SagTerm, scale: Any) -> SagTerm:
+    """Return the term on a body scaled by a factor; the factor and so the numbers may be arrays, also complex."""
     kind = type(term)
     return kind(**{name: getattr(term, name) * scale**power for name, power in kind.POWERS.items()})
 
 
 def of_kinds(terms: Sequence[SagTerm], kinds: Sequence[type[SagTerm]]) -> tuple[SagTerm, ...]:
-    """One term of each kind, in their order: the given ones, and those that add nothing for the rest."""
-    known: Mapping[Any, SagTerm] = {type(term): term for term in terms}
-    return tuple(known[kind] if kind in known else kind() for kind in kinds)
+    """Return one term of each kind, in the order of ``kinds``: those of ``terms``, or zero terms for missing kinds."""
+    by_kind: Mapping[Any, SagTerm] = {type(term): term for term in terms}
+    return tuple(by_kind[kind] if kind in by_kind else kind() for kind in kinds)
 
 
 def kinds_of(terms: Sequence[SagTerm]) -> tuple[type[SagTerm], ...]:
-    """Their kinds, each once, in an order that depends on the kinds alone."""
+    """Return the kinds of the terms, each once, in an order that depends on the kinds alone."""
     return tuple(sorted({type(term) for term in terms}, key=lambda kind: (kind.__module__, kind.__qualname__)))
 
 
 @dataclass(frozen=True)
 class XYPolynomial:
-    """Sum of c_ab x^a y^b of orders 2 to 4: a freeform. ``x2y`` stands for x^2 y; 1/m, 1/m^2, 1/m^3."""
+    """Freeform sag: sum of c_ab x^a y^b of orders 2 to 4.
+
+    The field ``x2y`` is the coefficient of x^2 y; units are 1/m, 1/m^2 and 1/m^3.
+    """
 
     POWERS: ClassVar[Mapping[str, int]] = FrozenMap(
         **dict.fromkeys(("x2", "xy", "y2"), -1),
@@ -82,7 +83,7 @@ class XYPolynomial:
     y4: Any = 0.0
 
     def _terms(self) -> dict[tuple[int, int], Any]:
-        """(a, b) -> c_ab."""
+        """Return the mapping (a, b) -> c_ab."""
         return {
             (2, 0): self.x2,
             (1, 1): self.xy,
@@ -99,11 +100,11 @@ class XYPolynomial:
         }
 
     def sag(self, x: Any, y: Any) -> Any:
-        """Height, metres."""
+        """Return the height, in metres."""
         return np.asarray(sum(c * x**a * y**b for (a, b), c in self._terms().items()))
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Height and slopes."""
+        """Return the height and its slopes."""
         coefficients: list[Any] = [0.0] * zernike.triangle_size(4)
         for (a, b), c in self._terms().items():
             coefficients[zernike.triangle_index(a, b)] = c
@@ -111,14 +112,14 @@ class XYPolynomial:
 
 
 LAST_NOLL = 36
-"""Highest Noll index of a sag's Zernike terms: all to radial order 7."""
+"""Highest Noll index of Zernike sag terms: all terms to radial order 7."""
 
 
 @dataclass(frozen=True)
 class ZernikeSag:
-    """Sum of a_j Z_j((x - x0)/radius, (y - y0)/radius), Noll's order, a_j = rms over the disk: a freeform as designed.
+    """Freeform sag as designed: sum of a_j Z_j((x - x0)/radius, (y - y0)/radius), Noll order, a_j = rms over the disk.
 
-    A mirror's figure error is none of it: that is a state's.
+    A mirror's figure error is not part of it; that belongs to the state (``Motion.figure``).
     """
 
     POWERS: ClassVar[Mapping[str, int]] = FrozenMap(
@@ -166,28 +167,28 @@ class ZernikeSag:
 
     @property
     def amplitudes(self) -> dict[int, Any]:
-        """Noll index -> a_j, metres."""
+        """Noll index -> amplitude a_j, in metres rms."""
         return {j: getattr(self, f"Z{j}") for j in range(1, LAST_NOLL + 1)}
 
     def sag(self, x: Any, y: Any) -> Any:
-        """Height, metres."""
+        """Return the height, in metres."""
         if not self.radius:
             return np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
         u, v = (np.asarray(x) - self.x0) / self.radius, (np.asarray(y) - self.y0) / self.radius
         return np.asarray(sum(a * zernike.zernike(j, u, v) for j, a in self.amplitudes.items()))
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Height and slopes."""
+        """Return the height and its slopes."""
         import drjit as dr
 
-        none = self.radius == 0.0
-        scale = dr.select(none, 0.0, 1.0 / dr.select(none, 1.0, self.radius))
+        is_zero = self.radius == 0.0
+        scale = dr.select(is_zero, 0.0, 1.0 / dr.select(is_zero, 1.0, self.radius))
         order = zernike.order_of(range(1, LAST_NOLL + 1))
         coefficients: list[Any] = [0.0] * zernike.triangle_size(order)
         for j, amplitude in self.amplitudes.items():
             for a, b, c in zernike.cartesian_terms(j):
-                place = zernike.triangle_index(a, b)
-                coefficients[place] = coefficients[place] + c * amplitude
+                index = zernike.triangle_index(a, b)
+                coefficients[index] = coefficients[index] + c * amplitude
         height, slope_x, slope_y = zernike.triangle_polynomial(
             (x - self.x0) * scale, (y - self.y0) * scale, coefficients, order
         )
@@ -195,6 +196,7 @@ class ZernikeSag:
 
 
 SAG_TERMS = ExtensionTable[type[SagTerm]]("sag_terms", {"polynomial": XYPolynomial, "zernike": ZernikeSag}, SagTerm)
-"""Name that a mirror's file may write under ``sag`` -> kind, whose numbers stand there by name. A new one is added
-here: the traces, their derivatives, the path tracer, meshes and the reader of files know it from this entry.
+"""Kinds of sag terms by the name that a mirror's file writes under ``sag``; the numbers follow there by field name.
+
+A new kind is added here: the traces, their derivatives, the path tracer, meshes and the file readers use this table.
 """

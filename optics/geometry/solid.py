@@ -1,12 +1,13 @@
-"""Convex bodies: what half-spaces enclose, exactly, and solids of glass with flat faces.
+"""Convex bodies as exact intersections of half-spaces, and glass solids with flat faces.
 
-Planes that almost meet in one point or almost coincide leave edges of nanometres, and no tolerance tells there which
-corners are one. So bodies are cut out of a large box with integers, plane by plane: every corner is the exact meeting
-point of three given planes, every question of sides has the exact answer, and two faces always share their edge. Edges
-too short for floating-point meshes are then taken out one by one, as long as the surface stays closed.
+Planes that almost meet in one point or almost coincide leave edges of nanometres, where no tolerance can decide which
+corners coincide. Bodies are therefore cut out of a large box in integer arithmetic, plane by plane: every corner is the
+exact intersection of three given planes, every side test is exact, and two adjacent faces always share their edge.
+Edges too short for floating-point meshes are then removed one by one, as long as the surface stays closed.
 
-A solid is convex: the points behind all of its faces. A face's frame has +z along the outward normal; the solid's own
-body carries it, so that a turn of the solid turns all faces and a turn of one face's body is an angle error.
+A solid is convex: the set of points behind all of its faces. A face's frame has +z along the outward normal. The
+solid's own body carries it, so that a rotation of the solid rotates all faces, and a rotation of one face's body is an
+angle error.
 """
 
 from __future__ import annotations
@@ -29,24 +30,26 @@ from optics.numerics.array_math import PhysicalError
 if TYPE_CHECKING:  # takes a third of a second
     import trimesh
 
-REACH = 100.0
-"""A body that reaches farther from the origin counts as open, metres."""
+MAX_EXTENT = 100.0
+"""Half-width of the box to cut from, metres; a body that extends farther from the origin counts as open."""
 
-MERGED = 1e-7
-"""Edges shorter than this are taken out, and a body thinner than this is none, metres: a metre in single precision, in
-which paths are traced, has steps of 6e-8 m."""
+MERGE_LENGTH = 1e-7
+"""Length below which edges are removed, and thickness below which a body counts as empty, metres.
+
+A metre in single precision, in which paths are traced, has steps of 6e-8 m.
+"""
 
 _BITS = 60
-"""Planes are rounded to 2**-60, 1e-18 of a unit normal or a metre: far below the rounding of doubles."""
+"""Planes are rounded to 2**-60, 1e-18 of a unit normal or a metre, far below the rounding of doubles."""
 
 _Plane = tuple[int, int, int, int]
-"""Normal and offset, n . x <= d."""
+"""Integer normal and offset of a half-space n . x <= d."""
 
 _Corner = tuple[int, int, int, int]
-"""Homogeneous x, y, z, w with w > 0."""
+"""Homogeneous integer coordinates x, y, z, w with w > 0."""
 
 _Rings = dict[int, list[int]]
-"""Face -> its corners, counterclockwise from outside."""
+"""Corners of each face, counterclockwise as seen from outside, by face number."""
 
 
 class OpenBodyError(PhysicalError, ValueError):
@@ -54,40 +57,42 @@ class OpenBodyError(PhysicalError, ValueError):
 
 
 class EmptyBodyError(PhysicalError, ValueError):
-    """No body, or one thinner than MERGED, lies in all half-spaces."""
+    """The half-spaces have no common body, or one thinner than ``MERGE_LENGTH``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Polyhedron:
-    """A convex body.
+    """Convex polyhedron.
 
     Attributes
     ----------
-    vertices : np.ndarray
-        Its corners, (V, 3), metres.
-    rings : tuple[tuple[int, ...], ...]
-        For each half-space the corners of its face, counterclockwise from outside; empty when the half-space leaves no
-        face, or none wider than ``MERGED``. Every edge is in two of them, once each way.
+    vertices : (V, 3) ndarray
+        Corners, metres.
+    rings : tuple of tuple of int
+        For each half-space the corners of its face, counterclockwise as seen from outside; empty when the half-space
+        has no face, or none wider than ``MERGE_LENGTH``. Every edge is in two rings, once in each direction.
     """
 
     vertices: np.ndarray
     rings: tuple[tuple[int, ...], ...]
 
 
-def enclosed(normals: np.ndarray, offsets: np.ndarray) -> Polyhedron:
-    """The body of all x with normals . x <= offsets.
+def half_space_intersection(normals: np.ndarray, offsets: np.ndarray) -> Polyhedron:
+    """Return the body of all x with normals . x <= offsets.
 
     Parameters
     ----------
-    normals : np.ndarray
-        Outward unit vectors, (F, 3).
-    offsets : np.ndarray
-        Along them from the origin, (F,), metres.
+    normals : (F, 3) ndarray
+        Outward unit vectors.
+    offsets : (F,) ndarray
+        Distances of the planes from the origin along the normals, metres.
 
     Raises
     ------
-    OpenBodyError, EmptyBodyError
-        There is no such body.
+    OpenBodyError
+        The half-spaces do not bound a body.
+    EmptyBodyError
+        The half-spaces have no common body.
     """
     count = len(offsets)
     planes = [_integers((*n, d)) for n, d in zip(normals.tolist(), offsets.tolist(), strict=True)]
@@ -95,13 +100,13 @@ def enclosed(normals: np.ndarray, offsets: np.ndarray) -> Polyhedron:
     for k in range(count):
         _cut(corners, rings, planes, k)
     if any(k >= count for k in rings):
-        raise OpenBodyError("open on one side")
+        raise OpenBodyError("the half-spaces leave the body open on one side")
     used = sorted({v for ring in rings.values() for v in ring})
     number = {v: i for i, v in enumerate(used)}
     vertices = np.array([[c / corners[v][3] for c in corners[v][:3]] for v in used])  # correctly rounded
     depth = offsets - np.min(vertices @ normals.T, axis=0)
-    if np.min(depth[list(rings)]) < MERGED:
-        raise EmptyBodyError("no room")
+    if np.min(depth[list(rings)]) < MERGE_LENGTH:
+        raise EmptyBodyError("the half-spaces enclose no volume")
     outlines = {k: [number[v] for v in ring] for k, ring in rings.items()}
     _merge(vertices, outlines)
     used = sorted({v for ring in outlines.values() for v in ring})
@@ -110,25 +115,26 @@ def enclosed(normals: np.ndarray, offsets: np.ndarray) -> Polyhedron:
 
 
 def _integers(plane: Iterable[float]) -> _Plane:
+    """Return a plane's normal and offset as integers in units of 2**-60."""
     a, b, c, d = (round(ldexp(value, _BITS)) for value in plane)
     return a, b, c, d
 
 
 def _box(planes: list[_Plane], first: int) -> tuple[list[_Corner], _Rings]:
-    """Corners and faces of the box to cut from; its planes are added to ``planes``, beginning with number ``first``."""
-    reach = int(REACH)
-    corners = [(x, y, z, 1) for x in (-reach, reach) for y in (-reach, reach) for z in (-reach, reach)]
+    """Return corners and faces of the box to cut from, and append its planes to ``planes``, numbered from ``first``."""
+    extent = int(MAX_EXTENT)
+    corners = [(x, y, z, 1) for x in (-extent, extent) for y in (-extent, extent) for z in (-extent, extent)]
     outlines = {(-1, 0, 0): (0, 1, 3, 2), (1, 0, 0): (4, 6, 7, 5), (0, -1, 0): (0, 4, 5, 1)}
     outlines |= {(0, 1, 0): (2, 3, 7, 6), (0, 0, -1): (0, 2, 6, 4), (0, 0, 1): (1, 5, 7, 3)}
     rings = {}
     for k, (normal, ring) in enumerate(outlines.items()):
-        planes.append(_integers((*normal, REACH)))
+        planes.append(_integers((*normal, MAX_EXTENT)))
         rings[first + k] = list(ring)
     return corners, rings
 
 
 def _cut(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int) -> None:
-    """Cut off what lies beyond plane number ``k``; a plane that cuts nothing off leaves no face."""
+    """Cut off everything beyond plane number ``k``; a plane that cuts nothing off leaves no face."""
     a, b, c, d = planes[k]
     side = {}
     for v in {v for ring in rings.values() for v in ring}:
@@ -136,7 +142,7 @@ def _cut(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int
         height = a * x + b * y + c * z - d * w
         side[v] = (height > 0) - (height < 0)
     if min(side.values()) >= 0:
-        raise EmptyBodyError("no room")
+        raise EmptyBodyError("the half-spaces enclose no volume")
     if max(side.values()) <= 0:
         return
     face_at = {(u, v): face for face, ring in rings.items() for u, v in _edges(ring)}
@@ -146,19 +152,19 @@ def _cut(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int
         if all(side[v] >= 0 for v in ring):
             del rings[face]
             continue
-        kept = []
+        cut_ring = []
         for u, v in _edges(ring):
             if side[u] <= 0:
-                kept.append(u)
+                cut_ring.append(u)
             if side[u] * side[v] < 0:
                 edge = (min(u, v), max(u, v))
                 if edge not in new:
                     new[edge] = len(corners)
-                    corners.append(_meeting(planes[face], planes[face_at[v, u]], planes[k]))
+                    corners.append(_intersection(planes[face], planes[face_at[v, u]], planes[k]))
                     side[new[edge]] = 0
-                kept.append(new[edge])
-        rings[face] = kept
-        after.update({v: u for u, v in _edges(kept) if side[u] == side[v] == 0})
+                cut_ring.append(new[edge])
+        rings[face] = cut_ring
+        after.update({v: u for u, v in _edges(cut_ring) if side[u] == side[v] == 0})
     start = next(iter(after))
     cap = [start]
     while after[cap[-1]] != start:
@@ -167,12 +173,12 @@ def _cut(corners: list[_Corner], rings: _Rings, planes: Sequence[_Plane], k: int
 
 
 def _edges(ring: Sequence[int]) -> Iterable[tuple[int, int]]:
-    """Consecutive corners of a ring, closed."""
+    """Return pairs of consecutive corners of a closed ring."""
     return zip(ring, (*ring[1:], ring[0]), strict=True)
 
 
-def _meeting(p: _Plane, q: _Plane, r: _Plane) -> _Corner:
-    """Where three planes meet in one point, by Cramer's rule."""
+def _intersection(p: _Plane, q: _Plane, r: _Plane) -> _Corner:
+    """Return the intersection of three planes, by Cramer's rule."""
     qr = (q[1] * r[2] - q[2] * r[1], q[2] * r[0] - q[0] * r[2], q[0] * r[1] - q[1] * r[0])
     rp = (r[1] * p[2] - r[2] * p[1], r[2] * p[0] - r[0] * p[2], r[0] * p[1] - r[1] * p[0])
     pq = (p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0])
@@ -182,15 +188,15 @@ def _meeting(p: _Plane, q: _Plane, r: _Plane) -> _Corner:
 
 
 def _merge(vertices: np.ndarray, rings: _Rings) -> None:
-    """Take out edges shorter than ``MERGED``, the shortest first: one end takes the other's place.
+    """Remove edges shorter than ``MERGE_LENGTH``, the shortest first, by merging one end into the other.
 
-    A corner stays where it is or goes, so that all that are left are corners of the exact body. An edge whose end
-    cannot go without tearing the surface stays.
+    A corner stays where it is or disappears, so that all remaining ones are corners of the exact body. An edge whose
+    end cannot be removed without opening the surface stays.
     """
     while True:
         edges = {(u, v) for ring in rings.values() for u, v in _edges(ring) if u < v}
         lengths = {(u, v): float(np.linalg.norm(vertices[u] - vertices[v])) for u, v in edges}
-        for u, v in sorted((e for e in edges if lengths[e] < MERGED), key=lambda e: (lengths[e], e)):
+        for u, v in sorted((e for e in edges if lengths[e] < MERGE_LENGTH), key=lambda e: (lengths[e], e)):
             changed = _without(rings, u, v)
             if changed is not None:
                 rings.clear()
@@ -201,26 +207,26 @@ def _merge(vertices: np.ndarray, rings: _Rings) -> None:
 
 
 def _without(rings: _Rings, u: int, v: int) -> _Rings | None:
-    """The faces with corner v drawn into its neighbour u; None when they would not be those of a body any more."""
-    out = {}
+    """Return the faces with corner v merged into its neighbour u, or None if they would no longer bound a body."""
+    remaining = {}
     for face, ring in rings.items():
         merged = [u if w == v else w for w in ring]
         merged = [w for w, after in _edges(merged) if w != after]
         if len(merged) > 2:
-            out[face] = merged
-    if len(out) < 4 or any(len(set(ring)) < len(ring) for ring in out.values()):
+            remaining[face] = merged
+    if len(remaining) < 4 or any(len(set(ring)) < len(ring) for ring in remaining.values()):
         return None
-    edges = {edge: face for face, ring in out.items() for edge in _edges(ring)}
-    closed = len(edges) == sum(map(len, out.values())) and all((b, a) in edges for a, b in edges)
+    edges = {edge: face for face, ring in remaining.items() for edge in _edges(ring)}
+    closed = len(edges) == sum(map(len, remaining.values())) and all((b, a) in edges for a, b in edges)
     common = Counter(
-        frozenset(pair) for f, g in combinations(out.values(), 2) for pair in combinations(set(f) & set(g), 2)
+        frozenset(pair) for f, g in combinations(remaining.values(), 2) for pair in combinations(set(f) & set(g), 2)
     )
-    # two corners that two faces share are an edge, and no other two faces share them
-    return out if closed and all(tuple(pair) in edges and count == 1 for pair, count in common.items()) else None
+    # two corners common to two faces must form an edge, and belong to no other pair of faces
+    return remaining if closed and all(tuple(pair) in edges and count == 1 for pair, count in common.items()) else None
 
 
 class Coating(Enum):
-    """What a face is made to do."""
+    """Surface treatment of a face."""
 
     MIRROR = "mirror"  # metallised: reflects from inside and outside
     TRANSMITTING = "transmitting"  # polished, anti-reflection coated
@@ -234,19 +240,19 @@ class SolidError(PhysicalError, ValueError):
 
 @dataclass(frozen=True)
 class Face:
-    """One face.
+    """Flat face of a solid.
 
     Attributes
     ----------
     name : str
-        Within the solid, e.g. ``window``, ``roof_a``.
+        Name within the solid, e.g. ``window``, ``roof_a``.
     body : str
-        Path of the tree's body that carries it (the solid's own, or a child of it when the face can have an error of
-        its own).
+        Path of the tree's body that carries it (the solid's own, or a child of it when the face can have an angle error
+        of its own).
     coating : Coating
-        What it does.
+        Surface treatment.
     pose : Pose
-        Of the face in that body's frame, +z outward.
+        Pose of the face in that body's frame, +z outward.
     """
 
     name: str
@@ -257,7 +263,7 @@ class Face:
 
 @dataclass(frozen=True)
 class Solid:
-    """A glass body.
+    """Glass body with flat faces.
 
     Attributes
     ----------
@@ -265,8 +271,8 @@ class Solid:
         Path of its body in the tree.
     material : str
         Name in the catalogues ``optics.materials.glass`` and ``optics.materials.material``.
-    faces : tuple[Face, ...]
-        All faces; their inner half-spaces meet in the body.
+    faces : tuple of Face
+        All faces; the solid is the intersection of their inner half-spaces.
     transparent : bool
         False for a body of which only the outer faces are used (light never goes inside).
     """
@@ -279,19 +285,19 @@ class Solid:
 
 @dataclass(frozen=True, eq=False)
 class SolidMesh:
-    """The body as a triangle mesh in the frame of the solid's body, metres.
+    """Triangle mesh of a solid in the frame of the solid's body, metres.
 
     Attributes
     ----------
-    vertices : np.ndarray
-        Corners, (V, 3).
-    triangles : np.ndarray
-        Closed, with outward winding, (T, 3).
-    face_of : np.ndarray
-        (T,) index into ``Solid.faces``.
-    polygons : tuple[np.ndarray, ...]
-        Face by face, its corners in order, (K, 3), counterclockwise from outside; (0, 3) for a ground face that the
-        other faces cut off.
+    vertices : (V, 3) ndarray
+        Corners.
+    triangles : (T, 3) ndarray
+        Corner indices of a closed mesh with outward winding.
+    face_of : (T,) ndarray
+        Index of each triangle's face in ``Solid.faces``.
+    polygons : tuple of (K, 3) ndarray
+        Corners of each face in order, counterclockwise as seen from outside; (0, 3) for a ground face that the other
+        faces cut off.
     """
 
     vertices: np.ndarray
@@ -301,23 +307,23 @@ class SolidMesh:
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """The same for who measures or draws it."""
+        """This mesh as a trimesh object, for measuring and drawing."""
         import trimesh
 
         return trimesh.Trimesh(self.vertices, self.triangles, process=False)
 
 
 def face_plane(face: Face, placed: PlacedBodies, state: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Point and outward unit normal of a face in the world, (3,) each.
+    """Return a point and the outward unit normal of a face in world coordinates, (3,) each.
 
     Parameters
     ----------
     face : Face
-        Of a solid.
+        Face of a solid.
     placed : PlacedBodies
-        Bodies of S states.
+        World poses of the bodies in S states.
     state : int
-        Which of them.
+        Index of the state.
     """
     pose = placed.pose(face.body, state)
     scale = float(placed.scale[state, placed.index[face.body]].real)
@@ -325,21 +331,21 @@ def face_plane(face: Face, placed: PlacedBodies, state: int = 0) -> tuple[np.nda
 
 
 def solid_mesh(solid: Solid, placed: PlacedBodies) -> SolidMesh:
-    """Mesh of the body that the faces enclose.
+    """Return the mesh of the body that a solid's faces enclose.
 
     Raises
     ------
     SolidError
-        The faces leave no room, leave the body open, or cut off one of them that is more than a ground surface.
+        The faces enclose nothing, leave the body open, or cut off a face that is not ground.
     """
-    own = placed.pose(solid.path).inverse()
+    to_body = placed.pose(solid.path).inverse()
     planes = [face_plane(face, placed, 0) for face in solid.faces]
-    normals = np.array([own.rotation @ n for _, n in planes])
-    offsets = np.einsum("fi,fi->f", normals, np.array([own.apply(p) for p, _ in planes]))
+    normals = np.array([to_body.rotation @ n for _, n in planes])
+    offsets = np.einsum("fi,fi->f", normals, np.array([to_body.apply(p) for p, _ in planes]))
     try:
-        body = enclosed(normals, offsets)
+        body = half_space_intersection(normals, offsets)
     except EmptyBodyError as error:
-        raise SolidError(f"{solid.path}: its faces leave no room between them") from error
+        raise SolidError(f"{solid.path}: its faces enclose no volume") from error
     except OpenBodyError as error:
         raise SolidError(f"{solid.path}: its faces do not enclose a body; it is open on one side") from error
     for face, ring in zip(solid.faces, body.rings, strict=True):

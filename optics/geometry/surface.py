@@ -1,4 +1,4 @@
-"""A surface: its ideal shape and its figure error, on NumPy arrays and, as a level function, in kernels."""
+"""Surfaces: ideal shape and figure error, on NumPy arrays and, as a level function, in Dr.Jit kernels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from optics.geometry import zernike
 from optics.geometry.aperture import Aperture
-from optics.geometry.sag_terms import SagTerm, grown
+from optics.geometry.sag_terms import SagTerm, scaled_term
 from optics.geometry.zernike import triangle_order, triangle_polynomial
 from optics.numerics.number_tree import FrozenMap
 
@@ -20,7 +20,7 @@ from optics.numerics.number_tree import FrozenMap
 class ZernikeFigure:
     """Sag error sum a_j Z_j((x - cx)/radius, (y - cy)/radius), Noll order, a_j = rms over the disk in metres.
 
-    Terms may be perturbed per state (``Motion.figure``); the disk stays.
+    A state may change the terms (``Motion.figure``); the disk is fixed.
     """
 
     radius: float
@@ -34,16 +34,16 @@ class ZernikeFigure:
         object.__setattr__(self, "terms", FrozenMap({int(k): float(v) for k, v in self.terms.items()}))
 
     def numbers(self, order: int) -> FigureNumbers:
-        """Write the figure as a polynomial of an order that is at least the figure's own, ``order``."""
+        """Return the figure as a polynomial of degree ``order``, at least the figure's own order."""
         return FigureNumbers(*self.centre, tuple(zernike.monomials(self.terms, order, self.radius)))
 
     @property
     def order(self) -> int:
-        """Highest radial order, -1 without terms."""
+        """Highest radial order; -1 without terms."""
         return zernike.order_of(self.terms)
 
     def sag(self, x: Any, y: Any) -> np.ndarray:
-        """Sag error at x, y (metres), NumPy."""
+        """Return the sag error at x, y, in metres (NumPy arrays)."""
         u = (np.asarray(x) - self.centre[0]) / self.radius
         v = (np.asarray(y) - self.centre[1]) / self.radius
         return np.asarray(sum((a * zernike.zernike(j, u, v) for j, a in self.terms.items()), np.zeros_like(u)))
@@ -55,12 +55,11 @@ class GridFigure:
 
     Attributes
     ----------
-    values : np.ndarray
+    values : ndarray
         Sag error in metres, shape (rows along y, columns along x), at least 4 x 4.
-    bounds : tuple[float, float, float, float]
-        x_min, x_max, y_min, y_max of the first and last samples, metres. The spline arrives at its edges with zero
-        slope (mirror condition) and stays at the edge's value outside: give a grid that reaches a few samples beyond
-        the clear aperture.
+    bounds : tuple of float
+        (x_min, x_max, y_min, y_max) of the first and last samples, metres. The spline reaches its edges with zero slope
+        (mirror condition) and is constant outside: use a grid that extends a few samples beyond the clear aperture.
     """
 
     values: np.ndarray
@@ -80,7 +79,7 @@ class GridFigure:
     @cached_property
     def spline(self) -> np.ndarray:
         """B-spline coefficients with a mirrored margin of two samples on every side, shape (rows + 4, columns + 4)."""
-        # messages about files wait for this module, and scipy takes a quarter of a second
+        # imported late: scipy takes 0.25 s, and commands that only check files import this module
         from scipy.ndimage import spline_filter
 
         coefficients = spline_filter(self.values, order=3, mode="mirror")
@@ -88,21 +87,23 @@ class GridFigure:
 
     @property
     def numbers(self) -> GridNumbers:
-        """What a kernel reads of it, with the coefficients ``spline`` at the beginning of its table."""
+        """Grid parameters for a kernel, with the coefficients ``spline`` at the start of its table."""
         dx, dy = self.spacing
         rows, columns = self.values.shape
         return GridNumbers(self.bounds[0], self.bounds[2], 1.0 / dx, 1.0 / dy, float(columns), float(rows), 0.0)
 
     def plus(self, other: GridFigure) -> GridFigure:
-        """The sum of two figures on the same samples; exact.
+        """Return the sum of two figures on the same samples; exact.
 
         Raises
         ------
         ValueError
-            They have other samples.
+            The two figures have different samples.
         """
         if self.bounds != other.bounds or self.values.shape != other.values.shape:
-            raise ValueError("two grid figures of one surface stand on different samples; put them on the same ones")
+            raise ValueError(
+                "two grid figures of one surface have different samples; resample one on the grid of the other"
+            )
         return GridFigure(self.values + other.values, self.bounds)
 
     def sampled_as(self, other: GridFigure) -> GridFigure:
@@ -119,27 +120,27 @@ class GridFigure:
         return (x1 - x0) / (self.values.shape[1] - 1), (y1 - y0) / (self.values.shape[0] - 1)
 
     def sag(self, x: Any, y: Any) -> np.ndarray:
-        """Sag error at x, y (metres), NumPy."""
-        # as in ``spline``
+        """Return the sag error at x, y, in metres (NumPy arrays)."""
+        # imported late, as in ``spline``
         from scipy.ndimage import map_coordinates
 
         dx, dy = self.spacing
         column = (np.asarray(x) - self.bounds[0]) / dx
         row = (np.asarray(y) - self.bounds[2]) / dy
         rows, columns = self.values.shape
-        place = [np.clip(row, 0.0, rows - 1.0), np.clip(column, 0.0, columns - 1.0)]
-        return np.asarray(map_coordinates(self.values, place, order=3, mode="mirror"))
+        coordinates = [np.clip(row, 0.0, rows - 1.0), np.clip(column, 0.0, columns - 1.0)]
+        return np.asarray(map_coordinates(self.values, coordinates, order=3, mode="mirror"))
 
 
 @dataclass(frozen=True, eq=False)
 class SummedFigure:
-    """Zernike terms and a grid together, as a deformed mirror's state has them."""
+    """Sum of Zernike terms and a grid, the figure of a deformed mirror."""
 
     terms: ZernikeFigure
     grid: GridFigure
 
     def sag(self, x: Any, y: Any) -> np.ndarray:
-        """Sag error at x, y (metres), NumPy."""
+        """Return the sag error at x, y, in metres (NumPy arrays)."""
         return self.terms.sag(x, y) + self.grid.sag(x, y)
 
 
@@ -148,7 +149,7 @@ Figure = ZernikeFigure | GridFigure | SummedFigure
 
 @dataclass(frozen=True, eq=False)
 class FigureNumbers:
-    """A figure as a polynomial about (x, y), metres: c_ab of x^a y^b, ordered by ``zernike.triangle_index``."""
+    """Figure as a polynomial about (x, y), metres: c_ab of x^a y^b, ordered by ``zernike.triangle_index``."""
 
     x: Any
     y: Any
@@ -162,8 +163,18 @@ class FigureNumbers:
 
 @dataclass(frozen=True, eq=False)
 class GridNumbers:
-    """Where the samples of a ``GridFigure`` stand: first ones at (x, y), metres; samples per metre; how many there are;
-    place of the first coefficient in the table.
+    """Sampling of a ``GridFigure`` in a kernel.
+
+    Attributes
+    ----------
+    x, y : float or array
+        Position of the first samples, metres.
+    per_x, per_y : float or array
+        Samples per metre.
+    columns, rows : float or array
+        Number of samples along x and y.
+    first : float or array
+        Index of the first coefficient in the table.
     """
 
     x: Any
@@ -177,19 +188,19 @@ class GridNumbers:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceNumbers:
-    """What a surface consists of in kernels: numbers, or arrays of them for many surfaces of the same form.
+    """Numbers of a surface in kernels, or arrays of them for many surfaces of the same form.
 
-    What is None or empty is no part of the code that ``level`` makes.
+    A field that is None or empty adds no code to the kernel that ``level`` makes.
 
     Attributes
     ----------
-    curvature, conic : Any
-        c, 1/m, and k; None for a plane.
-    even : tuple[Any, ...]
-        A4, A6, ..., m^-3, m^-5, ...
-    terms : tuple[SagTerm, ...]
-        Further terms of the sag, at most one of a kind.
-    figure, grid : FigureNumbers | None
+    curvature, conic : float or array, optional
+        Curvature c, 1/m, and conic constant k; None for a plane.
+    even : tuple
+        A4, A6, ..., in m^-3, m^-5, ...
+    terms : tuple of SagTerm
+        Further terms of the sag, at most one of each kind.
+    figure, grid : FigureNumbers and GridNumbers, optional
         Departures from that shape.
     """
 
@@ -202,36 +213,37 @@ class SurfaceNumbers:
 
     @property
     def is_conic(self) -> bool:
-        """True when there is nothing but a conic or a plane: a ray's crossing has a closed form."""
+        """True for a pure conic or plane, whose intersection with a ray has a closed form."""
         return not self.even and not self.terms and self.figure is None and self.grid is None
 
 
 def level(
     x: Any, y: Any, z: Any, surface: SurfaceNumbers, table: Any = None, active: Any = True
 ) -> tuple[Any, Any, Any, Any]:
-    """Level function G of a surface and its gradient, on Dr.Jit arrays.
+    """Return the level function G of a surface and its gradient, on Dr.Jit arrays.
 
-    With h all terms beyond the conic and the figure and w = z - h(x, y), the surface is where
+    With h the sum of all terms beyond the conic and of the figure, and w = z - h(x, y), the surface is where
 
         G = w - c/2 (x^2 + y^2 + (1 + k) w^2) = 0,
 
-    the conic's own equation in w: no square root and no division. G > 0 on the +z side; dG/dw = 1 - (1 + k) c w is
+    the equation of the conic in w, without square root or division. G > 0 on the +z side; dG/dw = 1 - (1 + k) c w is
     positive on the sheet of the vertex.
 
     Parameters
     ----------
-    x : Any
-        Where, in the surface's frame, metres.
-    y : Any
-        likewise.
-    z : Any
-        likewise.
+    x, y, z : Dr.Jit float
+        Points in the surface's frame, metres.
     surface : SurfaceNumbers
-        Its numbers.
-    table : Any
-        Coefficients of grid figures.
-    active : Any
-        Points that matter; elsewhere the table is not read.
+        Numbers of the surface.
+    table : Dr.Jit float, optional
+        Spline coefficients of grid figures.
+    active : Dr.Jit bool
+        Mask of the points that matter; the table is not read elsewhere.
+
+    Returns
+    -------
+    tuple
+        G, metres, and its derivatives by x, y and z.
     """
     import drjit as dr
 
@@ -273,7 +285,7 @@ def level(
 
 
 def newton_step(p: Any, d: Any, t: Any, surface: SurfaceNumbers, table: Any = None, active: Any = True) -> Any:
-    """A better distance from p along d to a surface than t; the other arguments as for ``level``."""
+    """Return a better distance than t from p along d to a surface; other arguments as for ``level``."""
     import drjit as dr
 
     value, nx, ny, nz = level(*along(p, d, t), surface, table, active)
@@ -281,14 +293,14 @@ def newton_step(p: Any, d: Any, t: Any, surface: SurfaceNumbers, table: Any = No
 
 
 def along(p: Any, d: Any, t: Any) -> tuple[Any, Any, Any]:
-    """Coordinates of p + t d."""
+    """Return the coordinates of p + t d."""
     import drjit as dr
 
     return dr.fma(t, d.x, p.x), dr.fma(t, d.y, p.y), dr.fma(t, d.z, p.z)
 
 
 def grid_figure(x: Any, y: Any, grid: GridNumbers, table: Any, active: Any = True) -> tuple[Any, Any, Any]:
-    """Cubic B-spline of a ``GridFigure`` and its slopes; ``table`` holds padded coefficients, row by row."""
+    """Return the cubic B-spline of a ``GridFigure`` and its slopes; ``table`` holds padded coefficients row by row."""
     import drjit as dr
 
     float_type = type(x)
@@ -301,7 +313,7 @@ def grid_figure(x: Any, y: Any, grid: GridNumbers, table: Any, active: Any = Tru
     wu, du = _weights(u - iu)
     wv, dv = _weights(v - iv)
     width = index_type(columns + 4.0)
-    # the table has two extra samples on every side, so that sample -1 of the stencil is at +1
+    # the table has a margin of two samples on every side, so that sample -1 of the stencil has index 1
     start = (index_type(iv) + 1) * width + index_type(iu) + 1 + index_type(grid.first)
     height: Any = 0.0 * x
     slope_x: Any = 0.0 * x
@@ -320,7 +332,7 @@ def grid_figure(x: Any, y: Any, grid: GridNumbers, table: Any, active: Any = Tru
 
 
 def _weights(f: Any) -> tuple[list[Any], list[Any]]:
-    """Cubic B-spline weights of samples -1, 0, 1, 2 at fraction f, and their derivatives."""
+    """Return the cubic B-spline weights of samples -1, 0, 1, 2 at fraction f, and their derivatives."""
     e = 1.0 - f
     values = [
         e * e * e / 6.0,
@@ -339,16 +351,16 @@ class Surface:
     Attributes
     ----------
     curvature : float
-        c = 1/R in 1/m; 0 is a plane. Positive: centre of curvature on the +z side.
+        Vertex curvature c = 1/R, 1/m; 0 is a plane. Positive: centre of curvature on the +z side.
     conic : float
-        k, Schwarzschild's constant (0 sphere, -1 paraboloid).
-    even : tuple[float, ...]
-        (A4, A6, A8, ...) in m^-3, m^-5, m^-7, ...
-    figure : Figure | None
+        Conic constant k (0 sphere, -1 paraboloid).
+    even : tuple of float
+        Even aspheric coefficients (A4, A6, A8, ...), in m^-3, m^-5, m^-7, ...
+    figure : ZernikeFigure, GridFigure or SummedFigure, optional
         Departure from that shape.
-    terms : tuple[SagTerm, ...]
-        Further terms of the sag (``optics.geometry.sag_terms``), at most one of a kind; without them the ideal shape is
-        one of revolution.
+    terms : tuple of SagTerm
+        Further terms of the sag (``optics.geometry.sag_terms``), at most one of each kind; without them the ideal shape
+        is rotationally symmetric.
     """
 
     curvature: float = 0.0
@@ -358,9 +370,9 @@ class Surface:
     terms: tuple[SagTerm, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that there is one term of a kind."""
+        """Check that there is at most one term of each kind."""
         if len({type(term) for term in self.terms}) < len(self.terms):
-            raise ValueError("a surface has two terms of the same kind; add their numbers up")
+            raise ValueError("a surface has two sag terms of the same kind; add their coefficients")
 
     @property
     def is_plane(self) -> bool:
@@ -369,38 +381,37 @@ class Surface:
 
     @property
     def zernike_figure(self) -> ZernikeFigure | None:
-        """The part of the figure that is Zernike terms."""
+        """Zernike part of the figure, or None."""
         if isinstance(self.figure, SummedFigure):
             return self.figure.terms
         return self.figure if isinstance(self.figure, ZernikeFigure) else None
 
     @property
     def grid_figure(self) -> GridFigure | None:
-        """The part of the figure that is a grid."""
+        """Grid part of the figure, or None."""
         if isinstance(self.figure, SummedFigure):
             return self.figure.grid
         return self.figure if isinstance(self.figure, GridFigure) else None
 
     def with_figure(self, figure: Figure | None) -> Surface:
-        """Return the shape with another figure."""
+        """Return this shape with another figure."""
         return replace(self, figure=figure)
 
-    def grown(self, scale: float) -> Surface:
-        """The surface of a body that is larger by a factor, its figure as it was, as ``optics.raytrace.system`` takes
-        it.
-        """
+    def scaled(self, scale: float) -> Surface:
+        """Return the surface of a body scaled by a factor; the figure is not scaled, as in ``optics.raytrace.system``."""
         even = tuple(a / scale ** (2 * n + 3) for n, a in enumerate(self.even))
-        terms = tuple(grown(term, scale) for term in self.terms)
+        terms = tuple(scaled_term(term, scale) for term in self.terms)
         return replace(self, curvature=self.curvature / scale, even=even, terms=terms)
 
     def figure_disk(self, aperture: Aperture | None) -> ZernikeFigure:
-        """Return the Zernike figure that terms are added to: the surface's own, or one without terms over the smallest
-        circle round the aperture.
+        """Return the Zernike figure to which terms are added.
+
+        It is the surface's own, or one without terms over the smallest circle that encloses the aperture.
 
         Raises
         ------
         ValueError
-            Neither a Zernike figure nor an aperture sets the disk.
+            There is neither a Zernike figure nor an aperture to define the disk.
         """
         if self.zernike_figure is not None:
             return self.zernike_figure
@@ -410,7 +421,7 @@ class Surface:
         return ZernikeFigure(disk.radius, disk.centre)
 
     def sag(self, x: Any, y: Any) -> np.ndarray:
-        """Height z at x, y (metres, any shape); NaN outside the conic's domain."""
+        """Return the height z at x, y (metres, any shape); NaN outside the conic's domain."""
         x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
         r2 = x * x + y * y
         with np.errstate(invalid="ignore"):
@@ -425,5 +436,5 @@ class Surface:
 
 
 def plane() -> Surface:
-    """A flat surface."""
+    """Return a flat surface."""
     return Surface()

@@ -1,4 +1,4 @@
-"""The rigid-body tree: bodies with poses relative to their parents, named pivots, and small motions of any of them."""
+"""Rigid-body tree: bodies with poses relative to their parents, named pivots, and small motions of any of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from optics.geometry.pose import Pose, rotation_matrix, triple
 from optics.geometry.surface import GridFigure
-from optics.numerics.array_math import product, turned
+from optics.numerics.array_math import matvec, product
 from optics.numerics.number_tree import FrozenMap
 
 ORIGIN = "origin"
@@ -19,7 +19,7 @@ ORIGIN = "origin"
 
 @dataclass(frozen=True)
 class Body:
-    """One node of the tree.
+    """Node of the rigid-body tree.
 
     Attributes
     ----------
@@ -27,11 +27,11 @@ class Body:
         Full name, parts joined by ``/``; the parent is the path without its last part.
     pose : Pose
         Pose relative to the parent.
-    pivots : Mapping[str, tuple[float, float, float]]
+    pivots : mapping of str to tuple of float
         Named points in the body's own frame, metres; ``origin`` always exists.
     scales : bool
-        Whether a scale applied to an ancestor also scales the interior of this body (a focal plane moves with the
-        structure that carries it but its detectors keep their size).
+        True when a scale applied to an ancestor also scales the interior of this body. (A focal plane moves with the
+        structure that carries it but its detectors keep their size.)
     """
 
     path: str
@@ -53,44 +53,44 @@ class Body:
         return self.path.rpartition("/")[0]
 
     def moved(self, motion: Motion) -> Body:
-        """The body at rest where a rigid motion takes it."""
-        turn, offset, _ = _affine([motion], [self])
+        """Return the body with the pose that a rigid motion gives it as its nominal pose."""
+        local_rotation, offset, _ = _affine([motion], [self])
         rotation, translation = self.pose.rotation, self.pose.translation
-        return replace(self, pose=Pose(product(rotation, turn[0]), translation + turned(rotation, offset[0])))
+        return replace(self, pose=Pose(product(rotation, local_rotation[0]), translation + matvec(rotation, offset[0])))
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A small motion of one body about a pivot, in its own frame: first the rotation vector, then the shift.
+    """Small motion of one body about a pivot, in its own frame: first the rotation vector, then the shift.
 
     Attributes
     ----------
-    rotate : tuple[float, float, float]
+    rotate : tuple of float
         Rotation vector, radians.
-    shift : tuple[float, float, float]
-        metres.
+    shift : tuple of float
+        Translation, metres.
     pivot : str
         Name of one of the body's pivots.
     scale : float
-        Relative growth of the body and all it carries about the pivot (isotropic expansion), e.g. 20e-6.
-    figure : Mapping[int, float]
+        Relative expansion of the body and everything it carries about the pivot (isotropic), e.g. 20e-6.
+    figure : mapping of int to float
         Surface error of a mirror or face, Noll index -> amplitude in metres of sag (see ``optics.geometry.surface``).
-    stretch : float
-        Relative growth of the body itself about the pivot: its surface, and the distances to what it carries; unlike
+    expansion : float
+        Relative expansion of the body itself about the pivot: its surface, and the distances to what it carries. Unlike
         ``scale`` it does not enlarge the bodies that it carries (each has a temperature of its own).
     index : float
         Change of the refractive index of a glass body.
-    index_gradient : tuple[float, float, float]
-        Gradient of that change in the body's frame, zero at its origin, 1/m.
-    grid : GridFigure | None
-        Surface error of a mirror or face beyond ``figure``, on a grid.
+    index_gradient : tuple of float
+        Gradient of the index change in the body's frame, zero at its origin, 1/m.
+    grid : GridFigure, optional
+        Surface error of a mirror or face on a grid, in addition to ``figure``.
     radius : float
         Relative change of the vertex radius of curvature of a mirror or face, e.g. 100e-6.
     conic : float
-        Change of its conic constant.
+        Change of the conic constant of a mirror or face.
     abbe : float
-        Relative change of the Abbe number of a glass body. Its index at the d line stays, and what the index differs
-        from that at any other wavelength goes with the inverse of the Abbe number.
+        Relative change of the Abbe number of a glass body. The index at the d line stays; the difference of the index
+        at any other wavelength from it changes with the inverse of the Abbe number.
     """
 
     rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -98,7 +98,7 @@ class Motion:
     pivot: str = ORIGIN
     scale: float = 0.0
     figure: Mapping[int, float] = field(default_factory=FrozenMap)
-    stretch: float = 0.0
+    expansion: float = 0.0
     index: float = 0.0
     index_gradient: tuple[float, float, float] = (0.0, 0.0, 0.0)
     grid: GridFigure | None = None
@@ -112,12 +112,18 @@ class Motion:
 
     @property
     def dispersion(self) -> float:
-        """Relative change of a glass's dispersion, which its Abbe number makes."""
+        """Relative change of a glass's dispersion that follows from the change of its Abbe number."""
         return 1.0 / (1.0 + self.abbe) - 1.0
 
     def component(self, kind: str, axis: int) -> float:
-        """One number of the motion, SI: ``rotate`` or ``shift`` by an axis, a ``figure`` term, or one of ``scale``,
-        ``radius``, ``conic``, ``index`` and ``abbe``.
+        """Return one number of the motion, in SI units.
+
+        Parameters
+        ----------
+        kind : str
+            ``rotate``, ``shift``, ``scale``, ``radius``, ``conic``, ``index``, ``abbe`` or ``figure``.
+        axis : int
+            Axis 0, 1 or 2 of a rotation or shift, or Noll index of a figure term; ignored by the other kinds.
 
         Raises
         ------
@@ -139,24 +145,26 @@ class Motion:
 
 
 AT_REST = Motion()
-"""Motion of a body that a state does not name."""
+"""Motion of a body that a state does not name: none."""
 
 State = Mapping[str, Motion]
-"""A perturbed state: body path -> motion; bodies not named stand at their nominal pose."""
+"""Perturbed state: body path -> motion; bodies not named stay at their nominal pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedBodies:
-    """World poses of every body for a batch of S states (complex when a complex-step derivative is taken).
+    """World poses of all bodies in S states (complex when a complex-step derivative is taken).
 
     Attributes
     ----------
-    index : Mapping[str, int]
-        Body path -> position along the second axis.
-    rotation : np.ndarray
-        (S, bodies, 3, 3); translation: (S, bodies, 3), metres.
-    scale : np.ndarray
-        (S, bodies), size of the body itself relative to nominal.
+    index : mapping of str to int
+        Body path -> index along the second axis.
+    rotation : (S, bodies, 3, 3) ndarray
+        World rotations.
+    translation : (S, bodies, 3) ndarray
+        World keys of the origins, metres.
+    scale : (S, bodies) ndarray
+        Size of each body itself relative to nominal.
     """
 
     index: Mapping[str, int]
@@ -165,23 +173,23 @@ class PlacedBodies:
     scale: np.ndarray
 
     def pose(self, path: str, state: int = 0) -> Pose:
-        """World pose of one body in one state (real part)."""
+        """Return the world pose of one body in one state (real part)."""
         i = self.index[path]
         return Pose(self.rotation[state, i].real, self.translation[state, i].real)
 
     def size(self, path: str) -> np.ndarray:
-        """Size of one body relative to nominal in each state, (S,) (real part)."""
+        """Return the size of one body relative to nominal in each state, (S,) (real part)."""
         return np.asarray(self.scale[:, self.index[path]].real)
 
 
 @dataclass(frozen=True)
 class RigidTree:
-    """Bodies in an order in which parents come before their children."""
+    """Rigid bodies, ordered so that parents come before their children."""
 
     bodies: tuple[Body, ...]
 
     def __post_init__(self) -> None:
-        """Check names and the order."""
+        """Check names and order."""
         seen: set[str] = set()
         for body in self.bodies:
             if body.path in seen:
@@ -191,7 +199,7 @@ class RigidTree:
             seen.add(body.path)
 
     def __getitem__(self, path: str) -> Body:
-        """The body of that path; KeyError when unknown."""
+        """Return the body at a path; raise KeyError when it is unknown."""
         for body in self.bodies:
             if body.path == path:
                 return body
@@ -202,51 +210,51 @@ class RigidTree:
         """All body paths, parents first."""
         return tuple(body.path for body in self.bodies)
 
-    def standing(self, state: State) -> RigidTree:
-        """The tree whose bodies stand by themselves as they do here in a state.
+    def with_nominal(self, state: State) -> RigidTree:
+        """Return the tree whose nominal poses are the poses of a state of this tree.
 
-        A state of that tree is one on top of this: ``compose(state, then, bodies)`` places the bodies here where
-        ``then`` places them there.
+        A state of the new tree comes on top of that state: ``compose(state, then, bodies)`` places the bodies of this
+        tree where ``then`` places those of the new one.
 
         Parameters
         ----------
-        state : State
+        state : mapping of str to Motion
             Body path -> rigid motion.
 
         Raises
         ------
         KeyError
-            It names an unknown body or pivot.
+            The state names an unknown body or pivot.
         ValueError
-            It lets a body grow.
+            The state expands a body.
         """
         for path, motion in state.items():
             if path not in self._index:
                 raise KeyError(path)
             if motion.pivot not in self[path].pivots:
                 raise KeyError(f"{path}: pivot {motion.pivot!r}")
-            if motion.scale or motion.stretch:
-                raise ValueError(f"{path}: a body that has grown is another body, and no other place of it")
+            if motion.scale or motion.expansion:
+                raise ValueError(f"{path}: a nominal state can only move bodies rigidly, not scale or expand them")
         return RigidTree(tuple(body.moved(state[body.path]) if body.path in state else body for body in self.bodies))
 
     def place(
         self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None
     ) -> PlacedBodies:
-        """World poses for each state.
+        """Return the world poses of all bodies in each state.
 
         Parameters
         ----------
-        states : Sequence[State]
+        states : sequence of State
             S perturbed states.
-        step : Sequence[tuple[str, str, int]] | None
-            Optional, one (path, kind, axis) per state with kind ``rotate``, ``shift``, ``scale`` or ``figure`` (the
-            axis is then the Noll index): adds an imaginary step of ``COMPLEX_STEP`` to that component, so that
-            imag/COMPLEX_STEP is the exact derivative.
+        step : sequence of (str, str, int), optional
+            One (path, kind, axis) per state with kind ``rotate``, ``shift``, ``scale`` or ``figure`` (the axis is then
+            the Noll index). Adds an imaginary step of ``COMPLEX_STEP`` to that component, so that imag/COMPLEX_STEP is
+            the exact derivative.
 
         Raises
         ------
         KeyError
-            a state names an unknown body or pivot.
+            A state names an unknown body or pivot.
         """
         index, nominal = self._index, self._nominal if step is None else self._nominal_complex
         moved = {path for state in states for path in state}
@@ -256,7 +264,7 @@ class RigidTree:
         if step is not None:
             moved |= {path for path, *_ in step}
         elif not moved and len(states) == 1:
-            return self._designed
+            return self._nominal_state
         count = len(states)
         dtype: Any = np.complex128 if step is not None else np.float64
         rotation = np.empty((count, len(index), 3, 3), dtype)
@@ -266,17 +274,17 @@ class RigidTree:
         passed_on = np.ones((count, len(index)), dtype)
         for body, parent in zip(self.bodies, self._parents, strict=True):
             if parent in moved:
-                moved.add(body.path)  # it is carried along
+                moved.add(body.path)  # its carrier moves it
         carried = [body for body in self.bodies if body.path in moved]
-        place = {body.path: k for k, body in enumerate(carried)}
-        motion, offset, growth, stretch = _local_motions(carried, states, step, dtype)
-        # bodies as far from the root are placed together
+        row = {body.path: k for k, body in enumerate(carried)}
+        motion, offset, local_scale, expansion = _local_motions(carried, states, step, dtype)
+        # all bodies of one depth are placed together
         for level in self._levels:
             bodies = [body for body in level if body.path in moved]
             if not bodies:
                 continue
-            i, k = ([table[body.path] for body in bodies] for table in (index, place))
-            own = [np.array([getattr(body.pose, part) for body in bodies]) for part in ("rotation", "translation")]
+            i, k = ([table[body.path] for body in bodies] for table in (index, row))
+            local = [np.array([getattr(body.pose, part) for body in bodies]) for part in ("rotation", "translation")]
             if bodies[0].parent:
                 p = [index[body.parent] for body in bodies]
                 base_rotation, base_translation = rotation[:, p], translation[:, p]
@@ -285,31 +293,31 @@ class RigidTree:
                 base_rotation = np.broadcast_to(np.eye(3, dtype=dtype), (count, len(bodies), 3, 3))
                 base_translation = np.zeros((count, len(bodies), 3), dtype)
                 inherited = distances = np.ones((count, len(bodies)), dtype)
-            here = product(base_rotation, own[0])
-            inner = np.where([body.scales for body in bodies], inherited, 1.0)
-            rotation[:, i] = product(here, np.swapaxes(motion[k], 0, 1))
+            world = product(base_rotation, local[0])
+            inherited_scale = np.where([body.scales for body in bodies], inherited, 1.0)
+            rotation[:, i] = product(world, np.swapaxes(motion[k], 0, 1))
             translation[:, i] = (
-                turned(base_rotation, distances[..., None] * own[1])
+                matvec(base_rotation, distances[..., None] * local[1])
                 + base_translation
-                + turned(here, np.swapaxes(offset[k], 0, 1))
+                + matvec(world, np.swapaxes(offset[k], 0, 1))
             )
-            passed_on[:, i] = inner * growth[k].T
-            scale[:, i] = inner * growth[k].T * stretch[k].T
+            passed_on[:, i] = inherited_scale * local_scale[k].T
+            scale[:, i] = inherited_scale * local_scale[k].T * expansion[k].T
         return PlacedBodies(index, rotation, translation, scale)
 
     @cached_property
     def _index(self) -> FrozenMap[str, int]:
-        """Path -> number of a body."""
+        """Body path -> index of the body."""
         return FrozenMap({path: i for i, path in enumerate(self.paths)})
 
     @cached_property
     def _parents(self) -> tuple[str, ...]:
-        """Parent of each body."""
+        """Path of each body's parent."""
         return tuple(body.parent for body in self.bodies)
 
     @cached_property
     def _levels(self) -> tuple[tuple[Body, ...], ...]:
-        """The bodies by their distance from the root."""
+        """Bodies grouped by their depth in the tree."""
         far: dict[str, int] = {}
         for body in self.bodies:
             far[body.path] = far[body.parent] + 1 if body.parent else 0
@@ -318,8 +326,8 @@ class RigidTree:
         )
 
     @cached_property
-    def _designed(self) -> PlacedBodies:
-        """One state that nothing moves; everybody's, so that nobody may write to it."""
+    def _nominal_state(self) -> PlacedBodies:
+        """Nominal state; shared by all callers and therefore read-only."""
         rotation, translation = (array[None].copy() for array in self._nominal)
         scale = np.ones(rotation.shape[:2])
         for array in (rotation, translation, scale):
@@ -328,21 +336,22 @@ class RigidTree:
 
     @cached_property
     def _nominal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations (bodies, 3, 3) and translations (bodies, 3) of bodies that nothing moves."""
+        """Nominal world rotations (bodies, 3, 3) and translations (bodies, 3)."""
         return self._at_rest(np.float64)
 
     @cached_property
     def _nominal_complex(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nominal poses as complex sums round them."""
+        """Nominal world poses computed in complex arithmetic, which rounds differently."""
         return self._at_rest(np.complex128)
 
     def _at_rest(self, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nominal world rotations (bodies, 3, 3) and translations (bodies, 3) in a data type."""
         rotation, translation = np.empty((len(self.bodies), 3, 3), dtype), np.empty((len(self.bodies), 3), dtype)
         for i, body in enumerate(self.bodies):
             rotation[i], translation[i] = body.pose.rotation, body.pose.translation
             if body.parent:
                 p = self._index[body.parent]
-                # one state, in the order in which many are summed
+                # summed in the same order as a batch of states
                 rotation[i] = product(rotation[None, p], body.pose.rotation)[0]
                 carried = np.einsum("sij,sj->si", rotation[None, p], body.pose.translation[None].astype(dtype))[0]
                 translation[i] = carried + translation[p]
@@ -357,22 +366,22 @@ COMPLEX_STEP = 1e-40
 def _local_motions(
     bodies: Sequence[Body], states: Sequence[State], step: Sequence[tuple[str, str, int]] | None, dtype: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation (B, S, 3, 3), translation (B, S, 3) in each body's frame, growth and stretch (B, S) of their motions."""
+    """Return rotation (B, S, 3, 3), translation (B, S, 3), scale and expansion (B, S) of motions in each body's frame."""
     size = len(bodies), len(states)
     rotate, shift = np.zeros((*size, 3), dtype), np.zeros((*size, 3), dtype)
-    growth, stretch = np.ones(size, dtype), np.ones(size, dtype)
+    scale, expansion = np.ones(size, dtype), np.ones(size, dtype)
     pivot = np.zeros((*size, 3))
     for b, body in enumerate(bodies):
-        named = {s: state[body.path] for s, state in enumerate(states) if body.path in state}
-        if named:
-            own = list(named)
-            numbers = np.array([(*m.rotate, *m.shift, m.scale, m.stretch) for m in named.values()])
-            rotate[b, own], shift[b, own] = numbers[:, :3], numbers[:, 3:6]
-            growth[b, own], stretch[b, own] = 1.0 + numbers[:, 6], 1.0 + numbers[:, 7]
-            for name in {motion.pivot for motion in named.values()}:
+        motions = {s: state[body.path] for s, state in enumerate(states) if body.path in state}
+        if motions:
+            columns = list(motions)
+            numbers = np.array([(*m.rotate, *m.shift, m.scale, m.expansion) for m in motions.values()])
+            rotate[b, columns], shift[b, columns] = numbers[:, :3], numbers[:, 3:6]
+            scale[b, columns], expansion[b, columns] = 1.0 + numbers[:, 6], 1.0 + numbers[:, 7]
+            for name in {motion.pivot for motion in motions.values()}:
                 if name not in body.pivots:
                     raise KeyError(f"{body.path}: pivot {name!r}")
-                pivot[b, [s for s, motion in named.items() if motion.pivot == name]] = body.pivots[name]
+                pivot[b, [s for s, motion in motions.items() if motion.pivot == name]] = body.pivots[name]
         for s, (path, kind, axis) in enumerate(step or ()):
             if path != body.path:
                 continue
@@ -381,16 +390,16 @@ def _local_motions(
             elif kind == "shift":
                 shift[b, s, axis] += 1j * COMPLEX_STEP
             elif kind == "scale":
-                growth[b, s] += 1j * COMPLEX_STEP
+                scale[b, s] += 1j * COMPLEX_STEP
             elif kind != FIGURE:  # a figure changes the surface, not the pose: see ``optics.raytrace.system``
                 raise ValueError(f"unknown kind of motion {kind!r}")
-    turned = rotation_matrix(rotate)
-    offset = pivot + shift - (growth * stretch)[..., None] * np.einsum("bsij,bsj->bsi", turned, pivot)
-    return turned, offset, growth, stretch
+    rotation = rotation_matrix(rotate)
+    offset = pivot + shift - (scale * expansion)[..., None] * np.einsum("bsij,bsj->bsi", rotation, pivot)
+    return rotation, offset, scale, expansion
 
 
 def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
-    """One state that does ``then`` on top of ``first``: x -> first(then(x)) in every body's frame.
+    """Return the state that applies ``then`` on top of ``first``: x -> first(then(x)) in every body's frame.
 
     Exact for the rigid parts; figures, conic constants and indices add.
 
@@ -403,39 +412,39 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
 
 
 def composed(states: Sequence[State], bodies: Mapping[str, Body]) -> State:
-    """One state that does several, each on top of the one before it, as ``compose`` has it of two."""
-    return each_composed([states], bodies)[0]
+    """Return the state that applies several states, each on top of the one before it (see ``compose``)."""
+    return compose_each([states], bodies)[0]
 
 
-def each_composed(several: Sequence[Sequence[State]], bodies: Mapping[str, Body]) -> list[State]:
-    """The same of some sequences of states: one state for each, worked out together."""
-    along: list[dict[str, list[Motion]]] = [{} for _ in several]
-    for own, states in zip(along, several, strict=True):
+def compose_each(sequences: Sequence[Sequence[State]], bodies: Mapping[str, Body]) -> list[State]:
+    """Return the composed state of each sequence of states, computed together (see ``composed``)."""
+    chains: list[dict[str, list[Motion]]] = [{} for _ in sequences]
+    for chain, states in zip(chains, sequences, strict=True):
         for state in states:
             for path, motion in state.items():
-                own.setdefault(path, []).append(motion)
-    out = [{path: motions[0] for path, motions in own.items()} for own in along]
-    # the second motions of all bodies together, then the third ones
-    for k in range(1, max((len(motions) for own in along for motions in own.values()), default=0)):
-        places = [(s, path) for s, own in enumerate(along) for path, motions in own.items() if len(motions) > k]
-        pairs = [(out[s][path], along[s][path][k]) for s, path in places]
-        for (s, path), motion in zip(places, _both(pairs, [bodies[path] for _, path in places]), strict=True):
+                chain.setdefault(path, []).append(motion)
+    out = [{path: motions[0] for path, motions in chain.items()} for chain in chains]
+    # first the second motions of all bodies together, then the third ones
+    for k in range(1, max((len(motions) for chain in chains for motions in chain.values()), default=0)):
+        keys = [(s, path) for s, chain in enumerate(chains) for path, motions in chain.items() if len(motions) > k]
+        pairs = [(out[s][path], chains[s][path][k]) for s, path in keys]
+        for (s, path), motion in zip(keys, _composed_pairs(pairs, [bodies[path] for _, path in keys]), strict=True):
             out[s][path] = motion
     return [*out]
 
 
-def _both(pairs: Sequence[tuple[Motion, Motion]], bodies: Sequence[Body]) -> list[Motion]:
-    """First motions with second ones on top, about the origins of N bodies."""
-    (turn_1, offset_1, growth), (turn_2, offset_2, _) = (_affine([pair[k] for pair in pairs], bodies) for k in range(2))
-    turn, offset = product(turn_1, turn_2), turned(turn_1, growth[:, None] * offset_2) + offset_1
-    rotate = _turned_both(pairs, turn)
+def _composed_pairs(pairs: Sequence[tuple[Motion, Motion]], bodies: Sequence[Body]) -> list[Motion]:
+    """Return the composition of each pair of motions, about the origins of N bodies."""
+    (rot_1, offset_1, scale), (rot_2, offset_2, _) = (_affine([pair[k] for pair in pairs], bodies) for k in range(2))
+    rotation, offset = product(rot_1, rot_2), matvec(rot_1, scale[:, None] * offset_2) + offset_1
+    rotate = _composed_rotations(pairs, rotation)
     return [
         Motion(
             rotate=rotate[k],
             shift=triple(offset[k]),
             scale=(1.0 + before.scale) * (1.0 + motion.scale) - 1.0,
             figure={j: before.figure.get(j, 0.0) + motion.figure.get(j, 0.0) for j in {*before.figure, *motion.figure}},
-            stretch=(1.0 + before.stretch) * (1.0 + motion.stretch) - 1.0,
+            expansion=(1.0 + before.expansion) * (1.0 + motion.expansion) - 1.0,
             index=before.index + motion.index,
             index_gradient=triple([a + b for a, b in zip(before.index_gradient, motion.index_gradient, strict=True)]),
             grid=_sum(before.grid, motion.grid),
@@ -447,15 +456,20 @@ def _both(pairs: Sequence[tuple[Motion, Motion]], bodies: Sequence[Body]) -> lis
     ]
 
 
-def _turned_both(pairs: Sequence[tuple[Motion, Motion]], turn: np.ndarray) -> list[tuple[float, float, float]]:
-    """Rotation vectors of two motions together, whose matrices are ``turn``, (N, 3, 3); most motions turn nothing."""
+def _composed_rotations(
+    pairs: Sequence[tuple[Motion, Motion]], rotations: np.ndarray
+) -> list[tuple[float, float, float]]:
+    """Return the rotation vectors of N composed rotations with matrices ``rotations`` (N, 3, 3).
+
+    Most motions rotate nothing; they keep their vectors.
+    """
     out = [then.rotate if any(then.rotate) else first.rotate for first, then in pairs]
-    both = [k for k, (first, then) in enumerate(pairs) if any(first.rotate) and any(then.rotate)]
-    if both:
-        # messages about files and help wait for this module, and scipy takes a quarter of a second
+    indices = [k for k, (first, then) in enumerate(pairs) if any(first.rotate) and any(then.rotate)]
+    if indices:
+        # imported late: scipy takes 0.25 s, and commands that only check files import this module
         from scipy.spatial.transform import Rotation
 
-        for k, vector in zip(both, Rotation.from_matrix(turn[both]).as_rotvec(), strict=True):
+        for k, vector in zip(indices, Rotation.from_matrix(rotations[indices]).as_rotvec(), strict=True):
             out[k] = triple(vector)
     return out
 
@@ -467,9 +481,9 @@ def _sum(first: GridFigure | None, then: GridFigure | None) -> GridFigure | None
 
 
 def _affine(motions: Sequence[Motion], bodies: Sequence[Body]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation (N, 3, 3), offset (N, 3) and growth (N,) of x -> R growth x + offset, as ``RigidTree.place`` has it."""
+    """Return rotation R (N, 3, 3), offset (N, 3) and scale s (N,) of x -> R s x + offset, as in ``RigidTree.place``."""
     pivot = np.array([body.pivots[motion.pivot] for motion, body in zip(motions, bodies, strict=True)])
     rotate, shift = (np.array([getattr(motion, name) for motion in motions]) for name in ("rotate", "shift"))
-    growth = np.array([(1.0 + motion.scale) * (1.0 + motion.stretch) for motion in motions])
-    turn = rotation_matrix(rotate)
-    return turn, pivot + shift - growth[:, None] * turned(turn, pivot), growth
+    scale = np.array([(1.0 + motion.scale) * (1.0 + motion.expansion) for motion in motions])
+    rotation = rotation_matrix(rotate)
+    return rotation, pivot + shift - scale[:, None] * matvec(rotation, pivot), scale

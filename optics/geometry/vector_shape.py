@@ -1,8 +1,8 @@
 """Vector shapes in a plane, with the closed form of their Fourier transforms and their images under smooth maps.
 
 The spectrum of a shape is S(fx, fy) = integral over it of exp(-2 pi i (fx x + fy y)) dx dy, frequencies in cycles/m.
-For a polygon, Gauss' theorem with k = 2 pi f, the edges' vectors d_j, middles m_j and outward normals n_j (of length
-|d_j|) gives (e.g. Lee and Mittra, IEEE Trans. Antennas Propag. 31, 99 (1983))
+For a polygon with k = 2 pi f, edge vectors d_j, edge midpoints m_j and outward normals n_j (of length |d_j|), Gauss'
+theorem gives (e.g. Lee and Mittra, IEEE Trans. Antennas Propag. 31, 99 (1983))
 
     S = i/|k|^2 sum_j (k . n_j) exp(-i k . m_j) sinc(k . d_j / 2),    sinc(s) = sin(s)/s.
 
@@ -19,31 +19,31 @@ import numpy as np
 from optics.numerics.array_math import UnphysicalError
 
 PointMap = Callable[[np.ndarray], np.ndarray]
-"""A smooth map of points, (N, 2) -> (N, 2), metres."""
+"""Smooth map of points, (N, 2) -> (N, 2), metres."""
 
 BEND_TOLERANCE = 1e-9
-"""Largest distance between a mapped outline and the shape that stands for it, metres: 1/7000 of a 7 um pixel."""
+"""Largest distance between a mapped outline and the shape that represents it, metres: 1/7000 of a 7 um pixel."""
 
 _MOST_PIECES = 4096
-"""Pieces of one edge after which a map counts as not smooth."""
+"""Largest number of pieces of one edge; a map that needs more counts as not smooth."""
 
 _BLOCK = 1 << 14
-"""Frequencies worked on together: their arrays stay in the processor's cache."""
+"""Number of frequencies processed in one block: their arrays stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Polygon:
-    """A simple polygon (no self-intersection; not checked), of either orientation.
+    """Simple polygon (no self-intersection; not checked), of either orientation.
 
     Attributes
     ----------
-    vertices : np.ndarray
-        (V, 2), metres.
+    vertices : (V, 2) ndarray
+        Vertices in order, metres.
 
     Raises
     ------
     ValueError
-        Fewer than three vertices, vertices that are not finite, or no area.
+        There are fewer than three vertices, vertices that are not finite, or no area.
     """
 
     vertices: np.ndarray
@@ -66,30 +66,30 @@ class Polygon:
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """x_min, x_max, y_min, y_max, metres."""
+        """Bounding box (x_min, x_max, y_min, y_max), in metres."""
         (x0, y0), (x1, y1) = self.vertices.min(axis=0), self.vertices.max(axis=0)
         return float(x0), float(x1), float(y0), float(y1)
 
     def spectrum(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Fourier transform of the polygon, m^2.
+        """Return the Fourier transform of the polygon, in m^2.
 
         The sum over the edges loses eps * perimeter / (|k| area) of the area to rounding. Because the normals of a
-        closed outline sum to 0, 1 may be taken off every exp * sinc; where |k| times the polygon's radius is below 1
-        this is done (with all differences in closed form), and the loss stays at eps * perimeter * radius / area down
-        to f = 0.
+        closed outline sum to 0, 1 may be subtracted from every exp * sinc; where |k| times the polygon's radius is
+        below 1 this is done (with all differences in closed form), and the loss stays at eps * perimeter * radius /
+        area down to f = 0.
 
         Parameters
         ----------
-        fx : np.ndarray
+        fx : ndarray
             Frequencies along x, cycles/m, of at most two axes.
-        fy : np.ndarray
-            The same along y; they broadcast. A product grid, fx (C,) and fy (R, 1), is fast: its complex exponentials
-            are worked out per axis.
+        fy : ndarray
+            Frequencies along y, cycles/m; they broadcast with ``fx``. A product grid, fx (C,) and fy (R, 1), is fast:
+            its complex exponentials are computed per axis.
 
         Returns
         -------
-        np.ndarray
-            Complex, of the broadcast shape.
+        ndarray
+            Complex spectrum of the broadcast shape.
         """
         kx, ky, shape = _wave_numbers(fx, fy)
         (x0, x1, y0, y1) = self.bounds
@@ -116,12 +116,12 @@ class Polygon:
         return out.reshape(shape)
 
     def mapped(self, point_map: PointMap, tolerance: float = BEND_TOLERANCE) -> Polygon:
-        """The polygon under a smooth map; edges are divided only where the map bends them by more than the tolerance.
+        """Return the polygon under a smooth map; edges are divided only where the map bends them beyond the tolerance.
 
         Parameters
         ----------
-        point_map : PointMap
-            (N, 2) -> (N, 2), metres.
+        point_map : callable
+            Map (N, 2) -> (N, 2), metres.
         tolerance : float
             Largest distance of the new edges from the mapped ones, metres.
 
@@ -146,16 +146,16 @@ class Polygon:
 
 @dataclass(frozen=True, eq=False)
 class Disk:
-    """A disk, or an ellipse: the points centre + radius * stretch @ p with |p| <= 1.
+    """Disk or ellipse: the points centre + radius * stretch @ p with |p| <= 1.
 
     Attributes
     ----------
-    centre : np.ndarray
-        (2,), metres.
+    centre : (2,) ndarray
+        Centre, metres.
     radius : float
-        metres.
-    stretch : np.ndarray
-        (2, 2); the unit matrix for a circle.
+        Radius before the linear map ``stretch``, metres.
+    stretch : (2, 2) ndarray
+        Linear map of the disk; the unit matrix for a circle.
 
     Raises
     ------
@@ -183,27 +183,30 @@ class Disk:
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """x_min, x_max, y_min, y_max, metres."""
+        """Bounding box (x_min, x_max, y_min, y_max), in metres."""
         (x, y), (hx, hy) = self.centre, self.radius * np.hypot(self.stretch[:, 0], self.stretch[:, 1])
         return float(x - hx), float(x + hx), float(y - hy), float(y + hy)
 
     def spectrum(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-        """Fourier transform, area * 2 J1(q)/q with q = |radius stretch^T k|, m^2; arguments as ``Polygon.spectrum``."""
-        # messages about files wait for this module, and scipy takes a tenth of a second
+        """Return the Fourier transform, area * 2 J1(q)/q with q = |radius stretch^T k|, in m^2.
+
+        Arguments are those of ``Polygon.spectrum``.
+        """
+        # imported late: scipy takes 0.1 s, and commands that only check files import this module
         from scipy.special import j1
 
         kx, ky, shape = _wave_numbers(fx, fy)
         (a, b), (c, d) = self.radius * self.stretch
-        # the offset changes nothing but q = 0
+        # the offset matters at q = 0 only, where 2 J1(q)/q becomes 1
         q = np.hypot(a * kx + c * ky, b * kx + d * ky) + 1e-300
         out = (2.0 * self.area * j1(q) / q) * _phasor(kx, self.centre[0])
         out *= _phasor(ky, self.centre[1])
         return np.asarray(out).reshape(shape)
 
     def mapped(self, point_map: PointMap, tolerance: float = BEND_TOLERANCE) -> Disk | Polygon:
-        """The disk under a smooth map: the ellipse nearest to its mapped rim, or a polygon where no ellipse will do.
+        """Return the ellipse nearest to the mapped rim, or a polygon if no ellipse is within the tolerance.
 
-        Arguments and errors as ``Polygon.mapped``.
+        Arguments and errors are those of ``Polygon.mapped``.
         """
 
         def rim(t: np.ndarray) -> np.ndarray:
@@ -213,33 +216,33 @@ class Disk:
         t = np.arange(float(_RIM_POINTS))
         wave = 2.0 * np.pi / _RIM_POINTS * t
         harmonics = np.stack([np.ones_like(t), np.cos(wave), np.sin(wave)])
-        seen = _apply(point_map, rim(t))
-        centre, cosine, sine = harmonics @ seen / np.sum(harmonics**2, axis=1)[:, None]
-        off = seen - harmonics.T @ np.stack([centre, cosine, sine])
-        if np.max(np.hypot(off[:, 0], off[:, 1])) <= tolerance:
+        mapped_rim = _apply(point_map, rim(t))
+        centre, cosine, sine = harmonics @ mapped_rim / np.sum(harmonics**2, axis=1)[:, None]
+        residual = mapped_rim - harmonics.T @ np.stack([centre, cosine, sine])
+        if np.max(np.hypot(residual[:, 0], residual[:, 1])) <= tolerance:
             return Disk(centre, self.radius, np.stack([cosine, sine], axis=-1) / self.radius)
         return Polygon(_polyline(rim, _RIM_POINTS, point_map, tolerance))
 
 
 _RIM_POINTS = 32
-"""Points of a disk's rim at which a map is asked whether it bends."""
+"""Number of rim points of a disk at which a map is tested for departure from an ellipse."""
 
 
 @dataclass(frozen=True, eq=False)
 class HalfPlane:
-    """All points x with normal . (x - point) > 0.
+    """Half-plane: all points x with normal . (x - point) > 0.
 
     Attributes
     ----------
-    point : np.ndarray
-        On the edge, (2,), metres; where the edge keeps its place and direction under a map.
-    normal : np.ndarray
-        Toward the inside, (2,); made a unit vector.
+    point : (2,) ndarray
+        Point on the edge, metres, at which the edge keeps position and direction under a map.
+    normal : (2,) ndarray
+        Normal toward the inside; normalised to a unit vector.
 
     Raises
     ------
     ValueError
-        No normal.
+        The normal is zero.
     """
 
     point: np.ndarray
@@ -255,18 +258,18 @@ class HalfPlane:
         object.__setattr__(self, "normal", _frozen(normal / length))
 
     def distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Distance of points from the edge, metres, positive inside; x and y broadcast."""
+        """Return the distance of points from the edge, metres, positive inside; x and y broadcast."""
         return np.asarray(self.normal[0] * (x - self.point[0]) + self.normal[1] * (y - self.point[1]))
 
     def mapped(self, point_map: PointMap, step: float = 1e-5) -> HalfPlane:
-        """The half plane whose edge touches the mapped edge at the mapped point.
+        """Return the half-plane whose edge is tangent to the mapped edge at the mapped point.
 
         Parameters
         ----------
-        point_map : PointMap
-            (N, 2) -> (N, 2), metres.
+        point_map : callable
+            Map (N, 2) -> (N, 2), metres.
         step : float
-            Metres along the edge and its normal over which the map is differentiated (central differences).
+            Step along the edge and its normal over which the map is differentiated (central differences), metres.
 
         Raises
         ------
@@ -278,10 +281,10 @@ class HalfPlane:
         point, ahead, behind, inside, outside = _apply(point_map, self.point + steps)
         tangent, inward = ahead - behind, inside - outside
         normal = np.array([tangent[1], -tangent[0]])
-        turn = float(normal @ inward)
-        if turn == 0.0:
+        orientation = float(normal @ inward)
+        if orientation == 0.0:
             raise UnphysicalError("the map has no inverse at the half plane's point")
-        return HalfPlane(point, np.sign(turn) * normal)
+        return HalfPlane(point, np.sign(orientation) * normal)
 
 
 FiniteShape = Polygon | Disk
@@ -290,24 +293,27 @@ Shape = Polygon | Disk | HalfPlane
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """Middles, vectors and outward normals (of the edges' lengths) of V edges, (V, 2) each."""
+    """Midpoints, vectors and outward normals (of the edges' lengths) of V edges, (V, 2) each."""
 
     middle: np.ndarray
     vector: np.ndarray
     normal: np.ndarray
 
     @classmethod
-    def of(cls, start: np.ndarray, turn: float) -> _Edges:
-        """Edges of a closed outline from its corners (V, 2); turn: +1 counter-clockwise, -1 clockwise."""
+    def of(cls, start: np.ndarray, orientation: float) -> _Edges:
+        """Return the edges of a closed outline from its corners (V, 2).
+
+        ``orientation`` is +1 for counterclockwise corners, -1 for clockwise ones.
+        """
         vector = np.roll(start, -1, axis=0) - start
-        return cls(start + 0.5 * vector, vector, turn * np.stack([vector[:, 1], -vector[:, 0]], axis=-1))
+        return cls(start + 0.5 * vector, vector, orientation * np.stack([vector[:, 1], -vector[:, 0]], axis=-1))
 
     def sum(self, kx: np.ndarray, ky: np.ndarray) -> np.ndarray:
-        """Sum of (k . n) exp(-i k . m) sinc(k . d/2) over the edges, for kx (., C) and ky (R, .)."""
+        """Return the sum of (k . n) exp(-i k . m) sinc(k . d/2) over the edges, for kx (., C) and ky (R, .)."""
         total = np.zeros(np.broadcast_shapes(kx.shape, ky.shape), complex)
         for m, d, n in zip(self.middle, self.vector, self.normal, strict=True):
             half = 0.5 * d[0] * kx + 0.5 * d[1] * ky
-            half += 1e-300  # changes nothing but 0, where sin(s)/s is now 1
+            half += 1e-300  # matters at 0 only, where sin(s)/s becomes 1
             share = np.sin(half)
             share /= half
             share *= n[0] * kx + n[1] * ky
@@ -317,7 +323,7 @@ class _Edges:
         return total
 
     def sum_near_zero(self, kx: np.ndarray, ky: np.ndarray, area: float) -> np.ndarray:
-        """The spectrum i/|k|^2 sum (k . n) (exp(-i k . m) sinc(k . d/2) - 1) for small k, (M,) each."""
+        """Return the spectrum i/|k|^2 sum (k . n) (exp(-i k . m) sinc(k . d/2) - 1) for small k, (M,) each."""
         size = np.hypot(kx, ky)
         safe = np.where(size == 0.0, 1.0, size)
         ux, uy = kx / safe, ky / safe
@@ -331,7 +337,7 @@ class _Edges:
 
 
 def _sinc_less_one(s: np.ndarray) -> np.ndarray:
-    """sin(s)/s - 1 for |s| <= 1, by its power series to s^18: without the difference's loss of digits."""
+    """Return sin(s)/s - 1 for |s| <= 1, by its power series to s^18, which avoids the cancellation of the difference."""
     square = s * s
     total = np.ones_like(s)
     for n in range(18, 3, -2):
@@ -339,8 +345,9 @@ def _sinc_less_one(s: np.ndarray) -> np.ndarray:
     return np.asarray(-square / 6.0 * total)
 
 
-def _phasor(k: np.ndarray, place: float) -> np.ndarray:
-    phase = k * -place
+def _phasor(k: np.ndarray, position: float) -> np.ndarray:
+    """Return exp(-i k x) at x = ``position``."""
+    phase = k * -position
     out = np.empty(phase.shape, complex)
     np.cos(phase, out=out.real)
     np.sin(phase, out=out.imag)
@@ -348,7 +355,7 @@ def _phasor(k: np.ndarray, place: float) -> np.ndarray:
 
 
 def _wave_numbers(fx: np.ndarray, fy: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
-    """2 pi fx and 2 pi fy with two axes, and the shape of the answer."""
+    """Return 2 pi fx and 2 pi fy with two axes each, and the broadcast shape of the result."""
     fx, fy = np.asarray(fx, float), np.asarray(fy, float)
     shape = np.broadcast_shapes(fx.shape, fy.shape)
     if len(shape) > 2:
@@ -359,11 +366,11 @@ def _wave_numbers(fx: np.ndarray, fy: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _polyline(
     curve: Callable[[np.ndarray], np.ndarray], spans: int, point_map: PointMap, tolerance: float
 ) -> np.ndarray:
-    """Points (N, 2) on the image of a closed curve of parameter 0 <= t < spans, whose chords keep to the tolerance.
+    """Return points (N, 2) on the image of a closed curve whose chords deviate from it by at most the tolerance.
 
-    The curve is smooth between whole t. Each span is cut evenly into as few pieces as its bend asks for; a chord's
-    distance from the curve falls with the square of their number. It is measured at three places, because a curve with
-    an inflection crosses its chord in the middle.
+    The curve has the parameter 0 <= t < spans and is smooth between integer t. Each span is divided evenly into as few
+    pieces as its curvature requires; a chord's distance from the curve falls with the square of their number. It is
+    measured at three points, because a curve with an inflection crosses its chord in the middle.
     """
     if not tolerance > 0.0:
         raise ValueError(f"the tolerance must be positive, found {tolerance}")
@@ -374,14 +381,16 @@ def _polyline(
         number = np.repeat(np.arange(spans), pieces)
         step = np.arange(len(number)) - first[number]
         t = number[:, None] + (step[:, None] + probes) / pieces[number, None]
-        seen = _apply(point_map, curve(t.ravel())).reshape(len(number), len(probes), 2)
-        corners = seen[:, 0]
+        mapped = _apply(point_map, curve(t.ravel())).reshape(len(number), len(probes), 2)
+        corners = mapped[:, 0]
         chord = np.roll(corners, -1, axis=0) - corners
-        off = seen[:, 1:] - corners[:, None]
+        offset = mapped[:, 1:] - corners[:, None]
         length = np.hypot(chord[:, 0], chord[:, 1])[:, None]
-        across = np.abs(chord[:, None, 0] * off[..., 1] - chord[:, None, 1] * off[..., 0])
-        away = np.where(length > 0.0, across / np.where(length > 0.0, length, 1.0), np.hypot(off[..., 0], off[..., 1]))
-        bend = np.maximum.reduceat(np.max(away, axis=1), first)
+        across = np.abs(chord[:, None, 0] * offset[..., 1] - chord[:, None, 1] * offset[..., 0])
+        deviation = np.where(
+            length > 0.0, across / np.where(length > 0.0, length, 1.0), np.hypot(offset[..., 0], offset[..., 1])
+        )
+        bend = np.maximum.reduceat(np.max(deviation, axis=1), first)
         if np.all(bend <= tolerance):
             return corners
         more = np.maximum(pieces + 1, np.ceil(pieces * np.sqrt(bend / tolerance)))
@@ -391,16 +400,17 @@ def _polyline(
 
 
 def _apply(point_map: PointMap, points: np.ndarray) -> np.ndarray:
-    """The map at points (N, 2), checked."""
-    seen = np.asarray(point_map(points), float)
-    if seen.shape != points.shape:
-        raise ValueError(f"the map must take (N, 2) to (N, 2), but took {points.shape} to {seen.shape}")
-    if not np.all(np.isfinite(seen)):
-        raise UnphysicalError("the map gives points that are not finite; does the target leave the field?")
-    return seen
+    """Return the mapped points (N, 2), after checking shape and finiteness."""
+    mapped = np.asarray(point_map(points), float)
+    if mapped.shape != points.shape:
+        raise ValueError(f"the map must take (N, 2) to (N, 2), but took {points.shape} to {mapped.shape}")
+    if not np.all(np.isfinite(mapped)):
+        raise UnphysicalError("the map gives points that are not finite; the target may extend beyond the field")
+    return mapped
 
 
 def _vector(value: np.ndarray, what: str) -> np.ndarray:
+    """Return a read-only vector (2,), after checking shape and finiteness."""
     out = _frozen(value)
     if out.shape != (2,) or not np.all(np.isfinite(out)):
         raise ValueError(f"{what} needs two finite numbers, found {value}")
@@ -408,6 +418,7 @@ def _vector(value: np.ndarray, what: str) -> np.ndarray:
 
 
 def _frozen(value: np.ndarray) -> np.ndarray:
+    """Return a read-only float copy."""
     out = np.array(value, float)
     out.setflags(write=False)
     return out

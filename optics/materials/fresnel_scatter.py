@@ -224,8 +224,9 @@ def lobe_area(scale: float, exponent: float) -> float:
 
 
 def acceptance(distance: Any, scale: Any, exponent: Any, abg: Any) -> Any:
-    """Return the probability of accepting a drawn distance: 0.5 or more for usual g; 1 for Harvey-Shack (``abg`` <
-    0.5).
+    """Return the probability of accepting a drawn distance; 1 for Harvey-Shack (``abg`` < 0.5).
+
+    It is 0.5 or more for usual g.
     """
     x = distance / scale
     half = 0.5 * exponent

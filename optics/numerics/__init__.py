@@ -1,1 +1,1 @@
-"""Arrays and kernels: backends, fixed sums, quadrature, immutable maps."""
+"""Numerical foundations: array backends, deterministic sums, quadrature, constrained least squares, immutable maps."""

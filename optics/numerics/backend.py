@@ -243,8 +243,9 @@ ONE_THREAD = {
 
 
 def cores() -> int:
-    """Return the number of cores that this process may use: those assigned to it, or fewer if the variable THREADS_VARIABLE says
-    so.
+    """Return the number of cores that this process may use.
+
+    These are the cores assigned to it, or fewer if the environment variable ``THREADS_VARIABLE`` says so.
     """
     named = os.environ.get(THREADS_VARIABLE, "")
     return min(_assigned_cores(), int(named)) if named.isdecimal() and int(named) > 0 else _assigned_cores()

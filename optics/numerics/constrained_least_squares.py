@@ -1,11 +1,11 @@
-"""Least squares under equations and inequalities, with exact Jacobians: sequential quadratic programming.
+"""Least squares under equality and inequality constraints, with exact Jacobians: sequential quadratic programming.
 
-Every step solves a damped linear least squares problem under the linearised constraints (by its dual, which is a
-non-negative least squares problem: Lawson and Hanson, Solving Least Squares Problems, chapter 23). Steps are judged by
-the cost and the sum of all violations at a price above every multiplier (Han's exact penalty). A second-order
-correction solves the step's problem again with the residuals and constraints that were found where it ended, so that
-curved constraints and a curved valley are followed and not cut short (Nocedal and Wright, Numerical Optimization,
-2nd ed., section 18.3). A step that is refused is damped more and asked for a smaller share of what is violated.
+Every step solves a damped linear least-squares problem under the linearised constraints (by its dual, which is a
+non-negative least-squares problem: Lawson and Hanson, Solving Least Squares Problems, chapter 23). Steps are judged by
+the cost and the sum of all violations at a penalty above every multiplier (Han's exact penalty function). A
+second-order correction solves the step's problem again with the residuals and constraints evaluated at its end, so that
+curved constraints and a curved valley are followed and not cut short (Nocedal and Wright, Numerical Optimization, 2nd
+ed., section 18.3). After a rejected step the damping is increased and a smaller fraction of the violations is removed.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-20, 1e6
-"""Damping relative to the squares of the Jacobian's columns: at first, at least, and where no better place is near."""
+"""Damping relative to the squared norms of the Jacobian's columns: initial, smallest, and where the search gives up."""
 _RIDGE = 1e-12
-"""Added to the unit diagonal of the dual problem: constraints may depend on each other, or contradict each other."""
-_DEAREST = 1e3
-"""Largest price of a violation: constraints that contradict each other have no multipliers."""
-_ACCEPTED = 1e-3
-"""Least share of what a step promised that it has to keep."""
+"""Ridge added to the unit diagonal of the dual problem: constraints may be dependent or contradictory."""
+_MAX_PENALTY = 1e3
+"""Largest penalty of a violation: constraints that contradict each other have no finite multipliers."""
+_MIN_GAIN_RATIO = 1e-3
+"""Smallest ratio of actual to predicted decrease of the merit for which a step is accepted."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Residuals and constraints at one place, R and C of them.
+    """Residuals (R) and constraints (C) at one point of the V variables.
 
     Attributes
     ----------
-    residuals : np.ndarray
-        (R,).
-    constraints : np.ndarray
-        (C,), each zero (equations) or not above zero (inequalities) where it is held.
-    d_residuals, d_constraints : np.ndarray | None
-        Derivatives (R, V), (C, V); None where they were not asked for.
+    residuals : (R,) ndarray
+        Residuals.
+    constraints : (C,) ndarray
+        Constraints; fulfilled where zero (equations) or not positive (inequalities).
+    d_residuals, d_constraints : ndarray, optional
+        Derivatives (R, V) and (C, V); None where they were not requested.
     """
 
     residuals: np.ndarray
@@ -48,27 +48,27 @@ class Sample:
 
     @property
     def cost(self) -> float:
-        """Half the sum of squares."""
+        """Half the sum of squared residuals."""
         return 0.5 * float(self.residuals @ self.residuals)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where a search ended.
+    """Result of a constrained least-squares search.
 
     Attributes
     ----------
-    x : np.ndarray
-        (V,).
+    x : (V,) ndarray
+        Final point.
     sample : Sample
-        There, with derivatives.
-    multipliers : np.ndarray
-        Of the constraints (C,), not negative for inequalities: by how much the cost falls per unit by which the
-        constraint is eased.
+        Residuals and constraints there, with derivatives.
+    multipliers : (C,) ndarray
+        Lagrange multipliers, not negative for inequalities: decrease of the cost per unit by which a constraint is
+        relaxed.
     converged : bool
-        Whether it ended because no step is worth taking, not for want of iterations.
+        True when no further step improves the solution; False when the iterations were used up.
     jacobians : int
-        Samples with derivatives that it took.
+        Number of evaluations with derivatives.
     """
 
     x: np.ndarray
@@ -79,11 +79,11 @@ class Solution:
 
 
 Evaluate = Callable[[np.ndarray, bool], Sample | None]
-"""Sample at x, with derivatives if the second argument is true; None where there is nothing (the step is refused)."""
+"""Function that returns the sample at x, with derivatives if the second argument is true; None rejects the step."""
 
 
 def violations(constraints: np.ndarray, equal: np.ndarray) -> np.ndarray:
-    """By how much constraints (C,) are violated, not negative; ``equal`` (C,) tells which are equations."""
+    """Return the violations of constraints (C,), not negative; ``equal`` (C,) is the mask of equations."""
     return np.where(equal, np.abs(constraints), np.maximum(constraints, 0.0))
 
 
@@ -95,105 +95,105 @@ def constrained_least_squares(
     high: np.ndarray | None = None,
     iterations: int = 100,
     tolerance: float = 1e-8,
-    held: float = 1e-8,
+    constraint_tolerance: float = 1e-8,
 ) -> Solution:
-    """Least sum of squares under constraints, near a start.
+    """Minimise a sum of squares under constraints, from a starting point.
 
     Parameters
     ----------
-    evaluate : Evaluate
-        Residuals and constraints.
-    start : np.ndarray
-        (V,), between the bounds.
-    equal : np.ndarray
-        Which constraints are equations, (C,).
-    low : np.ndarray | None
-        Least x, (V,), held at every step; None for none.
-    high : np.ndarray | None
-        Largest x, likewise.
+    evaluate : callable
+        Residuals and constraints at a point (``Evaluate``).
+    start : (V,) ndarray
+        Starting point, between the bounds.
+    equal : (C,) ndarray of bool
+        Mask of the constraints that are equations.
+    low : (V,) ndarray, optional
+        Lower bounds of x, respected at every step; none by default.
+    high : (V,) ndarray, optional
+        Upper bounds of x, respected at every step; none by default.
     iterations : int
-        At most, one Jacobian each.
+        Largest number of iterations, one Jacobian each.
     tolerance : float
-        Ends where two steps after each other promise, or bring, less than this share of the cost.
-    held : float
-        Violation that counts as none.
+        Relative decrease of the cost; the search ends after two successive steps that promise, or bring, less.
+    constraint_tolerance : float
+        Violation below which a constraint counts as fulfilled.
 
     Raises
     ------
     ValueError
-        There is nothing at the start.
+        ``evaluate`` returns None at the start.
     """
-    here = evaluate(start, True)
-    if here is None:
-        raise ValueError("least squares have to start where there are residuals")
+    sample = evaluate(start, True)
+    if sample is None:
+        raise ValueError("the residuals cannot be evaluated at the starting point")
     x, count = np.asarray(start, dtype=float), len(start)
     low = np.full(count, -np.inf) if low is None else low
     high = np.full(count, np.inf) if high is None else high
-    damping, idle, jacobians, price = _FIRST_DAMPING, 0, 1, 0.0
+    damping, stalled, jacobians, penalty = _FIRST_DAMPING, 0, 1, 0.0
     widths = np.zeros(count)
     multipliers = np.zeros(len(equal))
     for _ in range(iterations):
-        assert here.d_residuals is not None
-        widths = np.maximum(widths, np.linalg.norm(here.d_residuals, axis=0))
-        share, growth, moved = 1.0, 2.0, False
+        assert sample.d_residuals is not None
+        widths = np.maximum(widths, np.linalg.norm(sample.d_residuals, axis=0))
+        fraction, growth, moved = 1.0, 2.0, False
         while True:
-            model = _Model.of(here, widths, damping, equal, (low - x, high - x))
-            step, found = model.solve(here.residuals, here.constraints, share)
-            if share == 1.0:
-                multipliers = found
-            price = max(price, min(2.0 * float(np.abs(found).max(initial=0.0)), _DEAREST))
-            start_merit, promised = _merit(here, equal, price), model.promised(step, price)
+            model = _Model.of(sample, widths, damping, equal, (low - x, high - x))
+            step, step_multipliers = model.solve(sample.residuals, sample.constraints, fraction)
+            if fraction == 1.0:
+                multipliers = step_multipliers
+            penalty = max(penalty, min(2.0 * float(np.abs(step_multipliers).max(initial=0.0)), _MAX_PENALTY))
+            start_merit, promised = _merit(sample, equal, penalty), model.promised(step, penalty)
             trial = evaluate(x + step, False)
-            taken = _merit(trial, equal, price)
+            new_merit = _merit(trial, equal, penalty)
             if trial is not None:
-                remains = trial.residuals - here.d_residuals @ step, trial.constraints - model.slopes @ step
-                second, _ = model.solve(*remains, share)
-                corrected = _merit(evaluate(x + second, False), equal, price)
-                if corrected < taken:
-                    step, taken = second, corrected
-            ratio = (start_merit - taken) / promised if promised > 0.0 else -1.0
-            moved = ratio > _ACCEPTED
+                remains = trial.residuals - sample.d_residuals @ step, trial.constraints - model.slopes @ step
+                second, _ = model.solve(*remains, fraction)
+                corrected = _merit(evaluate(x + second, False), equal, penalty)
+                if corrected < new_merit:
+                    step, new_merit = second, corrected
+            ratio = (start_merit - new_merit) / promised if promised > 0.0 else -1.0
+            moved = ratio > _MIN_GAIN_RATIO
             if moved:
                 damping *= max(0.1, 1.0 - (2.0 * min(ratio, 1.2) - 1.0) ** 3)
                 damping = max(damping, _LEAST_DAMPING)
                 break
-            if promised <= tolerance * here.cost or damping > _MOST_DAMPING:
+            if promised <= tolerance * sample.cost or damping > _MOST_DAMPING:
                 break
-            damping, growth, share = damping * growth, 2.0 * growth, 0.5 * share
-        violated = float(violations(here.constraints, equal).max(initial=0.0))
+            damping, growth, fraction = damping * growth, 2.0 * growth, 0.5 * fraction
+        violated = float(violations(sample.constraints, equal).max(initial=0.0))
         if not moved:
-            return Solution(x, here, multipliers, violated <= held, jacobians)
-        worth = max(promised, start_merit - taken) > tolerance * here.cost or violated > held
-        there = evaluate(x + step, True)
-        assert there is not None
-        x, here, jacobians, idle = x + step, there, jacobians + 1, 0 if worth else idle + 1
-        if idle >= 2:
-            return Solution(x, here, multipliers, True, jacobians)
-    return Solution(x, here, multipliers, False, jacobians)
+            return Solution(x, sample, multipliers, violated <= constraint_tolerance, jacobians)
+        progress = max(promised, start_merit - new_merit) > tolerance * sample.cost or violated > constraint_tolerance
+        new_sample = evaluate(x + step, True)
+        assert new_sample is not None
+        x, sample, jacobians, stalled = x + step, new_sample, jacobians + 1, 0 if progress else stalled + 1
+        if stalled >= 2:
+            return Solution(x, sample, multipliers, True, jacobians)
+    return Solution(x, sample, multipliers, False, jacobians)
 
 
-def _merit(sample: Sample | None, equal: np.ndarray, price: float) -> float:
-    """Cost and the price of violations; infinite where there is nothing."""
+def _merit(sample: Sample | None, equal: np.ndarray, penalty: float) -> float:
+    """Return the cost plus penalised violations; infinite where there is no sample."""
     if sample is None or not np.all(np.isfinite(sample.residuals)):
         return np.inf
-    return sample.cost + price * float(violations(sample.constraints, equal).sum())
+    return sample.cost + penalty * float(violations(sample.constraints, equal).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """A step's problem: least squares damped by D, min |J p + r|^2 + |D p|^2, under linearised constraints.
+    """Subproblem of one step: damped least squares, min |J p + r|^2 + |D p|^2, under linearised constraints.
 
     Attributes
     ----------
     sample : Sample
-        Where the step begins.
-    triangle : np.ndarray
-        R of the QR decomposition of J above D, (V, V).
-    basis : np.ndarray
-        Its Q, (R, V), of the rows of J.
-    equal : np.ndarray
-        Which constraints are equations.
-    room : tuple[np.ndarray, np.ndarray]
+        Sample at which the step begins.
+    triangle : (V, V) ndarray
+        R of the QR decomposition of J stacked on D.
+    basis : (R, V) ndarray
+        Rows of its Q that belong to J.
+    equal : (C,) ndarray of bool
+        Mask of the constraints that are equations.
+    room : (ndarray, ndarray)
         Lower and upper bounds of the step, (V,) each.
     """
 
@@ -207,6 +207,7 @@ class _Model:
     def of(
         cls, sample: Sample, widths: np.ndarray, damping: float, equal: np.ndarray, room: tuple[np.ndarray, np.ndarray]
     ) -> _Model:
+        """Return the subproblem at a sample; ``widths`` (V,) are the largest norms of the Jacobian's columns so far."""
         assert sample.d_residuals is not None
         most = widths.max(initial=0.0)
         damp = np.sqrt(damping) * np.maximum(widths, 1e-8 * most if most > 0.0 else 1.0)
@@ -219,45 +220,45 @@ class _Model:
         assert self.sample.d_constraints is not None
         return self.sample.d_constraints
 
-    def solve(self, residuals: np.ndarray, constraints: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-        """The step (V,) and the multipliers (C,) if residuals and constraints at its foot were these.
+    def solve(self, residuals: np.ndarray, constraints: np.ndarray, fraction: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the step (V,) and the multipliers (C,) for residuals and constraints at its start.
 
-        With R p = z - q, where q is Q^T r, it is the shortest z that takes away a ``share`` of what is violated:
-        equations by their pseudoinverse, inequalities G z <= h by the dual, y >= 0 with least |G^T y|^2 / 2 + h y.
+        With R p = z - q, where q is Q^T r, it is the shortest z that removes a ``share`` of the violations: equations
+        by their pseudoinverse, inequalities G z <= h by the dual, y >= 0 with least |G^T y|^2 / 2 + h y.
         """
         low, high = self.room
         eye = np.eye(len(low))
         upper, lower = np.isfinite(high), np.isfinite(low)
-        aims = np.where(self.equal, share * constraints, np.where(constraints > 0.0, share, 1.0) * constraints)
+        targets = np.where(self.equal, fraction * constraints, np.where(constraints > 0.0, fraction, 1.0) * constraints)
         slopes = np.concatenate([self.slopes, eye[upper], -eye[lower]])
-        aims = np.concatenate([aims, -high[upper], low[lower]])
-        equal = np.concatenate([self.equal, np.zeros(len(aims) - len(self.equal), dtype=bool)])
+        targets = np.concatenate([targets, -high[upper], low[lower]])
+        equal = np.concatenate([self.equal, np.zeros(len(targets) - len(self.equal), dtype=bool)])
         shift = self.basis.T @ residuals
-        turned = solve_triangular(self.triangle, slopes.T, trans="T").T
-        aims = turned @ shift - aims
-        size = np.linalg.norm(turned, axis=1)
+        rotated = solve_triangular(self.triangle, slopes.T, trans="T").T
+        targets = rotated @ shift - targets
+        size = np.linalg.norm(rotated, axis=1)
         size = np.where(size > 0.0, size, 1.0)
-        turned, aims = turned / size[:, None], aims / size
-        multipliers = np.zeros(len(aims))
-        inverse = np.linalg.pinv(turned[equal])
-        fixed = inverse @ aims[equal]
+        rotated, targets = rotated / size[:, None], targets / size
+        multipliers = np.zeros(len(targets))
+        inverse = np.linalg.pinv(rotated[equal])
+        fixed = inverse @ targets[equal]
         z = fixed
         if not equal.all():
-            free = np.eye(len(low)) - inverse @ turned[equal]
-            rows = turned[~equal] @ free
-            rest = aims[~equal] - turned[~equal] @ fixed
+            free = np.eye(len(low)) - inverse @ rotated[equal]
+            rows = rotated[~equal] @ free
+            rest = targets[~equal] - rotated[~equal] @ fixed
             factor = np.linalg.cholesky(rows @ rows.T + _RIDGE * np.eye(len(rows)))
             goal = solve_triangular(factor, -rest, lower=True)
             multipliers[~equal] = nnls(factor.T, goal, maxiter=30 * len(rows))[0]
             z = fixed - rows.T @ multipliers[~equal]
-        multipliers[equal] = -inverse.T @ (z + turned[~equal].T @ multipliers[~equal])
+        multipliers[equal] = -inverse.T @ (z + rotated[~equal].T @ multipliers[~equal])
         step = solve_triangular(self.triangle, z - shift)
         return np.clip(step, low, high), (multipliers / size)[: len(constraints)]
 
-    def promised(self, step: np.ndarray, price: float) -> float:
-        """By how much the merit falls if residuals and constraints are linear."""
+    def promised(self, step: np.ndarray, penalty: float) -> float:
+        """Return the decrease of the merit that a step would bring if residuals and constraints were linear."""
         assert self.sample.d_residuals is not None
         linear = Sample(
             self.sample.residuals + self.sample.d_residuals @ step, self.sample.constraints + self.slopes @ step
         )
-        return _merit(self.sample, self.equal, price) - _merit(linear, self.equal, price)
+        return _merit(self.sample, self.equal, penalty) - _merit(linear, self.equal, penalty)

@@ -9,9 +9,9 @@ from functools import cache, cached_property
 from importlib.metadata import EntryPoint, distribution, distributions
 from typing import Any, TypeVar
 
-# not in one word: in a wheel that is what stands before the modules' names
+# written in two parts: the wheel build puts the one word before module names
 PREFIX = "space_camera_twin" + "."
-"""Beginning of the names of the groups of entry points; the name of the table follows."""
+"""Prefix of the names of the groups of entry points; the name of the table follows."""
 
 Value = TypeVar("Value")
 
@@ -22,7 +22,7 @@ class EntryPointError(Exception):
 
 @dataclass(frozen=True)
 class Entry:
-    """An entry point that a distribution declares, and what it is loaded from."""
+    """Entry point declared by a distribution, and the object reference that it is loaded from."""
 
     distribution: str
     version: str
@@ -39,27 +39,27 @@ def entries() -> tuple[Entry, ...]:
     """Return the entries of all tables, in the order of the distributions' names.
 
     Only distributions whose entry points mention ``PREFIX`` are parsed, which takes 3 ms instead of 8 with 200
-    installed. Of a distribution that is installed twice the first one on the path counts.
+    installed. Of a distribution that is installed twice, the first on the path counts.
     """
-    names = {found.name for found in distributions() if PREFIX in (found.read_text("entry_points.txt") or "")}
-    points = [(found, point) for found in map(distribution, sorted(names)) for point in found.entry_points]
-    every = (Entry(found.name, found.version, point.group, point.name, point.value) for found, point in points)
-    return tuple(entry for entry in every if entry.group.startswith(PREFIX))
+    names = {dist.name for dist in distributions() if PREFIX in (dist.read_text("entry_points.txt") or "")}
+    points = [(dist, point) for dist in map(distribution, sorted(names)) for point in dist.entry_points]
+    all_entries = (Entry(dist.name, dist.version, point.group, point.name, point.value) for dist, point in points)
+    return tuple(entry for entry in all_entries if entry.group.startswith(PREFIX))
 
 
 class ExtensionTable(UserDict[str, Value]):
-    """A table of this program with the entries of other distributions behind its own.
+    """Table of this program, extended by the entries of other distributions.
 
-    Other distributions are looked for when the table is read first, and an entry is imported when its value is asked
-    for: neither a program's start nor a broken entry that nobody asks for costs anything.
+    Other distributions are searched when the table is first read, and an entry is imported when its value is requested:
+    neither the program's start nor a broken entry that nobody requests costs anything.
 
     Parameters
     ----------
-    name
-        Of the group of entry points, without ``PREFIX``.
-    own
+    name : str
+        Name of the group of entry points, without ``PREFIX``.
+    own : mapping of str to value
         Entries of this program, by name.
-    kind
+    kind : type
         Class of the values. An entry may also be a class whose instance without arguments is of that kind.
     """
 
@@ -69,14 +69,14 @@ class ExtensionTable(UserDict[str, Value]):
 
     @cached_property
     def data(self) -> dict[str, Any]:  # type: ignore[override]
-        """Name -> value, or the entry that the value is loaded from, or the error that reading it is."""
-        found: dict[str, Any] = dict(self._own)
+        """Name -> value, or the entry from which the value is loaded, or the error to raise when it is read."""
+        table: dict[str, Any] = dict(self._own)
         for entry in entries():
-            if entry.group == self.group and (other := found.setdefault(entry.name, entry)) is not entry:
+            if entry.group == self.group and (other := table.setdefault(entry.name, entry)) is not entry:
                 owner = other.distribution if isinstance(other, Entry) else "the twin or of a third distribution"
                 remedy = f"rename it there, or pip uninstall {entry.distribution}"
-                found[entry.name] = EntryPointError(f"{entry} has the name of an entry of {owner}; {remedy}")
-        return found
+                table[entry.name] = EntryPointError(f"{entry} has the name of an entry of {owner}; {remedy}")
+        return table
 
     def __getitem__(self, name: str) -> Value:
         found = self.data[name]
@@ -88,12 +88,13 @@ class ExtensionTable(UserDict[str, Value]):
 
 @cache
 def _loaded(entry: Entry, kind: Any) -> Any:
-    remedy = f"mend or update it, or pip uninstall {entry.distribution}"
+    """Return the value of an entry, imported and checked against the table's kind."""
+    remedy = f"repair or update it, or pip uninstall {entry.distribution}"
     try:
-        found = EntryPoint(entry.name, entry.value, entry.group).load()
-        found = found() if isinstance(found, type) and not isinstance(found, kind) else found
+        value = EntryPoint(entry.name, entry.value, entry.group).load()
+        value = value() if isinstance(value, type) and not isinstance(value, kind) else value
     except Exception as error:
         raise EntryPointError(f"{entry} cannot be loaded ({type(error).__name__}: {error}); {remedy}") from error
-    if not isinstance(found, kind):
-        raise EntryPointError(f"{entry} is of type {type(found).__name__}, not {kind.__name__}; {remedy}")
-    return found
+    if not isinstance(value, kind):
+        raise EntryPointError(f"{entry} is of type {type(value).__name__}, not {kind.__name__}; {remedy}")
+    return value

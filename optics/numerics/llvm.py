@@ -1,8 +1,8 @@
-"""Which LLVM library Dr.Jit compiles with.
+"""Selection of the LLVM library that Dr.Jit compiles with.
 
-Dr.Jit generates code that needs LLVM 17 or newer. Left to itself it takes the first libLLVM that the system offers; on
+Dr.Jit generates code that needs LLVM 17 or newer. By default it takes the first libLLVM that the system offers; on
 Debian 12 that is 14 or 15, and then `drjit.maximum`, `minimum`, `clip`, `safe_sqrt`, `atan2` and every Mitsuba render
-abort the whole process ("Cannot select: fmaximum"). So the library that the package karellen-llvm-core brings is named
+abort the whole process ("Cannot select: fmaximum"). So the library of the package karellen-llvm-core is named
 explicitly, in the environment variable that Dr.Jit reads when it is first imported.
 """
 
@@ -18,29 +18,29 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 PACKAGE = "karellen-llvm-core"
 LIBRARY = "libLLVM.so.19.1"
 OLDEST = 17
-"""The oldest major version of LLVM that Dr.Jit's code compiles with."""
+"""Oldest major version of LLVM that Dr.Jit's code compiles with."""
 
 
 class LibraryMissing(ImportError):
-    """A shared library that Dr.Jit or Mitsuba needs is not there; the message says what to install."""
+    """A shared library that Dr.Jit or Mitsuba needs is missing; the message says what to install."""
 
 
 def ensure_llvm() -> Path | None:
-    """Name the LLVM library to Dr.Jit, once and before `import drjit`; later calls change nothing.
+    """Set the LLVM library for Dr.Jit, once and before `import drjit`; later calls change nothing.
 
     A value of `DRJIT_LIBLLVM_PATH` that the user set is respected. On systems for which there is no wheel of LLVM
     (other than Linux on x86-64) nothing is set and Dr.Jit's own search decides.
 
     Returns
     -------
-    Path | None
+    Path or None
         The library that Dr.Jit will load, or None where Dr.Jit searches by itself.
 
     Raises
     ------
     LibraryMissing
         libatomic.so.1 cannot be loaded; or the LLVM wheel is not installed; or the library that the user named does not
-        exist; or drjit was imported before this and has found an LLVM that is too old.
+        exist; or drjit was imported before and has loaded an LLVM that is too old.
     """
     check_libatomic()
     named = os.environ.get(VARIABLE)
@@ -64,7 +64,7 @@ def ensure_llvm() -> Path | None:
 
 
 def find_llvm() -> Path | None:
-    """The LLVM library that karellen-llvm-core installed for this interpreter, or None."""
+    """Return the LLVM library that karellen-llvm-core installed for this interpreter, or None."""
     candidates = [Path(sysconfig.get_path("data")) / "lib" / LIBRARY, Path(sys.prefix) / "lib" / LIBRARY]
     try:
         files = importlib.metadata.files(PACKAGE) or []
@@ -82,7 +82,7 @@ def check_libatomic() -> None:
     Raises
     ------
     LibraryMissing
-        It does not load.
+        The library does not load.
     """
     if sys.platform != "linux":
         return
@@ -95,7 +95,7 @@ def check_libatomic() -> None:
 
 
 def _check_loaded() -> None:
-    """Somebody imported drjit first, so it has already chosen; that is fine only if it chose a usable LLVM."""
+    """Raise LibraryMissing if drjit was imported before optics and has chosen an LLVM that is too old."""
     import drjit
 
     drjit.has_backend(drjit.JitBackend.LLVM)

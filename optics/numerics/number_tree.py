@@ -1,9 +1,10 @@
-"""Numbers with names: nested frozen dataclasses and tuples whose leaves are numbers or arrays of them.
+"""Trees of named numbers, and an immutable mapping.
 
-A leaf is named by its path, the names of fields and the places in tuples that lead to it: ``("surface", "even", 0)``.
-None stands for what is not there, and has no leaves.
+A tree consists of nested frozen dataclasses and tuples whose leaves are numbers or arrays of them. A leaf is named by
+its path, the field names and tuple indices that lead to it: ``("surface", "even", 0)``. None stands for an absent
+branch, and has no leaves.
 
-A mapping that cannot be changed, so that values that hold one can be hashed, compared and pickled.
+``FrozenMap`` is a dict that cannot be changed, so that values that contain one can be hashed, compared and pickled.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Value = TypeVar("Value")
 
 
 class FrozenMap(dict[Key, Value]):
-    """A dict that refuses changes; hashable when its values are."""
+    """Dict that refuses changes; hashable when its values are."""
 
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(frozenset(self.items()))
@@ -41,41 +42,43 @@ Tree = TypeVar("Tree")
 
 
 def leaves(tree: Any) -> dict[Path, Any]:
-    """Path -> leaf of every number in a tree, in the order of its fields."""
-    found: dict[Path, Any] = {}
-    _collect(tree, (), found)
-    return found
+    """Return path -> leaf for every number in a tree, in the order of its fields."""
+    out: dict[Path, Any] = {}
+    _collect(tree, (), out)
+    return out
 
 
-def _collect(tree: Any, path: Path, found: dict[Path, Any]) -> None:
+def _collect(tree: Any, path: Path, out: dict[Path, Any]) -> None:
+    """Add the leaves of a tree to ``found``, with ``path`` before their own paths."""
     if tree is None:
         return
     if isinstance(tree, tuple):
-        for place, branch in enumerate(tree):
-            _collect(branch, (*path, place), found)
+        for index, branch in enumerate(tree):
+            _collect(branch, (*path, index), out)
         return
     names = _names(tree.__class__)
     if names is None:
-        found[path] = tree
+        out[path] = tree
         return
     for name in names:
-        _collect(getattr(tree, name), (*path, name), found)
+        _collect(getattr(tree, name), (*path, name), out)
 
 
 def form_of(tree: Tree) -> Tree:
-    """The form of a tree: in the place of each number its place in ``numbers_in``."""
-    places = count()
-    return map_leaves(lambda number: next(places), tree)
+    """Return the tree with each number replaced by its index in ``numbers_in``."""
+    indices = count()
+    return map_leaves(lambda number: next(indices), tree)
 
 
 def numbers_in(tree: Any) -> list[Any]:
-    """All numbers of a tree, in the order of its fields."""
+    """Return all numbers of a tree, in the order of its fields."""
     numbers: list[Any] = []
     _append_numbers(tree, numbers)
     return numbers
 
 
 def _append_numbers(tree: Any, numbers: list[Any]) -> None:
+    """Append all numbers of a tree to a list."""
     for branch in _branches(tree):
         if branch is None:
             continue
@@ -86,20 +89,21 @@ def _append_numbers(tree: Any, numbers: list[Any]) -> None:
 
 
 def _branches(tree: Any) -> Iterable[Any]:
-    """What a tuple or a dataclass holds, in the order of its fields."""
+    """Return the elements of a tuple or the field values of a dataclass, in order."""
     return tree if isinstance(tree, tuple) else [getattr(tree, name) for name in _names(tree.__class__) or ()]
 
 
 def map_leaves(function: Callable[..., Any], tree: Tree, *others: Any) -> Tree:
-    """A tree of the same form whose leaves are ``function(leaf, its counterparts in the others)``.
+    """Return a tree of the same form whose leaves are ``function(leaf, corresponding leaves of the others)``.
 
-    The others are of the form of ``tree``, but may have None where it has leaves; the result may, too.
+    The others have the form of ``tree``, but may have None where it has leaves; the result may, too.
     """
     mapped: Tree = _mapped(function, tree, others)
     return mapped
 
 
 def _mapped(function: Callable[..., Any], tree: Any, others: tuple[Any, ...]) -> Any:
+    """Return ``map_leaves`` of a branch."""
     if tree is None:
         return None
     if not others:
@@ -118,7 +122,10 @@ def _mapped(function: Callable[..., Any], tree: Any, others: tuple[Any, ...]) ->
 
 
 def _mapped_alone(function: Callable[[Any], Any], tree: Any) -> Any:
-    """Map the leaves of one tree. Every trace does this to hundreds of numbers, most of which stand side by side."""
+    """Map the leaves of one tree.
+
+    Every trace does this for hundreds of numbers, most of which are siblings; hence this fast path.
+    """
     whole, names = isinstance(tree, tuple), _names(tree.__class__)
     if not whole and names is None:
         return function(tree)
@@ -134,11 +141,12 @@ def _mapped_alone(function: Callable[[Any], Any], tree: Any) -> Any:
 
 
 def _all(branches: tuple[Any, ...] | None, count: int) -> tuple[Any, ...]:
+    """Return the branches, or ``count`` times None for an absent tuple."""
     return (None,) * count if branches is None else branches
 
 
 def with_leaf(tree: Tree, path: Path, value: Any) -> Tree:
-    """A copy in which the number at ``path`` is another one.
+    """Return a copy of the tree with another number at ``path``.
 
     Raises
     ------
@@ -152,6 +160,7 @@ def with_leaf(tree: Tree, path: Path, value: Any) -> Tree:
 
 
 def _rebuilt(tree: Any, path: Path, value: Any) -> Any:
+    """Return a copy of a branch with another number at ``path``."""
     if not path:
         return value
     first, rest = path[0], path[1:]
@@ -162,5 +171,5 @@ def _rebuilt(tree: Any, path: Path, value: Any) -> Any:
 
 @cache
 def _names(kind: type) -> tuple[str, ...] | None:
-    """Fields of a dataclass in the order of its arguments; None for the type of a leaf."""
+    """Return the fields of a dataclass in the order of its arguments; None for the type of a leaf."""
     return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else None

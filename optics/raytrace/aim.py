@@ -1,4 +1,4 @@
-"""Ray aiming: find the rays that pass given points of a given element (stop, prism aperture) exactly."""
+"""Ray aiming: exact rays through given points of a given element (stop, prism aperture)."""
 
 from __future__ import annotations
 
@@ -15,25 +15,27 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
 
 DEFAULT_TOLERANCE = 1e-11
+"""Largest distance of an aimed ray from its target, metres."""
 MAX_ITERATIONS = 25
+"""Number of Newton or Broyden steps after which aiming fails."""
 
 
 class AimError(PhysicalError, RuntimeError):
-    """No ray from the given place reaches the given point."""
+    """No ray from the given point reaches the target."""
 
 
 @dataclass(frozen=True, eq=False)
 class RayFan:
-    """A two-parameter family of rays per ray to be aimed: q = (a, b) moves the direction or the launch point.
+    """Two-parameter family of rays for each ray to be aimed: q = (a, b) moves the direction or the launch point.
 
     Attributes
     ----------
-    position : np.ndarray
-        Launch points, world, (B, N, 3), metres.
-    direction : np.ndarray
-        Unit directions, world, (B, N, 3).
-    axes : np.ndarray
-        Two vectors per ray or per system, broadcastable to (B, N, 2, 3).
+    position : (B, N, 3) ndarray
+        Launch points in the world frame, metres.
+    direction : (B, N, 3) ndarray
+        Unit directions in the world frame.
+    axes : ndarray
+        Two vectors e1, e2 per ray or per system, broadcastable to (B, N, 2, 3).
     moves_position : bool
         True: launch point = position + a e1 + b e2 (a collimated beam); False: direction = normalised (direction + a e1
         + b e2) (a point source).
@@ -45,9 +47,9 @@ class RayFan:
     moves_position: bool = False
 
     def at(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Launch points and directions for parameters q (B, N, 2)."""
+        """Return launch points and directions for parameters q (B, N, 2)."""
         start = self.position if self.moves_position else self.direction
-        # component by component: each is one block of memory
+        # component by component, since each is one block of memory
         moved = np.empty((3, *q.shape[:2]))
         for x in range(3):
             np.multiply(q[..., 0], self.axes[..., 0, x], out=moved[x])
@@ -61,13 +63,13 @@ class RayFan:
 
 
 def transverse_axes(direction: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Two unit vectors square to ``direction`` (..., 3), the first near ``first``; shape (..., 2, 3)."""
+    """Return two unit vectors (..., 2, 3) perpendicular to ``direction`` (..., 3), the first near ``first``."""
     e1 = first - direction * np.sum(first * direction, axis=-1, keepdims=True)
     e1 = e1 / np.linalg.norm(e1, axis=-1, keepdims=True)
     return np.stack([e1, np.cross(direction, e1)], axis=-2)
 
 
-# what is no number is told by AimError alone
+# values that are not finite end in AimError, without NumPy's warnings
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")
 def aim(
     backend: Backend,
@@ -81,58 +83,60 @@ def aim(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve for the rays that meet the last element of ``systems`` at ``target``.
 
-    Newton's method with one difference Jacobian per ray, improved by Broyden's rank-one update. A ray that has arrived
-    stays, so that its numbers do not depend on what else is aimed with it.
+    Newton's method with one difference Jacobian per ray, improved by Broyden's rank-one update. A converged ray is not
+    changed further, so that its numbers do not depend on the other rays.
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the trace.
     systems : SystemBatch
-        B systems that end at the element to be hit; apertures are not looked at.
+        B systems that end at the target element; apertures are ignored.
     fan : RayFan
-        The families of rays.
-    target : np.ndarray
-        x, y on that element, metres of its nominal size, broadcastable to (B, N, 2): points of an aperture, which grows
-        with its body.
-    start : np.ndarray | None
-        Parameters to start from, broadcastable to (B, N, 2); default 0.
-    jacobian : np.ndarray | None
-        d(hit)/dq to start from, broadcastable to (B, N, 2, 2); default by differences of size ``step``.
+        Families of rays.
+    target : ndarray
+        Target x, y on that element, metres at its nominal size, broadcastable to (B, N, 2): points of an aperture,
+        which expands with its body.
+    start : ndarray, optional
+        Initial parameters, broadcastable to (B, N, 2); 0 by default.
+    jacobian : ndarray, optional
+        Initial d(hit)/dq, broadcastable to (B, N, 2, 2); by default from differences of size ``step``.
     tolerance : float
-        Largest distance from the target there, metres.
+        Largest distance from the target on the element, metres.
     step : float
         Difference step of the parameters (metres or radians).
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray]
-        Parameters (B, N, 2) and the Jacobian (B, N, 2, 2).
+    q : (B, N, 2) ndarray
+        Parameters of the aimed rays.
+    jacobian : (B, N, 2, 2) ndarray
+        d(hit)/dq there.
 
     Raises
     ------
     AimError
-        Not converged.
+        The iteration does not converge.
     """
     uploaded = systems.upload(backend)
 
     def hit(q: np.ndarray) -> np.ndarray:
         position, direction = fan.at(q)
-        return trace(backend, uploaded, make_rays(backend, position, direction)).place()
+        return trace(backend, uploaded, make_rays(backend, position, direction)).xy()
 
     count = max(systems.count, fan.position.shape[0], fan.direction.shape[0])
     rays = max(fan.position.shape[1], fan.direction.shape[1], np.shape(target)[-2] if np.ndim(target) > 1 else 1)
     shape = (count, rays, 2)
     q = np.array(np.broadcast_to(0.0 if start is None else start, shape), dtype=np.float64)
     goal = np.broadcast_to(target, shape) * systems.size[:, None, None]
-    here = hit(q)
+    current = hit(q)
     if jacobian is None:
-        columns = [(hit(q + step * np.eye(2)[k]) - here) / step for k in range(2)]
+        columns = [(hit(q + step * np.eye(2)[k]) - current) / step for k in range(2)]
         slope = np.stack(columns, axis=-1)
     else:
         slope = np.array(np.broadcast_to(jacobian, (*shape, 2)), dtype=np.float64)
     for _ in range(MAX_ITERATIONS):
-        miss = goal - here
+        miss = goal - current
         worst = float(np.max(np.abs(miss)))
         if worst <= tolerance:
             return q, slope
@@ -141,28 +145,28 @@ def aim(
         moving = np.max(np.abs(miss), axis=-1)[..., None] > tolerance
         change = np.where(moving, _solve(slope, miss), 0.0)
         q = q + change
-        there = hit(q)
-        error = (there - here) - np.einsum("bnij,bnj->bni", slope, change)
+        moved = hit(q)
+        error = (moved - current) - np.einsum("bnij,bnj->bni", slope, change)
         norm = np.sum(change**2, axis=-1)[..., None, None]
         moving = moving[..., None]
         update = error[..., :, None] * change[..., None, :] / np.where(moving, norm, 1.0)
         slope = np.where(moving, slope + update, slope)
-        here = there
+        current = moved
     raise AimError(
-        f"aiming at the last element did not converge: {float(np.max(np.abs(goal - here))):.3g} m off after "
+        f"aiming at the last element did not converge: {float(np.max(np.abs(goal - current))):.3g} m off after "
         f"{MAX_ITERATIONS} steps; the perturbation may move the beam off the mirrors"
     )
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solutions (..., 2) of 2 x 2 systems by Cramer's rule, in a few passes; not finite where singular."""
+    """Return the solutions (..., 2) of 2 x 2 systems by Cramer's rule; not finite where singular."""
     (a, b), (c, d) = np.moveaxis(matrix, (-2, -1), (0, 1))
     x, y = np.moveaxis(right, -1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None]
 
 
-def alive_along(
+def surviving_rays(
     backend: Backend,
     assembly: Assembly,
     names: Sequence[str],
@@ -170,27 +174,29 @@ def alive_along(
     direction: np.ndarray,
     state: State | None = None,
 ) -> Iterator[tuple[Element, np.ndarray]]:
-    """Which rays are still alive after each element of a sequence, to tell where they get lost; traced step by step.
+    """Yield which rays are still valid after each element of a sequence, to find where rays are lost.
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the trace.
     assembly : Assembly
         The instrument.
-    names : Sequence[str]
+    names : sequence of str
         Elements in the order in which light meets them.
-    position : np.ndarray
-        Of the rays, world, metres, broadcastable to (N, 3).
-    direction : np.ndarray
-        Unit vectors, likewise.
-    state : State | None
-        What is perturbed.
+    position : ndarray
+        Ray positions in the world frame, metres, broadcastable to (N, 3).
+    direction : ndarray
+        Unit directions in the world frame, broadcastable to (N, 3).
+    state : State, optional
+        Perturbed state; nominal by default.
 
     Yields
     ------
-    tuple[Element, np.ndarray]
-        The element and a mask (N,).
+    element : Element
+        The element.
+    valid : (N,) ndarray of bool
+        Mask of the rays that are valid after it.
     """
     rays = make_rays(backend, position, direction)
     for count in range(1, len(names) + 1):

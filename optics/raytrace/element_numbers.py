@@ -1,6 +1,6 @@
-"""What the trace reads of one element: its frame, its shape and clear aperture, and the media on both sides.
+"""Numbers of one element for the trace: its frame, shape and clear aperture, and the media on both sides.
 
-What decides the code of a kernel, as against the numbers that it works on, is a `Structure`.
+``Structure`` holds what determines the code of a kernel, as against the numbers that it works on.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from optics.geometry import zernike
 from optics.geometry.aperture import ApertureNumbers
-from optics.geometry.sag_terms import SagTerm, grown, kinds_of, of_kinds
+from optics.geometry.sag_terms import SagTerm, kinds_of, of_kinds, scaled_term
 from optics.geometry.surface import (
     Figure,
     FigureNumbers,
@@ -30,29 +30,29 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 
 @dataclass(frozen=True)
 class Structure:
-    """What decides the code of the kernel (as against the numbers that it works on), for one element."""
+    """Properties of one element that determine the code of a kernel."""
 
     interaction: Interaction
     plane: bool
     even: int
-    terms: tuple[type[SagTerm], ...]  # kinds of further terms of the sag
+    terms: tuple[type[SagTerm], ...]  # kinds of the further sag terms
     figure_order: int  # radial order of the Zernike figure, -1 for none
     grid: bool
     aperture: type[ApertureNumbers] | None
-    graded: tuple[bool, bool] = (False, False)  # whether the medium before and the one after has an index gradient
+    graded: tuple[bool, bool] = (False, False)  # index gradient in the medium before and after
 
 
 @dataclass(frozen=True, eq=False)
 class CoordinateNumbers:
-    """One coordinate of a rigid transform: ``shift`` + ``turn`` . p, metres."""
+    """One coordinate of a rigid transform: ``shift`` + ``row`` . p, in metres."""
 
     shift: Any
-    turn: tuple[Any, Any, Any]
+    row: tuple[Any, Any, Any]
 
 
 @dataclass(frozen=True, eq=False)
 class FrameNumbers:
-    """A rigid transform of points, coordinate by coordinate."""
+    """Rigid transform of points, coordinate by coordinate."""
 
     x: CoordinateNumbers
     y: CoordinateNumbers
@@ -60,7 +60,7 @@ class FrameNumbers:
 
     @classmethod
     def of(cls, rows: np.ndarray) -> FrameNumbers:
-        """From its numbers in the order of the fields, (12, ...)."""
+        """Return the transform from its numbers (12, ...) in the order of the fields."""
         return cls(*(CoordinateNumbers(c[0], (c[1], c[2], c[3])) for c in rows.reshape(3, 4, *rows.shape[1:])))
 
     @property
@@ -71,7 +71,10 @@ class FrameNumbers:
 
 @dataclass(frozen=True, eq=False)
 class IndexNumbers:
-    """Refractive index of a medium: ``index`` + ``gradient`` . p at p in the element's frame; no gradient: None."""
+    """Refractive index of a medium, ``index`` + ``gradient`` . p at p in the element's frame.
+
+    The gradient is None in a homogeneous medium.
+    """
 
     index: Any
     gradient: tuple[Any, Any, Any] | None = None
@@ -79,16 +82,18 @@ class IndexNumbers:
 
 @dataclass(frozen=True, eq=False)
 class ElementNumbers:
-    """All that the trace reads of one element.
+    """Numbers of one element that the trace reads.
 
     Attributes
     ----------
     frame : FrameNumbers
-        From the frame of the element before (the world for the first) into this element's.
+        Transform from the frame of the element before (the world for the first) into this element's.
     surface : SurfaceNumbers
-        Its shape; aperture: its clear aperture, None for an unlimited one.
+        Shape of the surface.
+    aperture : DiskNumbers, RingNumbers, RectangleNumbers or EllipseNumbers, optional
+        Clear aperture; None if unlimited.
     before, after : IndexNumbers
-        Refractive index on the side that light comes from and on the one that it goes to.
+        Refractive indices on the side that light comes from and on the side that it goes to.
     """
 
     frame: FrameNumbers
@@ -99,8 +104,8 @@ class ElementNumbers:
 
 
 @dataclass(frozen=True, eq=False)
-class OwnNumbers:
-    """Numbers of an element that do not depend on where it stands; as of ``ElementNumbers``."""
+class LocalNumbers:
+    """Numbers of an element that do not depend on its pose; fields as in ``ElementNumbers``."""
 
     surface: SurfaceNumbers
     aperture: ApertureNumbers | None
@@ -110,14 +115,14 @@ class OwnNumbers:
 
 @dataclass(frozen=True)
 class Medium:
-    """What light travels in: a glass body of the assembly, or something homogeneous of a given index."""
+    """Medium that light travels in: a glass body of the assembly, or a homogeneous medium of a given index."""
 
     solid: str | None = None
     index: float = 1.0
 
 
 def media_along(chain: Sequence[Element]) -> list[Medium]:
-    """The medium before the first element, between the elements and after the last one."""
+    """Return the media before the first element, between the elements and after the last one."""
     out = [Medium()]
     for element in chain:
         before = out[-1]
@@ -131,15 +136,17 @@ def media_along(chain: Sequence[Element]) -> list[Medium]:
 
 
 def structure_of(elements: Sequence[Element]) -> Structure:
-    """Common structure of elements as designed, the i-th ones of several chains."""
+    """Return the common structure of nominal elements, the i-th ones of several chains."""
     grid = any(_known_figure(e) is not None and e.surface.grid_figure is not None for e in elements)
     apertures = [None if e.aperture is None else type(e.aperture.numbers()) for e in elements]
-    kinds = {(e.interaction, e.surface.is_plane, own) for e, own in zip(elements, apertures, strict=True)}
+    kinds = {
+        (e.interaction, e.surface.is_plane, aperture_kind) for e, aperture_kind in zip(elements, apertures, strict=True)
+    }
     if len(kinds) != 1:
         names = ", ".join(sorted(e.name for e in elements))
         raise ValueError(f"elements of different kinds cannot be batched: {names}")
     interaction, is_plane, aperture = kinds.pop()
-    # a plane may have terms that are zero, and the terms that a surface lacks are
+    # terms that a surface lacks are zero, also on a plane
     terms = kinds_of([term for e in elements for term in e.surface.terms])
     even = 0 if is_plane else max(len(e.surface.even) for e in elements)
     figures = [e.surface.zernike_figure for e in elements]
@@ -148,15 +155,17 @@ def structure_of(elements: Sequence[Element]) -> Structure:
 
 
 def _known_figure(element: Element) -> Figure | None:
-    """The figure of an element's surface; ValueError for one that the trace would leave out."""
+    """Return the figure of an element's surface; raise ValueError for a type that the trace does not support."""
     match element.surface.figure:
         case None | ZernikeFigure() | GridFigure() | SummedFigure() as figure:
             return figure
         case other:
-            raise ValueError(f"element {element.name!r}: the trace knows no figure of type {type(other).__name__}")
+            raise ValueError(
+                f"element {element.name!r}: the trace does not support a figure of type {type(other).__name__}"
+            )
 
 
-def own_numbers_of(
+def local_numbers_of(
     assembly: Assembly,
     element: Element,
     media: tuple[Medium, Medium],
@@ -164,16 +173,17 @@ def own_numbers_of(
     states: Sequence[State],
     placed: PlacedBodies,
     step: Sequence[tuple[str, str, int]] | None,
-) -> OwnNumbers:
-    """Shape, aperture and indices of an element between two media, each number (S,), complex when a derivative is
-    carried.
+) -> LocalNumbers:
+    """Return shape, aperture and indices of an element between two media.
+
+    Each number has shape (S,), and is complex when a derivative is carried.
     """
     scale = placed.scale[:, placed.index[element.body]]
     sides = zip(media, structure.graded, strict=True)
     outer, inner = (_index_numbers(assembly, element, medium, graded, states, placed) for medium, graded in sides)
-    return OwnNumbers(
+    return LocalNumbers(
         _surface_numbers(element, structure, scale, states, step),
-        # an edge has no derivative: it lets a ray pass or stops it
+        # an aperture has no derivative: it passes a ray or blocks it
         None if element.aperture is None else element.aperture.numbers(scale.real),
         outer,
         inner,
@@ -183,7 +193,7 @@ def own_numbers_of(
 def _index_numbers(
     assembly: Assembly, element: Element, medium: Medium, graded: bool, states: Sequence[State], placed: PlacedBodies
 ) -> IndexNumbers:
-    """Index (S,) of a medium beside an element, with its gradient in the element's frame where it is graded."""
+    """Return the index (S,) of a medium next to an element, with its gradient in the element's frame if it has one."""
     if medium.solid is None:
         index = np.full(len(states), medium.index)
         gradient = np.zeros((len(states), 3)) if graded else None
@@ -192,12 +202,12 @@ def _index_numbers(
         index = np.array([assembly.index(medium.solid, m) for m in motions])
         gradient = None
         if graded:
-            here, glass = placed.index[element.body], placed.index[medium.solid]
-            own = np.array([m.index_gradient for m in motions])
-            world = np.einsum("sij,sj->si", placed.rotation[:, glass], own)
-            gradient = np.einsum("sji,sj->si", placed.rotation[:, here], world)
-            away = placed.translation[:, here] - placed.translation[:, glass]
-            index = index + np.einsum("si,si->s", world, away)
+            face, glass = placed.index[element.body], placed.index[medium.solid]
+            gradients = np.array([m.index_gradient for m in motions])
+            world = np.einsum("sij,sj->si", placed.rotation[:, glass], gradients)
+            gradient = np.einsum("sji,sj->si", placed.rotation[:, face], world)
+            offset = placed.translation[:, face] - placed.translation[:, glass]
+            index = index + np.einsum("si,si->s", world, offset)
     return IndexNumbers(index, None if gradient is None else (gradient[:, 0], gradient[:, 1], gradient[:, 2]))
 
 
@@ -208,6 +218,7 @@ def _surface_numbers(
     states: Sequence[State],
     step: Sequence[tuple[str, str, int]] | None,
 ) -> SurfaceNumbers:
+    """Return the numbers of an element's shape in each state; the grid figure is added elsewhere."""
     surface = element.surface
     curvature, conic, even = None, None, []
     if not structure.plane:
@@ -217,7 +228,7 @@ def _surface_numbers(
         for n in range(structure.even):
             term = surface.even[n] if n < len(surface.even) else 0.0
             even.append(term / scale ** (2 * n + 3))
-    terms = tuple(grown(term, scale) for term in of_kinds(surface.terms, structure.terms))
+    terms = tuple(scaled_term(term, scale) for term in of_kinds(surface.terms, structure.terms))
     figure = _figure_numbers(element, structure.figure_order, states, step) if structure.figure_order >= 0 else None
     return SurfaceNumbers(curvature, conic, tuple(even), terms, figure)
 
@@ -225,7 +236,7 @@ def _surface_numbers(
 def _figure_numbers(
     element: Element, order: int, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None
 ) -> FigureNumbers:
-    """Monomial coefficients of the Zernike figure of each state."""
+    """Return the monomial coefficients of the Zernike figure in each state."""
     figure = element.figure_disk
     kind = np.float64 if step is None else np.complex128
     table = np.empty((len(states), zernike.triangle_size(order)), kind)
@@ -241,25 +252,26 @@ def _figure_numbers(
 
 
 _NO_GRID = GridFigure(np.zeros((4, 4)), (-1.0, 1.0, -1.0, 1.0))
-"""What a system without a grid reads where others of its batch have one."""
+"""Zero grid, read by a system without a grid where others of its batch have one."""
 
 
 def grid_numbers(elements: Sequence[Element], states: Sequence[State]) -> tuple[GridNumbers, np.ndarray]:
-    """Numbers of the grids of the i-th elements of all chains in all states, (chains * states,) each, and one table of
-    the coefficients of all.
+    """Return the numbers of the grids of the i-th elements of all chains in all states, and their coefficient table.
+
+    The numbers have shape (chains * states,) each; the one table holds the coefficients of all grids.
     """
     first: dict[int, int] = {}
     figures, numbers, tables, length = [], [], [], 0
     for element in elements:
-        own: dict[int, GridFigure] = {}  # a grid that many states share is added to the element's and stored once
+        by_motion: dict[int, GridFigure] = {}  # a grid shared by many states is added and stored once
         for state in states:
             motion = state.get(element.body, AT_REST)
-            if id(motion.grid) not in own:
-                own[id(motion.grid)] = element.grid_in(motion) or _NO_GRID
-            figure = own[id(motion.grid)]
+            if id(motion.grid) not in by_motion:
+                by_motion[id(motion.grid)] = element.grid_in(motion) or _NO_GRID
+            figure = by_motion[id(motion.grid)]
             if id(figure) not in first:
                 first[id(figure)] = length
-                figures.append(figure)  # so that its id remains its own
+                figures.append(figure)  # kept alive, so that its id stays unique
                 tables.append(figure.spline.ravel())
                 length += tables[-1].size
             numbers.append(replace(figure.numbers, first=float(first[id(figure)])))

@@ -1,6 +1,7 @@
-"""First-order quantities by derivatives of the exact trace: parabasal about a chief ray, paraxial about the axis.
+"""First-order quantities by derivatives of the exact trace, and changes of a line camera by exact chief rays.
 
-Line of sight, roll and principal distance of a line camera, by exact chief rays.
+First-order data are parabasal about a chief ray, or paraxial about the axis. The changes of a line camera are its line
+of sight, roll and principal distance.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from optics.numerics.array_math import determinant, inner, inverse, product
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.system import SystemBatch
-from optics.raytrace.trace import jvp, make_rays, require_some, trace
+from optics.raytrace.trace import jvp, make_rays, require_rays, trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,14 +23,14 @@ class RayMatrix:
 
     Attributes
     ----------
-    image_by_position, image_by_angle : np.ndarray
-        d(x, y on the last element)/d(launch), (B, 2, 2), 1 and m/rad.
-    direction_by_position, direction_by_angle : np.ndarray
-        d(direction x, y on the last element)/d(launch), (B, 2, 2).
-    stop_by_position, stop_by_angle : np.ndarray
-        The same for the hit on the stop, (B, 2, 2).
-    direction : np.ndarray
-        Unit direction of the ray at the last element, in its frame, (B, 3).
+    image_by_position, image_by_angle : (B, 2, 2) ndarray
+        d(x, y on the last element)/d(launch), in 1 and m/rad.
+    direction_by_position, direction_by_angle : (B, 2, 2) ndarray
+        d(direction x, y on the last element)/d(launch), in 1/m and 1.
+    stop_by_position, stop_by_angle : (B, 2, 2) ndarray
+        d(x, y on the stop)/d(launch), in 1 and m/rad.
+    direction : (B, 3) ndarray
+        Unit direction of the ray at the last element, in its frame.
     """
 
     image_by_position: np.ndarray
@@ -47,17 +48,17 @@ class FirstOrder:
 
     Attributes
     ----------
-    scale : np.ndarray
-        d(image x, y)/d(object angle about the two launch axes) with the stop point held, (B, 2, 2), metres per radian:
-        the local principal distance along each axis, which is that of the plane where the image is taken; off-diagonal
-        terms are rotation and anamorphism.
-    principal_distance : np.ndarray
-        Sqrt|det scale|, (B,), metres.
-    entrance_magnification : np.ndarray
-        d(stop x, y)/d(launch x, y), (B, 2, 2).
-    exit_pupil_distance : np.ndarray
-        From the image upstream along the chief ray, mean over both axes, (B,), metres; negative when the pupil lies
-        downstream, large when the image space is telecentric.
+    scale : (B, 2, 2) ndarray
+        d(image x, y)/d(object angle about the two launch axes) with the stop point held, metres per radian: the local
+        principal distance along each axis, for the plane where the image is taken; off-diagonal terms are rotation and
+        anamorphism.
+    principal_distance : (B,) ndarray
+        Sqrt|det scale|, metres.
+    entrance_magnification : (B, 2, 2) ndarray
+        d(stop x, y)/d(launch x, y).
+    exit_pupil_distance : (B,) ndarray
+        Distance of the exit pupil from the image, upstream along the chief ray, mean over both axes, metres; negative
+        when the pupil lies downstream, large when the image space is telecentric.
     """
 
     scale: np.ndarray
@@ -69,22 +70,22 @@ class FirstOrder:
 def ray_matrix(
     backend: Backend, systems: SystemBatch, stop: int, position: np.ndarray, direction: np.ndarray, axes: np.ndarray
 ) -> RayMatrix:
-    """Differentiate one ray per system by forward-mode AD.
+    """Differentiate one ray per system by forward-mode automatic differentiation.
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the trace.
     systems : SystemBatch
         B systems.
     stop : int
         Index of the stop in the sequence.
-    position : np.ndarray
-        Launch points, world, (B, 3).
-    direction : np.ndarray
-        Unit directions, (B, 3).
-    axes : np.ndarray
-        Two launch axes square to the direction, (B, 2, 3).
+    position : (B, 3) ndarray
+        Launch points in the world frame, metres.
+    direction : (B, 3) ndarray
+        Unit directions in the world frame.
+    axes : (B, 2, 3) ndarray
+        Two launch axes perpendicular to the direction.
     """
     zero = np.zeros_like(axes)
     out = jvp(
@@ -103,13 +104,13 @@ def ray_matrix(
 
 
 def first_order(matrix: RayMatrix) -> FirstOrder:
-    """Chief-ray quantities from the ray matrix: neighbouring fields through the same stop point."""
-    follow = -product(inverse(matrix.stop_by_position), matrix.stop_by_angle)
-    scale = matrix.image_by_angle + product(matrix.image_by_position, follow)
-    turn = matrix.direction_by_angle + product(matrix.direction_by_position, follow)
+    """Return chief-ray quantities from the ray matrix, from neighbouring fields through the same stop point."""
+    to_stop = -product(inverse(matrix.stop_by_position), matrix.stop_by_angle)
+    scale = matrix.image_by_angle + product(matrix.image_by_position, to_stop)
+    angle = matrix.direction_by_angle + product(matrix.direction_by_position, to_stop)
     principal_distance = np.sqrt(np.abs(determinant(scale)))
     # two chief rays cross where image step - s * direction step vanishes, s measured upstream
-    distance = np.sum(scale * turn, axis=(-1, -2)) / np.maximum(np.sum(turn * turn, axis=(-1, -2)), 1e-30)
+    distance = np.sum(scale * angle, axis=(-1, -2)) / np.maximum(np.sum(angle * angle, axis=(-1, -2)), 1e-30)
     return FirstOrder(scale, principal_distance, matrix.stop_by_position, distance)
 
 
@@ -120,8 +121,8 @@ class Paraxial:
     Attributes
     ----------
     focal_length : float
-        Effective focal length, the magnitude 1 / sqrt|det d(direction)/d(launch)|; it does not depend on where the
-        image plane stands, and is infinite without power.
+        Effective focal length, the magnitude 1 / sqrt|det d(direction)/d(launch)|; independent of the position of the
+        image plane, and infinite without power.
     back_focal_length : float
         Distance of the paraxial focus from the last surface, downstream; infinite without power.
     entrance_pupil : float
@@ -129,10 +130,10 @@ class Paraxial:
     exit_pupil : float
         Distance of the exit pupil from the image plane, upstream; infinite where chief rays leave parallel.
     exit_magnification : float
-        Diameter of the exit pupil over that of the entrance pupil.
+        Diameter of the exit pupil divided by that of the entrance pupil.
     angular_magnification : float
-        Angle between two collimated beams after the system over that before it; it is what a system without power has
-        in place of a focal length.
+        Angle between two collimated beams after the system divided by that before it; it characterises an afocal
+        system, which has no focal length.
     """
 
     focal_length: float
@@ -147,47 +148,49 @@ class Paraxial:
 def paraxial(matrix: RayMatrix, before: float, behind: float) -> Paraxial:
     """Return the paraxial data of the first system of a ray matrix.
 
-    Steps of the ray at the image are taken square to the ray, so that a turned image plane has no part in them.
+    Displacements of the ray at the image are taken perpendicular to the ray, so that the tilt of the image plane has no
+    effect.
 
     Parameters
     ----------
     matrix : RayMatrix
-        Derivatives about the ray along the axis, by ``ray_matrix``.
+        Derivatives about the ray along the axis, from ``ray_matrix``.
     before : float
         Distance along the ray from its launch point to the first surface, metres.
     behind : float
         Distance along the ray from the last surface to the image, metres.
     """
     ray = matrix.direction[0]
-    square = transverse_axes(ray, np.array([1.0, 0.0, 0.0]))
-    # a step in the plane, and one of the unit direction, along these axes
-    from_place = square[:, :2]
-    from_angle = square[:, :2] - np.outer(square[:, 2], ray[:2]) / ray[2]
-    place, shift = from_place @ matrix.image_by_position[0], from_place @ matrix.image_by_angle[0]
-    power, turn = from_angle @ matrix.direction_by_position[0], from_angle @ matrix.direction_by_angle[0]
-    follow = -inverse(matrix.stop_by_position)[0] @ matrix.stop_by_angle[0]
-    chief, chief_turn = shift + place @ follow, turn + power @ follow
-    away = float(np.sum(chief_turn**2))
-    exit_pupil = np.sum(chief * chief_turn) / away if away else np.inf
+    axes = transverse_axes(ray, np.array([1.0, 0.0, 0.0]))
+    # components along these axes of a step in the plane, and of a step of the unit direction
+    from_position = axes[:, :2]
+    from_angle = axes[:, :2] - np.outer(axes[:, 2], ray[:2]) / ray[2]
+    position, shift = from_position @ matrix.image_by_position[0], from_position @ matrix.image_by_angle[0]
+    power, angle = from_angle @ matrix.direction_by_position[0], from_angle @ matrix.direction_by_angle[0]
+    to_stop = -inverse(matrix.stop_by_position)[0] @ matrix.stop_by_angle[0]
+    chief, chief_angle = shift + position @ to_stop, angle + power @ to_stop
+    square = float(np.sum(chief_angle**2))
+    exit_pupil = np.sum(chief * chief_angle) / square if square else np.inf
     return Paraxial(
         focal_length=float(1.0 / np.sqrt(np.abs(determinant(power)))),
-        back_focal_length=float(behind - np.sum(place * power) / np.sum(power**2)),
-        entrance_pupil=float(before + 0.5 * np.trace(follow)),
+        back_focal_length=float(behind - np.sum(position * power) / np.sum(power**2)),
+        entrance_pupil=float(before + 0.5 * np.trace(to_stop)),
         exit_pupil=float(exit_pupil),
-        exit_magnification=float(np.sqrt(np.abs(determinant(place - exit_pupil * power)))) if away else np.inf,
-        angular_magnification=float(np.sqrt(np.abs(determinant(turn)))),
+        exit_magnification=float(np.sqrt(np.abs(determinant(position - exit_pupil * power)))) if square else np.inf,
+        angular_magnification=float(np.sqrt(np.abs(determinant(angle)))),
     )
 
 
 def equal_area_radius(points: np.ndarray) -> float:
-    """Return the radius of the circle whose area a closed smooth curve through evenly spread points (N, 2) encloses."""
+    """Return the radius of the circle with the area of a closed smooth curve through evenly spaced points (N, 2)."""
     return float(np.sqrt(enclosed_area(points) / np.pi))
 
 
 def enclosed_area(points: np.ndarray) -> float:
-    """Return the area within a closed smooth curve through points (N, 2) that are spread evenly along it.
+    """Return the area enclosed by a closed smooth curve through points (N, 2) that are evenly spaced along it.
 
-    It is the area of the polygon times that of a circle over that of the regular polygon in it: exact for an ellipse.
+    It is the area of the polygon times the ratio of a circle's area to that of its inscribed regular polygon: exact for
+    an ellipse.
     """
     u, v = points.T
     polygon = 0.5 * abs(float(np.sum(u * np.roll(v, -1) - v * np.roll(u, -1))))
@@ -208,32 +211,36 @@ def aim_chief_rays(
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the trace.
     to_stop : SystemBatch
         B systems from the image side to the stop (last element).
-    points : np.ndarray
-        Image points, world, (B, M, 3).
-    guess : np.ndarray
+    points : (B, M, 3) ndarray
+        Image points in the world frame, metres.
+    guess : ndarray
         Rough direction from the image to the last mirror, broadcastable to (B, M, 3).
-    transverse : np.ndarray
-        Direction near which the first transverse axis is taken, (3,).
-    start : tuple[np.ndarray, np.ndarray] | None
-        Parameters (B, M, 2) and their Jacobian (B, M, 2, 2) of rays that are near, as this returns them.
+    transverse : (3,) ndarray
+        Direction near which the first transverse axis is taken.
+    start : (ndarray, ndarray), optional
+        Parameters (B, M, 2) and Jacobian (B, M, 2, 2) of nearby rays, as returned by this function.
 
     Returns
     -------
-    tuple[RayFan, np.ndarray, np.ndarray]
-        The family of the rays, their parameters (B, M, 2) and Jacobian (B, M, 2, 2).
+    fan : RayFan
+        Family of the rays.
+    q : (B, M, 2) ndarray
+        Parameters of the rays.
+    jacobian : (B, M, 2, 2) ndarray
+        Jacobian of the aiming.
 
     Raises
     ------
     AimError
-        No ray gets there.
+        No ray reaches the centre of the stop.
     """
     direction = np.broadcast_to(guess, points.shape)
     fan = RayFan(points, direction, transverse_axes(direction, np.broadcast_to(transverse, direction.shape)))
-    near, slope = (None, None) if start is None else start
-    return fan, *aim(backend, to_stop, fan, np.zeros(2), near, slope)
+    initial, slope = (None, None) if start is None else start
+    return fan, *aim(backend, to_stop, fan, np.zeros(2), initial, slope)
 
 
 def chief_rays(
@@ -245,42 +252,44 @@ def chief_rays(
     transverse: np.ndarray,
     start: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Chief rays of image points, traced backward from the image through the centre of the stop.
+    """Return the chief rays of image points, traced backward from the image through the centre of the stop.
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the trace.
     to_stop : SystemBatch
         B systems from the image side to the stop (last element).
     to_object : SystemBatch
-        The same systems on to the first mirror.
-    points : np.ndarray
-        Image points, world, (B, M, 3).
-    guess : np.ndarray
+        The same systems, continued to the first mirror.
+    points : (B, M, 3) ndarray
+        Image points in the world frame, metres.
+    guess : ndarray
         Rough direction from the image to the last mirror, broadcastable to (B, M, 3).
-    transverse : np.ndarray
-        Direction near which the first transverse axis is taken, (3,).
-    start : tuple[np.ndarray, np.ndarray] | None
-        As of `aim_chief_rays`.
+    transverse : (3,) ndarray
+        Direction near which the first transverse axis is taken.
+    start : (ndarray, ndarray), optional
+        Parameters and Jacobian of nearby rays, as for ``aim_chief_rays``.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray]
-        Points on the rays after the first mirror, and object-space directions toward the scene, world, (B, M, 3) each.
+    position : (B, M, 3) ndarray
+        Points on the rays after the first mirror, world frame, metres.
+    direction : (B, M, 3) ndarray
+        Object-space unit directions toward the scene, world frame.
 
     Raises
     ------
     AimError, BeamMissedError
-        Light is lost.
+        A ray does not reach the stop or the first mirror.
     """
     fan, q, _ = aim_chief_rays(backend, to_stop, points, guess, transverse, start)
     position, direction = fan.at(q)
     out = trace(backend, to_object, make_rays(backend, position, direction), world=True)
     assert out.world is not None
-    places, leaving, _, valid = out.numpy(out.world)
-    require_some(valid, "the imaging path")
-    return places, leaving
+    origins, leaving, _, valid = out.numpy(out.world)
+    require_rays(valid, "the imaging path")
+    return origins, leaving
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,16 +298,16 @@ class LineChange:
 
     Attributes
     ----------
-    d_alpha, d_beta : np.ndarray
+    d_alpha, d_beta : (B,) ndarray
         Rotation of the line of sight about the nominal camera's Y and X, radians (right-hand rule).
-    d_gamma : np.ndarray
+    d_gamma : (B,) ndarray
         Rotation of the imaged line about the line of sight, radians.
-    principal_distance : np.ndarray
-        f = sum(L tan W)/sum(tan^2 W) over the line (paper 004, eq. 3), (B,), metres. L is counted in pixels times their
-        nominal pitch, so that f is what the pixels see: a camera that grows with its line CCD keeps the angle of a
-        pixel, and so f.
-    d_f : np.ndarray
-        Its change, metres.
+    principal_distance : (B,) ndarray
+        f = sum(L tan W)/sum(tan^2 W) over the line (paper 004, eq. 3), metres. L is counted in pixels times their
+        nominal pitch, so that f describes the angle of a pixel: a camera that expands together with its line CCD keeps
+        that angle, and so f.
+    d_f : (B,) ndarray
+        Change of the principal distance, metres.
     nominal_distance : float
         Principal distance of the nominal state, metres.
     """
@@ -312,29 +321,32 @@ class LineChange:
 
     @property
     def vector(self) -> np.ndarray:
-        """The changes d_alpha, d_beta, d_gamma (radians) and d_f (metres), (B, 4)."""
+        """Changes d_alpha, d_beta, d_gamma (radians) and d_f (metres), (B, 4)."""
         return np.stack([self.d_alpha, self.d_beta, self.d_gamma, self.d_f], axis=-1)
 
 
 def line_tangents(
     sight: np.ndarray, position: np.ndarray, camera: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the points of a line look, in the tangent plane about each state's own line of sight.
+    """Return lines of sight, roll and tangents of a line's view directions, about each state's own line of sight.
 
     Parameters
     ----------
-    sight : np.ndarray
-        Object-space directions of the line's points, world, (S, M, 3); M odd, the middle point is the line's centre.
-    position : np.ndarray
-        As of `line_change`, (M,), metres.
-    camera : np.ndarray
-        As of `line_change`, (3, 3).
+    sight : (S, M, 3) ndarray
+        Object-space directions of the line's points in the world frame; M odd, the middle point is the line's centre.
+    position : (M,) ndarray
+        Coordinate of the points along camera Y on the nominal line CCD, metres.
+    camera : (3, 3) ndarray
+        Nominal camera axes X, Y, Z in the world as columns.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray, np.ndarray]
-        Lines of sight in the camera's axes (S, 3), roll of the imaged line about them (S,), radians, and tangents along
-        the imaged line, (S, M), positive as ``position``.
+    axis : (S, 3) ndarray
+        Lines of sight in the camera's axes.
+    roll : (S,) ndarray
+        Roll of the imaged line about them, radians.
+    tangent : (S, M) ndarray
+        Tangents along the imaged line, with the sign of ``position``.
     """
     local = product(sight, camera)
     middle = sight.shape[1] // 2
@@ -354,22 +366,22 @@ def line_tangents(
 
 
 def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> LineChange:
-    """Compare perturbed states with the nominal one.
+    """Return the changes of perturbed states against the nominal one.
 
     Parameters
     ----------
-    sight : np.ndarray
-        Object-space directions of the line's points, world, (1 + B, M, 3); entry 0 is the nominal state; M odd, the
-        middle point is the line's centre.
-    position : np.ndarray
-        Coordinate of the points along camera Y on the nominal line CCD, (M,), metres.
-    camera : np.ndarray
-        Columns = nominal camera axes X, Y, Z in the world, (3, 3); Z is the nominal line of sight.
+    sight : (1 + B, M, 3) ndarray
+        Object-space directions of the line's points in the world frame; entry 0 is the nominal state; M odd, the middle
+        point is the line's centre.
+    position : (M,) ndarray
+        Coordinate of the points along camera Y on the nominal line CCD, metres.
+    camera : (3, 3) ndarray
+        Nominal camera axes X, Y, Z in the world as columns; Z is the nominal line of sight.
     """
     axis, roll, tangent = line_tangents(sight, position, camera)
     distance = inner(tangent, position) / np.sum(tangent**2, axis=-1)
     rolled = roll[1:] - roll[0]
-    # a camera that images upright has a roll of half a turn, by either sign
+    # a camera with an upright image has a roll of 180 deg, of either sign
     rolled = rolled - 2.0 * np.pi * np.round(rolled / (2.0 * np.pi))
     return LineChange(
         d_alpha=np.arctan2(axis[1:, 0], axis[1:, 2]),

@@ -1,21 +1,21 @@
-"""What turns and displaces a monitor's beam, kind by kind: faces on bodies, elements on faces, clear apertures.
+"""Reflectors of a monitor's beam, by kind: their bodies and faces, optical elements and clear apertures.
 
 The 180-deg prism is a slice of a corner cube. Its frame has z along the beam that enters, x along the transfer, the
 origin in the middle of its window:
 
     z ^        mirror ________________________ roof_a, roof_b
       |              /                        |    (seen along y, the two roof faces
-      |             /                         |     stand at +-45 deg about the ridge)
+      |             /                         |     are at +-45 deg about the ridge)
       +---> x       |__entry____________exit__|
                              window
 
-A ray that enters at (x, y) leaves at (-x, -y), antiparallel: the point reflection at the apex (0, 0, z_apex), whatever
-the prism's attitude. The beam passes at a distance ``roof_offset`` from the ridge: all of it meets roof_a first.
+A ray that enters at (x, y) leaves at (-x, -y), antiparallel: point reflection at the apex (0, 0, z_apex), whatever the
+prism's attitude. The beam passes at a distance ``roof_offset`` from the ridge, so that all of it meets roof_a first.
 
 The 0-deg prism is a rhomboid, its frame's z along the beam, x along the displacement, the origin in its middle.
 
-Both have a hollow twin without glass in the beam: plane mirrors on plates, held by a bar of the same material. Bar and
-plates are one body for heat; the bar is the reflector's own body, the plates stand on it.
+Both have a hollow counterpart without glass in the beam: plane mirrors on plates, held by a bar of the same material.
+Bar and plates are one body for heat; the bar is the reflector's own body, which carries the plates.
 """
 
 from __future__ import annotations
@@ -37,60 +37,61 @@ from optics.numerics.extension_table import ExtensionTable
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Element, Interaction
 
-EDGE = 0.003
-"""How far glass and mirrors reach beyond their clear apertures, metres."""
-BOND = 1e-4
-"""Between the plate of a mirror and the frame that holds it, metres."""
+EDGE_MARGIN = 0.003
+"""Margin of glass and mirrors beyond their clear apertures, metres."""
+BOND_GAP = 1e-4
+"""Gap between the plate of a mirror and the frame that holds it, metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """What the beam does at one optical face.
+    """Interaction of the beam with one optical face.
 
     Attributes
     ----------
     name : str
-        Of the element within the prism, e.g. ``entry``.
+        Name of the element within the prism, e.g. ``entry``.
     face : str
-        Which face (its body is ``<solid>/<face>``, with a child for each passage if there are several).
+        Name of the face (its body is ``<solid>/<face>``, with a child for each passage if there are several).
     interaction : Interaction
-        Refract, reflect or total.
-    place : np.ndarray
-        Of the beam's middle on the face, in the solid's frame, metres.
-    direction : np.ndarray
-        Of the beam when it arrives, in the solid's frame.
+        Refraction, reflection or total reflection.
+    position : (3,) ndarray
+        Centre of the beam on the face, in the solid's frame, metres.
+    direction : (3,) ndarray
+        Direction of the beam when it arrives, in the solid's frame.
     """
 
     name: str
     face: str
     interaction: Interaction
-    place: np.ndarray
+    position: np.ndarray
     direction: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """Where a reflector stands and what it is to do; its frame has z along the beam that enters, x along the way on
-    which the beam is displaced.
+    """Pose and required geometry of a reflector.
+
+    Its frame has z along the entering beam, x along the beam's displacement.
 
     Attributes
     ----------
     path : str
-        Of its body; all other bodies stand below it.
+        Path of its body; all its other bodies are below it.
     pose : Pose
-        Of that body in the one that carries it.
+        Pose of that body in the body that carries it.
     key : str
         Prefix of its elements' names.
     material : str
-        Of its glass, or of the frame and the mirrors that it holds.
+        Material of its glass, or of the frame and the mirrors that it holds.
     length : float
-        From the middle of the entering to that of the leaving beam along x, metres.
+        Distance along x from the centre of the entering to that of the leaving beam, metres.
     width : float
-        Of the clear apertures, metres.
+        Width of the clear apertures, metres.
     hand : float
-        Of a reflector that returns the beam, +1: the beam enters at +y of the middle; -1: the mirror image.
-    errors : Mapping[str, tuple[float, float]]
-        Face -> tilt about its x and y, as made, radians.
+        Handedness of a reflector that returns the beam; +1: the beam enters at +y of the middle; -1: the mirror image.
+    errors : mapping of str to (float, float)
+        Face -> manufacturing tilt about its x and y, radians.
     """
 
     path: str
@@ -105,20 +106,21 @@ class Mount:
 
 @dataclass(frozen=True, eq=False)
 class ReflectorParts:
-    """A reflector ready for the assembly.
+    """Bodies, elements and solids of a reflector, ready for the assembly.
 
     Attributes
     ----------
-    bodies : tuple[Body, ...]
-        Its own and its faces'; the first has the pivots ``apex`` and ``centre``.
-    elements : tuple[Element, ...]
-        In the order in which the beam that leaves the camera meets them, with clear apertures.
-    solids : tuple[Solid, ...]
-        Its glass, or its frame and mirrors: those whose bodies another one's carries are one piece with it.
+    bodies : tuple of Body
+        Its own body and its faces'; the first has the pivots ``apex`` and ``centre``.
+    elements : tuple of Element
+        Elements with clear apertures, in the order in which the beam that leaves the camera meets them.
+    solids : tuple of Solid
+        Its glass, or its frame and mirrors; solids whose body is carried by another one's are one piece with it.
     path_length : float
-        Of the beam's middle inside the glass, metres.
-    apex : tuple[float, float, float]
-        Of a reflector that returns the beam the point about which it may turn, else its middle, in its frame, metres.
+        Length of the beam's central ray inside the glass, metres.
+    apex : tuple of float
+        For a reflector that returns the beam, the point about which rotations leave the beam unchanged; else its
+        middle; in its frame, metres.
     """
 
     bodies: tuple[Body, ...]
@@ -128,40 +130,43 @@ class ReflectorParts:
     apex: tuple[float, float, float]
 
 
-def _nowhere(width: float) -> float:
+def _no_offset(width: float) -> float:
+    """Return no lateral offset, whatever the width."""
     return 0.0
 
 
-def _middle(length: float, width: float) -> tuple[float, float, float]:
+def _origin(length: float, width: float) -> tuple[float, float, float]:
+    """Return the origin of the frame, whatever the size."""
     return (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Reflector:
-    """A kind of reflector, as the monitor of an instrument's file may name it.
+    """Kind of reflector that the monitor of an instrument's file may name.
 
     Attributes
     ----------
     returns : bool
-        The beam goes back antiparallel, from (x, y) to (-x, -y) (what stands for the 180-deg prism); else on in its
-        direction, displaced by ``Mount.length`` along x (the 0-deg prism).
-    faces : tuple[str, ...]
-        Those that may be tilted as made.
-    parts : Callable[[Mount], ReflectorParts]
-        Makes it; ValueError where it cannot be made for its mount.
-    sideways : Callable[[float], float]
-        Width -> how far from the middle along y the beam passes, metres.
-    null_point : Callable[[float, float], tuple[float, float, float]]
-        Length and width -> where it may turn without turning the beam, in its frame, metres.
+        True: the beam returns antiparallel, from (x, y) to (-x, -y) (like the 180-deg prism); False: it keeps its
+        direction, displaced by ``Mount.length`` along x (like the 0-deg prism).
+    faces : tuple of str
+        Names of the faces that may have a manufacturing tilt.
+    parts : callable
+        Mount -> ReflectorParts; raises ValueError where the reflector is impossible for its mount.
+    lateral_offset : callable
+        Width -> distance of the beam from the middle along y, metres.
+    null_point : callable
+        Length and width -> point about which rotations leave the beam's direction and position unchanged, in its frame,
+        metres.
     transparent : bool
-        It is made of glass that the beam goes through, whose index has to be known; else of any material.
+        True for a reflector of glass that the beam passes through, whose index has to be known; False for any material.
     """
 
     returns: bool
     faces: tuple[str, ...]
     parts: Callable[[Mount], ReflectorParts]
-    sideways: Callable[[float], float] = _nowhere
-    null_point: Callable[[float, float], tuple[float, float, float]] = _middle
+    lateral_offset: Callable[[float], float] = _no_offset
+    null_point: Callable[[float, float], tuple[float, float, float]] = _origin
     transparent: bool = True
 
 
@@ -172,62 +177,68 @@ _S = 1.0 / sqrt(2.0)
 
 
 def prism_180(mount: Mount) -> ReflectorParts:
-    """The lateral-transfer prism."""
+    """Return the parts of the lateral-transfer prism."""
     length, width, hand = mount.length, mount.width, mount.hand
     off = roof_offset(width)
     half = 0.5 * width
     height = _beam_height(width)
     apex = null_point(length, width)
-    reach, side = 0.5 * length + half + EDGE, off + half + EDGE
+    end, side = 0.5 * length + half + EDGE_MARGIN, off + half + EDGE_MARGIN
     planes: list[Plane] = [
         ("window", (0, 0, -1), (0, 0, 0), Coating.TRANSMITTING),
         ("mirror", (-1, 0, 1), apex, Coating.MIRROR),
         ("roof_a", (_S, hand, _S), apex, Coating.TOTAL),
         ("roof_b", (_S, -hand, _S), apex, Coating.TOTAL),
-        ("top", (0, 0, 1), (0, 0, height + half + EDGE), Coating.GROUND),
+        ("top", (0, 0, 1), (0, 0, height + half + EDGE_MARGIN), Coating.GROUND),
         ("side_a", (0, 1, 0), (0, side, 0), Coating.GROUND),
         ("side_b", (0, -1, 0), (0, -side, 0), Coating.GROUND),
-        ("end_a", (-1, 0, 0), (-reach, 0, 0), Coating.GROUND),
-        ("end_b", (1, 0, 0), (reach, 0, 0), Coating.GROUND),
+        ("end_a", (-1, 0, 0), (-end, 0, 0), Coating.GROUND),
+        ("end_b", (1, 0, 0), (end, 0, 0), Coating.GROUND),
     ]
     x = 0.5 * length
-    up, along, turned = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.5, -hand * _S, -0.5])
-    at, y = np.array, hand * off
+    up, along, reflected = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.5, -hand * _S, -0.5])
+    point, y = np.array, hand * off
     passages = [
-        Passage("entry", "window", Interaction.REFRACT, at([-x, y, 0.0]), up),
-        Passage("mirror", "mirror", Interaction.REFLECT, at([-x, y, height]), up),
-        Passage("roof_a", "roof_a", Interaction.TOTAL, at([x - sqrt(2.0) * off, y, height]), along),
-        Passage("roof_b", "roof_b", Interaction.TOTAL, at([x, -y, height - sqrt(2.0) * off]), turned),
-        Passage("exit", "window", Interaction.REFRACT, at([x, -y, 0.0]), -up),
+        Passage("entry", "window", Interaction.REFRACT, point([-x, y, 0.0]), up),
+        Passage("mirror", "mirror", Interaction.REFLECT, point([-x, y, height]), up),
+        Passage("roof_a", "roof_a", Interaction.TOTAL, point([x - sqrt(2.0) * off, y, height]), along),
+        Passage("roof_b", "roof_b", Interaction.TOTAL, point([x, -y, height - sqrt(2.0) * off]), reflected),
+        Passage("exit", "window", Interaction.REFRACT, point([x, -y, 0.0]), -up),
     ]
     return _parts(mount, planes, passages, apex, {"window": (0.0, 0.0, 0.0)})
 
 
 def _beam_height(width: float) -> float:
-    """Height of the transferred beam above the window, metres: its way down from the roof clears the window's edge."""
-    return sqrt(2.0) * roof_offset(width) + sqrt(3.0) * 0.5 * width + EDGE
+    """Return the height of the transferred beam above the window, metres; the returning beam clears the window's edge."""
+    return sqrt(2.0) * roof_offset(width) + sqrt(3.0) * 0.5 * width + EDGE_MARGIN
 
 
 def null_point(length: float, width: float) -> tuple[float, float, float]:
-    """Apex of the 180-deg prism's three reflecting faces in its frame, metres: turns about it leave the beam alone."""
+    """Return the apex of the 180-deg prism's reflecting faces in its frame, metres.
+
+    Rotations about it leave the beam unchanged.
+    """
     return (0.0, 0.0, _beam_height(width) + 0.5 * length)
 
 
 def roof_offset(width: float) -> float:
-    """How far from the ridge the beam passes the 180-deg prism, metres: no clear aperture reaches over the ridge."""
-    return 0.5 * width + EDGE
+    """Return the beam's distance from the ridge of the 180-deg prism, metres.
+
+    It is so large that no clear aperture extends over the ridge.
+    """
+    return 0.5 * width + EDGE_MARGIN
 
 
 def prism_0(mount: Mount) -> ReflectorParts:
-    """The rhomboid.
+    """Return the parts of the rhomboid.
 
     Raises
     ------
     ValueError
-        The displacement is too small for the width, so that the rhomboid would cut the beam.
+        The displacement is too small for the width, so that the rhomboid would vignette the beam.
     """
     shift, width = mount.length, mount.width
-    half = 0.5 * width + EDGE
+    half = 0.5 * width + EDGE_MARGIN
     _require_length(mount, "a rhomboid", "displace", half + 0.5 * width)
     x = 0.5 * shift
     planes: list[Plane] = [
@@ -249,51 +260,55 @@ def prism_0(mount: Mount) -> ReflectorParts:
 
 
 def hollow_transfer(mount: Mount) -> ReflectorParts:
-    """Three mirrors square to each other: a slice of a hollow corner cube.
+    """Return the parts of three mutually perpendicular mirrors: a slice of a hollow corner cube.
 
     Raises
     ------
     ValueError
-        They stand so near to each other that one is in the other's beam.
+        The mirrors are so close that one would block another's beam.
     """
     length, width, hand = mount.length, mount.width, mount.hand
     off, half, apex = hollow_offset(width), 0.5 * width, hollow_null_point(length, width)
     x, y, height = 0.5 * length, hand * off, apex[2] - 0.5 * length
-    # how far roof_a reaches back along the transfer, over the ridge's side, and the mirror toward it
-    least = sqrt(2.0) * off + (sqrt(3.0) + 1.0) * half + 3.0 * (EDGE + _thickness(width))
+    # extent of roof_a back along the transfer, on the ridge's side, and of the mirror toward it
+    least = sqrt(2.0) * off + (sqrt(3.0) + 1.0) * half + 3.0 * (EDGE_MARGIN + _thickness(width))
     _require_length(mount, "mirrors", "transfer", least)
-    up, along, turned = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.5, -hand * _S, -0.5])
+    up, along, reflected = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.5, -hand * _S, -0.5])
     mirrors = [
         (_mirror("mirror", [-x, y, height], up), (1, 0, -1)),
         (_mirror("roof_a", [x - sqrt(2.0) * off, y, height], along), (-_S, -hand, -_S)),
-        (_mirror("roof_b", [x, -y, height - sqrt(2.0) * off], turned), (-_S, hand, -_S)),
+        (_mirror("roof_b", [x, -y, height - sqrt(2.0) * off], reflected), (-_S, hand, -_S)),
     ]
     return _on_frame(mount, mirrors, apex, 2)
 
 
 def hollow_offset(width: float) -> float:
-    """How far from the ridge the beam passes the hollow transfer, metres: the plates of the roof do not meet there."""
-    return roof_offset(width) + 2.0 * EDGE + _thickness(width)
+    """Return the beam's distance from the ridge of the hollow transfer, metres.
+
+    It is so large that the plates of the roof do not touch at the ridge.
+    """
+    return roof_offset(width) + 2.0 * EDGE_MARGIN + _thickness(width)
 
 
 def hollow_null_point(length: float, width: float) -> tuple[float, float, float]:
-    """Where the planes of the three mirrors meet, in the frame of the hollow transfer, metres; no mirror reaches below
-    z = 0.
+    """Return the intersection of the three mirror planes, in the frame of the hollow transfer, metres.
+
+    It is so high that no mirror extends below z = 0.
     """
-    height = sqrt(2.0) * hollow_offset(width) + sqrt(3.0) * 0.5 * width + 3.0 * EDGE
+    height = sqrt(2.0) * hollow_offset(width) + sqrt(3.0) * 0.5 * width + 3.0 * EDGE_MARGIN
     return (0.0, 0.0, height + 0.5 * length)
 
 
 def periscope(mount: Mount) -> ReflectorParts:
-    """Two parallel mirrors.
+    """Return the parts of two parallel mirrors.
 
     Raises
     ------
     ValueError
-        The displacement is so small that one stands in the other's beam.
+        The displacement is so small that one mirror would block the other's beam.
     """
     shift, width = mount.length, mount.width
-    _require_length(mount, "mirrors", "displace", width + 2.0 * (EDGE + _thickness(width)))
+    _require_length(mount, "mirrors", "displace", width + 2.0 * (EDGE_MARGIN + _thickness(width)))
     x, along_z, along_x = 0.5 * shift, np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
     mirrors = [
         (_mirror("mirror_a", [-x, 0.0, 0.0], along_z), (1, 0, -1)),
@@ -303,7 +318,7 @@ def periscope(mount: Mount) -> ReflectorParts:
 
 
 def _require_length(mount: Mount, what: str, does: str, least: float) -> None:
-    """Refuse a reflector whose parts would cut the beam, since it displaces it by less than ``least`` metres."""
+    """Raise UnphysicalError if the reflector displaces the beam by less than ``least`` metres and would vignette it."""
     if mount.length < least:
         width, length = 1e3 * mount.width, 1e3 * mount.length
         text = f"{mount.path}: {what} of width {width:.4g} mm cannot {does} the beam by only {length:.4g} mm"
@@ -311,13 +326,16 @@ def _require_length(mount: Mount, what: str, does: str, least: float) -> None:
 
 
 def _thickness(width: float) -> float:
-    """Thickness of a mirror's plate, metres: an eighth of its length, which is sqrt(2) times the beam's width."""
+    """Return the thickness of a mirror's plate, metres.
+
+    It is an eighth of the plate's length, which is sqrt(2) times the beam's width.
+    """
     return 0.18 * width
 
 
-def _mirror(name: str, place: Sequence[float], direction: np.ndarray) -> Passage:
-    """What the beam does at a mirror of its own face."""
-    return Passage(name, name, Interaction.REFLECT, np.array(place), direction)
+def _mirror(name: str, position: Sequence[float], direction: np.ndarray) -> Passage:
+    """Return the passage of a mirror that has a face of its own."""
+    return Passage(name, name, Interaction.REFLECT, np.array(position), direction)
 
 
 def _on_frame(
@@ -326,18 +344,19 @@ def _on_frame(
     apex: tuple[float, float, float],
     axis: int,
 ) -> ReflectorParts:
-    """Each mirror, given with its normal toward the light, on a plate of its own; a bar beyond them all along ``axis``
-    that holds them.
+    """Return mirrors on plates of their own, held by a bar beyond them all along ``axis``.
+
+    Each mirror is given with its normal toward the light.
     """
     passages = [passage for passage, _ in mirrors]
     planes: list[Plane] = [
-        (p.face, normal, (p.place[0], p.place[1], p.place[2]), Coating.MIRROR) for p, normal in mirrors
+        (p.face, normal, (p.position[0], p.position[1], p.position[2]), Coating.MIRROR) for p, normal in mirrors
     ]
     bodies, elements, _ = _faces(mount, planes, passages, apex, {}, None)
     plates, corners = [], []
     for body, element in zip(bodies[1:], elements, strict=True):
         assert isinstance(element.aperture, Ellipse)
-        high = np.array([element.aperture.half_x + EDGE, element.aperture.half_y + EDGE, 0.0])
+        high = np.array([element.aperture.half_x + EDGE_MARGIN, element.aperture.half_y + EDGE_MARGIN, 0.0])
         low = np.array([-high[0], -high[1], -_thickness(mount.width)])
         faces = _box(body.path, low, high, Coating.MIRROR)
         plates.append(Solid(body.path, mount.material, faces, transparent=False))
@@ -346,14 +365,17 @@ def _on_frame(
     middle, half = 0.5 * (low + high), 0.5 * mount.width
     other = 3 - axis  # the bar lies along x
     low[other], high[other] = middle[other] - half, middle[other] + half
-    low[axis] = high[axis] + BOND
+    low[axis] = high[axis] + BOND_GAP
     high[axis] = low[axis] + _thickness(mount.width)
     frame = Solid(mount.path, mount.material, _box(mount.path, low, high), transparent=False)
     return ReflectorParts(bodies, elements, (frame, *plates), 0.0, apex)
 
 
 def _box(body: str, low: np.ndarray, high: np.ndarray, front: Coating = Coating.GROUND) -> tuple[Face, ...]:
-    """Faces of a box between two corners in a body's frame, metres; ``front`` is the one toward +z."""
+    """Return the faces of a box between two corners in a body's frame, metres.
+
+    ``front`` is the coating of the face toward +z.
+    """
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     out = []
     for name, axis, sign in (("front", 2, 1.0), ("back", 2, -1.0), *_SIDES):
@@ -373,11 +395,12 @@ def _parts(
     apex: tuple[float, float, float],
     origins: Mapping[str, tuple[float, float, float]],
 ) -> ReflectorParts:
-    """Bodies, elements and solid from planes and passages; ``origins`` places the frame of a face that two passages
-    share.
+    """Return bodies, elements and solid of a prism from planes and passages.
+
+    ``origins`` gives the origin of the frame of a face that two passages share.
     """
     bodies, elements, faces = _faces(mount, planes, passages, apex, origins, mount.path)
-    inside = sum(float(norm(b.place - a.place)) for a, b in pairwise(passages))
+    inside = sum(float(norm(b.position - a.position)) for a, b in pairwise(passages))
     return ReflectorParts(bodies, elements, (Solid(mount.path, mount.material, faces),), inside, apex)
 
 
@@ -389,7 +412,10 @@ def _faces(
     origins: Mapping[str, tuple[float, float, float]],
     solid: str | None,
 ) -> tuple[tuple[Body, ...], tuple[Element, ...], tuple[Face, ...]]:
-    """Bodies and elements from planes and passages, and all faces; ``solid`` is the glass that light goes through."""
+    """Return bodies, elements and all faces from planes and passages.
+
+    ``solid`` is the glass that light passes through.
+    """
     path, width, errors = mount.path, mount.width, mount.errors
     used = {p.face: p for p in reversed(passages)}
     shared = {face for face in used if sum(p.face == face for p in passages) > 1}
@@ -403,22 +429,22 @@ def _faces(
             faces.append(Face(name, path, coating, Pose(_axes(np.array(normal, float), None), np.array(point, float))))
             continue
         passage = used[name]
-        origin = np.array(origins[name]) if name in origins else passage.place
+        origin = np.array(origins[name]) if name in origins else passage.position
         frame = Pose(_axes(np.array(normal, float), passage.direction), origin)
         tilted = frame @ Pose(rotation_matrix(np.array([*errors.get(name, (0.0, 0.0)), 0.0])))
         bodies.append(Body(f"{path}/{name}", tilted))
         faces.append(Face(name, f"{path}/{name}", coating))
         frames[name] = frame
-        # two footprints far apart on one face tilt differently when it bends: each has a body of its own
+        # two footprints far apart on one face tilt differently when it bends, so each has a body of its own
         bodies += [
-            Body(_footprint(path, p, shared), Pose(np.eye(3), frame.inverse().apply(p.place)))
+            Body(_footprint(path, p, shared), Pose(np.eye(3), frame.inverse().apply(p.position)))
             for p in passages
             if p.face == name and name in shared
         ]
     elements = []
     for passage in passages:
         frame = frames[passage.face]
-        centre = np.zeros(3) if passage.face in shared else frame.inverse().apply(passage.place)
+        centre = np.zeros(3) if passage.face in shared else frame.inverse().apply(passage.position)
         cosine = abs(float(inner(frame.rotation[:, 2], passage.direction)))
         aperture = Ellipse(0.5 * width / cosine, 0.5 * width, (float(centre[0]), float(centre[1])))
         name, body = f"{mount.key}/{passage.name}", _footprint(path, passage, shared)
@@ -427,18 +453,19 @@ def _faces(
 
 
 def _footprint(path: str, passage: Passage, shared: set[str]) -> str:
-    """Body on which a passage's element stands: the face's, or a child of it when the beam meets the face twice."""
-    own = f"{path}/{passage.face}"
-    return f"{own}/{passage.name}" if passage.face in shared else own
+    """Return the body of a passage's element: the face's, or a child of it when the beam meets the face twice."""
+    face = f"{path}/{passage.face}"
+    return f"{face}/{passage.name}" if passage.face in shared else face
 
 
 def _centre(passages: list[Passage]) -> tuple[float, float, float]:
-    middle = np.mean([p.place for p in passages], axis=0)
+    """Return the mean position of the passages, metres."""
+    middle = np.mean([p.position for p in passages], axis=0)
     return (float(middle[0]), float(middle[1]), float(middle[2]))
 
 
 def _axes(normal: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
-    """Columns x, y, z of a face's frame: z along the normal, x where the arriving beam leans."""
+    """Return the axes of a face's frame as columns: z along the normal, x along the arriving beam's tangential part."""
     z = normal / norm(normal)
     lean = np.zeros(3) if direction is None else direction - inner(direction, z) * z
     if norm(lean) < 1e-6:
@@ -451,9 +478,9 @@ def _axes(normal: np.ndarray, direction: np.ndarray | None) -> np.ndarray:
 def facet_block(
     path: str, material: str, facets: Mapping[str, str], spread: tuple[float, float], height: float
 ) -> Solid:
-    """The central prism: mirror facets on bodies of their own (name -> path), closed by side walls and a bottom.
+    """Return the central prism: mirror facets on bodies of their own (name -> path), side walls and a bottom.
 
-    The walls stand as far behind the middles of the facets as those are from the apex.
+    The walls are as far behind the centres of the facets as those are from the apex.
     """
     x, y = 2.0 * spread[0], 2.0 * spread[1]
     walls: list[Plane] = [
@@ -478,7 +505,8 @@ _REFLECTORS: dict[str, Reflector] = {
     "periscope": Reflector(False, ("mirror_a", "mirror_b"), periscope, transparent=False),
 }
 REFLECTORS = ExtensionTable("reflectors", _REFLECTORS, Reflector)
-"""Name that an instrument's file may write as ``kind`` of ``monitor.prism_180``, if it returns the beam, or of
-``monitor.prism_0`` -> kind. A new one is added here: the reader of files, the instrument, its images, heat, stray light
-and pictures know it from this entry.
+"""Kinds of reflectors by the name that an instrument's file writes as ``kind``.
+
+Kinds that return the beam belong to ``monitor.prism_180``, others to ``monitor.prism_0``. A new kind is added here: the
+file reader, the instrument, its images, heat, stray light and pictures use this table.
 """

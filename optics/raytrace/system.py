@@ -1,11 +1,11 @@
-"""Numbers of a sequence of elements for a batch of systems, ready for the trace.
+"""Batches of systems: the numbers of element sequences in perturbed states, ready for the trace.
 
 A *system* is one sequence in one perturbed state. Sequences of the same structure (same kinds of surface in the same
 order) can be batched together: the two cameras of an instrument, left and right channels, hundreds of states.
 
-The assembly keeps the numbers of the design. States are written over them: frames, indices and their gradients, radii,
-conic constants and Zernike figures; and each number of a body that has grown goes with a power of its size. Elements
-are worked out one by one only for derivatives and for figures on a grid.
+The assembly caches the numbers of the nominal design. States overwrite them: frames, indices and their gradients,
+radii, conic constants and Zernike figures; and each number of an expanded body is scaled by a power of its size.
+Elements are computed one by one only for derivatives and for grid figures.
 """
 
 from __future__ import annotations
@@ -25,44 +25,48 @@ from optics.raytrace.assembly import Assembly, Element
 from optics.raytrace.element_numbers import (
     ElementNumbers,
     FrameNumbers,
+    LocalNumbers,
     Medium,
-    OwnNumbers,
     Structure,
     grid_numbers,
+    local_numbers_of,
     media_along,
-    own_numbers_of,
     structure_of,
 )
 
 
-def touched_bodies(assembly: Assembly, states: Sequence[State], placed: PlacedBodies) -> set[str]:
-    """Bodies that some state names, or that stand or are otherwise than designed because their carriers do."""
+def changed_bodies(assembly: Assembly, states: Sequence[State], placed: PlacedBodies) -> set[str]:
+    """Return the bodies that a state names, or whose pose or size differs from nominal because their carriers' does."""
     nominal = assembly.place()
-    other = np.any(placed.rotation != nominal.rotation, axis=(0, 2, 3))
-    other |= np.any(placed.translation != nominal.translation, axis=(0, 2))
-    other |= np.any(placed.scale != nominal.scale, axis=0)
-    return {path for path, i in placed.index.items() if other[i]}.union(*states)
+    changed = np.any(placed.rotation != nominal.rotation, axis=(0, 2, 3))
+    changed |= np.any(placed.translation != nominal.translation, axis=(0, 2))
+    changed |= np.any(placed.scale != nominal.scale, axis=0)
+    return {path for path, i in placed.index.items() if changed[i]}.union(*states)
 
 
 def frames_of(placed: PlacedBodies, bodies: np.ndarray) -> np.ndarray:
-    """Per element of chains, the transform into its frame from that of the element before: numbers of
-    ``FrameNumbers``, (K, 12, C * S), chain by chain.
+    """Return the transforms into each element's frame from that of the element before, for all chains and states.
 
     Parameters
     ----------
     placed : PlacedBodies
-        The bodies of S states.
-    bodies : np.ndarray
-        Numbers of those of the elements, (C, K).
+        World poses of the bodies in S states.
+    bodies : (C, K) ndarray of int
+        Indices of the elements' bodies, for C chains of K elements.
+
+    Returns
+    -------
+    (K, 12, C * S) ndarray
+        Numbers of ``FrameNumbers`` per element, chain by chain.
     """
     rotation, translation = placed.rotation[:, bodies], placed.translation[:, bodies]
-    turn, offset = np.empty_like(rotation), np.empty_like(translation)
-    turn[:, :, 0] = np.swapaxes(rotation[:, :, 0], -1, -2)
+    relative, offset = np.empty_like(rotation), np.empty_like(translation)
+    relative[:, :, 0] = np.swapaxes(rotation[:, :, 0], -1, -2)
     offset[:, :, 0] = -np.einsum("scij,sci->scj", rotation[:, :, 0], translation[:, :, 0])
-    turn[:, :, 1:] = np.einsum("sckmi,sckmj->sckij", rotation[:, :, 1:], rotation[:, :, :-1])
-    away = translation[:, :, :-1] - translation[:, :, 1:]
-    offset[:, :, 1:] = np.einsum("sckmi,sckm->scki", rotation[:, :, 1:], away)
-    numbers = np.concatenate([offset[..., None], turn], axis=-1).transpose(2, 3, 4, 1, 0)
+    relative[:, :, 1:] = np.einsum("sckmi,sckmj->sckij", rotation[:, :, 1:], rotation[:, :, :-1])
+    step = translation[:, :, :-1] - translation[:, :, 1:]
+    offset[:, :, 1:] = np.einsum("sckmi,sckm->scki", rotation[:, :, 1:], step)
+    numbers = np.concatenate([offset[..., None], relative], axis=-1).transpose(2, 3, 4, 1, 0)
     return np.ascontiguousarray(numbers).reshape(len(numbers), 12, -1)
 
 
@@ -72,21 +76,21 @@ class SystemBatch:
 
     Attributes
     ----------
-    structure : tuple[Structure, ...]
-        Per element.
-    form : tuple[tuple[ElementNumbers, ...], FrameNumbers]
-        Per element what the trace reads, and the pose of the last element, with the row of each number.
-    numbers : np.ndarray
-        (L, B).
+    structure : tuple of Structure
+        Structure of each element.
+    form : (tuple of ElementNumbers, FrameNumbers)
+        Numbers that the trace reads per element, and the pose of the last element; each number replaced by its row.
+    numbers : (L, B) ndarray
+        Values of all numbers, row by row.
     world : Poses
         Poses of the elements in the world.
-    tangents : tuple[ElementNumbers, ...] | None
-        ``values`` for the derivative that was asked for (None for a number that has none), or None.
-    world_tangents : Poses | None
-        Likewise of ``world``.
-    size : np.ndarray
-        Of the last element's body relative to nominal, (B,).
-    grids : tuple[np.ndarray | None, ...]
+    tangents : tuple of ElementNumbers, optional
+        Derivatives of ``values`` by the requested parameter (None for a number that has none); None without one.
+    world_tangents : Poses, optional
+        Derivatives of ``world``.
+    size : (B,) ndarray
+        Size of the last element's body relative to nominal.
+    grids : tuple of ndarray, optional
         Per element, the spline tables of all systems' grid figures, one after the other; None without any.
     states : int
         Number of states S; systems are ordered sequence by sequence, B = sequences * S.
@@ -104,30 +108,30 @@ class SystemBatch:
 
     @property
     def count(self) -> int:
-        """B."""
+        """Number of systems B."""
         return int(self.numbers.shape[1])
 
     @cached_property
     def values(self) -> tuple[ElementNumbers, ...]:
-        """Per element, what the trace reads, each number (B,)."""
+        """Numbers that the trace reads per element, each of shape (B,)."""
         return map_leaves(lambda row: self.numbers[row], self.form[0])
 
-    def upload(self, backend: Backend, own: bool = False) -> UploadedSystems:
+    def upload(self, backend: Backend, separate: bool = False) -> UploadedSystems:
         """Copy to the backend's memory as kernel inputs; derivatives, if any, become forward-mode gradients.
 
         Parameters
         ----------
         backend : Backend
-            Where to.
+            Backend to upload to.
         own : bool
-            Each number of the systems is an array of its own, so that it may be differentiated by; else those of
-            several systems lie in one.
+            True: each number is an array of its own, so that results can be differentiated by it; False: the numbers of
+            several systems share one array.
         """
         grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
         if self.tangents is None:
-            # of a single system each number is one for all rays, which no ray needs to look up
-            alone = own or self.count == 1
-            numbers = tuple(backend.opaque_each(list(self.numbers))) if alone else backend.opaque(self.numbers)
+            # a single system has one value of each number for all rays, so that no lookup is needed
+            individually = separate or self.count == 1
+            numbers = tuple(backend.opaque_each(list(self.numbers))) if individually else backend.opaque(self.numbers)
             return UploadedSystems(backend, self.structure, self.form, numbers, grids, self.count, False)
         import drjit as dr
 
@@ -143,7 +147,7 @@ class SystemBatch:
         return UploadedSystems(backend, self.structure, self.form, tuple(numbers_in(derived)), grids, self.count, True)
 
     def take(self, systems: np.ndarray) -> SystemBatch:
-        """The systems of the given indices."""
+        """Return the systems of the given indices."""
         if np.array_equal(systems, np.arange(self.count)):
             return self
 
@@ -169,44 +173,46 @@ class Poses:
 
     Attributes
     ----------
-    rotation : np.ndarray
-        Element frame to world, (B, K, 3, 3); translation: its origin, metres, (B, K, 3).
+    rotation : (B, K, 3, 3) ndarray
+        Rotations from element frame to world.
+    translation : (B, K, 3) ndarray
+        Origins of the elements, metres.
     """
 
     rotation: np.ndarray
     translation: np.ndarray
 
     def last(self) -> FrameNumbers:
-        """Poses of the last elements."""
+        """Return the poses of the last elements."""
         return FrameNumbers.of(self.last_rows())
 
     def last_rows(self) -> np.ndarray:
-        """The numbers of ``last`` in their order, (12, B)."""
+        """Return the numbers of ``last`` in the order of the fields, (12, B)."""
         both = np.concatenate([self.translation[:, -1, :, None], self.rotation[:, -1]], axis=-1)
         return np.ascontiguousarray(both.reshape(len(both), 12).T)
 
 
 @dataclass(frozen=True, eq=False)
 class UploadedSystems:
-    """A ``SystemBatch`` in the memory of a backend.
+    """``SystemBatch`` in the memory of a backend.
 
     Attributes
     ----------
     backend : Backend
-        Whose arrays they are.
-    structure : tuple[Structure, ...]
-        Per element.
-    form : tuple[tuple[ElementNumbers, ...], FrameNumbers]
-        As of ``SystemBatch``.
-    numbers : Any
-        L Dr.Jit arrays (B,); or one of all of them, (L * B,), number by number.
-    grids : tuple[Any, ...]
-        As of ``SystemBatch``.
+        Backend of the arrays.
+    structure : tuple of Structure
+        Structure of each element.
+    form : (tuple of ElementNumbers, FrameNumbers)
+        Rows of the numbers, as in ``SystemBatch``.
+    numbers : Dr.Jit arrays
+        L arrays (B,); or one array (L * B,), number by number.
+    grids : tuple
+        Spline tables per element, as in ``SystemBatch``.
     count : int
-        B.
+        Number of systems B.
     differentiable : bool
-        Whether numbers carry derivatives.
-    first : int | None
+        True when numbers carry derivatives.
+    first : int, optional
         Row of the first element's first number, where the elements are part of a longer sequence; else None.
     """
 
@@ -221,7 +227,7 @@ class UploadedSystems:
 
     @cached_property
     def values(self) -> tuple[ElementNumbers, ...]:
-        """Per element its numbers, Dr.Jit arrays (B,)."""
+        """Numbers per element, Dr.Jit arrays (B,)."""
         import drjit as dr
 
         if isinstance(self.numbers, tuple):
@@ -232,8 +238,9 @@ class UploadedSystems:
         )
 
     def section(self, first: int, last: int) -> UploadedSystems:
-        """Elements ``first`` to ``last - 1`` alone, for rays in the frame of the element before them; the pose remains
-        the last element's of all.
+        """Return elements ``first`` to ``last - 1`` alone, for rays in the frame of the element before them.
+
+        The pose remains that of the last element of the whole sequence.
         """
         part = slice(first, last)
         form = self.form[0][part], self.form[1]
@@ -243,16 +250,16 @@ class UploadedSystems:
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """What some states do to shapes, in so far as it decides the code of a kernel.
+    """Changes of shape in some states that determine the code of a kernel.
 
     Attributes
     ----------
-    orders : Mapping[str, int]
+    orders : mapping of str to int
         Body -> highest radial order of its figures.
-    gridded : frozenset[str]
-        Bodies with a figure on a grid.
-    graded : frozenset[str]
-        Glass bodies with a gradient of their index.
+    gridded : frozenset of str
+        Bodies with a grid figure.
+    graded : frozenset of str
+        Glass bodies with an index gradient.
     """
 
     orders: Mapping[str, int]
@@ -261,7 +268,7 @@ class _Shapes:
 
     @classmethod
     def of(cls, states: Sequence[State]) -> _Shapes:
-        """Look through the motions of states."""
+        """Return the changes that the motions of the states cause."""
         orders: dict[str, int] = {}
         gridded, graded = set(), set()
         for state in states:
@@ -281,25 +288,25 @@ class _Chains:
 
     Attributes
     ----------
-    elements, media : tuple[tuple[Element, ...], ...]
-        Of each chain: the elements, and what light travels in before, between and after them.
-    bodies : np.ndarray
-        Numbers of the elements' bodies, (C, K).
-    depends : tuple[frozenset[str], ...]
-        Per element of the chains, the bodies whose shape or index it may have to do with.
-    designed : tuple[Structure, ...]
-        Structure of the elements as designed.
+    elements, media : tuple of tuple
+        Elements of each chain, and the media before, between and after them.
+    bodies : (C, K) ndarray of int
+        Indices of the elements' bodies.
+    depends : tuple of frozenset of str
+        Per element of the chains, the bodies whose shape or index may affect it.
+    nominal : tuple of Structure
+        Structure of the nominal elements.
     """
 
     elements: tuple[tuple[Element, ...], ...]
     media: tuple[tuple[Medium, ...], ...]
     bodies: np.ndarray
     depends: tuple[frozenset[str], ...]
-    designed: tuple[Structure, ...]
+    nominal: tuple[Structure, ...]
 
     @classmethod
     def of(cls, assembly: Assembly, sequences: tuple[str | tuple[str, ...], ...]) -> _Chains:
-        """The chains of sequences; ValueError where their lengths differ."""
+        """Return the chains of sequences; raise ValueError where their lengths differ."""
         named = [assembly.sequences[s] if isinstance(s, str) else s for s in sequences]
         chains = tuple(tuple(assembly.elements[name] for name in names) for names in named)
         lengths = {len(chain) for chain in chains}
@@ -316,38 +323,40 @@ class _Chains:
         return cls(chains, media, bodies, tuple(depends), designed)
 
     def radius(self, i: int, c: int) -> float:
-        """Of the disk of a figure of the i-th element of a chain, metres."""
+        """Return the radius of the figure's disk of the i-th element of chain c, metres."""
         if (i, c) not in self._radii:
             self._radii[i, c] = self.elements[c][i].figure_disk.radius
         return self._radii[i, c]
 
     @cached_property
     def _radii(self) -> dict[tuple[int, int], float]:
+        """Cache of ``radius``."""
         return {}
 
     def elements_at(self, i: int) -> list[Element]:
-        """The i-th ones of all chains."""
+        """Return the i-th elements of all chains."""
         return [chain[i] for chain in self.elements]
 
     def structure(self, shapes: _Shapes) -> tuple[Structure, ...]:
-        """Of the elements with what states do to their shapes."""
-        changed, out = shapes.orders.keys() | shapes.gridded | shapes.graded, list(self.designed)
-        for i, one in enumerate(out):
+        """Return the structure of the elements with the states' changes of shape."""
+        changed, out = shapes.orders.keys() | shapes.gridded | shapes.graded, list(self.nominal)
+        for i, nominal in enumerate(out):
             if changed.isdisjoint(self.depends[i]):
                 continue
             bodies = {element.body for element in self.elements_at(i)}
             out[i] = replace(
-                one,
-                figure_order=max(one.figure_order, *(shapes.orders.get(body, -1) for body in bodies)),
-                grid=one.grid or not shapes.gridded.isdisjoint(bodies),
+                nominal,
+                figure_order=max(nominal.figure_order, *(shapes.orders.get(body, -1) for body in bodies)),
+                grid=nominal.grid or not shapes.gridded.isdisjoint(bodies),
                 graded=(self._graded(i, shapes), self._graded(i + 1, shapes)),
             )
         return tuple(out)
 
     def _graded(self, medium: int, shapes: _Shapes) -> bool:
+        """Return True when a medium has an index gradient in some chain and state."""
         return any(media[medium].solid in shapes.graded for media in self.media)
 
-    def own(
+    def local_numbers(
         self,
         assembly: Assembly,
         i: int,
@@ -355,24 +364,25 @@ class _Chains:
         states: Sequence[State],
         placed: PlacedBodies,
         step: Sequence[tuple[str, str, int]] | None = None,
-    ) -> tuple[OwnNumbers, np.ndarray | None]:
-        """Shapes and indices of the i-th elements, each number (C * S,), and the tables of their grids; worked out once
-        for an element that several chains share.
+    ) -> tuple[LocalNumbers, np.ndarray | None]:
+        """Return shapes and indices of the i-th elements, each number (C * S,), and the tables of their grids.
+
+        An element that several chains share is computed once.
         """
-        found: dict[tuple[str, Medium, Medium], OwnNumbers] = {}
+        by_key: dict[tuple[str, Medium, Medium], LocalNumbers] = {}
         keys = [(chain[i].name, m[i], m[i + 1]) for chain, m in zip(self.elements, self.media, strict=True)]
         for key in keys:
-            if key not in found:
+            if key not in by_key:
                 name, before, after = key
-                found[key] = own_numbers_of(
+                by_key[key] = local_numbers_of(
                     assembly, assembly.elements[name], (before, after), structure, states, placed, step
                 )
-        parts = [found[key] for key in keys]
-        own = map_leaves(lambda *arrays: np.concatenate(arrays), parts[0], *parts[1:])
+        parts = [by_key[key] for key in keys]
+        numbers = map_leaves(lambda *arrays: np.concatenate(arrays), parts[0], *parts[1:])
         if not structure.grid:
-            return own, None
+            return numbers, None
         grid, spline = grid_numbers(self.elements_at(i), states)
-        return replace(own, surface=replace(own.surface, grid=grid)), spline
+        return replace(numbers, surface=replace(numbers.surface, grid=grid)), spline
 
 
 @dataclass(frozen=True, eq=False)
@@ -381,10 +391,12 @@ class _Sides:
 
     Attributes
     ----------
-    rows, chains, bodies : np.ndarray
-        Row of the index on each, its chain, and the number of the element's body, (N,).
-    gradient : np.ndarray
-        Which sides have a gradient of the index; slopes: its rows, (3, of these).
+    rows, chains, bodies : (N,) ndarray of int
+        Row of the index of each side, its chain, and the index of the element's body.
+    gradient : ndarray of int
+        Sides that have an index gradient.
+    slopes : (3, ...) ndarray of int
+        Rows of the gradient's components of those sides.
     """
 
     rows: np.ndarray
@@ -396,25 +408,25 @@ class _Sides:
 
 @dataclass(frozen=True, eq=False)
 class _Design:
-    """Numbers of C chains of one structure as designed, and what a state does to them.
+    """Numbers of C chains of one structure in the nominal state, and how a state changes them.
 
     Attributes
     ----------
     chains : _Chains
-        Whose they are.
-    structure, form : tuple[Structure, ...]
-        As of ``SystemBatch``.
-    numbers : np.ndarray
-        (L, C); those of frames are left open.
-    grids : tuple[np.ndarray | None, ...]
-        As of ``SystemBatch``.
-    grown : Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
-        Power -> rows and chains of the numbers that grow with that power of their bodies' sizes, and these bodies'
-        numbers.
-    glass : Mapping[str, _Sides]
-        Glass body -> the sides of elements that it lies on.
-    frame_rows : np.ndarray
-        Rows of the elements' frames and of the last pose, (K + 1, 12).
+        The chains.
+    structure, form : tuple
+        Structure and rows, as in ``SystemBatch``.
+    numbers : (L, C) ndarray
+        Nominal numbers; those of frames are not set.
+    grids : tuple of ndarray, optional
+        Spline tables, as in ``SystemBatch``.
+    scaling : mapping of int to (ndarray, ndarray, ndarray)
+        Power -> rows and chains of the numbers that scale with that power of their bodies' sizes, and the indices of
+        these bodies.
+    glass : mapping of str to _Sides
+        Glass body -> sides of elements on which it lies.
+    frame_rows : (K + 1, 12) ndarray of int
+        Rows of the elements' frames and of the last pose.
     """
 
     chains: _Chains
@@ -422,40 +434,41 @@ class _Design:
     form: tuple[tuple[ElementNumbers, ...], FrameNumbers]
     numbers: np.ndarray
     grids: tuple[np.ndarray | None, ...]
-    grown: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
+    scaling: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
     glass: Mapping[str, _Sides]
     frame_rows: np.ndarray
 
     @classmethod
     def of(cls, assembly: Assembly, chains: _Chains, structure: tuple[Structure, ...]) -> _Design:
-        """Work them out."""
+        """Return the nominal numbers of chains."""
         placed, frame = assembly.place(), FrameNumbers.of(np.zeros((12, len(chains.elements))))
         twice = replace(placed, scale=np.full_like(placed.scale, 2.0))
 
         def values(placed: PlacedBodies) -> tuple[tuple[ElementNumbers, ...], list[np.ndarray | None]]:
             own, grids = zip(
-                *(chains.own(assembly, i, one, ({},), placed) for i, one in enumerate(structure)), strict=True
+                *(chains.local_numbers(assembly, i, one, ({},), placed) for i, one in enumerate(structure)), strict=True
             )
             return tuple(ElementNumbers(frame, o.surface, o.aperture, o.before, o.after) for o in own), grids
 
         designed, grids = values(placed)
         form = form_of((designed, frame))
         numbers, doubled = (np.array(numbers_in((own, frame))) for own in (designed, values(twice)[0]))
-        # each goes with a power of its body's size, which can be read off without rounding at twice the size
+        # each scales with a power of its body's size, which follows exactly from the numbers at twice the size
         known = (numbers != 0.0) & (doubled != 0.0)
         power = np.frexp(np.divide(doubled, numbers, out=np.ones_like(numbers), where=known))[1] - 1
         element = np.zeros(len(numbers), int)
         for i, own in enumerate(form[0]):
             element[numbers_in(own)] = i
-        grown = {}
+        scaling = {}
         for one in set(power.ravel().tolist()) - {0}:
             rows, columns = np.nonzero(power == one)
-            grown[one] = rows, columns, chains.bodies[columns, element[rows]]
+            scaling[one] = rows, columns, chains.bodies[columns, element[rows]]
         frames = np.array([numbers_in(f) for f in (*(own.frame for own in form[0]), form[1])])
-        return cls(chains, structure, form, numbers, tuple(grids), grown, cls._sides(chains, form[0]), frames)
+        return cls(chains, structure, form, numbers, tuple(grids), scaling, cls._sides(chains, form[0]), frames)
 
     @staticmethod
     def _sides(chains: _Chains, form: tuple[ElementNumbers, ...]) -> dict[str, _Sides]:
+        """Return glass body -> sides of elements on which it lies."""
         found: dict[str, list[tuple[Any, int, int]]] = {}
         for c, media in enumerate(chains.media):
             for i, own in enumerate(form):
@@ -473,24 +486,25 @@ class _Design:
         return out
 
     def in_states(self, assembly: Assembly, states: Sequence[State], placed: PlacedBodies) -> np.ndarray:
-        """The numbers in S states, but for grids, (L, C * S)."""
+        """Return the numbers in S states, except grid figures, (L, C * S)."""
         count = len(states)
         out = np.repeat(self.numbers[:, :, None], count, axis=2)
         if np.any(placed.scale != 1.0):
-            self._grow(out, placed)
+            self._apply_scale(out, placed)
         paths = {path for state in states for path in state}
         for solid in paths.intersection(self.glass):
             self._set_index(out, assembly, solid, states, placed)
         known: dict[tuple[str, int, float], np.ndarray] = {}
         for i, structure in enumerate(self.structure):
             if not paths.isdisjoint(self.chains.depends[i]):
-                self._reshape(out, i, structure, states, known)
+                self._apply_shape(out, i, structure, states, known)
         flat = out.reshape(len(out), -1)
         flat[self.frame_rows[:-1]] = frames_of(placed, self.chains.bodies)
         return flat
 
-    def _grow(self, out: np.ndarray, placed: PlacedBodies) -> None:
-        for power, (rows, columns, bodies) in self.grown.items():
+    def _apply_scale(self, out: np.ndarray, placed: PlacedBodies) -> None:
+        """Scale the numbers of expanded bodies."""
+        for power, (rows, columns, bodies) in self.scaling.items():
             size = placed.scale[:, bodies].T
             factor = size
             for _ in range(abs(power) - 1):
@@ -503,18 +517,19 @@ class _Design:
     def _set_index(
         self, out: np.ndarray, assembly: Assembly, solid: str, states: Sequence[State], placed: PlacedBodies
     ) -> None:
+        """Set the refractive index of a glass body in each state."""
         sides, glass = self.glass[solid], placed.index[solid]
         motions = [state.get(solid, AT_REST) for state in states]
         out[sides.rows, sides.chains] = [assembly.index(solid, motion) for motion in motions]
         if not sides.gradient.size:
             return
-        columns, here = sides.chains[sides.gradient], sides.bodies[sides.gradient]
+        columns, faces = sides.chains[sides.gradient], sides.bodies[sides.gradient]
         world = np.einsum("sij,sj->si", placed.rotation[:, glass], [motion.index_gradient for motion in motions])
-        out[sides.slopes, columns] = np.einsum("snji,sj->ins", placed.rotation[:, here], world)
-        away = placed.translation[:, here] - placed.translation[:, glass, None]
-        out[sides.rows[sides.gradient], columns] += np.einsum("si,sni->ns", world, away)
+        out[sides.slopes, columns] = np.einsum("snji,sj->ins", placed.rotation[:, faces], world)
+        offset = placed.translation[:, faces] - placed.translation[:, glass, None]
+        out[sides.rows[sides.gradient], columns] += np.einsum("si,sni->ns", world, offset)
 
-    def _reshape(
+    def _apply_shape(
         self,
         out: np.ndarray,
         i: int,
@@ -522,7 +537,10 @@ class _Design:
         states: Sequence[State],
         known: dict[tuple[str, int, float], np.ndarray],
     ) -> None:
-        """Add what states do to the shape of the i-th elements; ``known``: body, order and radius -> figures."""
+        """Add the states' changes of the shapes of the i-th elements.
+
+        ``known`` caches figures by body, order and radius.
+        """
         surface = self.form[0][i].surface
         for c, element in enumerate(self.chains.elements_at(i)):
             motions = [state.get(element.body, AT_REST) for state in states]
@@ -538,12 +556,12 @@ class _Design:
 
 
 def _figures(motions: Sequence[Motion], order: int, radius: float) -> np.ndarray:
-    """Coefficients that figures of S motions add, (T, S), as ``zernike.monomials`` has them."""
+    """Return the coefficients that figures of S motions add, (T, S), as in ``zernike.monomials``."""
     amplitudes = np.zeros((len(motions), max(j for motion in motions for j in motion.figure)))
     for s, motion in enumerate(motions):
         for j, amplitude in motion.figure.items():
             amplitudes[s, j - 1] = amplitude
-    # in one order on every processor
+    # summed in a fixed order on every processor
     return np.asarray(np.einsum("sj,jt->ts", amplitudes, zernike.unit_monomials(amplitudes.shape[1], order, radius)))
 
 
@@ -554,26 +572,26 @@ def assemble(
     step: Sequence[tuple[str, str, int]] | None = None,
     placed: PlacedBodies | None = None,
 ) -> SystemBatch:
-    """Work out the numbers of every sequence in every state.
+    """Compute the numbers of every sequence in every state.
 
     Parameters
     ----------
     assembly : Assembly
         The instrument.
-    sequences : Sequence[str | Sequence[str]]
-        Names of sequences, or element-name tuples, all of the same structure.
-    states : Sequence[State]
+    sequences : sequence of str or of sequence of str
+        Names of sequences, or tuples of element names, all of the same structure.
+    states : sequence of State
         S perturbed states.
-    step : Sequence[tuple[str, str, int]] | None
-        Optional derivative: one (body, kind, axis) per state; kind ``rotate``, ``shift``, ``scale`` or ``figure`` (the
-        axis is then a Noll index that the state's figure names, with 0 if there is none).
-    placed : PlacedBodies | None
-        The bodies of these states, when already placed.
+    step : sequence of (str, str, int), optional
+        Derivative: one (body, kind, axis) per state; kind ``rotate``, ``shift``, ``scale`` or ``figure`` (the axis is
+        then a Noll index that the state's figure names, with 0 if there is none).
+    placed : PlacedBodies, optional
+        World poses of the bodies in these states, if already computed.
 
     Returns
     -------
     SystemBatch
-        A batch of len(sequences) * S systems, sequence by sequence.
+        Batch of len(sequences) * S systems, sequence by sequence.
 
     Raises
     ------
@@ -581,16 +599,16 @@ def assemble(
         The sequences differ in structure.
     """
     placed = assembly.place(states, step) if placed is None else placed
-    known = assembly.worked_out
-    along = tuple(s if isinstance(s, str) else tuple(s) for s in sequences)
-    chains = known.get(along)
+    cache = assembly.system_cache
+    key = tuple(s if isinstance(s, str) else tuple(s) for s in sequences)
+    chains = cache.get(key)
     if chains is None:
-        chains = known[along] = _Chains.of(assembly, along)
+        chains = cache[key] = _Chains.of(assembly, key)
     shapes = _Shapes.of(states)
     structure = chains.structure(shapes)
-    design = known.get((along, structure))
+    design = cache.get((key, structure))
     if design is None:
-        design = known[along, structure] = _Design.of(assembly, chains, structure)
+        design = cache[key, structure] = _Design.of(assembly, chains, structure)
     world = Poses(*(np.concatenate([a[:, b] for b in chains.bodies]) for a in (placed.rotation, placed.translation)))
     size = np.concatenate([placed.size(chain[-1].body) for chain in chains.elements])
     grids = list(design.grids)
@@ -599,13 +617,13 @@ def assemble(
         numbers[design.frame_rows[-1]] = world.last_rows()
         for i, here in enumerate(design.form[0]):
             if not shapes.gridded.isdisjoint(chains.depends[i]):
-                own, grids[i] = chains.own(assembly, i, structure[i], states, placed)
+                own, grids[i] = chains.local_numbers(assembly, i, structure[i], states, placed)
                 rows = numbers_in((here.surface, here.aperture, here.before, here.after))
                 numbers[rows] = numbers_in((own.surface, own.aperture, own.before, own.after))
         return SystemBatch(structure, design.form, numbers, world, None, None, size, tuple(grids), len(states))
     values = []
     for i, frame in enumerate(frames_of(placed, chains.bodies)):
-        own, grids[i] = chains.own(assembly, i, structure[i], states, placed, step)
+        own, grids[i] = chains.local_numbers(assembly, i, structure[i], states, placed, step)
         values.append(ElementNumbers(FrameNumbers.of(frame), own.surface, own.aperture, own.before, own.after))
     numbers = np.array([number.real for number in numbers_in((tuple(values), world.last()))])
     tangents, world_tangents = None, None
@@ -618,4 +636,5 @@ def assemble(
 
 
 def _tangent(value: np.ndarray) -> np.ndarray | None:
+    """Return the derivative of a complex-step value; None for a real one."""
     return value.imag / COMPLEX_STEP if np.iscomplexobj(value) else None

@@ -1,21 +1,17 @@
-"""Float64 sequential ray trace on Dr.Jit: positions, directions and optical path lengths through a batch of systems.
+"""Float64 sequential ray trace on Dr.Jit, with derivatives: positions, directions and optical paths of batched systems.
 
-Curved rays where the refractive index has a gradient.
+Curved rays in an index gradient. With d tau = ds / n the ray equation d/ds (n dr/ds) = grad n becomes r'' = n grad n.
+For n = n0 + g . (r - r0) the index along the ray obeys n'' = |g|^2 n, so that
 
-With d tau = ds / n the ray equation d/ds (n dr/ds) = grad n becomes r'' = n grad n. For n = n0 + g . (r - r0) the index
-along the ray obeys n'' = |g|^2 n, so that
+    n(tau) = n0 cosh x + a/|g| sinh x,    x = |g| tau,  a = g . T0,  T0 = n0 d0, r(tau) = r0 + T0 tau + g [n0 (cosh x -
+    1) / |g|^2 + a (sinh x / |g| - tau) / |g|^2], optical path = integral of n^2 d tau.
 
-    n(tau) = n0 cosh x + a/|g| sinh x,    x = |g| tau,  a = g . T0,  T0 = n0 d0,
-    r(tau) = r0 + T0 tau + g [n0 (cosh x - 1) / |g|^2 + a (sinh x / |g| - tau) / |g|^2],
-    optical path = integral of n^2 d tau.
+The hyperbolic functions are evaluated by their power series, which have no 0/0 at g = 0. (Born and Wolf, Principles of
+Optics, section 3.2, for the ray equation.)
 
-The hyperbolic functions are taken as their power series, which have no 0/0 at g = 0. (Born and Wolf,
-Principles of Optics, section 3.2, for the ray equation.)
-
-Derivatives of a ray trace: Jacobian-vector products (forward mode) and vector-Jacobian products (reverse mode).
-
-One backward pass gives the derivative of a weighted sum of ray coordinates by every number of every system, however
-many there are; forward mode (``optics.raytrace.trace``) gives all rays' derivatives by one parameter.
+Derivatives. ``jvp`` gives Jacobian-vector products (forward mode): all rays' derivatives by one parameter. ``vjp``
+gives vector-Jacobian products (reverse mode): one backward pass yields the derivative of a weighted sum of ray
+coordinates by every number of every system, however many there are.
 """
 
 from __future__ import annotations
@@ -39,21 +35,21 @@ from optics.raytrace.system import SystemBatch, UploadedSystems
 
 @dataclass(frozen=True, eq=False)
 class GradedRay:
-    """A curved ray, as Dr.Jit arrays in the frame of the element that it goes to.
+    """Curved ray in an index gradient, as Dr.Jit arrays in the frame of the element that it goes to.
 
     Attributes
     ----------
-    origin : Any
-        r0, metres.
-    tangent : Any
-        T0 = n0 d0, d0 a unit vector.
-    index : Any
-        n0 at the origin.
-    gradient : tuple[Any, Any, Any]
-        Components of g, 1/m.
-    along : Any
+    origin : Vector3
+        Origin r0, metres.
+    tangent : Vector3
+        T0 = n0 d0, with d0 a unit vector.
+    index : Float
+        Index n0 at the origin.
+    gradient : tuple of Float
+        Components of the gradient g, 1/m.
+    along : Float
         a = g . T0.
-    square : Any
+    square : Float
         |g|^2.
     """
 
@@ -66,7 +62,7 @@ class GradedRay:
 
     @classmethod
     def start(cls, p: Any, d: Any, index_at_zero: Any, gradient: tuple[Any, Any, Any]) -> GradedRay:
-        """The ray from p along the unit vector d, where the index is index_at_zero + gradient . p."""
+        """Return the ray from p along the unit vector d, where the index is index_at_zero + gradient . p."""
         gx, gy, gz = gradient
         index = index_at_zero + gx * p.x + gy * p.y + gz * p.z
         tangent = index * d
@@ -87,27 +83,27 @@ class GradedRay:
         )
 
     def position(self, tau: Any) -> Any:
-        """r(tau), metres."""
+        """Return r(tau), in metres."""
         x2 = self.square * tau * tau
         even = 0.5 * tau * tau * (1.0 + x2 / 12.0 * (1.0 + x2 / 30.0))
         odd = tau * tau * tau / 6.0 * (1.0 + x2 / 20.0 * (1.0 + x2 / 42.0))
         return self._add(self.origin + self.tangent * tau, self.index * even + self.along * odd)
 
     def slope(self, tau: Any) -> Any:
-        """dr/dtau = n times the unit direction."""
+        """Return dr/dtau, which is n times the unit direction."""
         x2 = self.square * tau * tau
         odd = tau * (1.0 + x2 / 6.0 * (1.0 + x2 / 20.0))
         even = 0.5 * tau * tau * (1.0 + x2 / 12.0 * (1.0 + x2 / 30.0))
         return self._add(self.tangent, self.index * odd + self.along * even)
 
     def direction(self, tau: Any) -> Any:
-        """Unit direction at r(tau)."""
+        """Return the unit direction at r(tau)."""
         import drjit as dr
 
         return dr.normalize(self.slope(tau))
 
     def optical_path(self, tau: Any) -> Any:
-        """Integral of n ds from the origin, metres."""
+        """Return the integral of n ds from the origin, in metres."""
         y = 4.0 * self.square * tau * tau
         first = tau * (1.0 + y / 12.0 * (1.0 + y / 20.0 * (1.0 + y / 42.0)))
         second = tau * tau * (1.0 + y / 12.0 * (1.0 + y / 30.0))
@@ -116,12 +112,15 @@ class GradedRay:
         return n * n * first + a * n * second + a * a * third
 
     def _add(self, vector: Any, amount: Any) -> Any:
+        """Return the vector plus ``amount`` times the gradient."""
         gx, gy, gz = self.gradient
         return type(vector)(vector.x + amount * gx, vector.y + amount * gy, vector.z + amount * gz)
 
 
-def meeting(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, attached: bool, steps: int) -> Any:
-    """Parameter at which a curved ray meets the surface, by Newton's method from the straight ray's."""
+def curve_intersection(
+    curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, attached: bool, steps: int
+) -> Any:
+    """Return the parameter at which a curved ray intersects the surface, by Newton's method from the straight ray's."""
     import drjit as dr
 
     def step(ray: GradedRay, tau: Any, numbers: SurfaceNumbers) -> Any:
@@ -139,51 +138,63 @@ def meeting(curve: GradedRay, tau: Any, surface: SurfaceNumbers, table: Any, att
 
 
 NEWTON_STEPS = 3
-"""Newton steps from the conic to the asphere. The departure of a mirror from its conic is below 1e-4 m and its slope
-below 1e-3, so that each step gains at least six digits; three reach rounding. A ray that has not converged is marked
-invalid."""
+"""Number of Newton steps from the conic to the asphere.
 
-FURTHER_STEPS = 2
-"""Additional Newton steps for a surface with further terms of its sag, and for an aspheric face of a lens, which may
-depart by millimetres.
+The departure of a mirror from its conic is below 1e-4 m and its slope below 1e-3, so that each step gains at least six
+digits; three reach rounding. A ray that has not converged is marked invalid.
 """
 
-SECTION = 6
-"""Elements that one kernel traces where there are many rays, which pass through memory between kernels. The time to
-compile it grows faster than its length."""
+FURTHER_STEPS = 2
+"""Additional Newton steps for a surface with further sag terms, and for an aspheric face of a lens.
 
-FEW = 1 << 16
-"""Rays below which every element is a kernel of its own: so few stay in the processor's cache. Elements of one
-structure then share a kernel wherever they stand in their sequences, and all kernels of the main job together take a
-fifth of the time to compile."""
+Their departures from the conic may be millimetres.
+"""
 
-FEWEST_LANES = 32
-"""Systems from which each lane of the processor traces one; of more than two threads each has to have half as many. Of
-fewer systems a trace element by element takes up to half as much time again, and its kernels, which elements share,
-are compiled already: those of lanes take seconds."""
+KERNEL_ELEMENTS = 6
+"""Number of elements that one kernel traces where there are many rays, which pass through memory between kernels.
 
-FEWEST_IN_LANES = 1 << 15
-"""Rays from which they do: fewer take some milliseconds in any way."""
+The time to compile a kernel grows faster than its length.
+"""
 
-MOST_RECORDINGS = 16
-"""Of one trace in one thread: it is recorded anew where a bundle has other numbers in common, such as a direction."""
+CACHED_RAYS = 1 << 16
+"""Number of rays below which every element is a kernel of its own: so few stay in the processor's cache.
+
+Elements of one structure then share a kernel wherever they are in their sequences, and all kernels of the main job
+together take a fifth of the time to compile.
+"""
+
+MIN_LANE_SYSTEMS = 32
+"""Number of systems per two threads from which each lane of the processor traces all rays of one system.
+
+With fewer systems an element-by-element trace takes up to half as much time again, but its kernels, which elements
+share, are compiled already: those of lanes take seconds.
+"""
+
+MIN_LANE_RAYS = 1 << 15
+"""Number of rays from which lanes are used: fewer take some milliseconds either way."""
+
+MAX_RECORDINGS = 16
+"""Largest number of recordings of one trace in one thread.
+
+A trace is recorded anew where a bundle shares other numbers, such as a direction.
+"""
 
 CONVERGED = 1e-12
-"""Largest distance to the surface of a valid hit, metres."""
+"""Largest distance to the surface of a valid intersection, metres."""
 
 
 class BeamMissedError(PhysicalError, RuntimeError):
-    """No ray of a bundle gets through a sequence."""
+    """No ray of a bundle passes through a sequence."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays in Dr.Jit arrays: positions and unit directions, optical path, and whether each is still alive.
+    """Rays in Dr.Jit arrays: positions and unit directions, optical path, and whether each is still valid.
 
     Attributes
     ----------
-    position, direction, path, valid : Any
-        Of width systems * N; a direction that all rays share is of width 1.
+    position, direction, path, valid : Dr.Jit arrays
+        Arrays of width systems * N, lengths in metres; a direction that all rays share has width 1.
     systems : int
         Number of systems that the rays are for, system by system; 1: every system gets all of them.
     """
@@ -203,12 +214,12 @@ class Traced:
     ----------
     local : Rays
         Rays in the last element's own frame, after the interaction.
-    world : Rays | None
-        The same rays in the world frame (position and direction), None unless asked for.
-    hits : Mapping[int, Any]
-        Element index -> local position on that element, for those asked to be kept.
+    world : Rays, optional
+        The same rays in the world frame (position and direction); None unless requested.
+    hits : mapping of int to Vector3
+        Element index -> local intersection with that element, for those requested.
     count : int
-        B systems.
+        Number of systems B.
     """
 
     local: Rays
@@ -217,7 +228,10 @@ class Traced:
     count: int
 
     def numpy(self, rays: Rays | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Position (B, N, 3), direction (B, N, 3), path (B, N), valid (B, N) of ``local`` (default) or ``world``."""
+        """Return position (B, N, 3), direction (B, N, 3), path (B, N) and valid (B, N) as NumPy arrays.
+
+        They are those of ``rays``, by default ``local``.
+        """
         rays = self.local if rays is None else rays
         return (
             rows(rays.position, self.count),
@@ -227,17 +241,17 @@ class Traced:
         )
 
     def hit(self, element: int) -> np.ndarray:
-        """Local positions (B, N, 3) on an element that was kept, metres."""
+        """Return the local intersections (B, N, 3) with a requested element, in metres."""
         return rows(self.hits[element], self.count)
 
-    def place(self, element: int | None = None) -> np.ndarray:
-        """Local x, y (B, N, 2), metres, on the last element or on one that was kept."""
+    def xy(self, element: int | None = None) -> np.ndarray:
+        """Return the local x, y (B, N, 2), in metres, on the last element or on a requested one."""
         vector = self.local.position if element is None else self.hits[element]
         return np.moveaxis(np.stack([c.numpy() for c in (vector.x, vector.y)]).reshape(2, self.count, -1), 0, -1)
 
 
 def rows(vector: Any, count: int) -> np.ndarray:
-    """Components of a ``Vector3`` of B * N rays as an array (B, N, 3); in memory one component after the other."""
+    """Return the components of a ``Vector3`` of B * N rays as an array (B, N, 3), stored component by component."""
     return np.moveaxis(np.stack([c.numpy() for c in vector]).reshape(3, count, -1), 0, -1)
 
 
@@ -245,18 +259,18 @@ def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, pat
     """Upload rays given by positions in metres and unit directions, broadcastable to each other.
 
     Shape (N, 3) or (3,) makes rays that every system gets; (B, N, 3) makes each of B systems its own. A direction (3,)
-    is kept as one vector: a trace through conics is held up by the memory that it reads.
+    is kept as one vector: a trace through conics is limited by the memory that it reads.
 
     Parameters
     ----------
     backend : Backend
-        Where to.
-    position : np.ndarray
-        (3,), (N, 3) or (B, N, 3), metres.
-    direction : np.ndarray
-        Unit vectors, likewise.
-    path : np.ndarray | None
-        Optical path so far, metres, one for each ray; 0 by default.
+        Backend to upload to.
+    position : (3,), (N, 3) or (B, N, 3) ndarray
+        Positions, metres.
+    direction : (3,), (N, 3) or (B, N, 3) ndarray
+        Unit directions.
+    path : ndarray, optional
+        Optical path so far of each ray, metres; 0 by default.
     """
     import drjit as dr
 
@@ -266,7 +280,7 @@ def make_rays(backend: Backend, position: np.ndarray, direction: np.ndarray, pat
     n = position.size // 3
     start = dr.zeros(backend.Float, n) if path is None else backend.opaque(path)
     valid = dr.full(backend.Bool, True, n)
-    if n < FEW:
+    if n < CACHED_RAYS:
         dr.make_opaque(start, valid)
     heading = backend.vector(direction.reshape(-1, 3)[:1] if shared else direction)
     return Rays(backend.vector(position), heading, start, valid, systems)
@@ -280,28 +294,28 @@ def trace(
     world: bool = False,
     evaluate: bool = True,
 ) -> Traced:
-    """Send rays, given in the world frame, through each system.
+    """Trace rays, given in the world frame, through each system.
 
     Parameters
     ----------
     backend : Backend
-        Where to compute.
-    systems : SystemBatch | UploadedSystems
+        Backend of the trace.
+    systems : SystemBatch or UploadedSystems
         B systems.
     rays : Rays
-        For these systems, or rays that every system gets.
-    keep : Collection[int]
-        Indices of elements whose hit points are wanted.
+        Rays for these systems, or rays that every system gets.
+    keep : collection of int
+        Indices of elements whose intersections are requested.
     world : bool
-        Also return the final rays in the world frame.
+        True to return the final rays in the world frame, too.
     evaluate : bool
-        Launch the kernel now (False leaves a graph to build on).
+        True to launch the kernel now; False leaves a graph to build on.
 
     Returns
     -------
     Traced
-        The rays at the last element. Rays that miss a surface or an aperture, or are totally reflected at a refracting
-        surface, are marked invalid; their numbers stay finite but mean nothing.
+        Rays at the last element. Rays that miss a surface or an aperture, or are totally reflected at a refracting
+        surface, are marked invalid; their numbers stay finite but are meaningless.
 
     Raises
     ------
@@ -311,50 +325,52 @@ def trace(
     import drjit as dr
 
     uploaded = systems.upload(backend) if isinstance(systems, SystemBatch) else systems
-    rays, shared = _spread(backend, rays, uploaded.count)
+    rays, shared = _full_width(backend, rays, uploaded.count)
     differentiable = uploaded.differentiable or dr.grad_enabled(rays.position) or dr.grad_enabled(rays.direction)
     lanes = _lanes(uploaded, dr.width(rays.position)) if evaluate and not differentiable else None
-    alone = lanes is None and not differentiable and dr.width(rays.position) < FEW
-    section = 1 if alone else SECTION
-    how = _Way(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate, section, alone)
-    if alone and shared is not None:  # else the first element's kernel would be another one
+    alone = lanes is None and not differentiable and dr.width(rays.position) < CACHED_RAYS
+    section = 1 if alone else KERNEL_ELEMENTS
+    plan = _TracePlan(backend, uploaded.structure, tuple(sorted(keep)), world, differentiable, evaluate, section, alone)
+    if alone and shared is not None:  # so that all elements share one kernel
         shared = dr.arange(backend.UInt, dr.width(rays.position)) // shared
         dr.eval(shared)
     stride = None if uploaded.count == 1 else dr.opaque(backend.UInt, uploaded.count)
     start = None if uploaded.first is None else dr.opaque(backend.UInt, uploaded.first * uploaded.count)
-    through = _frozen(how, uploaded.form) if evaluate and not differentiable else partial(how.through, uploaded.form)
+    through = (
+        _recorded(plan, uploaded.form) if evaluate and not differentiable else partial(plan.through, uploaded.form)
+    )
     (p, d, path, valid), hits, outside = through(
         (uploaded.numbers, uploaded.grids, stride, start, lanes),
         (rays.position, rays.direction, rays.path, rays.valid),
         shared,
     )
     local = Rays(p, d, path, valid, uploaded.count)
-    seen = Rays(outside[0], outside[1], path, valid, uploaded.count) if world else None
-    return Traced(local, seen, dict(zip(how.keep, hits, strict=True)), uploaded.count)
+    outside_rays = Rays(outside[0], outside[1], path, valid, uploaded.count) if world else None
+    return Traced(local, outside_rays, dict(zip(plan.keep, hits, strict=True)), uploaded.count)
 
 
 @dataclass(frozen=True)
-class _Way:
-    """What the instructions of a trace depend on; all else is numbers that they read.
+class _TracePlan:
+    """Everything that the instructions of a trace depend on; all else is numbers that they read.
 
     Attributes
     ----------
     backend : Backend
-        Where to compute.
-    structure : tuple[Structure, ...]
-        Of the elements.
-    keep : tuple[int, ...]
-        Elements whose hit points are wanted, ascending.
+        Backend of the trace.
+    structure : tuple of Structure
+        Structure of each element.
+    keep : tuple of int
+        Elements whose intersections are requested, ascending.
     world : bool
-        Whether the final rays in the world frame are.
+        True when the final rays are requested in the world frame, too.
     differentiable : bool
-        Whether numbers or rays carry derivatives.
+        True when numbers or rays carry derivatives.
     evaluate : bool
-        Whether kernels are launched.
+        True when kernels are launched.
     section : int
-        Elements of a kernel.
+        Number of elements of a kernel.
     alone : bool
-        Whether all elements of one structure share a kernel; ``section`` is 1.
+        True when all elements of one structure share a kernel; ``section`` is then 1.
     """
 
     backend: Backend
@@ -367,21 +383,21 @@ class _Way:
     alone: bool
 
     def through(self, form: Any, numbers: Any, rays: Any, shared: Any) -> Any:
-        """Rays after the last element, hit points, and the former in the world frame.
+        """Return the rays after the last element, the requested intersections, and the rays in the world frame.
 
         Parameters
         ----------
-        form : Any
-            As of ``UploadedSystems``.
-        numbers : Any
-            Likewise, the grids, how many systems there are, as an array of width 1 or None for one; where the numbers
-            begin, likewise or None for the beginning; and the systems' own places, (B,), where each takes its rays one
-            after the other, else None.
-        rays : Any
-            Position, direction, path and whether they are alive.
-        shared : Any
-            Rays of each system, as an array of width 1; the system of each ray where elements are ``alone``; None for a
-            single system.
+        form : tuple
+            Rows of the numbers, as in ``UploadedSystems``.
+        numbers : tuple
+            Numbers and grids as in ``UploadedSystems``; number of systems, as an array of width 1, or None for one;
+            offset of the numbers, likewise, or None for 0; and the indices of the systems (B,) where each takes its
+            rays one after the other, else None.
+        rays : tuple
+            Position, direction, path and validity.
+        shared : UInt
+            Number of rays of each system, as an array of width 1; the system of each ray where elements are ``alone``;
+            None for a single system.
         """
         table, grids, stride, start, systems = numbers
         own = self._system(rays[0], shared) if systems is None else systems
@@ -394,7 +410,7 @@ class _Way:
             elements = [lookup(form[0][i]) for i in leg]
             pose = lookup(form[1]) if self.world and last else None
             if systems is not None:
-                rays = self._one_by_one(leg, elements, pose, grids, rays, (systems, shared), hits, outside)
+                rays = self._along_in_lanes(leg, elements, pose, grids, rays, (systems, shared), hits, outside)
                 continue
             rays = self._along(leg, elements, grids, rays, hits)
             if last:
@@ -403,40 +419,40 @@ class _Way:
         return rays, hits, tuple(outside) if self.world else None
 
     def _system(self, position: Any, shared: Any) -> Any:
-        """The system of each ray; None for a single system."""
+        """Return the system of each ray; None for a single system."""
         import drjit as dr
 
         return shared if shared is None or self.alone else dr.arange(self.backend.UInt, dr.width(position)) // shared
 
     def _launch(self, leg: range, form: Any, lookup: _Lookup, rays: Any, hits: list[Any], outside: list[Any]) -> None:
-        """Launch the kernel of a leg, where kernels are launched at its end."""
+        """Launch the kernel of a leg, if kernels are launched at its end."""
         import drjit as dr
 
         last = leg.stop == len(self.structure)
         if self.alone or not (self.differentiable or last):
-            lookup.go_on((form[1] if last else form[0][leg.stop].frame).x.shift)
+            lookup.advance((form[1] if last else form[0][leg.stop].frame).x.shift)
             dr.eval(*rays, lookup.place)
         if last and self.evaluate:
             dr.eval(*rays, hits, outside)
 
     def _at_end(self, rays: Any, pose: FrameNumbers | None, outside: list[Any]) -> Any:
-        """Rays at the last element; with its pose also, into ``outside``, in the world."""
+        """Return the rays at the last element; with its pose, also append them in the world frame to ``outside``."""
         import drjit as dr
 
         p, d, path, valid = rays
-        d = d + dr.zeros(self.backend.Float, dr.width(p))  # nothing may have turned a shared direction
+        d = d + dr.zeros(
+            self.backend.Float, dr.width(p)
+        )  # full width also if no element has changed a shared direction
         if pose is not None:
             to_world = pose.coordinates
             outside += [
-                self.backend.Vector3(
-                    *(c.turn[0] * p.x + c.turn[1] * p.y + c.turn[2] * p.z + c.shift for c in to_world)
-                ),
-                self.backend.Vector3(*(c.turn[0] * d.x + c.turn[1] * d.y + c.turn[2] * d.z for c in to_world)),
+                self.backend.Vector3(*(c.row[0] * p.x + c.row[1] * p.y + c.row[2] * p.z + c.shift for c in to_world)),
+                self.backend.Vector3(*(c.row[0] * d.x + c.row[1] * d.y + c.row[2] * d.z for c in to_world)),
             ]
         return p, d, path, valid
 
     def _along(self, leg: range, elements: Sequence[ElementNumbers], grids: Any, rays: Any, hits: list[Any]) -> Any:
-        """Rays after some elements, of each the hit points into ``hits`` where they are kept."""
+        """Return the rays after some elements, and append requested intersections to ``hits``."""
         import drjit as dr
 
         backend, differentiable = self.backend, self.differentiable
@@ -444,7 +460,7 @@ class _Way:
         for i, element in zip(leg, elements, strict=True):
             structure, table = self.structure[i], grids[i]
             surface = element.surface
-            p, d = _into_frame(backend, p, d, element.frame)
+            p, d = _to_frame(backend, p, d, element.frame)
             steps = _steps(surface, structure.interaction)
             t, ok = _distance(p, d, surface, table, differentiable, steps)
             if element.before.gradient is None:
@@ -452,9 +468,9 @@ class _Way:
                 path = dr.fma(element.before.index, t, path)
             else:
                 curve = GradedRay.start(p, d, element.before.index, element.before.gradient)
-                tau = meeting(curve, t / curve.index, surface, table, differentiable, steps)
+                tau = curve_intersection(curve, t / curve.index, surface, table, differentiable, steps)
                 p, d, path = curve.position(tau), curve.direction(tau), path + curve.optical_path(tau)
-                ok = _reached(p, surface, table)
+                ok = _on_surface(p, surface, table)
             valid = valid & ok
             if element.aperture is not None:
                 valid = valid & element.aperture.contains(p.x, p.y)
@@ -465,7 +481,7 @@ class _Way:
                 hits.append(p)
         return p, d, path, valid
 
-    def _one_by_one(
+    def _along_in_lanes(
         self,
         leg: range,
         elements: Sequence[ElementNumbers],
@@ -476,60 +492,64 @@ class _Way:
         hits: list[Any],
         outside: list[Any],
     ) -> Any:
-        """A leg along which each lane of the processor takes all rays of one system, one after the other.
+        """Trace a leg along which each lane of the processor takes all rays of one system, one after the other.
 
-        It reads the system's numbers once. Where each lane has a ray of its own, it looks up all of them, which takes
-        more time than the rays.
+        A lane reads its system's numbers once. Where each lane has a ray of its own, it looks up all of them, which
+        takes more time than the rays.
 
         Parameters
         ----------
         leg : range
-            Of the elements.
-        elements : Sequence[ElementNumbers]
-            Their numbers, each (B,).
-        pose : FrameNumbers | None
-            Of the last element where rays in the world are wanted at its end, likewise.
-        grids : Any
-            As of ``through``.
-        rays : Any
-            likewise.
-        owned : tuple[Any, Any]
-            The systems' own places, and the rays of each.
-        hits : list[Any]
-            To which hit points are added.
-        outside : list[Any]
-            Likewise rays in the world.
+            Indices of the elements.
+        elements : sequence of ElementNumbers
+            Numbers of the elements, each (B,).
+        pose : FrameNumbers, optional
+            Pose of the last element, where rays in the world frame are requested at its end.
+        grids : tuple
+            Spline tables, as for ``through``.
+        rays : tuple
+            Position, direction, path and validity.
+        owned : tuple
+            Indices of the systems, and the number of rays of each.
+        hits : list
+            List to which intersections are appended.
+        outside : list
+            List to which rays in the world frame are appended.
         """
         import drjit as dr
 
         systems, shared = owned
         first = systems * shared
         kept = sum(i in self.keep for i in leg)
-        made = self._room(rays[0].x, 2 + kept + 2 * (pose is not None))
+        arrays = self._allocated(rays[0].x, 2 + kept + 2 * (pose is not None))
 
         def ray(place: Any) -> tuple[Any, ...]:
-            at = first + place
-            mine = tuple(array if dr.width(array) == 1 else dr.gather(type(array), array, at) for array in rays)
+            index = first + place
+            ray_arrays = tuple(
+                array if dr.width(array) == 1 else dr.gather(type(array), array, index) for array in rays
+            )
             own_hits: list[Any] = []
             own_outside: list[Any] = []
-            end = self._along(leg, elements, grids, mine, own_hits)
+            end = self._along(leg, elements, grids, ray_arrays, own_hits)
             if leg.stop == len(self.structure):
                 end = self._at_end(end, pose, own_outside)
-            for target, value in zip(made, (*end, *own_hits, *own_outside), strict=True):
-                dr.scatter(target, value, at)
+            for target, value in zip(arrays, (*end, *own_hits, *own_outside), strict=True):
+                dr.scatter(target, value, index)
             return (place + 1,)
 
         (ended,) = dr.while_loop(
             (dr.zeros(self.backend.UInt, dr.width(systems)),), lambda place: place < shared, ray, mode="symbolic"
         )
-        dr.eval(made, ended)
-        hits += made[4 : 4 + kept]
-        outside += made[4 + kept :]
-        return tuple(made[:4])
+        dr.eval(arrays, ended)
+        hits += arrays[4 : 4 + kept]
+        outside += arrays[4 + kept :]
+        return tuple(arrays[:4])
 
-    def _room(self, like: Any, vectors: int) -> list[Any]:
-        """Arrays of the size of another one, for position, direction, path and whether rays are alive, and further
-        vectors, whatever that size was when this was recorded: their contents, which are written over, come from it.
+    def _allocated(self, like: Any, vectors: int) -> list[Any]:
+        """Return arrays of the size of ``like`` for position, direction, path, validity and further vectors.
+
+        Their contents, which are overwritten, are computed from ``like``, so that their size follows it in every replay
+        of the recording.
         """
         import drjit as dr
 
@@ -543,41 +563,41 @@ class _Way:
 _threads = local()
 
 
-def _frozen(way: _Way, form: Any) -> Any:
-    """The instructions of a trace, recorded when they run for the first time and launched without Python after that.
+def _recorded(plan: _TracePlan, form: Any) -> Any:
+    """Return the instructions of a trace, recorded when they first run and launched without Python after that.
 
-    A recording is of one thread.
+    A recording belongs to one thread.
     """
     import drjit as dr
 
-    known = getattr(_threads, "known", None)
-    if known is None:
-        known = _threads.known = {}
-    found = known.get(way)
-    if found is None:
-        recorded = partial(way.through, form)
+    recordings = getattr(_threads, "known", None)
+    if recordings is None:
+        recordings = _threads.known = {}
+    function = recordings.get(plan)
+    if function is None:
+        recorded = partial(plan.through, form)
 
-        # what a frozen function closes over is compared at each call; a default is not
-        @dr.freeze(limit=MOST_RECORDINGS, warn_after=10 * MOST_RECORDINGS)
+        # variables in a closure are compared at each call of a frozen function, default arguments are not
+        @dr.freeze(limit=MAX_RECORDINGS, warn_after=10 * MAX_RECORDINGS)
         def through(numbers: Any, rays: Any, shared: Any, run: Any = recorded) -> Any:
             return run(numbers, rays, shared)
 
-        found = known[way] = through
-    return found
+        function = recordings[plan] = through
+    return function
 
 
-def require_some(valid: np.ndarray, what: str) -> None:
+def require_rays(valid: np.ndarray, what: str) -> None:
     """Raise BeamMissedError when some system of ``valid`` (B, N) has no valid ray at all."""
     alive = np.asarray(np.any(valid.reshape(len(valid), -1), axis=1))
     if not alive.all():
         raise BeamMissedError(
-            f"no ray gets through {what} in {int((~alive).sum())} of {len(alive)} cases; the perturbation moves the "
+            f"no ray passes through {what} in {int((~alive).sum())} of {len(alive)} cases; the perturbation moves the "
             "beam off a mirror or an aperture"
         )
 
 
-def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
-    """Bring rays to full width; how many each system has, as an array of width 1, or None for a single system."""
+def _full_width(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
+    """Return rays of full width, and the number of rays per system as an array of width 1 (None for a single system)."""
     import drjit as dr
 
     if count == 1:
@@ -598,12 +618,12 @@ def _spread(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
 
 
 def _lanes(systems: UploadedSystems, rays: int) -> Any:
-    """The systems' own places, (B,), where systems and rays are enough to fill the lanes of all threads; else None."""
+    """Return the indices of the systems (B,), or None where they and the rays do not fill the lanes of all threads."""
     import drjit as dr
 
     backend, threads = systems.backend, dr.thread_count()
-    fewest = max(2, FEWEST_LANES * max(2, threads) // 2)
-    if backend.name != "llvm" or systems.count < fewest or rays < FEWEST_IN_LANES:
+    fewest = max(2, MIN_LANE_SYSTEMS * max(2, threads) // 2)
+    if backend.name != "llvm" or systems.count < fewest or rays < MIN_LANE_RAYS:
         return None
     lanes = dr.arange(backend.UInt, systems.count)
     dr.make_opaque(lanes)
@@ -611,25 +631,25 @@ def _lanes(systems: UploadedSystems, rays: int) -> Any:
 
 
 class _Lookup:
-    """Numbers of each ray's or lane's system, element after element.
+    """Lookup of the numbers of each ray's or lane's system, element after element.
 
-    The row at which they begin goes along with the rays from kernel to kernel. Were it written into a kernel, no two
-    elements could share one.
+    The row at which they begin is passed along with the rays from kernel to kernel. If it were written into a kernel,
+    no two elements could share one.
 
     Parameters
     ----------
-    backend
-        Of the rays.
-    numbers
-        As of ``UploadedSystems``.
-    stride
-        How many systems there are, as an array of width 1; None for a single one.
-    start
-        Where the first element's numbers begin, likewise; None for the beginning.
-    system
-        Of each ray, or of each lane; None for a single one.
-    row
-        At which the numbers of the first element begin.
+    backend : Backend
+        Backend of the rays.
+    numbers : Dr.Jit arrays
+        Numbers, as in ``UploadedSystems``.
+    stride : UInt, optional
+        Number of systems, as an array of width 1; None for a single one.
+    start : UInt, optional
+        Offset of the first element's numbers, as an array of width 1; None for 0.
+    system : UInt, optional
+        System of each ray or lane; None for a single one.
+    row : int
+        Row at which the numbers of the first element begin.
     """
 
     def __init__(self, backend: Backend, numbers: Any, stride: Any, start: Any, system: Any, row: int) -> None:
@@ -638,7 +658,7 @@ class _Lookup:
         self.place = None if isinstance(numbers, tuple) else system if start is None else system + start
 
     def __call__(self, form: Any) -> Any:
-        """Numbers of a form with their rows."""
+        """Return the numbers of a form of rows."""
         import drjit as dr
 
         if self.place is not None:
@@ -647,29 +667,31 @@ class _Lookup:
             return map_leaves(lambda row: self._numbers[row], form)
         return map_leaves(lambda row: dr.gather(self._number, self._numbers[row], self._system), form)
 
-    def go_on(self, row: int) -> None:
-        """Let the numbers begin at another row."""
+    def advance(self, row: int) -> None:
+        """Set the row at which the next numbers begin."""
         if self.place is not None:
             self.place, self._row = self._after(row), row
 
     def _after(self, row: int) -> Any:
+        """Return the index of a row's number, for each ray or lane."""
         return self.place + self._count(row - self._row) * self._stride
 
 
-def _into_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[Any, Any]:
+def _to_frame(backend: Backend, p: Any, d: Any, frame: FrameNumbers) -> tuple[Any, Any]:
+    """Return positions and directions transformed into an element's frame."""
     import drjit as dr
 
     def point(c: CoordinateNumbers) -> Any:
-        return dr.fma(c.turn[0], p.x, dr.fma(c.turn[1], p.y, dr.fma(c.turn[2], p.z, c.shift)))
+        return dr.fma(c.row[0], p.x, dr.fma(c.row[1], p.y, dr.fma(c.row[2], p.z, c.shift)))
 
     def vector(c: CoordinateNumbers) -> Any:
-        return dr.fma(c.turn[0], d.x, dr.fma(c.turn[1], d.y, c.turn[2] * d.z))
+        return dr.fma(c.row[0], d.x, dr.fma(c.row[1], d.y, c.row[2] * d.z))
 
     return backend.Vector3(*map(point, frame.coordinates)), backend.Vector3(*map(vector, frame.coordinates))
 
 
 def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiable: bool, steps: int) -> tuple[Any, Any]:
-    """Path from p along d to the surface (may be negative) and whether it exists."""
+    """Return the path from p along d to the surface (may be negative) and whether the intersection exists."""
     import drjit as dr
 
     if surface.curvature is None:
@@ -685,12 +707,12 @@ def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiabl
         discriminant = b * b - a * e
         ok = discriminant >= 0.0
         root = dr.sqrt(dr.select(ok, discriminant, 1.0))
-        # of the two crossings the one on the vertex sheet: the denominator keeps d.z's sign and does not cancel, but
-        # for rays that start beyond the centre, or near the other sheet of a hyperboloid; there the root's other form
-        # does not
-        turn = dr.copysign(root, d.z)
-        near = b * turn > 0.0
-        t = dr.select(near, -(b + turn) / dr.select(near, a, 1.0), e / dr.select(near, 1.0, turn - b))
+        # of the two intersections, take the one on the vertex sheet. The denominator keeps d.z's sign and does not
+        # cancel, except for rays that start beyond the centre, or near the other sheet of a hyperboloid; the other
+        # form of the root does not cancel there.
+        signed_root = dr.copysign(root, d.z)
+        near = b * signed_root > 0.0
+        t = dr.select(near, -(b + signed_root) / dr.select(near, a, 1.0), e / dr.select(near, 1.0, signed_root - b))
         if surface.is_conic:
             return t, ok & (q * c * dr.fma(t, d.z, p.z) < 1.0)
     numbers = surface
@@ -708,28 +730,28 @@ def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiabl
 
 
 def _steps(surface: SurfaceNumbers, interaction: Interaction) -> int:
-    """Newton steps from the conic to the surface."""
+    """Return the number of Newton steps from the conic to the surface."""
     lens = bool(surface.even) and interaction is Interaction.REFRACT
     return NEWTON_STEPS + (FURTHER_STEPS if surface.terms or lens else 0)
 
 
-def _reached(p: Any, surface: SurfaceNumbers, table: Any) -> Any:
-    """Whether p lies on the surface's sheet through the vertex."""
+def _on_surface(p: Any, surface: SurfaceNumbers, table: Any) -> Any:
+    """Return whether p lies on the sheet of the surface through the vertex."""
     return _on_sheet(level(p.x, p.y, p.z, surface, table))
 
 
-def _on_sheet(found: tuple[Any, Any, Any, Any]) -> Any:
-    """Whether a point with that level and gradient lies on the sheet: level / nz is its height to first order."""
+def _on_sheet(level_and_gradient: tuple[Any, Any, Any, Any]) -> Any:
+    """Return whether a point with that level and gradient lies on the sheet; level / nz is its height to first order."""
     import drjit as dr
 
-    value, _, _, nz = found
+    value, _, _, nz = level_and_gradient
     return (nz > 0.0) & (dr.abs(value) < CONVERGED * nz)
 
 
 def _redirect(
     backend: Backend, p: Any, d: Any, element: ElementNumbers, interaction: Interaction, table: Any
 ) -> tuple[Any, Any]:
-    """Direction after reflection or refraction (Snell), and whether it exists."""
+    """Return the direction after reflection or refraction (Snell), and whether it exists."""
     import drjit as dr
 
     _, nx, ny, nz = level(p.x, p.y, p.z, element.surface, table)
@@ -743,7 +765,7 @@ def _redirect(
         f = -2.0 * along / square
         return backend.Vector3(dr.fma(f, nx, d.x), dr.fma(f, ny, d.y), dr.fma(f, nz, d.z)), beyond
     if interaction is not Interaction.REFRACT:
-        raise ValueError(f"the trace knows no interaction {interaction}")
+        raise ValueError(f"the trace does not support the interaction {interaction}")
     norm = dr.rsqrt(square)
     cosine = along * norm
     ratio = before / after
@@ -755,7 +777,7 @@ def _redirect(
 
 
 def _index_at(p: Any, medium: IndexNumbers) -> Any:
-    """Refractive index at a point of the surface."""
+    """Return the refractive index at a point of the surface."""
     import drjit as dr
 
     if medium.gradient is None:
@@ -765,9 +787,11 @@ def _index_at(p: Any, medium: IndexNumbers) -> Any:
 
 
 DIFFERENTIATED = 1
-"""Elements that one kernel differentiates in forward mode. Its code is several times that of a trace, and the time to
-compile it grows faster than its length: with six elements in one, the kernels of the main job take twice as long to
-compile as one by one, and those of derivatives no less to run."""
+"""Number of elements that one kernel differentiates in forward mode.
+
+Its code is several times that of a trace, and the time to compile it grows faster than its length: with six elements in
+one, the kernels of the main job take twice as long to compile as one by one, and those of derivatives no less to run.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -776,12 +800,12 @@ class RayTangents:
 
     Attributes
     ----------
-    position, direction : np.ndarray
-        (B, N, 3), metres and 1 per unit of the parameter.
-    path : np.ndarray
-        Optical path, (B, N).
-    hits : Mapping[int, np.ndarray]
-        Element index -> derivative of the local hit there, (B, N, 3), for those asked to be kept.
+    position, direction : (B, N, 3) ndarray
+        Derivatives, in metres and 1 per unit of the parameter.
+    path : (B, N) ndarray
+        Derivative of the optical path, metres per unit of the parameter.
+    hits : mapping of int to ndarray
+        Element index -> derivative of the local intersection, (B, N, 3), for those requested.
     traced : Traced
         The rays themselves.
     """
@@ -802,24 +826,24 @@ def jvp(
     direction_step: np.ndarray | float = 0.0,
     keep: Collection[int] = (),
 ) -> RayTangents:
-    """Trace rays and differentiate them by one parameter each.
+    """Trace rays and differentiate each by one parameter (forward mode).
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the trace.
     systems : SystemBatch
         B systems; derivatives that they carry (``assemble(..., step=...)``) are added.
-    position : np.ndarray
-        Launch points, world, (B, N, 3), metres.
-    direction : np.ndarray
-        Unit directions, (B, N, 3).
-    position_step : np.ndarray | float
+    position : (B, N, 3) ndarray
+        Launch points in the world frame, metres.
+    direction : (B, N, 3) ndarray
+        Unit directions in the world frame.
+    position_step : ndarray or float
         Derivative of the launch points, broadcastable to (B, N, 3).
-    direction_step : np.ndarray | float
-        Derivative of the directions, square to them, broadcastable to (B, N, 3).
-    keep : Collection[int]
-        Indices of elements whose hits are differentiated too.
+    direction_step : ndarray or float
+        Derivative of the directions, perpendicular to them, broadcastable to (B, N, 3).
+    keep : collection of int
+        Indices of elements whose intersections are differentiated, too.
     """
     import drjit as dr
 
@@ -828,8 +852,8 @@ def jvp(
     steps = [
         backend.vector(np.broadcast_to(s, direction.shape).reshape(-1, 3)) for s in (position_step, direction_step)
     ]
-    along = dr.zeros(backend.Float, dr.width(rays.position))
-    dr.make_opaque(along, rays.path, rays.valid)  # the first kernel is that of the others
+    path_step = dr.zeros(backend.Float, dr.width(rays.position))
+    dr.make_opaque(path_step, rays.path, rays.valid)  # so that the first element shares the kernel of the others
     hits: dict[int, Any] = {}
     slopes: dict[int, Any] = {}
     for first in range(0, len(uploaded.structure), DIFFERENTIATED):
@@ -838,25 +862,25 @@ def jvp(
         dr.set_grad(rays.position, steps[0])
         dr.set_grad(rays.direction, steps[1])
         dr.enable_grad(rays.path)
-        dr.set_grad(rays.path, along)
-        own = [i - first for i in keep if first <= i < last]
-        traced = trace(backend, uploaded.section(first, last), rays, keep=own, evaluate=False)
+        dr.set_grad(rays.path, path_step)
+        kept = [i - first for i in keep if first <= i < last]
+        traced = trace(backend, uploaded.section(first, last), rays, keep=kept, evaluate=False)
         local = traced.local
-        met = list(traced.hits.values())
-        # interior gradients are kept: a hit on the way is an input of the rays at the end
-        dr.forward_to(local.position, local.direction, local.path, met, flags=dr.ADFlag.ClearEdges)
-        steps, along = [dr.grad(local.position), dr.grad(local.direction)], dr.grad(local.path)
-        at = [dr.grad(vector) for vector in met]
+        intersections = list(traced.hits.values())
+        # interior gradients are kept: an intermediate intersection is an input of the final rays
+        dr.forward_to(local.position, local.direction, local.path, intersections, flags=dr.ADFlag.ClearEdges)
+        steps, path_step = [dr.grad(local.position), dr.grad(local.direction)], dr.grad(local.path)
+        gradients = [dr.grad(vector) for vector in intersections]
         # one launch for all: each array evaluated by itself would trace everything again in a kernel of its own
-        dr.eval(steps, along, at, local.position, local.direction, local.path, local.valid, met)
+        dr.eval(steps, path_step, gradients, local.position, local.direction, local.path, local.valid, intersections)
         hits.update({first + i: dr.detach(vector) for i, vector in traced.hits.items()})
-        slopes.update({first + i: slope for i, slope in zip(traced.hits, at, strict=True)})
+        slopes.update({first + i: slope for i, slope in zip(traced.hits, gradients, strict=True)})
         place, heading, path = (dr.detach(array) for array in (local.position, local.direction, local.path))
         rays = Rays(place, heading, path, local.valid, systems.count)
     return RayTangents(
         rows(steps[0], systems.count),
         rows(steps[1], systems.count),
-        along.numpy().reshape(systems.count, -1),
+        path_step.numpy().reshape(systems.count, -1),
         {i: rows(slope, systems.count) for i, slope in slopes.items()},
         Traced(rays, None, hits, systems.count),
     )
@@ -864,16 +888,16 @@ def jvp(
 
 @dataclass(frozen=True, eq=False)
 class RayCotangents:
-    """Derivatives of S_b = sum_n w_bn . r_bn, with r the rays at the last element of system b and w given weights.
+    """Derivatives of the weighted sums S_b = sum_n w_bn . r_bn of ray positions r at the last element of system b.
 
     Attributes
     ----------
-    values : tuple[Mapping[Path, np.ndarray], ...]
-        Per element, path of a number -> dS_b/d(number of system b), (B,), for those that were asked for.
-    position : np.ndarray
-        dS_b/d(launch point), (B, N, 3), per metre.
-    direction : np.ndarray
-        dS_b/d(launch direction), (B, N, 3); its part along the ray means nothing by itself.
+    values : tuple of mapping of Path to ndarray
+        Per element, path of a number -> dS_b/d(number of system b), (B,), for those requested.
+    position : (B, N, 3) ndarray
+        dS_b/d(launch point), per metre.
+    direction : (B, N, 3) ndarray
+        dS_b/d(launch direction); its component along the ray is meaningless by itself.
     """
 
     values: tuple[Mapping[Path, np.ndarray], ...]
@@ -889,33 +913,33 @@ def vjp(
     weight: np.ndarray,
     names: Sequence[Collection[Path]],
 ) -> RayCotangents:
-    """Trace rays and differentiate a weighted sum of where they end by everything they depend on.
+    """Trace rays and differentiate a weighted sum of their final positions by all inputs (reverse mode).
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the trace.
     systems : SystemBatch
-        B systems; derivatives that they carry are left aside.
-    position : np.ndarray
-        Launch points, world, (B, N, 3), metres.
-    direction : np.ndarray
-        Unit directions, (B, N, 3).
-    weight : np.ndarray
-        Of the positions at the last element, in its own frame, broadcastable to (B, N, 3).
-    names : Sequence[Collection[Path]]
+        B systems; derivatives that they carry are ignored.
+    position : (B, N, 3) ndarray
+        Launch points in the world frame, metres.
+    direction : (B, N, 3) ndarray
+        Unit directions in the world frame.
+    weight : ndarray
+        Weights of the positions at the last element, in its own frame, broadcastable to (B, N, 3).
+    names : sequence of collection of Path
         Per element, paths of the numbers in ``systems.values`` to differentiate by.
 
     Returns
     -------
     RayCotangents
-        Derivatives; rays that are stopped or lost count as if they went on.
+        Derivatives; rays that are blocked or lost count as if they continued.
     """
     import drjit as dr
 
-    alone = replace(systems, tangents=None, world_tangents=None)
-    uploaded = replace(alone.upload(backend, own=True), differentiable=True)
-    wanted = [leaves(numbers)[path] for numbers, own in zip(uploaded.values, names, strict=True) for path in own]
+    plain = replace(systems, tangents=None, world_tangents=None)
+    uploaded = replace(plain.upload(backend, separate=True), differentiable=True)
+    wanted = [leaves(numbers)[path] for numbers, paths in zip(uploaded.values, names, strict=True) for path in paths]
     rays = make_rays(backend, position, direction)
     for variable in (*wanted, rays.position, rays.direction):
         dr.enable_grad(variable)
@@ -926,6 +950,6 @@ def vjp(
 
     slopes = [dr.grad(variable) for variable in (*wanted, rays.position, rays.direction)]
     dr.eval(slopes)  # one launch for all
-    at = iter(slope.numpy() for slope in slopes[:-2])
-    values = tuple({path: next(at) for path in own} for own in names)
+    gradients = iter(slope.numpy() for slope in slopes[:-2])
+    values = tuple({path: next(gradients) for path in paths} for paths in names)
     return RayCotangents(values, rows(slopes[-2], systems.count), rows(slopes[-1], systems.count))

@@ -1,1 +1,1 @@
-"""Test targets, their images, the collimator they are shown in."""
+"""Test targets, their images, and the collimator that presents them to a camera."""

@@ -1,4 +1,4 @@
-"""A collimator as the camera sees it: a plane wave with errors of its own, curved when its target is moved."""
+"""Collimator as the camera sees it: a plane wave with wavefront error, curved when the target is out of focus."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from optics.numerics.number_tree import FrozenMap
 
 
 class TooNarrowError(PhysicalError, ValueError):
-    """The collimator's aperture does not hold the camera's beam."""
+    """The collimator's aperture is smaller than the camera's beam."""
 
 
 @dataclass(frozen=True)
 class Collimator:
-    """A collimator with a target at its focus.
+    """Collimator with a target at its focus.
 
     Attributes
     ----------
     focal_length : float
-        metres.
+        Focal length, metres.
     radius : float
-        Of its aperture, metres.
-    wavefront : Mapping[int, float]
+        Radius of the aperture, metres.
+    wavefront : mapping of int to float
         Noll index -> wavefront error over the aperture, metres rms, positive where the wave is ahead.
     """
 
@@ -39,33 +39,33 @@ class Collimator:
         object.__setattr__(self, "wavefront", FrozenMap(self.wavefront))
 
     def path(self, point: np.ndarray, target_shift: float = 0.0) -> np.ndarray:
-        """Optical path that the beam brings along, beyond that of a plane wave.
+        """Return the optical path of the incoming beam, beyond that of a plane wave.
 
         Parameters
         ----------
-        point : np.ndarray
-            Transverse coordinates from the collimator's axis, (..., 2), metres.
+        point : (..., 2) ndarray
+            Transverse coordinates from the collimator's axis, metres.
         target_shift : float
-            Of the target out of the focus, along the light's travel (toward the collimator's optics, so that the beam
-            diverges), metres. The camera's image then moves along the light's travel by ``target_shift * (f /
-            focal_length)**2`` (Newton's equation).
+            Displacement of the target from the focus, along the direction of the light (toward the collimator's optics,
+            so that the beam diverges), metres. The camera's image then moves along the direction of the light by
+            ``target_shift * (f / focal_length)**2`` (Newton's equation).
 
         Returns
         -------
-        np.ndarray
-            (...,) metres.
+        (...) ndarray
+            Optical path, metres.
 
         Raises
         ------
         TooNarrowError
-            a point outside the aperture.
+            A point lies outside the aperture.
         """
         square = np.sum(point**2, axis=-1)
         if np.max(square) > self.radius**2:
-            reach = 2e3 * float(np.sqrt(np.max(square)))
+            width = 2e3 * float(np.sqrt(np.max(square)))
             raise TooNarrowError(
-                f"the camera's beam is {reach:.0f} mm wide about the collimator's axis, the collimator's aperture "
-                f"{2e3 * self.radius:.0f} mm"
+                f"the camera's beam is {width:.0f} mm wide about the collimator's axis, but the collimator's "
+                f"aperture is only {2e3 * self.radius:.0f} mm"
             )
         out = 0.5 * target_shift / self.focal_length**2 * square
         if self.wavefront:

@@ -4,10 +4,8 @@ The irradiance is the inverse Fourier transform of the target's spectrum T (clos
 ``optics.geometry.vector_shape``) times a transfer function H: optical transfer function, pixel aperture, smear, charge
 diffusion, whatever is linear. H ends at a known cut-off, so no supersampling is needed: every pixel gets the exact
 value at its centre, which with the pixel aperture in H is the mean over the pixel. Signs: I(x) = integral of T(f) H(f)
-exp(+2 pi i f . x) df, so that a factor exp(-2 pi i f . s) in H moves the image by +s. Because I is real,
-H(-f) = conj H(f), and only half of it is asked for.
-
-A collimator as the camera sees it: a plane wave with errors of its own, curved when its target is moved.
+exp(+2 pi i f . x) df, so that a factor exp(-2 pi i f . s) in H moves the image by +s. Because I is real, H(-f) = conj
+H(f), and only half of it is evaluated.
 """
 
 from __future__ import annotations
@@ -28,118 +26,122 @@ from optics.targets.target_shapes import Target
 from optics.waves.diffraction import Grid
 
 Transfer = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Complex H at frequencies fx, fy, (N,) each, cycles/m; it must not depend on the order in which it is asked."""
+"""Function that returns complex H at frequencies fx, fy, (N,) each, cycles/m, independent of their order."""
 
 _SAMPLES = 16
-"""Knots of an edge profile per 1/cut-off: the quintic spline through them is good to 1e-9."""
+"""Knots of an edge profile per 1/cut-off: the quintic spline through them is accurate to 1e-9."""
 
 _NODES = 16
-"""Gauss-Legendre nodes per panel, in which an edge profile's integrand turns by one cycle. A transfer function may add
-two more: the rule's error on three cycles is below 1e-12."""
+"""Gauss-Legendre nodes per panel, in which the phase of an edge profile's integrand changes by one cycle.
+
+A transfer function may add two more cycles: the rule's error on three cycles is below 1e-12.
+"""
 
 _LEAST_PANELS = 32
-"""Panels for a transfer function that is only piecewise smooth."""
+"""Smallest number of panels, for a transfer function that is only piecewise smooth."""
 
 LEAST_GUARD = 64.0
 """Default distance between the window and the periodic copies of the target, in units of 1/cut-off."""
 
 _FACTORS = (1.0, 4.0, 16.0, 64.0)
-"""Periods of the Fourier series for ever lower frequencies, in units of the first one."""
+"""Periods of the Fourier series for successively lower frequencies, in units of the first period."""
 
 _WIDTH = 1.5
 """Width of a low pass times the distance of the copies; its kernel there is 1e-9 of its peak."""
 
 _WIDTHS = 7.0
-"""Width of a low pass at which it counts as 0: it is 5e-11."""
+"""Frequency, in widths of a low pass, at which it counts as 0: it is 5e-11."""
 
 _BLOCK = 1 << 17
-"""Frequencies worked on together, to bound memory."""
+"""Number of frequencies processed in one block, to bound memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeProfile:
-    """Image of a half plane as a function of the distance from its edge.
+    """Image of a half-plane as a function of the distance from its edge.
 
     Attributes
     ----------
-    normal : np.ndarray
-        Of the half plane, unit, (2,).
-    reach : float
+    normal : (2,) ndarray
+        Unit normal of the half-plane.
+    extent : float
         Largest distance from the edge, metres.
     level : float
         H(0), the image far inside.
     spline : BSpline
-        Irradiance over distance.
+        Irradiance as a function of distance.
     """
 
     normal: np.ndarray
-    reach: float
+    extent: float
     level: float
     spline: BSpline
 
     @classmethod
-    def build(cls, transfer: Transfer, normal: np.ndarray, cutoff: float, reach: float) -> EdgeProfile:
+    def build(cls, transfer: Transfer, normal: np.ndarray, cutoff: float, extent: float) -> EdgeProfile:
         """Integrate the transfer function along the normal.
 
         E(d) = H(0)/2 + integral from -inf to inf of H(f n)/(2 pi i f) exp(2 pi i f d) df (principal value). For a real
-        image the two halves of the axis make E(d) = H(0)/2 + integral from 0 to the cut-off of
-        Im[H(f n) exp(2 pi i f d)]/(pi f) df, whose integrand is finite at f = 0: no singularity is left.
+        image the two halves of the axis make E(d) = H(0)/2 + integral from 0 to the cut-off of Im[H(f n) exp(2 pi i f
+        d)]/(pi f) df, whose integrand is finite at f = 0: no singularity is left.
 
         Parameters
         ----------
-        transfer : Transfer
-            H.
-        normal : np.ndarray
-            Toward the bright side, (2,).
+        transfer : callable
+            Transfer function H.
+        normal : (2,) ndarray
+            Normal toward the bright side.
         cutoff : float
             Frequency above which H is 0, cycles/m.
-        reach : float
-            Largest distance from the edge that will be asked for, metres.
+        extent : float
+            Largest distance from the edge at which the profile is evaluated, metres.
         """
-        _check_positive(cutoff=cutoff, reach=reach)
+        _check_positive(cutoff=cutoff, extent=extent)
         normal = np.asarray(normal, float) / np.hypot(*normal)
         normal.setflags(write=False)
-        sampling = _edge_sampling(cutoff, reach)
+        sampling = _edge_sampling(cutoff, extent)
         f = sampling.frequency
-        both = _ask(transfer, np.append(f, 0.0) * normal[0], np.append(f, 0.0) * normal[1])
+        both = _evaluated(transfer, np.append(f, 0.0) * normal[0], np.append(f, 0.0) * normal[1])
         level = float(both[-1].real)
         with one_blas_thread():
             table = (sampling.coarse * (sampling.share * both[:-1])) @ sampling.fine
         distance = sampling.distance
         values = 0.5 * level + table.imag.ravel()[: len(distance)]
-        return cls(normal, reach, level, make_interp_spline(distance, values, k=5))
+        return cls(normal, extent, level, make_interp_spline(distance, values, k=5))
 
     def __call__(self, distance: np.ndarray) -> np.ndarray:
-        """Irradiance at distances from the edge, metres, positive on the bright side; bright is 1 where H(0) = 1.
+        """Return the irradiance at distances from the edge, metres, positive on the bright side.
+
+        It is 1 far inside where H(0) = 1.
 
         Raises
         ------
         ValueError
-            a distance beyond the reach.
+            A distance exceeds ``extent``.
         """
         distance = np.asarray(distance, float)
-        if distance.size and np.max(np.abs(distance)) > self.reach * (1.0 + 1e-12):
+        if distance.size and np.max(np.abs(distance)) > self.extent * (1.0 + 1e-12):
             raise UnphysicalError(
-                f"the edge profile reaches {self.reach:.3g} m, but {np.max(np.abs(distance)):.3g} m is asked for"
+                f"the edge profile extends to {self.extent:.3g} m, but {np.max(np.abs(distance)):.3g} m is requested"
             )
         return np.asarray(self.spline(distance))
 
     def image(self, edge: HalfPlane, x: Grid, y: Grid) -> np.ndarray:
-        """Irradiance at pixel centres, (R, C), for any edge with the profile's normal.
+        """Return the irradiance at pixel centres, (R, C), for any edge with the profile's normal.
 
         Parameters
         ----------
         edge : HalfPlane
-            Half plane with the profile's normal.
+            Half-plane with the profile's normal.
         x : Grid
             Pixel centres along columns, (C,), metres.
         y : Grid
-            Along rows, (R,), metres.
+            Pixel centres along rows, (R,), metres.
 
         Raises
         ------
         ValueError
-            An edge with another normal, or pixels beyond the reach.
+            The edge has another normal, or pixels lie beyond ``extent``.
         """
         if np.max(np.abs(edge.normal - self.normal)) > 1e-12:
             raise ValueError(f"the profile belongs to the normal {self.normal}, the edge has {edge.normal}")
@@ -148,17 +150,17 @@ class EdgeProfile:
 
 @dataclass(frozen=True, eq=False)
 class _EdgeSampling:
-    """What the integral of an edge profile needs and the transfer function does not change.
+    """Parts of an edge profile's integral that do not depend on the transfer function.
 
     Attributes
     ----------
-    frequency, share : np.ndarray
-        Gauss' nodes (N,) and their weights over pi f.
-    distance : np.ndarray
-        (D,) knots of the profile, metres.
-    coarse, fine : np.ndarray
-        exp(2 pi i f d) of distances taken apart into coarse + fine steps, (A, N) and (N, B), A B >= D, so that the sum
-        over frequencies becomes one matrix product.
+    frequency, share : (N,) ndarray
+        Gauss nodes, and their weights divided by pi f.
+    distance : (D,) ndarray
+        Knots of the profile, metres.
+    coarse, fine : (A, N) and (N, B) ndarray
+        exp(2 pi i f d) of distances split into coarse and fine steps, A B >= D, so that the sum over frequencies
+        becomes one matrix product.
     """
 
     frequency: np.ndarray
@@ -169,15 +171,16 @@ class _EdgeSampling:
 
 
 @lru_cache(maxsize=8)
-def _edge_sampling(cutoff: float, reach: float) -> _EdgeSampling:
-    panels = _LEAST_PANELS + int(np.ceil(cutoff * reach))
+def _edge_sampling(cutoff: float, extent: float) -> _EdgeSampling:
+    """Return the sampling of an edge profile to a distance ``extent``."""
+    panels = _LEAST_PANELS + int(np.ceil(cutoff * extent))
     node, weight = gauss(_NODES)
     f = (cutoff / panels * (np.arange(panels)[:, None] + 0.5 * (node + 1.0))).ravel()
     share = np.tile(0.5 * cutoff / panels * weight, panels) / (np.pi * f)
-    count = int(np.ceil(2.0 * reach * cutoff * _SAMPLES)) + 7
+    count = int(np.ceil(2.0 * extent * cutoff * _SAMPLES)) + 7
     fine = int(np.ceil(np.sqrt(count)))
-    step = 2.0 * reach / (count - 7)
-    start = -reach - 3.0 * step
+    step = 2.0 * extent / (count - 7)
+    start = -extent - 3.0 * step
     coarse = np.exp(2j * np.pi * (start + step * fine * np.arange(-(-count // fine)))[:, None] * f)
     steps = np.exp(2j * np.pi * f[:, None] * (step * np.arange(fine)))
     return _EdgeSampling(f, share, start + step * np.arange(count), coarse, steps)
@@ -186,53 +189,53 @@ def _edge_sampling(cutoff: float, reach: float) -> _EdgeSampling:
 def target_image(
     target: Target, transfer: Transfer, cutoff: float, x: Grid, y: Grid, guard: float | None = None
 ) -> np.ndarray:
-    """Irradiance of a target at pixel centres.
+    """Return the irradiance of a target at pixel centres.
 
-    Half planes are integrated along their normals (``EdgeProfile``), with no other approximation than rounding and a
-    spline (1e-8). Finite shapes become a Fourier series whose period is the window and a guard, so that the copies of
+    Half-planes are integrated along their normals (``EdgeProfile``), with no other approximation than rounding and a
+    spline (1e-8). Finite shapes become a Fourier series whose period is the window plus a guard, so that the copies of
     the target are the guard away. A copy's tail falls only with the third power of the distance, because a diffraction
-    MTF has a cusp at f = 0. So ever lower frequencies, which carry the cusp, are summed with ever longer periods (4, 16
-    and 64 times), through a smooth partition of H. For a clear circular pupil the default guard then leaves an error
-    below 1e-6 of full brightness: 4e-7 for a disk as wide as a window of 64 pixels, where one period alone would leave
-    5e-4. The sum over frequencies runs separately along x and y straight to the pixels, where aliases fall together
-    (as in ``optics.waves.diffraction``), so that coarse pixels need no fine grid. Its cost goes with the square of
-    period times cut-off, so keep shapes near the window.
+    MTF has a cusp at f = 0. Successively lower frequencies, which carry the cusp, are therefore summed with
+    successively longer periods (4, 16 and 64 times), through a smooth partition of H. For a clear circular pupil the
+    default guard then leaves an error below 1e-6 of full brightness: 4e-7 for a disk as wide as a window of 64 pixels,
+    where one period alone would leave 5e-4. The sum over frequencies runs separately along x and y straight to the
+    pixels, where aliases coincide (as in ``optics.waves.diffraction``), so that coarse pixels need no fine grid. The
+    cost is proportional to the square of period times cut-off, so keep shapes near the window.
 
     Parameters
     ----------
     target : Target
-        In the image plane.
-    transfer : Transfer
-        H; called with arrays (N,) of frequencies inside the cut-off.
+        Target in the image plane.
+    transfer : callable
+        Transfer function H; called with arrays (N,) of frequencies inside the cut-off.
     cutoff : float
         Frequency above which H is 0, cycles/m.
     x : Grid
         Pixel centres of the C columns, metres.
     y : Grid
-        Pixel centres of the R rows.
-    guard : float | None
-        Metres added to the window's sides to make the period; default: so much that every copy of a shape is at least
+        Pixel centres of the R rows, metres.
+    guard : float, optional
+        Length added to the window's sides to make the period, metres; by default every copy of a shape is at least
         64/cutoff away from the window.
 
     Returns
     -------
-    np.ndarray
-        (R, C); where H(0) = 1, a wide bright area is 1.
+    (R, C) ndarray
+        Irradiance; where H(0) = 1, a wide bright area is 1.
 
     Raises
     ------
     ValueError
-        a shape that comes nearer than half of the guard to the copies of the window, or a bad argument.
+        A shape is nearer than half of the guard to the copies of the window, or an argument is invalid.
     """
     _check_positive(cutoff=cutoff, column_step=x.step, row_step=y.step)
-    level = float(_ask(transfer, np.zeros(1), np.zeros(1))[0].real)
+    level = float(_evaluated(transfer, np.zeros(1), np.zeros(1))[0].real)
     out = np.full((y.count, x.count), target.background * level)
     finite: list[tuple[float, FiniteShape]] = []
     for share, shape in target.parts:
         match shape:
             case HalfPlane():
-                reach = float(np.max(np.abs(shape.distance(x.points()[[0, -1]], y.points()[[0, -1], None]))))
-                profile = EdgeProfile.build(transfer, shape.normal, cutoff, max(reach, 1.0 / cutoff))
+                extent = float(np.max(np.abs(shape.distance(x.points()[[0, -1]], y.points()[[0, -1], None]))))
+                profile = EdgeProfile.build(transfer, shape.normal, cutoff, max(extent, 1.0 / cutoff))
                 out += share * profile.image(shape, x, y)
             case Polygon() | Disk():
                 finite.append((share, shape))
@@ -246,15 +249,15 @@ def target_image(
 def _finite_image(
     parts: list[tuple[float, FiniteShape]], transfer: Transfer, cutoff: float, x: Grid, y: Grid, guard: float | None
 ) -> np.ndarray:
-    """Irradiance of finite shapes, (R, C), as two Fourier series."""
+    """Return the irradiance of finite shapes, (R, C), as a sum of Fourier series of increasing periods."""
     overhang = _overhang(parts, x, y)
     if guard is None:
         guard = overhang + max(LEAST_GUARD / cutoff, overhang)
     _check_positive(guard=guard)
     if overhang > 0.5 * guard:
         raise UnphysicalError(
-            f"a shape reaches {overhang:.3g} m beyond the window and does not fit into its period; with a guard of"
-            f" {guard:.3g} m it may reach {0.5 * guard:.3g} m: enlarge the guard or the window"
+            f"a shape extends {overhang:.3g} m beyond the window and does not fit into its period; with a guard of"
+            f" {guard:.3g} m it may extend {0.5 * guard:.3g} m: enlarge the guard or the window"
         )
     window = np.array([x.step * (x.count - 1), y.step * (y.count - 1)])
     periods = [factor * (window + guard) for factor in _FACTORS]
@@ -271,7 +274,7 @@ def _finite_image(
 
 @dataclass(frozen=True)
 class _Band:
-    """A transfer function between two smooth low passes: what is below the first and not below the second."""
+    """Transfer function between two smooth low passes: inside the first and outside the second."""
 
     transfer: Transfer
     width: float
@@ -279,21 +282,21 @@ class _Band:
 
     def __call__(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
         square = fx * fx + fy * fy
-        return _ask(self.transfer, fx, fy) * (_low_pass(square, self.width) - _low_pass(square, self.next_width))
+        return _evaluated(self.transfer, fx, fy) * (_low_pass(square, self.width) - _low_pass(square, self.next_width))
 
 
 def _low_pass(square: np.ndarray, width: float) -> np.ndarray:
-    """1 - (1 - g)^2 with a Gaussian g of the given width: it leaves 1 at f = 0 with f^4; ``square`` is f^2."""
+    """Return 1 - (1 - g)^2 with a Gaussian g of the given width; it departs from 1 with f^4; ``square`` is f^2."""
     return np.asarray(1.0 - np.expm1(-0.5 * square / width**2) ** 2) if width > 0.0 else np.zeros_like(square)
 
 
 def _series(
     parts: list[tuple[float, FiniteShape]], transfer: Transfer, cutoff: float, x: Grid, y: Grid, periods: np.ndarray
 ) -> np.ndarray:
-    """Fourier series of the parts with the periods (x, y), its terms inside the cut-off, at pixel centres (R, C)."""
+    """Return the Fourier series of the parts with periods (x, y), terms inside the cut-off, at pixel centres (R, C)."""
     fx = np.arange(int(cutoff * periods[0]) + 1) / periods[0]
-    most = int(cutoff * periods[1])
-    fy = np.arange(-most, most + 1) / periods[1]
+    last = int(cutoff * periods[1])
+    fy = np.arange(-last, last + 1) / periods[1]
     columns = np.exp(2j * np.pi * fx[:, None] * x.points())
     columns[1:] *= 2.0  # terms of -fx are the conjugates of those of fx
     half = np.empty((len(fy), x.count), complex)
@@ -306,8 +309,8 @@ def _series(
         for share, shape in parts:
             terms += share * shape.spectrum(u, v)
         inside = u * u + v * v <= cutoff**2
-        at = np.nonzero(inside)
-        terms[inside] *= transfer(u[at[1]], v[at[0], 0])
+        index = np.nonzero(inside)
+        terms[inside] *= transfer(u[index[1]], v[index[0], 0])
         terms[~inside] = 0.0
         half[begin : begin + rows] = terms @ columns[: len(u)]
     image = np.exp(2j * np.pi * y.points()[:, None] * fy) @ half
@@ -315,15 +318,15 @@ def _series(
 
 
 def _overhang(parts: list[tuple[float, FiniteShape]], x: Grid, y: Grid) -> float:
-    """Largest distance of a shape's bounds beyond the window of pixel centres, metres; 0 if all lie inside."""
+    """Return the largest distance of a shape's bounds beyond the window of pixel centres, metres; 0 if all lie inside."""
     x0, x1, y0, y1 = np.array([shape.bounds for _, shape in parts]).T
     (left, right), (low, high) = x.points()[[0, -1]], y.points()[[0, -1]]
     beyond = (left - np.min(x0), np.max(x1) - right, low - np.min(y0), np.max(y1) - high)
     return max(0.0, *(float(distance) for distance in beyond))
 
 
-def _ask(transfer: Transfer, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
-    """H at frequencies (N,), checked."""
+def _evaluated(transfer: Transfer, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
+    """Return H at frequencies (N,), after checking shape and finiteness."""
     value = np.asarray(transfer(fx, fy))
     if value.shape != fx.shape or not np.all(np.isfinite(value)):
         raise ValueError(f"the transfer function must give one finite number per frequency, found shape {value.shape}")
@@ -331,6 +334,7 @@ def _ask(transfer: Transfer, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
 
 
 def _check_positive(**values: float) -> None:
+    """Raise ValueError if a named value is not positive and finite."""
     for name, value in values.items():
         if not (np.isfinite(value) and value > 0.0):
             raise ValueError(f"the {name.replace('_', ' ')} must be positive, found {value}")

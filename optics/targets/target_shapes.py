@@ -1,6 +1,6 @@
 """Test targets of optical benches as vector shapes: knife edge, bar group, star, pinhole; those of a camera's windows.
 
-A target lies in its own plane, metres, about the origin. ``Target.mapped`` takes it into an image plane, where columns
+A target lies in its own plane, in metres about the origin. ``Target.mapped`` maps it into an image plane, where columns
 count along x and rows along y. Levels are transmittances, 0 to 1.
 """
 
@@ -18,19 +18,19 @@ from optics.numerics.extension_table import ExtensionTable
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A plane of even transmittance with shapes on it.
+    """Plane of uniform transmittance with shapes on it.
 
     Attributes
     ----------
     background : float
-        Transmittance where no shape is, 0 to 1.
-    parts : tuple[tuple[float, Shape], ...]
-        (what the shape adds to the background, shape); shapes must not overlap (not checked).
+        Transmittance where there is no shape, 0 to 1.
+    parts : tuple of (float, Shape)
+        (transmittance that the shape adds to the background, shape); shapes must not overlap (not checked).
 
     Raises
     ------
     ValueError
-        a transmittance outside 0 to 1.
+        A transmittance is outside 0 to 1.
     """
 
     background: float
@@ -44,14 +44,14 @@ class Target:
                 raise ValueError(f"transmittances of a target lie between 0 and 1, found {level}")
 
     def mapped(self, point_map: PointMap, tolerance: float = BEND_TOLERANCE) -> Target:
-        """The target seen through a smooth map of points (N, 2) -> (N, 2), metres, such as a camera's chief rays.
+        """Return the target under a smooth map of points (N, 2) -> (N, 2), metres, such as a camera's chief rays.
 
         Parameters
         ----------
-        point_map : PointMap
+        point_map : callable
             The map.
         tolerance : float
-            Largest distance of a new outline from the mapped one, metres; half planes keep straight edges, the tangents
+            Largest distance of a new outline from the mapped one, metres; half-planes keep straight edges, the tangents
             at their points.
 
         Raises
@@ -67,35 +67,35 @@ class Target:
 
 
 def slanted_edge(angle: float, direction: Literal["x", "y"] = "y") -> Target:
-    """A knife edge through the origin, bright on one side, for the slanted-edge method (ISO 12233).
+    """Return a knife edge through the origin, bright on one side, for the slanted-edge method (ISO 12233).
 
     Parameters
     ----------
     angle : float
-        By which the edge is turned from its axis, from +x toward +y, radians, below 45 degrees either way.
-    direction : Literal['x', 'y']
-        The axis that the edge follows at angle 0: "y" for a profile along x (bright toward +x), "x" for a profile along
-        y (bright toward +y).
+        Rotation of the edge from its axis, from +x toward +y, radians, below 45 degrees either way.
+    direction : {'x', 'y'}
+        Axis that the edge follows at angle 0: "y" for a profile along x (bright toward +x), "x" for a profile along y
+        (bright toward +y).
     """
     if not abs(angle) < 0.25 * np.pi:
         raise ValueError(f"a slanted edge needs an angle below 45 degrees, found {np.degrees(angle):g}")
-    turn = angle if _is_y(direction) else angle + 0.5 * np.pi
-    return Target(0.0, ((1.0, HalfPlane(np.zeros(2), np.array([np.cos(turn), np.sin(turn)]))),))
+    normal_angle = angle if _is_y(direction) else angle + 0.5 * np.pi
+    return Target(0.0, ((1.0, HalfPlane(np.zeros(2), np.array([np.cos(normal_angle), np.sin(normal_angle)]))),))
 
 
 def bar_group(frequency: float, bars: int, length: float, angle: float = 0.0) -> Target:
-    """Bright bars on dark, each half a period wide, about the origin.
+    """Return bright bars on dark, each half a period wide, about the origin.
 
     Parameters
     ----------
     frequency : float
-        Along the bars' normal, cycles/m.
+        Spatial frequency along the bars' normal, cycles/m.
     bars : int
         Number of bright bars.
     length : float
-        Of a bar, metres.
+        Length of a bar, metres.
     angle : float
-        Of the bars' normal from +x toward +y, radians.
+        Angle of the bars' normal from +x toward +y, radians.
     """
     if not (np.isfinite(frequency) and frequency > 0.0):
         raise ValueError(f"bars need a positive frequency in cycles/m, found {frequency}")
@@ -112,7 +112,9 @@ def bar_group(frequency: float, bars: int, length: float, angle: float = 0.0) ->
 
 
 def siemens_star(spokes: int, radius: float, inner: float = 0.0) -> Target:
-    """Bright spokes on dark about the origin, each as wide in angle as the gaps; the first one lies along +x.
+    """Return bright spokes on dark about the origin, of the same angular width as the gaps.
+
+    The first spoke lies along +x.
 
     At the distance r from the middle the star has the frequency spokes / (2 pi r). The ends of the spokes are chords.
 
@@ -121,7 +123,7 @@ def siemens_star(spokes: int, radius: float, inner: float = 0.0) -> Target:
     spokes : int
         Number of bright spokes, 2 or more.
     radius : float
-        Of the corners, metres.
+        Distance of the outer corners from the middle, metres.
     inner : float
         Radius at which the spokes begin, metres; 0: they meet in the middle.
     """
@@ -136,38 +138,42 @@ def siemens_star(spokes: int, radius: float, inner: float = 0.0) -> Target:
 
 
 def pinhole(diameter: float) -> Target:
-    """A bright disk on dark at the origin; diameter in metres."""
+    """Return a bright disk on dark at the origin; diameter in metres."""
     if not (np.isfinite(diameter) and diameter > 0.0):
         raise ValueError(f"a pinhole needs a positive diameter, found {diameter}")
     return Target(0.0, ((1.0, Disk(np.zeros(2), 0.5 * diameter)),))
 
 
 SPOKES = 36
+"""Number of bright spokes of a window's Siemens star."""
 STAR_SHARE = 0.9
-"""The star's radius, as a share of half the window. The Nyquist frequency lies 11.5 pixels from its middle."""
+"""Radius of a window's star, as a fraction of half the window. The Nyquist frequency lies 11.5 pixels from its middle.
+"""
 
 PINHOLE = 1.0
 """Diameter of the pinhole's image, pixels."""
 
 
 def star_target(pitch: float, region: int) -> Target:
-    """The Siemens star of a window of ``region`` pixels of ``pitch`` metres."""
+    """Return the Siemens star of a window of ``region`` pixels of ``pitch`` metres."""
     return siemens_star(SPOKES, 0.5 * STAR_SHARE * region * pitch)
 
 
 def pinhole_target(pitch: float, region: int) -> Target:
-    """The pinhole of a window of ``region`` pixels of ``pitch`` metres."""
+    """Return the pinhole of a window of ``region`` pixels of ``pitch`` metres."""
     return pinhole(PINHOLE * pitch)
 
 
 TARGETS = ExtensionTable[Callable[[float, int], Target]]("targets", {"star": star_target, "pinhole": pinhole_target})
-"""Name -> target of finite shapes about the middle of a window, of a pixel pitch, metres on the nominal image, and the
-window's side, pixels. Each can be imaged by the cameras of a job beside the edges and bars, whose MTF the job measures
-itself. A new one is added here.
+"""Targets of finite shapes about the middle of a window, by name.
+
+Each is a function of the pixel pitch, in metres on the nominal image, and the window's side, in pixels. The cameras of
+a job can image them in addition to the edges and bars, whose MTF the job measures itself. A new target is added here.
 """
 
 
 def _is_y(direction: str) -> bool:
+    """Return True for the direction "y", False for "x"; raise ValueError for another."""
     if direction not in ("x", "y"):
         raise ValueError(f'the direction is "x" or "y", found {direction!r}')
     return direction == "y"

@@ -1,1 +1,1 @@
-"""Heat: temperature fields, thermo-elastic deformation of bodies."""
+"""Temperature fields, and the thermo-elastic deformation of bodies."""

@@ -13,9 +13,11 @@ from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.surface import Surface
 from optics.numerics.array_math import UnphysicalError
 
-CLOSE = 1e-3
-"""Corners nearer to each other than this part of the spacing are one for a mesh: what so small a facet changes is far
-below what the elements can tell."""
+MERGE_DISTANCE = 1e-3
+"""Relative distance, in spacings of the mesh, below which two corners are merged.
+
+The effect of a facet so small is far below the resolution of the elements.
+"""
 
 _FLAT = 1e-9  # relative size below which a body counts as flat
 _PLANE = 1e-11  # and that of the steps between two triangles below which they are one face
@@ -23,28 +25,31 @@ _INNER_SQUARE = 0.55  # half-diagonal of the inner block of a disk's mesh, in ra
 
 
 def mirror_mesh(surface: Surface, aperture: Aperture, thickness: float, behind: float, cells: int) -> MeshHex2:
-    """Hexahedra with 27 nodes between an optical face and a plane back; every node of the face lies on the surface.
+    """Return hexahedra with 27 nodes between an optical face and a plane back.
 
-    A rectangle is a grid; a disk is a square block with four blocks around it, so that no cell has a straight angle;
-    a disk with a hole is a ring of blocks.
+    Every node of the face lies on the surface.
+
+    A rectangle is a grid; a disk is a square block with four blocks around it, so that no cell has a straight angle; a
+    disk with a hole is a ring of blocks.
 
     Parameters
     ----------
     surface : Surface
         The optical face, in its own frame (metres), with its figure.
-    aperture : Aperture
-        The outline of the substrate (its edge is a cylinder or, also about an ellipse, a box along z).
+    aperture : Circle, Rectangle or Ellipse
+        Outline of the substrate (its edge is a cylinder or, also about an ellipse, a box along z).
     thickness : float
-        Least distance along z from the face to the back, metres.
+        Smallest distance along z from the face to the back, metres.
     behind : float
         Side of the face where the substrate lies: +1 toward +z, -1 toward -z.
     cells : int
-        Number of cells across the longer width; the layers through the thickness follow from it (at least 2).
+        Number of cells across the longer width; the number of layers through the thickness follows from it (at least
+        2).
 
     Raises
     ------
     ValueError
-        An impossible size, or the aperture reaches beyond the surface's domain.
+        A size is impossible, or the aperture extends beyond the surface's domain.
     """
     if behind not in (1.0, -1.0):
         raise ValueError(f"a substrate lies on side +1 or -1 of its face, found behind = {behind}")
@@ -66,15 +71,15 @@ def mirror_mesh(surface: Surface, aperture: Aperture, thickness: float, behind: 
             assert_never(aperture)
     sag = surface.sag(x, y)
     if not np.all(np.isfinite(sag)):
-        raise UnphysicalError("the aperture reaches beyond the domain of its surface")
+        raise UnphysicalError("the aperture extends beyond the domain of its surface")
     back = behind * (np.max(behind * sag) + thickness)
-    # as a displacement from the sag, so that the nodes of the face carry it to the last bit
+    # as a displacement from the sag, so that the nodes of the face have exactly this sag
     z = sag + depth * (back - sag)
     return _right_handed(MeshHex2(np.stack([x, y, z]), mesh.t))
 
 
 def _grid(aperture: Aperture, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 2) and quadrilaterals (Q, 4) of a grid over [-1, 1]^2 with cells about square on the aperture."""
+    """Return vertices (V, 2) and quadrilaterals (Q, 4) of a grid over [-1, 1]^2, nearly square on the aperture."""
     x0, x1, y0, y1 = aperture.bounds
     wide = max(x1 - x0, y1 - y0)
     nx, ny = (max(2, round(cells * w / wide)) for w in (x1 - x0, y1 - y0))
@@ -82,19 +87,22 @@ def _grid(aperture: Aperture, cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tensor(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and quadrilaterals of a tensor grid; vertex (i, j) has number i * len(b) + j."""
+    """Return vertices and quadrilaterals of a tensor grid; vertex (i, j) has index i * len(b) + j."""
     number = np.arange(len(a) * len(b)).reshape(len(a), len(b))
     corners = [number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]]
     return np.stack([np.repeat(a, len(b)), np.tile(b, len(a))], axis=-1), np.stack([c.ravel() for c in corners], axis=1)
 
 
 def _disk_blocks(cells: int, hole: bool) -> tuple[np.ndarray, np.ndarray]:
-    """A disk's blocks drawn as squares: the inner block is |u|, |v| <= 1/2, the rings around it are squares up to 1."""
+    """Return the blocks of a disk as squares.
+
+    The inner block is |u|, |v| <= 1/2, the rings around it are squares up to 1.
+    """
     side = max(2, cells // 2)
     rings = max(2, cells // 4)
     s = np.linspace(-1.0, 1.0, side + 1)[:-1]
-    one = np.ones_like(s)
-    outline = np.concatenate([np.stack(p, axis=-1) for p in ((s, -one), (one, s), (-s, one), (-one, -s))])
+    ones = np.ones_like(s)
+    outline = np.concatenate([np.stack(p, axis=-1) for p in ((s, -ones), (ones, s), (-s, ones), (-ones, -s))])
     size = np.linspace(0.5, 1.0, rings + 1)
     points = (size[:, None, None] * outline).reshape(-1, 2)
     number = np.arange(len(points)).reshape(rings + 1, len(outline))
@@ -104,16 +112,16 @@ def _disk_blocks(cells: int, hole: bool) -> tuple[np.ndarray, np.ndarray]:
         return points, quads
     inner, block = _tensor(np.linspace(-0.5, 0.5, side + 1), np.linspace(-0.5, 0.5, side + 1))
     # one number for the vertices that the inner block shares with the first ring
-    at = {tuple(p): i for i, p in enumerate(np.rint(inner * 2 * side).astype(int).tolist())}
+    index = {tuple(p): i for i, p in enumerate(np.rint(inner * 2 * side).astype(int).tolist())}
     renumbered = np.arange(len(points)) + len(inner)
     for i, p in enumerate(np.rint(points[: len(outline)] * 2 * side).astype(int).tolist()):
-        renumbered[i] = at[tuple(p)]
+        renumbered[i] = index[tuple(p)]
     renumbered[len(outline) :] -= len(outline)
     return np.concatenate([inner, points[len(outline) :]]), np.concatenate([block, renumbered[quads]])
 
 
 def _on_disk(u: np.ndarray, v: np.ndarray, inner: float) -> tuple[np.ndarray, np.ndarray]:
-    """From the squares of ``_disk_blocks`` to the unit disk with a hole of radius ``inner``."""
+    """Map the squares of ``_disk_blocks`` to the unit disk with a hole of radius ``inner``."""
     size = np.maximum(np.abs(u), np.abs(v))
     safe = np.where(size > 0.0, size, 1.0)
     along = np.where(np.abs(u) >= np.abs(v), v * np.sign(u), u * np.sign(v)) / safe  # place on a side, -1..1
@@ -134,7 +142,7 @@ def _on_disk(u: np.ndarray, v: np.ndarray, inner: float) -> tuple[np.ndarray, np
 
 
 def _extruded(plane: np.ndarray, quads: np.ndarray, layers: int) -> MeshHex1:
-    """Hexahedra over quadrilaterals, in ``layers`` from depth 0 to 1."""
+    """Return hexahedra over quadrilaterals, in ``layers`` from depth 0 to 1."""
     count = len(plane)
     depth = np.linspace(0.0, 1.0, layers + 1)
     points = np.concatenate([np.column_stack([plane, np.full(count, d)]) for d in depth])
@@ -147,32 +155,32 @@ def _extruded(plane: np.ndarray, quads: np.ndarray, layers: int) -> MeshHex1:
 
 
 def _right_handed(mesh: MeshHex2) -> MeshHex2:
-    """Return the mesh after a check that no cell is turned inside out (all have one sign of volume)."""
+    """Return the mesh after a check that no cell is inverted (all volumes have one sign)."""
     volume = mesh.mapping().detDF(np.array([[0.1, 0.9, 0.5], [0.1, 0.9, 0.5], [0.1, 0.9, 0.5]]))
     if not (np.all(volume > 0.0) or np.all(volume < 0.0)):
-        raise UnphysicalError("the face is too steep for its mesh: a cell is turned inside out")
+        raise UnphysicalError("the face is too steep for its mesh: a cell is inverted")
     return mesh
 
 
 def polyhedron_mesh(vertices: Any, spacing: float) -> MeshTet1:
-    """Tetrahedra that fill a convex polyhedron exactly.
+    """Return tetrahedra that fill a convex polyhedron exactly.
 
-    The body is cut into tetrahedra from its middle over the middles of its faces. Then every edge longer than
+    The body is divided into tetrahedra from its middle over the middles of its faces. Then every edge longer than
     ``spacing`` is halved, the longest of each tetrahedron first (Rivara, Int. J. Numer. Meth. Eng. 20, 745 (1984)).
-    Halving keeps volumes positive and faces plane, needs no repair and drives long thin pieces to compact ones.
+    Halving keeps volumes positive and faces plane, needs no repair and turns long thin pieces into compact ones.
 
     Parameters
     ----------
-    vertices : Any
-        Corners of the polyhedron in any order, metres, shape (V, 3).
+    vertices : (V, 3) array_like
+        Corners of the polyhedron in any order, metres.
     spacing : float
         Length of the longest edge of the mesh, metres.
 
     Raises
     ------
     ValueError
-        The points do not span a body, or one of them lies inside the hull of the others, so that the body meant cannot
-        be convex.
+        The points do not span a body, or one of them lies inside the hull of the others, so that the intended body
+        cannot be convex.
     """
     points = np.asarray(vertices, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4 or not np.all(np.isfinite(points)):
@@ -192,7 +200,7 @@ def polyhedron_mesh(vertices: Any, spacing: float) -> MeshTet1:
         raise UnphysicalError(
             f"the polyhedron is not convex: vertex {int(np.argmin(depth))} lies inside the others' hull"
         )
-    hull = ConvexHull(_apart(points[hull.vertices], CLOSE * spacing))
+    hull = ConvexHull(_separated(points[hull.vertices], MERGE_DISTANCE * spacing))
     fans = [_fan(corners, faces) for corners, faces in _slabs(*_faces(hull, _PLANE * size), spacing)]
     first = np.cumsum([0, *(len(n) for n, _ in fans)])
     nodes, number = np.unique(np.concatenate([n for n, _ in fans]), axis=0, return_inverse=True)
@@ -209,13 +217,13 @@ def polyhedron_mesh(vertices: Any, spacing: float) -> MeshTet1:
 
 
 def _volumes(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Signed volumes, shape (T,)."""
+    """Return the signed volumes, shape (T,)."""
     a, b, c, d = (nodes[tetrahedra[:, k]] for k in range(4))
     return np.asarray(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0)
 
 
 def _skin_area(nodes: np.ndarray, tetrahedra: np.ndarray) -> float:
-    """Area of the triangles that belong to one tetrahedron only: that of the body, unless neighbours do not fit."""
+    """Return the area of the triangles that belong to one tetrahedron only: the body's surface, if neighbours fit."""
     triangles = np.sort(tetrahedra[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3), axis=1)
     unique, times = np.unique(triangles, axis=0, return_counts=True)
     a, b, c = (nodes[unique[times == 1, k]] for k in range(3))
@@ -223,22 +231,22 @@ def _skin_area(nodes: np.ndarray, tetrahedra: np.ndarray) -> float:
 
 
 _Edges = list[tuple[int, int]]
-"""Triangles of one face: numbers of corners, each with the face on its left when seen from outside."""
+"""Directed edges of one face as pairs of corner indices, with the face on their left as seen from outside."""
 
 
-def _apart(points: np.ndarray, least: float) -> np.ndarray:
-    """Those of some points (P, 3) that are farther than ``least`` from all that were kept before, (K, 3)."""
-    kept: list[np.ndarray] = []
+def _separated(points: np.ndarray, least: float) -> np.ndarray:
+    """Return those of some points (P, 3) that are farther than ``least`` from all points selected before, (K, 3)."""
+    selected: list[np.ndarray] = []
     for point in points:
-        if all(np.linalg.norm(point - other) > least for other in kept):
-            kept.append(point)
-    return np.array(kept)
+        if all(np.linalg.norm(point - other) > least for other in selected):
+            selected.append(point)
+    return np.array(selected)
 
 
 def _faces(hull: ConvexHull, tolerance: float) -> tuple[np.ndarray, list[_Edges]]:
-    """Corners (V, 3) and faces of a hull; neighbouring triangles in one plane are one face.
+    """Return corners (V, 3) and faces of a hull; neighbouring triangles in one plane are one face.
 
-    A face is known by its edges and not by what lies in its plane: whatever the tolerance, neighbours fit.
+    A face is defined by its edges and not by the points in its plane: whatever the tolerance, neighbours fit.
     """
     points, triangles = hull.points, hull.simplices.copy()
     corners = points[triangles]
@@ -258,9 +266,9 @@ def _faces(hull: ConvexHull, tolerance: float) -> tuple[np.ndarray, list[_Edges]
 
 
 def _slabs(corners: np.ndarray, faces: list[_Edges], spacing: float) -> list[tuple[np.ndarray, list[_Edges]]]:
-    """Cut a body across its length into pieces about as long as it is wide: corners and faces of each.
+    """Cut a body across its length into pieces about as long as it is wide; return corners and faces of each.
 
-    Cuts stay away from the corners, so that no piece is a splinter. Neighbours have the very same corners in common.
+    Cuts stay away from the corners, so that no piece is a splinter. Neighbours share identical corners.
     """
     middle = np.mean(corners, axis=0)
     axes = np.linalg.svd(corners - middle)[2]
@@ -276,28 +284,28 @@ def _slabs(corners: np.ndarray, faces: list[_Edges], spacing: float) -> list[tup
         parts: tuple[list[_Edges], list[_Edges]] = ([], [])  # below, above
         section: _Edges = []
         for edges in faces:
-            own: tuple[_Edges, _Edges] = ([], [])
+            halves: tuple[_Edges, _Edges] = ([], [])
             ends = {}
             for u, v in edges:
                 side = along[u] > cut
                 if side == (along[v] > cut):
-                    own[side].append((u, v))
+                    halves[side].append((u, v))
                     continue
                 key = (min(u, v), max(u, v))
                 if key not in new:
                     a, b = key
-                    share = (cut - along[a]) / (along[b] - along[a])
+                    fraction = (cut - along[a]) / (along[b] - along[a])
                     new[key] = len(nodes)
-                    nodes.append(nodes[a] + share * (nodes[b] - nodes[a]))
+                    nodes.append(nodes[a] + fraction * (nodes[b] - nodes[a]))
                     along.append(cut)
-                own[side].append((u, new[key]))
-                own[not side].append((new[key], v))
+                halves[side].append((u, new[key]))
+                halves[not side].append((new[key], v))
                 ends[side] = new[key]
-            if ends:  # where the face's outline goes up, and where it comes down again
-                own[False].append((ends[False], ends[True]))
-                own[True].append((ends[True], ends[False]))
+            if ends:  # the two crossings of the face's outline
+                halves[False].append((ends[False], ends[True]))
+                halves[True].append((ends[True], ends[False]))
                 section.append((ends[True], ends[False]))
-            for part, piece in zip(parts, own, strict=True):
+            for part, piece in zip(parts, halves, strict=True):
                 if piece:
                     part.append(piece)
         pieces.append([*parts[0], section])
@@ -306,25 +314,25 @@ def _slabs(corners: np.ndarray, faces: list[_Edges], spacing: float) -> list[tup
 
 
 def _fan(corners: np.ndarray, faces: list[_Edges]) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra from a convex body's middle over the triangles from each face's middle to its edges."""
+    """Return tetrahedra from a convex body's middle over the triangles from each face's middle to its edges."""
     used = sorted({corner for edges in faces for edge in edges for corner in edge})
     number = {corner: k for k, corner in enumerate(used)}
     nodes = [*corners[used], np.mean(corners[used], axis=0)]
     tetrahedra = []
     for edges in faces:
-        # in an order that does not depend on the piece: the neighbour's face gets the same middle to the last bit
+        # in an order that does not depend on the piece, so that the neighbour's face gets exactly the same middle
         nodes.append(np.mean(corners[sorted({corner for edge in edges for corner in edge})], axis=0))
         tetrahedra += [(len(used), number[u], number[v], len(nodes) - 1) for u, v in edges]
     chosen = np.array(tetrahedra)
-    # all are turned alike
+    # all have the same orientation
     return np.array(nodes), chosen if np.sum(_volumes(np.array(nodes), chosen)) > 0.0 else chosen[:, [0, 2, 1, 3]]
 
 
 def _bisected(nodes: np.ndarray, tetrahedra: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Halve edges until none is longer than ``spacing``.
 
-    Each round halves the edges that are the longest in *every* tetrahedron around them. No tetrahedron has two of
-    them, so all its pieces fit their neighbours; and the longest edge of the mesh is always among them, so it ends.
+    Each round halves the edges that are the longest in *every* tetrahedron around them. No tetrahedron has two of them,
+    so all its pieces fit their neighbours; and the longest edge of the mesh is always among them, so the process ends.
     """
     pairs = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
     while True:
@@ -332,7 +340,7 @@ def _bisected(nodes: np.ndarray, tetrahedra: np.ndarray, spacing: float) -> tupl
         edges, which = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
         which = which.reshape(-1, 6)
         length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
-        # equal lengths must not compare by rounding errors: 9 digits, then by number
+        # equal lengths must not be ordered by rounding errors: compare 9 digits, then the index
         rank = np.empty(len(edges), int)
         rank[np.lexsort((np.arange(len(edges)), np.round(length / spacing, 9)))] = np.arange(len(edges))
         longest = which[np.arange(len(which)), np.argmax(rank[which], axis=1)]

@@ -1,19 +1,18 @@
-"""Displacements of the nodes of a finite-element program, as the motion and the change of figure of an optical face.
+"""Motion and figure change of an optical face from the nodal displacements of a finite-element program.
 
-The nodes' displacements are taken apart in this order, each part by what the one before leaves:
+The nodes' displacements are decomposed in this order, each part from the remainder of the one before:
 
-1. the rigid motion and the growth that are nearest to the displacements of the material, by weighted least squares
-   with an exact rotation (Umeyama 1991, doi 10.1109/34.88573). A node weighs as the part of the clear aperture that is
-   nearer to it than to any other (its Voronoi cell), so that a finer mesh in one place does not count more;
-2. the change of sag where the node now stands. The deformed surface goes through the displaced nodes: a node that
-   slides along the surface is compared with the nominal surface at its new place, so that no slope is neglected;
-3. Zernike terms of that change, from the piston on: the nearest rigid motion of the material leaves the optical surface
-   piston and tilts as it slides;
-4. the rest as a cubic spline on a grid, with the least bending where there are no nodes.
+1. the rigid motion and the scale nearest to the displacements of the material, by weighted least squares with an exact
+   rotation (Umeyama 1991, doi 10.1109/34.88573). A node's weight is the part of the clear aperture that is nearer to it
+   than to any other (its Voronoi cell), so that a finer mesh in one place does not count more;
+2. the change of sag at the node's new position. The deformed surface goes through the displaced nodes: a node that
+   slides along the surface is compared with the nominal surface at its new position, so that no slope is neglected;
+3. Zernike terms of that change, from piston on: the nearest rigid motion of the material leaves piston and tilts of the
+   optical surface as it slides;
+4. the rest as a cubic spline on a grid, with least bending where there are no nodes.
 
-What the nodes cannot say between them is judged by leaving every second one out: how well the spline of the others
-foretells them. A residual that the others do not foretell changes from node to node: the mesh prints through, or is too
-coarse.
+The error between the nodes is estimated by leaving out every second node and predicting it from the spline of the
+others. A residual that is not predicted changes from node to node: the mesh prints through, or is too coarse.
 """
 
 from __future__ import annotations
@@ -31,40 +30,44 @@ from optics.geometry.tree import Motion
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.number_tree import FrozenMap
 
-if TYPE_CHECKING:  # every file of a job waits for this module, and none for scipy
+if TYPE_CHECKING:  # imported late: scipy is slow, and every job imports this module
     from scipy.sparse import sparray
 
 TERMS = 36
-"""Zernike terms by default: to seventh order."""
+"""Default number of Zernike terms: to seventh order."""
 OFF_SURFACE = 2e-4
-"""How far from the nominal surface, in radii of the figure's disk, a node of it may stand: coordinates of seven digits
-and the chords of coarse elements stay below, the back of a mirror does not."""
-LEAST_NODES = 16
-WIDEST_GAP = 4.0
-"""Distance from a place of the aperture to its nearest node, in mean spacings of the nodes, that is refused."""
-LARGEST_GROWTH = 0.02
-LARGEST_FIGURE = 1e-3
-"""Largest change of sag, metres: beyond that a table has another unit or another frame than is told."""
-PRINTED = 0.3
-"""Share of the residual that nodes left out may contradict before it is called the mesh's."""
-SEEN = 1e-9
-"""Metres rms of sag below which nothing is said of the mesh: 1/300 of a wave of reflected light."""
+"""Largest distance of a node from the nominal surface, in radii of the figure's disk.
 
-_LATTICE = 5  # points of the lattice by which cells are measured, along one spacing of the nodes
-_FINEST = 1200  # points of it along the aperture at most
-_MARGIN = 5  # samples of the grid beyond the aperture: its edges have no slope
-_MOST_SAMPLES = 160  # along the longer side of the grid
+Coordinates of seven digits and the chords of coarse elements stay below, the back of a mirror does not.
+"""
+MIN_NODES = 16
+"""Smallest number of nodes on the clear aperture."""
+MAX_GAP = 4.0
+"""Largest allowed distance from a point of the aperture to its nearest node, in mean spacings of the nodes."""
+MAX_SCALE_CHANGE = 0.02
+"""Largest relative scale of the face; beyond it the displacements are taken to have another unit."""
+MAX_SAG_CHANGE = 1e-3
+"""Largest change of sag, metres; beyond it the table is taken to have another unit or frame than it names."""
+PRINTED = 0.3
+"""Ratio of the leave-out error to the residual above which the residual is attributed to the mesh."""
+SEEN = 1e-9
+"""Error of sag, metres rms, below which no print-through is reported: 1/300 of a wave of reflected light."""
+
+_LATTICE = 5  # lattice points per node spacing, by which the cells are measured
+_FINEST = 1200  # largest number of lattice points along the aperture
+_MARGIN = 5  # samples of the grid beyond the aperture, since the spline has zero slope at its edges
+_MOST_SAMPLES = 160  # largest number of samples along the longer side of the grid
 _BENDING = 1e-6  # weight of a second difference of spline coefficients against a node's residual
-_ROUNDING = 1e-14  # metres rms: a residual below is rounding and gets no grid
+_ROUNDING = 1e-14  # metres rms; a smaller residual is rounding and gets no grid
 
 
 class NodesError(PhysicalError, ValueError):
-    """Nodes that do not describe the face.
+    """The nodes do not describe the face.
 
     Attributes
     ----------
     allowed
-        What to do, in words.
+        What is allowed, in words.
     """
 
     def __init__(self, problem: str, allowed: str) -> None:
@@ -74,37 +77,36 @@ class NodesError(PhysicalError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class NodalDeformation:
-    """What the nodes' displacements are for the face, in its own nominal frame.
+    """Deformation of a face from the nodes' displacements, in its own nominal frame.
 
     Attributes
     ----------
-    rotate : tuple[float, float, float]
+    rotate : tuple of float
         Exact rotation vector about the frame's origin, radians.
-    shift : tuple[float, float, float]
-        Of the frame's origin, metres.
+    shift : tuple of float
+        Translation of the frame's origin, metres.
     growth : float
-        Relative, of the surface about the origin.
-    figure : FrozenMap[int, float]
-        Noll index -> metres rms over the disk, of sag along +z; from Z1 on.
-    grid : GridFigure | None
-        The rest on a grid, None where it is below rounding.
-    places : np.ndarray
-        x, y of the nodes that were used, where they stand on the moved face, metres, (K, 2).
-    weight : np.ndarray
-        Of these nodes, share of the clear aperture, (K,).
-    change : np.ndarray
-        Of sag at the nodes beyond the rigid motion and growth, metres, (K,).
-    residual : np.ndarray
-        What the Zernike terms leave of it, (K,).
-    lost : np.ndarray
-        What the grid leaves of that, (K,).
+        Relative scale of the surface about the origin.
+    figure : FrozenMap of int to float
+        Noll index -> amplitude of the change of sag along +z, metres rms over the disk; from Z1 on.
+    grid : GridFigure, optional
+        The rest on a grid; None where it is below rounding.
+    places : (K, 2) ndarray
+        Positions x, y of the nodes used, on the moved face, metres.
+    weight : (K,) ndarray
+        Fraction of the clear aperture that belongs to each of these nodes.
+    change : (K,) ndarray
+        Change of sag at the nodes beyond the rigid motion and scale, metres.
+    residual : (K,) ndarray
+        Change of sag minus the Zernike terms, metres.
+    lost : (K,) ndarray
+        Residual minus the grid, metres.
     between : float
-        Rms of the error at nodes that are left out, every second one, metres: what the mesh does not know between its
-        nodes is less.
+        Rms error at left-out nodes (every second one), metres; the error of the full mesh between its nodes is smaller.
     spacing : float
         Mean distance of the nodes, metres.
     others : int
-        How many nodes are not used, off the surface or outside of the aperture.
+        Number of nodes not used, off the surface or outside the aperture.
     """
 
     rotate: tuple[float, float, float]
@@ -122,48 +124,48 @@ class NodalDeformation:
     others: int = field(default=0)
 
     def rms(self, values: np.ndarray) -> float:
-        """Root of the mean square over the clear aperture of numbers at the nodes (K,)."""
+        """Return the root mean square over the clear aperture of values at the nodes (K,)."""
         return float(np.sqrt(np.sum(self.weight * values**2)))
 
     def range(self, values: np.ndarray) -> float:
-        """Highest less lowest in the clear aperture, of numbers at the nodes (K,)."""
+        """Return the peak-to-valley in the clear aperture of values at the nodes (K,)."""
         inside = values[self.weight > 0.0]
         return float(np.ptp(inside))
 
     @property
     def printed_through(self) -> bool:
-        """Whether a part of the residual that shows changes from node to node."""
+        """True when a significant part of the residual changes from node to node (mesh print-through)."""
         return self.between > SEEN and self.between > PRINTED * self.rms(self.residual)
 
     def motion(self) -> Motion:
         """Return the deformation as a motion of the face's body."""
-        return Motion(self.rotate, self.shift, figure=self.figure, stretch=self.growth, grid=self.grid)
+        return Motion(self.rotate, self.shift, figure=self.figure, expansion=self.growth, grid=self.grid)
 
 
 def nodal_deformation(
     nodes: Any, displacements: Any, surface: Surface, aperture: Aperture, terms: int = TERMS
 ) -> NodalDeformation:
-    """Take the displacements of nodes apart into a motion, Zernike terms and a grid.
+    """Decompose the displacements of nodes into a motion, Zernike terms and a grid.
 
-    Nodes off the surface, as those inside of the body, are left out. The order of the nodes is of no effect.
+    Nodes off the surface, such as those inside the body, are ignored. The order of the nodes has no effect.
 
     Parameters
     ----------
-    nodes : Any
-        Where they stand in the face's nominal frame, metres, (N, 3).
-    displacements : Any
-        Metres, (N, 3).
+    nodes : (N, 3) array_like
+        Nominal positions in the face's frame, metres.
+    displacements : (N, 3) array_like
+        Displacements, metres.
     surface : Surface
-        The face's nominal shape.
-    aperture : Aperture
-        The clear aperture, which the nodes have to cover.
+        Nominal shape of the face.
+    aperture : Circle, Rectangle or Ellipse
+        Clear aperture, which the nodes have to cover.
     terms : int
         Highest Noll index, 3 or more.
 
     Raises
     ------
     NodesError
-        Too few nodes on the surface, a gap between them, or displacements of another unit.
+        There are too few nodes on the surface, a gap between them, or displacements of another unit.
     """
     if not 3 <= terms <= zernike.MAX_NOLL:
         raise ValueError(f"the terms must end between Z3 and Z{zernike.MAX_NOLL}, found {terms}")
@@ -175,34 +177,34 @@ def nodal_deformation(
     order = np.lexsort(np.hstack([moves, points]).T)
     points, moves, spacing = _on_face(points[order], moves[order], surface, aperture)
     weight = _cells(points[:, :2], aperture, spacing)
-    turn, shift, size = _similarity(points, moves, weight)
-    if abs(size - 1.0) > LARGEST_GROWTH:
-        raise NodesError(f"the nodes' displacements grow the face by {100.0 * (size - 1.0):.3g} percent", _CHECK)
-    # where the nodes stand in the moved frame, and how far above the nominal surface there
-    places = (points + moves - shift) @ turn
-    change = places[:, 2] - surface.grown(size).sag(places[:, 0], places[:, 1])
-    if not np.all(np.isfinite(change)) or np.max(np.abs(change)) > LARGEST_FIGURE:
-        raise NodesError("the displacements bend the face by more than 1 mm", _CHECK)
+    rotation, shift, size = _similarity(points, moves, weight)
+    if abs(size - 1.0) > MAX_SCALE_CHANGE:
+        raise NodesError(f"the nodes' displacements scale the face by {100.0 * (size - 1.0):.3g} %", _CHECK)
+    # positions of the nodes in the moved frame, and their heights above the nominal surface
+    positions = (points + moves - shift) @ rotation
+    change = positions[:, 2] - surface.scaled(size).sag(positions[:, 0], positions[:, 1])
+    if not np.all(np.isfinite(change)) or np.max(np.abs(change)) > MAX_SAG_CHANGE:
+        raise NodesError("the displacements change the sag of the face by more than 1 mm", _CHECK)
     disk = surface.figure_disk(aperture)
-    x, y = places[:, 0], places[:, 1]
+    x, y = positions[:, 0], positions[:, 1]
     basis = zernike.basis(terms, (x - disk.centre[0]) / disk.radius, (y - disk.centre[1]) / disk.radius)
     if np.sum(weight > 0.0) < 2 * terms:
         text = f"{int(np.sum(weight > 0.0))} nodes on the clear aperture do not determine {terms} Zernike terms"
         raise NodesError(text, f"{2 * terms} nodes or more, or fewer terms")
     root = np.sqrt(weight)
-    # terms that hardly differ on the aperture are not told apart, as in ``face_change``
-    fitted = np.linalg.lstsq(basis * root[:, None], change * root, rcond=zernike.HELD)[0]
+    # nearly dependent combinations of terms are excluded, as in ``face_change``
+    fitted = np.linalg.lstsq(basis * root[:, None], change * root, rcond=zernike.RANK_TOLERANCE)[0]
     residual = change - basis @ fitted
-    grid, lost, between = _gridded(places[:, :2], residual, weight, aperture, spacing)
+    grid, lost, between = _gridded(positions[:, :2], residual, weight, aperture, spacing)
     from scipy.spatial.transform import Rotation
 
     return NodalDeformation(
-        triple(Rotation.from_matrix(turn).as_rotvec()),
+        triple(Rotation.from_matrix(rotation).as_rotvec()),
         triple(shift),
         size - 1.0,
         FrozenMap({j: float(a) for j, a in enumerate(fitted, 1)}),
         grid,
-        places[:, :2],
+        positions[:, :2],
         weight,
         change,
         residual,
@@ -213,51 +215,51 @@ def nodal_deformation(
     )
 
 
-_CHECK = "displacements in the unit of their heads, and nodes in the frame that is named"
+_CHECK = "displacements in the unit of the column heads, and nodes in the named frame"
 
 
 def _on_face(
     points: np.ndarray, moves: np.ndarray, surface: Surface, aperture: Aperture
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Nodes of the surface in and about the aperture, put exactly on it, and their mean spacing."""
+    """Return the nodes of the surface in and near the aperture, put exactly on it, and their mean spacing."""
     radius = surface.figure_disk(aperture).radius
     x0, x1, y0, y1 = aperture.bounds
     middle, half = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)]), np.array([0.5 * (x1 - x0), 0.5 * (y1 - y0)])
     with np.errstate(over="ignore", invalid="ignore"):
-        away = np.abs(points[:, 2] - surface.sag(points[:, 0], points[:, 1]))
-        level = away <= OFF_SURFACE * radius
-    here = level & np.all(np.abs(points[:, :2] - middle) <= 1.3 * half, axis=1)
-    inside = here & aperture.contains(points[:, 0], points[:, 1])
+        distance = np.abs(points[:, 2] - surface.sag(points[:, 0], points[:, 1]))
+        level = distance <= OFF_SURFACE * radius
+    near_face = level & np.all(np.abs(points[:, :2] - middle) <= 1.3 * half, axis=1)
+    inside = near_face & aperture.contains(points[:, 0], points[:, 1])
     count = int(np.sum(inside))
-    if count < LEAST_NODES:
-        near = float(np.nanmedian(away)) if np.any(np.isfinite(away)) else np.inf
-        text = f"{count} of {len(points)} nodes stand on the clear aperture of the nominal surface (half of the nodes "
+    if count < MIN_NODES:
+        near = float(np.nanmedian(distance)) if np.any(np.isfinite(distance)) else np.inf
+        text = f"{count} of {len(points)} nodes lie on the clear aperture of the nominal surface (half of the nodes "
         text += f"are farther than {1e3 * near:.3g} mm from it along z)"
         low, high = points.min(axis=0), points.max(axis=0)
         ranges = ", ".join(f"{1e3 * a:.4g} .. {1e3 * b:.4g}" for a, b in zip(low, high, strict=True))
         box = f"x {1e3 * x0:.4g} .. {1e3 * x1:.4g}, y {1e3 * y0:.4g} .. {1e3 * y1:.4g} mm"
         raise NodesError(
-            f"{text}; theirs are x, y, z = {ranges} mm",
-            f"{LEAST_NODES} or more within {1e3 * OFF_SURFACE * radius:.2g} mm of it, in {box}: check frame and unit",
+            f"{text}; the nodes span x, y, z = {ranges} mm",
+            f"{MIN_NODES} or more within {1e3 * OFF_SURFACE * radius:.2g} mm of it, in {box}: check frame and unit",
         )
     area = (x1 - x0) * (y1 - y0) * _filled(aperture)
     spacing = float(np.sqrt(area / count))
-    out = points[here].copy()
+    out = points[near_face].copy()
     out[:, 2] = surface.sag(out[:, 0], out[:, 1])
-    return out, moves[here], spacing
+    return out, moves[near_face], spacing
 
 
 def _lattice(aperture: Aperture, step: float) -> np.ndarray:
-    """Places in the aperture, (P, 2), metres. Their number along a side is odd to that of any even mesh."""
+    """Return lattice points in the aperture, (P, 2), metres, incommensurate with any even mesh."""
     x0, x1, y0, y1 = aperture.bounds
     counts = [int(np.clip(np.ceil(side / step), 40, _FINEST)) for side in (x1 - x0, y1 - y0)]
     x, y = (a + (b - a) * (np.arange(n) + 0.5) / n for (a, b), n in zip(((x0, x1), (y0, y1)), counts, strict=True))
-    every = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    return np.asarray(every[aperture.contains(every[:, 0], every[:, 1])])
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return np.asarray(points[aperture.contains(points[:, 0], points[:, 1])])
 
 
 def _filled(aperture: Aperture) -> float:
-    """Share of the aperture's box that it fills."""
+    """Return the fraction of the aperture's bounding box that the aperture fills."""
     x0, x1, y0, y1 = aperture.bounds
     step = min(x1 - x0, y1 - y0) / 200.0
     counts = [int(np.ceil(side / step)) for side in (x1 - x0, y1 - y0)]
@@ -265,42 +267,45 @@ def _filled(aperture: Aperture) -> float:
 
 
 def _cells(places: np.ndarray, aperture: Aperture, spacing: float) -> np.ndarray:
-    """Share of the aperture that is nearer to each place than to the others, (K,).
+    """Return the fraction of the aperture that is nearer to each position than to the others, (K,).
 
     Raises
     ------
     NodesError
-        a part of the aperture is far from all.
+        A part of the aperture is far from all nodes.
     """
     from scipy.spatial import cKDTree
 
     lattice = _lattice(aperture, spacing / _LATTICE)
     distance, nearest = cKDTree(places).query(lattice)
     worst = int(np.argmax(distance))
-    if distance[worst] > WIDEST_GAP * spacing:
+    if distance[worst] > MAX_GAP * spacing:
         x, y = 1e3 * lattice[worst]
         text = f"no node within {1e3 * distance[worst]:.3g} mm of x, y = {x:.4g}, {y:.4g} mm in the clear aperture"
-        raise NodesError(text, f"nodes over all of it, at most {1e3 * WIDEST_GAP * spacing:.2g} mm from any place")
+        raise NodesError(text, f"nodes over all of it, at most {1e3 * MAX_GAP * spacing:.2g} mm from any point of it")
     return np.asarray(np.bincount(nearest, minlength=len(places)) / len(lattice))
 
 
 def _similarity(points: np.ndarray, moves: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rotation (3, 3), shift (3,) and size s of p -> s R p + shift nearest to points + moves, by weighted squares."""
+    """Return rotation R, shift and size s of the similarity p -> s R p + shift nearest to points + moves.
+
+    The rotation has shape (3, 3), the shift (3,); the fit is by weighted least squares.
+    """
     middle, drift = weight @ points, weight @ moves
     p = points - middle
     q = p + (moves - drift)
     spread = float(np.sum(weight[:, None] * p * p))
     u, s, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", weight, q, p))
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    turn = (u * sign) @ vt
+    rotation = (u * sign) @ vt
     size = float(np.sum(s * sign)) / spread
-    return turn, middle + drift - size * turn @ middle, size
+    return rotation, middle + drift - size * rotation @ middle, size
 
 
 def _gridded(
-    places: np.ndarray, residual: np.ndarray, weight: np.ndarray, aperture: Aperture, spacing: float
+    positions: np.ndarray, residual: np.ndarray, weight: np.ndarray, aperture: Aperture, spacing: float
 ) -> tuple[GridFigure | None, np.ndarray, float]:
-    """The residual on a grid, what that leaves at the nodes, and the rms error at nodes left out."""
+    """Return the residual on a grid, its remainder at the nodes, and the rms error at left-out nodes."""
     if np.sqrt(np.sum(weight * residual**2)) < _ROUNDING:
         return None, residual, 0.0
     x0, x1, y0, y1 = aperture.bounds
@@ -310,30 +315,30 @@ def _gridded(
     half = [0.5 * step * (n - 1) for n in counts]
     cx, cy = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
     bounds = (cx - half[0], cx + half[0], cy - half[1], cy + half[1])
-    inner = (np.abs(places[:, 0] - cx) <= half[0]) & (np.abs(places[:, 1] - cy) <= half[1])
-    spline = _Spline(places[inner], bounds, (counts[1], counts[0]))
+    inner = (np.abs(positions[:, 0] - cx) <= half[0]) & (np.abs(positions[:, 1] - cy) <= half[1])
+    spline = _Spline(positions[inner], bounds, (counts[1], counts[0]))
     figure = spline.fit(residual[inner], np.ones(int(inner.sum()), bool))
-    lost = residual - figure.sag(places[:, 0], places[:, 1])
-    # the numbers of the nodes come from their sorted places; a draw takes neighbours apart
+    remainder = residual - figure.sag(positions[:, 0], positions[:, 1])
+    # nodes are sorted by position; a random permutation separates neighbours
     first = np.random.default_rng(0).permutation(int(inner.sum())) % 2 == 0
     missed = np.empty(int(inner.sum()))
     for part in (first, ~first):
-        rest = places[inner][~part]
+        rest = positions[inner][~part]
         missed[~part] = residual[inner][~part] - spline.fit(residual[inner], part).sag(rest[:, 0], rest[:, 1])
-    return figure, lost, float(np.sqrt(np.sum(weight[inner] * missed**2) / np.sum(weight[inner])))
+    return figure, remainder, float(np.sqrt(np.sum(weight[inner] * missed**2) / np.sum(weight[inner])))
 
 
 class _Spline:
-    """Least squares of a bicubic spline to values at scattered places, with a little weight on its bending.
+    """Least-squares fit of a bicubic spline to values at scattered positions, with a small weight on its bending.
 
     Parameters
     ----------
-    places
-        (K, 2), metres, inside of the bounds.
-    bounds
-        x_min, x_max, y_min, y_max of the first and last samples, metres.
-    shape
-        Samples along y and x.
+    places : (K, 2) ndarray
+        Positions inside the bounds, metres.
+    bounds : tuple of float
+        (x_min, x_max, y_min, y_max) of the first and last samples, metres.
+    shape : (int, int)
+        Number of samples along y and x.
     """
 
     def __init__(self, places: np.ndarray, bounds: tuple[float, float, float, float], shape: tuple[int, int]) -> None:
@@ -357,7 +362,7 @@ class _Spline:
         self._bending = _BENDING * (sum(b.T @ b for b in bending) + 2.0 * twist.T @ twist)
 
     def fit(self, values: np.ndarray, used: np.ndarray) -> GridFigure:
-        """The grid nearest to values (K,) at the places that are used (K,)."""
+        """Return the grid nearest to values (K,) at the positions selected by the mask ``used`` (K,)."""
         from scipy import sparse
         from scipy.sparse.linalg import splu
 
@@ -368,10 +373,10 @@ class _Spline:
         return GridFigure(_samples(coefficients), self._bounds)
 
 
-def _cubic(place: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Weights (K, 4) of a cubic B-spline's coefficients at places in samples, and their numbers (K, 4), mirrored."""
-    cell = np.clip(np.floor(place), 0, count - 2).astype(int)
-    f = (place - cell)[:, None]
+def _cubic(position: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights and indices (K, 4) of a cubic B-spline's coefficients at positions in samples, mirrored."""
+    cell = np.clip(np.floor(position), 0, count - 2).astype(int)
+    f = (position - cell)[:, None]
     e = 1.0 - f
     weights = np.hstack(
         [e**3 / 6.0, 2.0 / 3.0 - f**2 * (2.0 - f) / 2.0, 2.0 / 3.0 - e**2 * (2.0 - e) / 2.0, f**3 / 6.0]
@@ -381,12 +386,14 @@ def _cubic(place: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _first(count: int) -> sparray:
+    """Return the matrix of first differences."""
     from scipy import sparse
 
     return sparse.diags_array([-np.ones(count - 1), np.ones(count - 1)], offsets=[0, 1], shape=(count - 1, count))
 
 
 def _second(count: int) -> sparray:
+    """Return the matrix of second differences."""
     from scipy import sparse
 
     ones = np.ones(count - 2)
@@ -394,7 +401,7 @@ def _second(count: int) -> sparray:
 
 
 def _samples(coefficients: np.ndarray) -> np.ndarray:
-    """Values of a spline with mirrored edges at its samples: the inverse of SciPy's ``spline_filter``."""
+    """Return the values of a spline with mirrored edges at its samples: the inverse of SciPy's ``spline_filter``."""
     padded = np.pad(coefficients, 1, mode="reflect")
     rows = (padded[:-2] + 4.0 * padded[1:-1] + padded[2:]) / 6.0
     return np.asarray((rows[:, :-2] + 4.0 * rows[:, 1:-1] + rows[:, 2:]) / 6.0)

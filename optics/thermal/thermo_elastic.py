@@ -1,12 +1,10 @@
-"""Linear thermo-elasticity: how a body of one isotropic material deforms when its temperature changes.
+"""Linear thermo-elasticity: thermal deformation of a body of one isotropic material, and changes of its faces.
 
 Small strains: stress = lambda tr(e) 1 + 2 mu e - (3 lambda + 2 mu) a T 1, with e the symmetric gradient of the
 displacement u (metres), T the change of temperature (kelvin) and a the expansion (1/K). u minimises the elastic energy,
 in which Young's modulus is only a factor as long as all loads are thermal. Elements are quadratic (scikit-fem:
-hexahedra of 27 nodes, tetrahedra of 10), so on straight-edged cells the displacement of a body that is free and whose T
-is linear in place comes out exact to rounding. Rotations are small: vectors in radians, right-handed.
-
-Displacement fields of heated bodies, and what they do to the faces.
+hexahedra of 27 nodes, tetrahedra of 10), so on straight-edged cells the displacement of a free body whose T is linear
+in position is exact to rounding. Rotations are small: vectors in radians, right-handed.
 """
 
 from __future__ import annotations
@@ -31,24 +29,27 @@ from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.number_tree import FrozenMap
 
-_INSIDE = 1e-9  # how far outside of a cell, in cells, a point may lie for that cell to be taken at once
-_NEAR = 1e-3  # the same for a cell to be taken when none of the nearest cells holds the point: a curved face or rim
-_BEYOND = 0.02  # how far outside of the mesh, in cells, its field is still continued
-_CANDIDATES = ((12, _INSIDE), (150, _NEAR))  # how many cells to try, by distance, for points not yet placed so well
+_INSIDE = 1e-9  # largest distance outside a cell, in cells, at which it is accepted at once
+_NEAR = 1e-3  # largest distance at which it is accepted if no cell contains the point: a curved face or rim
+_BEYOND = 0.02  # largest distance outside the mesh, in cells, to which its field is extrapolated
+_CANDIDATES = (
+    (12, _INSIDE),
+    (150, _NEAR),
+)  # number of nearest cells to try for points that are not yet located so well
 
 
 @dataclass(frozen=True, eq=False)
 class Displacement:
-    """Displacement field of a body.
+    """Displacement field of a body on a mesh.
 
     Attributes
     ----------
-    nodes : np.ndarray
-        Metres, shape (N, 3).
-    values : np.ndarray
-        At the nodes, metres, shape (N, 3).
+    nodes : (N, 3) ndarray
+        Nodes, metres.
+    values : (N, 3) ndarray
+        Displacements at the nodes, metres.
     finder : Finder
-        The cells.
+        Search for the cells of points.
     """
 
     nodes: np.ndarray
@@ -56,46 +57,46 @@ class Displacement:
     finder: Finder
 
     def at(self, points: Any) -> np.ndarray:
-        """Displacement at points (P, 3) of the body, by the elements' own shape functions; metres, (P, 3).
+        """Return the displacement at points (P, 3) of the body, by the elements' own shape functions; metres, (P, 3).
 
-        Points outside of the mesh by up to 2 % of a cell are continued, as a curved face departs from its cells.
+        Points outside the mesh by up to 2 % of a cell are extrapolated, as a curved face deviates from its cells.
 
         Raises
         ------
         ValueError
-            a point lies farther outside.
+            A point lies farther outside.
         """
         dofs, shape = self.finder.shapes(np.asarray(points, np.float64))
         return np.asarray(np.einsum("pi,pix->px", shape, self.values[dofs]))
 
 
 class Displaced(Protocol):
-    """A body of which every point's displacement is known."""
+    """Protocol of a body whose displacement is known at every point."""
 
     def at(self, points: Any) -> np.ndarray:
-        """Displacement at points (P, 3) of the body, metres, (P, 3)."""
+        """Return the displacement at points (P, 3) of the body, metres, (P, 3)."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Formula:
-    """A displacement that a formula gives everywhere.
+    """Displacement given everywhere by a formula.
 
     Attributes
     ----------
-    field : Callable[[np.ndarray], np.ndarray]
+    field : callable
         Points (P, 3) in metres -> displacements (P, 3) in metres.
     """
 
     field: Callable[[np.ndarray], np.ndarray]
 
     def at(self, points: Any) -> np.ndarray:
-        """Displacement at points (P, 3), metres, (P, 3)."""
+        """Return the displacement at points (P, 3), metres, (P, 3)."""
         return self.field(np.asarray(points, np.float64))
 
 
 class Finder:
-    """Which cell a point lies in and the shape functions there."""
+    """Search for the cell of a point, and its shape functions there."""
 
     def __init__(self, mesh: MeshHex2 | MeshTet1, element: Any, dofs: np.ndarray):
         self._element, self._dofs = element, dofs
@@ -103,46 +104,46 @@ class Finder:
         self._corners = mesh.doflocs.T[mesh.dofs.element_dofs.T]  # (cells, J, 3)
         self._simplex = isinstance(mesh, MeshTet1)
         self._tree = cKDTree(np.mean(self._corners, axis=1))
-        # load cases of one body are sampled at the same faces, one after the other
+        # cached: load cases of one body are sampled at the same faces, one after the other
         self._last: tuple[bytes, tuple[np.ndarray, np.ndarray]] | None = None
 
     def shapes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers (P, I) of the nodes of each point's cell and their shape functions there (P, I)."""
+        """Return the node indices (P, I) of each point's cell, and their shape functions at the point (P, I)."""
         if points.ndim != 2 or points.shape[1] != 3 or not np.all(np.isfinite(points)):
             raise ValueError(f"points must be finite and of shape (P, 3), found shape {points.shape}")
         key = points.tobytes()
         if self._last is None or self._last[0] != key:
-            self._last = key, self._found(points)
+            self._last = key, self._search(points)
         return self._last[1]
 
-    def _found(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Shape functions as ``shapes`` gives them, found by a search."""
+    def _search(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return node indices and shape functions as ``shapes`` does, by a search among the nearest cells."""
         best = np.full(len(points), np.inf)
         cell = np.zeros(len(points), int)
-        place = np.zeros_like(points)
+        reference = np.zeros_like(points)
         for count, enough in _CANDIDATES:
-            left = np.flatnonzero(best > enough)
-            _, near = self._tree.query(points[left], np.arange(1, min(count, self._tree.n) + 1))
+            pending = np.flatnonzero(best > enough)
+            _, near = self._tree.query(points[pending], np.arange(1, min(count, self._tree.n) + 1))
             for column in near.T:
-                going = best[left] > _INSIDE
-                if not np.any(going):
+                open_points = best[pending] > _INSIDE
+                if not np.any(open_points):
                     break
-                some, tried = left[going], column[going]
-                local = self._local(points[some], tried)
+                rows, tried = pending[open_points], column[open_points]
+                local = self._local(points[rows], tried)
                 outside = np.max(np.maximum(-local, local - 1.0), axis=1)
                 if self._simplex:
                     outside = np.maximum(outside, np.sum(local, axis=1) - 1.0)
-                better = outside < best[some]
-                chosen = some[better]
-                best[chosen], cell[chosen], place[chosen] = outside[better], tried[better], local[better]
+                better = outside < best[rows]
+                chosen = rows[better]
+                best[chosen], cell[chosen], reference[chosen] = outside[better], tried[better], local[better]
         if len(points) and np.max(best) > _BEYOND:
             raise UnphysicalError(f"the point {points[int(np.argmax(best))].tolist()} m lies outside of the body")
         return self._dofs[:, cell].T, np.stack(
-            [self._element.lbasis(place.T, i)[0] for i in range(len(self._dofs))], axis=-1
+            [self._element.lbasis(reference.T, i)[0] for i in range(len(self._dofs))], axis=-1
         )
 
     def _local(self, points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-        """Coordinates of points (P, 3) in the reference cells of ``cells`` (P,), by Newton; infinite where it fails."""
+        """Return reference coordinates of points (P, 3) in cells (P,), by Newton's method; infinite where it fails."""
         corners = self._corners[cells]
         x = np.full_like(points, 0.25 if self._simplex else 0.5)
         for _ in range(1 if self._simplex else 8):
@@ -153,13 +154,13 @@ class Finder:
             x = x + step if self._simplex else np.clip(x + step, -0.5, 1.5)
             if np.max(np.abs(step)) < 1e-12:
                 break
-        # a point far from a cell may have no place in it; where the clipped iteration then stops means nothing
+        # a point far from a cell may have no reference coordinates; the end of the clipped iteration is then meaningless
         failed = np.max(np.abs(step), axis=1, keepdims=True) > 1e-8
         return x if self._simplex else np.where(failed, np.inf, x)
 
 
 def rigid_modes(points: np.ndarray) -> np.ndarray:
-    """Displacements of points (P, 3) by three unit shifts and three unit rotations about the origin, (6, 3 P)."""
+    """Return displacements of points (P, 3) by three unit shifts and three unit rotations about the origin, (6, 3 P)."""
     shifts = np.broadcast_to(np.eye(3)[:, None, :], (3, len(points), 3))
     turns = np.cross(np.eye(3)[:, None, :], points[None])
     return np.concatenate([shifts, turns]).reshape(6, -1)
@@ -167,18 +168,18 @@ def rigid_modes(points: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class FaceChange:
-    """How an optical face moved and changed, in the face's own nominal frame.
+    """Motion and change of figure of an optical face, in the face's own nominal frame.
 
     Attributes
     ----------
-    rotate : tuple[float, float, float]
+    rotate : tuple of float
         Small rotation vector about the frame's origin, radians.
-    shift : tuple[float, float, float]
-        Of the frame's origin, metres.
-    figure : Mapping[int, float]
-        Noll index -> metres rms over the disk, change of sag along +z; from Z4 on.
+    shift : tuple of float
+        Translation of the frame's origin, metres.
+    figure : mapping of int to float
+        Noll index -> amplitude of the change of sag along +z, metres rms over the disk; from Z4 on.
     residual_rms : float
-        What rotate, shift and figure leave of the change of sag, rms over the aperture, metres.
+        Rms over the aperture of the change of sag that rotate, shift and figure do not describe, metres.
     """
 
     rotate: tuple[float, float, float]
@@ -190,34 +191,35 @@ class FaceChange:
 def face_change(
     displacement: Displaced, surface: Surface, aperture: Aperture, pose: Pose, terms: int = 15
 ) -> FaceChange:
-    """Rigid motion and change of figure of a face, by least squares over its aperture.
+    """Return the rigid motion and change of figure of a face, by least squares over its aperture.
 
-    First the rigid motion nearest to the displacement of the material is taken off. What is left changes the sag at
-    fixed x, y by u_z - s_x u_x - s_y u_y (first order in u); into it Zernike terms from Z4 on are fitted, together with
-    the piston and tilts that a further rigid motion of this surface makes, which then go to the rigid motion. Of a
-    plane, rotate, shift and figure together thus hold the whole normal displacement but the residual.
+    First the rigid motion nearest to the displacement of the material is subtracted. The rest changes the sag at fixed
+    x, y by u_z - s_x u_x - s_y u_y (first order in u). Zernike terms from Z4 on are fitted to it, together with the
+    piston and tilts that a further rigid motion of this surface makes, which are then added to the rigid motion. For a
+    plane, rotate, shift and figure together thus describe the whole normal displacement except the residual.
 
     The disk of the terms is that of the surface's Zernike figure, else the aperture's circle, else the circle around
-    the rectangle, as in the ray trace. On a narrow rectangle some combinations of terms hardly differ; those that
-    show on the aperture by less than 1e-6 of their coefficients are left out, and the others serve only inside of it.
+    the rectangle, as in the ray trace. On a narrow rectangle some combinations of terms are nearly dependent; those
+    whose size on the aperture is less than 1e-6 of their coefficients are excluded, and the others are valid only
+    inside of it.
 
     Parameters
     ----------
     displacement : Displaced
-        Of the body.
+        Displacement of the body.
     surface : Surface
-        The face's nominal shape.
-    aperture : Aperture
-        The part of it to look at, which must lie on the body.
+        Nominal shape of the face.
+    aperture : Circle, Rectangle or Ellipse
+        Part of the face to analyse, which must lie on the body.
     pose : Pose
-        Of the face's frame in the mesh's.
+        Pose of the face's frame in the mesh's.
     terms : int
         Highest Noll index, 3 for none.
 
     Raises
     ------
     ValueError
-        The aperture reaches beyond the body, or ``terms`` is below 3.
+        The aperture extends beyond the body, or ``terms`` is below 3.
     """
     if not 3 <= terms <= zernike.MAX_NOLL:
         raise ValueError(f"a face's terms must end between Z3 and Z{zernike.MAX_NOLL}, found {terms}")
@@ -242,9 +244,9 @@ def face_change(
 
     change = sag_change(rest)
     z = zernike.basis(terms, (x - centre[0]) / radius, (y - centre[1]) / radius)[:, 3:]
-    further = sag_change(modes[2:5]).T * scale[2:5]  # piston and two tilts, of the size of the terms
+    further = sag_change(modes[2:5]).T * scale[2:5]  # piston and two tilts, scaled like the terms
     columns = np.concatenate([further, z], axis=1)
-    fitted = np.linalg.lstsq(columns * root[:, None], change * root, rcond=zernike.HELD)[0]
+    fitted = np.linalg.lstsq(columns * root[:, None], change * root, rcond=zernike.RANK_TOLERANCE)[0]
     rigid[2:5] += fitted[:3] * scale[2:5]
     residual = change - columns @ fitted
     return FaceChange(
@@ -256,7 +258,7 @@ def face_change(
 
 
 def _samples(aperture: Aperture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quadrature nodes x, y over an aperture and weights of a mean, each shape (P,)."""
+    """Return quadrature nodes x, y over an aperture and the weights of a mean, each shape (P,)."""
     match aperture:
         case Circle():
             nodes = quadrature.disk(10, inner=aperture.inner / aperture.radius)
@@ -276,19 +278,19 @@ def _samples(aperture: Aperture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 Field = Callable[[np.ndarray], Any]
-"""Something at points: (P, 3) metres -> (P,)."""
+"""Function of points: (P, 3) metres -> values (P,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Kinematic:
-    """Three balls in cone, groove and flat (3-2-1): they hold the body without stress.
+    """Kinematic support by three balls in cone, groove and flat (3-2-1), which holds the body without stress.
 
-    Point 0 stays where it is, point 1 moves only along the line from 0 to 1, point 2 only in the plane of the three.
+    Point 0 is fixed, point 1 moves only along the line from 0 to 1, point 2 only in the plane of the three.
 
     Attributes
     ----------
-    points : np.ndarray
-        In or on the body, metres, shape (3, 3); they need not be nodes.
+    points : (3, 3) ndarray
+        Support points in or on the body, metres; they need not be nodes.
     """
 
     points: np.ndarray
@@ -304,7 +306,7 @@ class Kinematic:
         object.__setattr__(self, "points", points)
 
     def released(self, motion: np.ndarray) -> np.ndarray:
-        """The six components of displacements (3 points, 3) that this support forbids, metres, shape (6,)."""
+        """Return the six components of displacements (3 points, 3) that this support forbids, metres, shape (6,)."""
         along = self.points[1] - self.points[0]
         along = along / np.linalg.norm(along)
         normal = np.cross(along, self.points[2] - self.points[0])
@@ -315,20 +317,20 @@ class Kinematic:
 
 @dataclass(frozen=True, eq=False)
 class Bonded:
-    """A part of the body's surface glued to a stiff foundation that expands by itself.
+    """Part of the body's surface bonded to a stiff foundation that expands independently.
 
-    The glued nodes move by expansion * change * (r - about).
+    The bonded nodes move by expansion * change * (r - about).
 
     Attributes
     ----------
-    where : Field
-        Nodes (N, 3) in metres -> which of them are glued, (N,) bool.
+    where : callable
+        Nodes (N, 3) in metres -> mask of the bonded ones, (N,) bool.
     expansion : float
-        Of the foundation, 1/K.
+        Thermal expansion of the foundation, 1/K.
     change : float
-        Of the foundation's temperature, kelvin.
-    about : tuple[float, float, float]
-        The point of the foundation that stays, metres, shape (3,).
+        Temperature change of the foundation, kelvin.
+    about : tuple of float
+        Fixed point of the foundation, metres.
     """
 
     where: Field
@@ -346,14 +348,16 @@ Support = Kinematic | Bonded
 
 
 class ElasticBody:
-    """A mesh of one material with its stiffness; factorisations are kept for further load cases.
+    """Mesh of one material with its stiffness matrix; factorisations are cached for further load cases.
 
     Attributes
     ----------
-    nodes
-        All nodes of the quadratic elements, metres, shape (N, 3).
-    places
-        At which loads are taken, metres, (P, 3); volumes: that they stand for, m^3, (P,).
+    nodes : (N, 3) ndarray
+        All nodes of the quadratic elements, metres.
+    places : (P, 3) ndarray
+        Quadrature points at which loads are evaluated, metres.
+    volumes : (P,) ndarray
+        Volumes that the quadrature points represent, m^3.
     """
 
     def __init__(self, mesh: MeshHex2 | MeshTet1, material: Material):
@@ -366,7 +370,7 @@ class ElasticBody:
         self._finder = Finder(mesh, element, basis.element_dofs)
         self._points = np.moveaxis(np.asarray(basis.global_coordinates()), 0, -1)  # (cells, Q, 3)
         self.places = self._points.reshape(-1, 3)
-        # evenly within a cell: Gauss' weights of tetrahedra may be negative
+        # uniform within a cell, since Gauss weights of tetrahedra may be negative
         self.volumes = np.repeat(np.mean(basis.dx, axis=1), self._points.shape[1])
         gradient = np.stack([np.asarray(b[0].grad) for b in basis.basis]).transpose(2, 0, 1, 3)  # (cells, I, 3, Q)
         cells, local, _, _ = gradient.shape
@@ -390,46 +394,46 @@ class ElasticBody:
     def solve_many(
         self, temperatures: Sequence[Field], support: Support | Sequence[Support]
     ) -> tuple[Displacement, ...]:
-        """One displacement for each temperature change.
+        """Return one displacement for each temperature change.
 
         Load cases on supports that hold the same nodes share one factorisation, and so do all kinematic supports.
 
         Parameters
         ----------
-        temperatures : Sequence[Field]
+        temperatures : sequence of callable
             Changes of temperature in kelvin, points (P, 3) -> (P,).
-        support : Support | Sequence[Support]
-            One for all, or one for each load case.
+        support : Kinematic or Bonded, or a sequence of them
+            One support for all, or one for each load case.
 
         Raises
         ------
         ValueError
-            a temperature is not finite or of another shape, a bond holds too few nodes, or a kinematic point lies
-            outside of the body.
+            A temperature is not finite or of another shape, a bond holds too few nodes, or a kinematic point lies
+            outside the body.
         """
         supports = [support] * len(temperatures) if isinstance(support, Kinematic | Bonded) else list(support)
         out = []
-        for temperature, held in zip(temperatures, supports, strict=True):
+        for temperature, case in zip(temperatures, supports, strict=True):
             load = self._load(temperature)
-            match held:
+            match case:
                 case Bonded():
-                    glued = self._glued(held)
-                    moved = held.expansion * held.change * (self.nodes[glued] - np.asarray(held.about))
-                    fixed = (3 * glued[:, None] + np.arange(3)).ravel()
+                    bonded = self._bonded_nodes(case)
+                    moved = case.expansion * case.change * (self.nodes[bonded] - np.asarray(case.about))
+                    fixed = (3 * bonded[:, None] + np.arange(3)).ravel()
                     values = self._solved(load, fixed, moved.ravel())
                 case Kinematic():
-                    # thermal loads are in balance, so any six components may be held to solve; the support's own come
-                    # after
+                    # thermal loads are in equilibrium, so any six components may be fixed to solve; the support's
+                    # constraints are applied afterwards
                     modes = rigid_modes(self.nodes)
                     fixed = np.sort(qr(modes, mode="r", pivoting=True)[1][:6])
-                    values = self._supported(self._solved(load, fixed, np.zeros(6)), held)
+                    values = self._supported(self._solved(load, fixed, np.zeros(6)), case)
                 case _:
-                    assert_never(held)
+                    assert_never(case)
             out.append(Displacement(self.nodes, values, self._finder))
         return tuple(out)
 
     def _load(self, temperature: Field) -> np.ndarray:
-        """Thermal forces over Young's modulus, shape (3 N,)."""
+        """Return the thermal forces divided by Young's modulus, shape (3 N,)."""
         points = self.places
         change = np.asarray(temperature(points), np.float64)
         if change.shape != (len(points),):
@@ -441,8 +445,8 @@ class ElasticBody:
         forces = bulk * np.einsum("eiq,eq->ei", self._weighted, change.reshape(self._points.shape[:2]))
         return np.bincount(self._dofs.ravel(), forces.ravel(), 3 * len(self.nodes))
 
-    def _glued(self, support: Bonded) -> np.ndarray:
-        """Numbers of the nodes that a bond holds."""
+    def _bonded_nodes(self, support: Bonded) -> np.ndarray:
+        """Return the indices of the nodes that a bond holds."""
         chosen = np.flatnonzero(np.asarray(support.where(self.nodes), bool))
         if len(chosen) < 3 or _on_a_line(self.nodes[chosen]):
             raise UnphysicalError(
@@ -451,7 +455,7 @@ class ElasticBody:
         return chosen
 
     def _solved(self, load: np.ndarray, fixed: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Nodal displacements (N, 3) with the components ``fixed`` held at ``values``."""
+        """Return nodal displacements (N, 3) with the components ``fixed`` held at ``values``."""
         key = fixed.tobytes()
         if key not in self._factors:
             free = np.setdiff1d(np.arange(len(load)), fixed)
@@ -467,7 +471,7 @@ class ElasticBody:
         return out.reshape(-1, 3)
 
     def _supported(self, values: np.ndarray, support: Kinematic) -> np.ndarray:
-        """Move a deformation rigidly to where the support lets it be."""
+        """Move a deformation rigidly so that it satisfies the support."""
         at_points = Displacement(self.nodes, values, self._finder).at(support.points)
         modes = rigid_modes(support.points).reshape(6, 3, 3)
         matrix = np.stack([support.released(mode) for mode in modes], axis=-1)
@@ -478,26 +482,26 @@ class ElasticBody:
 def free_linear_field(
     expansion: float, change: float, gradient: Any, about: Any = (0.0, 0.0, 0.0)
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Exact displacement of a free body whose temperature changes by T = change + gradient . (r - about).
+    """Return the exact displacement of a free body whose temperature changes by T = change + gradient . (r - about).
 
     u = a change q + a ((g . q) q - q^2 g / 2) with q = r - about. Its strain is a T in all directions, so there is no
-    stress in any shape of body. Of all rigid motions the one is chosen that leaves ``about`` in place and unturned;
-    elsewhere the body turns by the rotation a (g x q).
+    stress in any shape of body. Of all rigid motions the one is chosen that leaves ``about`` fixed without rotation;
+    elsewhere the body rotates by a (g x q).
 
     Parameters
     ----------
     expansion : float
-        a, 1/K.
+        Thermal expansion a, 1/K.
     change : float
-        Kelvin at ``about``.
-    gradient : Any
-        g, K/m, shape (3,).
-    about : Any
-        Metres, shape (3,).
+        Change of temperature at ``about``, kelvin.
+    gradient : (3,) array_like
+        Gradient g, K/m.
+    about : (3,) array_like
+        Fixed point, metres.
 
     Returns
     -------
-    Callable[[np.ndarray], np.ndarray]
+    callable
         Points (P, 3) in metres -> displacements (P, 3) in metres.
     """
     g, origin = np.asarray(gradient, np.float64), np.asarray(about, np.float64)
@@ -511,6 +515,6 @@ def free_linear_field(
 
 
 def _on_a_line(points: np.ndarray) -> bool:
-    """True when points (P, 3) span no plane, within 1e-6 of their extent."""
+    """Return True when points (P, 3) span no plane, within 1e-6 of their extent."""
     spread = np.linalg.svd(points - np.mean(points, axis=0), compute_uv=False)
     return bool(spread[1] <= 1e-6 * spread[0])

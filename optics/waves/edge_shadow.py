@@ -1,14 +1,12 @@
-"""Shadows that the edges of surfaces throw into exit pupils: obscurations, vanes, vignetting.
+"""Shadows of surfaces' edges in exit pupils (obscurations, vanes, vignetting), and the illuminated part of a stop.
 
-An edge lies on a surface, a pupil is a function over the stop. The rays of one image meet the surface at places that
-are a smooth function of the stop's coordinates, as long as edges stop no ray in the trace. This function is fitted by
-polynomials and inverted at the corners of the edge's outline. What the edge blocks then is convex polygons on the stop,
-which ``optics.waves.pupil_shadow`` takes out of the pupil exactly.
+An edge lies on a surface, a pupil is a function over the stop. The rays of one image meet the surface at positions that
+are a smooth function of the stop's coordinates, as long as edges block no ray in the trace. This function is fitted by
+polynomials and inverted at the corners of the edge's outline. The blocked part of the stop is then a set of convex
+polygons, which ``optics.waves.pupil_shadow`` subtracts from the pupil exactly.
 
-The part of a stop that light comes through: a quadrature over it, and whether it is a ring.
-
-Of a smooth integrand the whole disk is integrated by Gauss' rule, and what shadows take is taken off again, each of
-them by a rule of its own that ends at their sides. So edges leave no raster.
+``LitStop`` is a quadrature over the illuminated part of a stop. A smooth integrand is integrated over the whole disk by
+Gauss' rule, and each shadow is subtracted by a rule of its own that ends at its sides. So edges leave no raster.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
-from optics.geometry.polygon import area, area_in_disk, compact, intersect, sides, widened
+from optics.geometry.polygon import area, area_in_disk, compact, intersect, padded, sides
 from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
@@ -30,15 +28,18 @@ DEGREE = 10
 """Degree of the polynomials that map the stop to a surface."""
 
 ROUND_SIDES = (48, 96, 192)
-"""Of the polygon that stands for a round edge and has its area, the fewest that do: where circles nearly touch or
-nearly coincide, what is between two of them is thinner than what is between a circle and its polygon."""
+"""Numbers of sides, tried in this order, of the polygon of equal area that represents a round edge.
+
+Where circles nearly touch or nearly coincide, the area between two of them is thinner than that between a circle and
+its polygon.
+"""
 
 FINE_SHARE, COARSE_SHARE = 3e-4, 3e-3
 """Change of a shadow's share of the stop by twice as many sides: up to the first the fewer do, up to the second the
 more. They are right to a third of it."""
 
 MOST_PIECES = 160
-"""Of a shadow: the time of a transfer function grows with the square of their number."""
+"""Largest number of pieces of a shadow: the time of a transfer function grows with the square of their number."""
 
 _WINDOW, _WINDOW_SIDES = 1.2, 16
 """Polygon about the stop's unit disk to which outlines are cut before their corners are followed to their rays."""
@@ -52,52 +53,52 @@ WORST_FIT = 3e-4
 
 @dataclass(frozen=True, eq=False)
 class StopOutlines:
-    """Outlines of edges as the images see them on the stop's unit disk: convex polygons, counterclockwise.
+    """Outlines of edges projected onto the stop's unit disk for B images: convex polygons, counterclockwise.
 
     Attributes
     ----------
-    clear : tuple[np.ndarray, ...]
-        Light comes through inside of all of them only, (B, V, 2) each.
-    blocked : tuple[np.ndarray, ...]
-        Light is stopped in any of them, (B, V, 2) each; some are empty.
+    clear : tuple of (B, V, 2) ndarray
+        Polygons inside all of which light passes.
+    blocked : tuple of (B, V, 2) ndarray
+        Polygons inside any of which light is blocked; some are empty.
     """
 
     clear: tuple[np.ndarray, ...] = ()
     blocked: tuple[np.ndarray, ...] = ()
 
     def __add__(self, other: StopOutlines) -> StopOutlines:
-        """The edges of both."""
+        """Return the outlines of both."""
         return StopOutlines(self.clear + other.clear, self.blocked + other.blocked)
 
     def take(self, which: np.ndarray | slice) -> StopOutlines:
-        """Those of the images of the given indices."""
+        """Return the outlines of the images of the given indices."""
         return StopOutlines(tuple(one[which] for one in self.clear), tuple(one[which] for one in self.blocked))
 
     def shadows(self, count: int, further: Sequence[np.ndarray] = ()) -> np.ndarray:
-        """What edges and other shadows take of ``count`` pupils.
+        """Return the shadows of edges and of other bodies in ``count`` pupils.
 
         Parameters
         ----------
         count : int
-            B.
-        further : Sequence[np.ndarray]
-            Convex polygons of other shadows, counterclockwise, (B, V, 2) each.
+            Number of images B.
+        further : sequence of (B, V, 2) ndarray
+            Convex polygons of other shadows, counterclockwise.
 
         Returns
         -------
-        np.ndarray
-            Convex polygons that do not overlap, (B, K, W, 2); some are empty.
+        (B, K, W, 2) ndarray
+            Convex polygons that do not overlap; some are empty.
         """
         # each image by itself: what is one piece in one of them may be many in another
         each = [self._of_one(number, further) for number in range(count)]
         pieces, corners = (max(shape[k] for shape in (one.shape for one in each)) for k in (0, 1))
         out = np.zeros((count, pieces, corners, 2))
         for number, one in enumerate(each):
-            out[number, : len(one)] = widened(one, corners)
+            out[number, : len(one)] = padded(one, corners)
         return out
 
     def _of_one(self, number: int, further: Sequence[np.ndarray]) -> np.ndarray:
-        """``shadows`` of one image, (K, W, 2)."""
+        """Return ``shadows`` of one image, (K, W, 2)."""
         some = slice(number, number + 1)
         lit = _window(1)
         for polygon in self.clear:
@@ -109,32 +110,34 @@ class StopOutlines:
         pieces, _ = separate(dark, fewest=True)
         every = [*(pieces[0] if dark else ()), *(piece[0] for piece in beyond)]
         width = max((len(piece) for piece in every), default=3)
-        return np.stack([widened(piece[None], width)[0] for piece in every]) if every else np.zeros((0, 3, 2))
+        return np.stack([padded(piece[None], width)[0] for piece in every]) if every else np.zeros((0, 3, 2))
 
 
 def settled_shadows(
     outlines: Callable[[int], StopOutlines], count: int, further: Sequence[np.ndarray] = ()
 ) -> tuple[np.ndarray, float]:
-    """Shadows of ``count`` pupils with as many sides of round edges as they need.
+    """Return the shadows of ``count`` pupils, with round edges of as many sides as needed.
 
     Parameters
     ----------
-    outlines : Callable[[int], StopOutlines]
-        Of the edges, by the number of sides that stand for a round one.
+    outlines : callable
+        Number of sides of a round edge's polygon -> StopOutlines.
     count : int
-        B.
-    further : Sequence[np.ndarray]
-        As of ``StopOutlines.shadows``.
+        Number of images B.
+    further : sequence of (B, V, 2) ndarray
+        Convex polygons of other shadows, as for ``StopOutlines.shadows``.
 
     Returns
     -------
-    tuple[np.ndarray, float]
-        Pieces as of ``StopOutlines.shadows``, and how much of the stop their shares are right to.
+    pieces : (B, K, W, 2) ndarray
+        Shadows as from ``StopOutlines.shadows``.
+    error : float
+        Accuracy of their shares of the stop.
 
     Raises
     ------
     UnphysicalError
-        As of ``StopOutlines.shadows``, or edges that all sides are too few for.
+        There are too many pieces, or the largest number of sides is too small.
     """
     few, *more = ROUND_SIDES
     pieces = _few_enough(outlines(few).shadows(count, further))
@@ -155,7 +158,7 @@ def settled_shadows(
 
 
 def _few_enough(pieces: np.ndarray) -> np.ndarray:
-    """Pieces of shadows (B, K, V, 2). Raises UnphysicalError where there are too many for a transfer function."""
+    """Return pieces of shadows (B, K, V, 2); raise UnphysicalError where there are too many for a transfer function."""
     if pieces.shape[1] > MOST_PIECES:
         raise UnphysicalError(
             f"edges cut the pupil into {pieces.shape[1]} pieces of shadow, more than {MOST_PIECES}, which its transfer "
@@ -165,24 +168,28 @@ def _few_enough(pieces: np.ndarray) -> np.ndarray:
 
 
 def shares_of_stop(pieces: np.ndarray) -> np.ndarray:
-    """Shares of the stop that pieces of shadows (B, K, V, 2), which do not overlap, take, (B,)."""
+    """Return the fractions (B,) of the stop covered by pieces of shadows (B, K, V, 2) that do not overlap."""
     return np.asarray(np.sum(area_in_disk(pieces), axis=-1) / np.pi)
 
 
 def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quadrature over the part within the stop of pieces of shadows, with ``count`` nodes along each side of a box.
+    """Return a quadrature over the parts of shadows within the stop, with ``count`` nodes along each side of a box.
 
     Parameters
     ----------
-    pieces : np.ndarray
-        Convex polygons that do not overlap, counterclockwise, (B, K, V, 2); K may be 0.
+    pieces : (B, K, V, 2) ndarray
+        Convex polygons that do not overlap, counterclockwise; K may be 0.
     count : int
-        nodes.
+        Number of nodes along each side.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray, np.ndarray]
-        Points, complex, (B, Q), weights of the area, (B, Q), and the areas of the pieces, (B, K).
+    points : (B, Q) ndarray
+        Nodes, complex.
+    weights : (B, Q) ndarray
+        Area weights.
+    areas : (B, K) ndarray
+        Areas of the pieces.
     """
     images, number = pieces.shape[:2]
     if not number:
@@ -202,27 +209,27 @@ def outlines_on_stop(
     round_sides: int = ROUND_SIDES[0],
     lit: np.ndarray | None = None,
 ) -> StopOutlines:
-    """The edges of one surface as B images see them.
+    """Return the outlines of one surface's edges on the stop, for B images.
 
     Parameters
     ----------
-    places : np.ndarray
-        Where the rays through ``nodes`` meet the surface, in its own x and y, (B, N, 2), metres; of rays that edges
-        stop, too.
-    edges : Sequence[Edge]
-        Of the surface; light comes through where all let it.
+    places : (B, N, 2) ndarray
+        Intersections of the rays through ``nodes`` with the surface, in its own x and y, metres; also of rays that
+        edges block.
+    edges : sequence of Edge
+        Edges of the surface; light passes where all let it.
     nodes : PupilNodes
         Quadrature over the stop's unit disk.
     round_sides : int
-        Of the polygon that stands for a round edge.
-    lit : np.ndarray | None
-        Which rays no edge before the surface stops, (B, N); None for all. Where light is stopped already, nothing is
-        left to be cut, and the polynomials go on smoothly.
+        Number of sides of the polygon that represents a round edge.
+    lit : (B, N) ndarray of bool, optional
+        Mask of the rays that no edge before the surface blocks; None for all. Where light is blocked already, there is
+        nothing left to block, and the polynomials are only continued smoothly.
 
     Raises
     ------
     UnphysicalError
-        Places that no polynomials follow, as of a surface near a focus.
+        Polynomials do not follow the intersections, as on a surface near a focus.
     """
     known = np.all(np.isfinite(places), axis=-1)
     lit = known if lit is None else lit & known
@@ -254,7 +261,7 @@ def outlines_on_stop(
             seen = [_on_the_stop(outline, terms) for outline in outlines]
             if edge.blocks and isinstance(edge.shape, Circle) and edge.shape.inner and _covers(edge, edge.shape, terms):
                 # a ring that reaches beyond every beam lets light through its hole alone
-                hole = Edge(Circle(edge.shape.inner, edge.shape.centre), turn=edge.turn)
+                hole = Edge(Circle(edge.shape.inner, edge.shape.centre), rotation=edge.rotation)
                 clear += [_on_the_stop(outline, terms) for outline in next(_outlines(hole, round_sides))[0]]
             elif blocks:
                 blocked += seen
@@ -266,19 +273,20 @@ def outlines_on_stop(
 
 
 def _idle(edge: Edge, around: np.ndarray, lit: np.ndarray) -> bool:
-    """Whether a clear edge without a hole lets all of the light through that comes to places (B, N, 2), those lit."""
+    """Return True for a clear edge without a hole that passes all illuminated positions (B, N, 2)."""
     if edge.blocks or (isinstance(edge.shape, Circle) and edge.shape.inner):
         return False
     return bool(np.all(edge.passes(around[..., 0], around[..., 1]), where=lit))
 
 
 _AROUND = 1.1
-"""Times the light about its middle: a clear edge beyond stops nothing of it, as nodes stand nearer to each other."""
+"""Scale of the beam about its middle within which a clear edge may block something: nodes do not reach the beam's edge.
+"""
 
 
 def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:
-    """Whether the disk within the outer edge of a ring holds all of the stop in every image."""
-    disk = Edge(replace(ring, inner=0.0), edge.blocks, edge.turn)
+    """Return True when the disk within a ring's outer edge contains all of the stop in every image."""
+    disk = Edge(replace(ring, inner=0.0), edge.blocks, edge.rotation)
     (outline,), _ = next(_outlines(disk, ROUND_SIDES[0]))
     rim = _window(len(terms), 1.0, RIM_SIDES)
     inside = intersect(rim, *sides(_on_the_stop(outline, terms)))
@@ -286,13 +294,13 @@ def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:
 
 
 def _disk(count: int) -> np.ndarray:
-    """The polygon of a disk of radius 1, which has its area, (count, 2)."""
+    """Return the regular polygon (count, 2) with the area of the unit disk."""
     angle = 2.0 * np.pi * np.arange(count) / count
     return np.asarray(np.sqrt(angle[1] / np.sin(angle[1])) * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
 
 
 def _outlines(edge: Edge, round_sides: int) -> Iterator[tuple[list[np.ndarray], bool]]:
-    """Convex outlines (V, 2) on the surface, and whether light is stopped in them or outside of all of them."""
+    """Yield convex outlines (V, 2) on the surface, and whether light is blocked in them or outside all of them."""
     shape, unit = edge.shape, _disk(round_sides)
     match shape:
         case Circle():
@@ -321,17 +329,17 @@ def _outlines(edge: Edge, round_sides: int) -> Iterator[tuple[list[np.ndarray], 
 
 
 _FAR = 100.0
-"""Where a vane ends, metres: outside of every beam."""
+"""Length of a vane, metres: beyond every beam."""
 
 
 def _turned(outlines: list[np.ndarray], edge: Edge) -> list[np.ndarray]:
-    """Outlines about the origin at the edge's place and turn."""
-    c, s = np.cos(edge.turn), np.sin(edge.turn)
+    """Return outlines about the origin at the edge's position and rotation."""
+    c, s = np.cos(edge.rotation), np.sin(edge.rotation)
     return [outline @ np.array([[c, s], [-s, c]]) + np.array(edge.shape.centre) for outline in outlines]
 
 
 def _convex_parts(corners: np.ndarray) -> list[np.ndarray]:
-    """A polygon (V, 2) whose sides do not cross, as convex ones: itself, or triangles cut off ear by ear."""
+    """Return a polygon (V, 2) whose sides do not cross as convex ones: itself, or triangles cut off by ear clipping."""
     rest = corners if area(corners[None])[0] > 0.0 else corners[::-1]
     out = []
     while len(rest) > 3:
@@ -353,29 +361,31 @@ def _convex_parts(corners: np.ndarray) -> list[np.ndarray]:
 
 
 def _divided(corners: np.ndarray) -> np.ndarray:
-    """A polygon (V, 2) with further corners on its sides, which may bend on the stop."""
+    """Return a polygon (V, 2) with further corners on its sides, which may be curved on the stop."""
     share = np.arange(_PARTS)[:, None] / _PARTS
     return np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
 
 
 _PARTS = 8
-"""Parts into which each side of a rectangle is divided."""
+"""Number of parts into which each side of a rectangle is divided."""
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the cross product of vectors in a plane."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
 def _window(count: int, radius: float = _WINDOW, number: int = _WINDOW_SIDES) -> np.ndarray:
-    """A regular polygon about a disk, (B, number, 2)."""
+    """Return a regular polygon about a disk, (B, number, 2)."""
     angle = 2.0 * np.pi * (np.arange(number) + 0.5) / number
     corners = radius / np.cos(np.pi / number) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.broadcast_to(corners, (count, *corners.shape))
 
 
 def _on_the_stop(outline: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """An outline (V, 2) on the surface as seen on the stop of B images, counterclockwise, (B, W, 2); empty where it
-    lies outside of the beam.
+    """Return an outline (V, 2) of the surface projected onto the stop of B images, counterclockwise, (B, W, 2).
+
+    It is empty where the outline lies outside the beam.
     """
     # place of the ray through the middle of the stop, and the derivatives of places there
     values, rise = _followed(terms, np.zeros((len(terms), 1, 2)))
@@ -398,7 +408,7 @@ def _on_the_stop(outline: np.ndarray, terms: np.ndarray) -> np.ndarray:
 
 
 def _followed(terms: np.ndarray, at: np.ndarray, step: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
-    """Places (B, V, 2) of rays through points (B, V, 2) of the stop, and their derivatives, (B, V, 2, 2)."""
+    """Return surface positions of rays through points of the stop, both (B, V, 2), and derivatives (B, V, 2, 2)."""
 
     def value(points: np.ndarray) -> np.ndarray:
         return np.asarray(products(points[..., 0], points[..., 1], DEGREE) @ terms)
@@ -409,8 +419,9 @@ def _followed(terms: np.ndarray, at: np.ndarray, step: float = 1e-5) -> tuple[np
 
 
 def _around(lit: np.ndarray) -> np.ndarray:
-    """What the stop has outside of a convex polygon (V, 2) in the window, counterclockwise: a convex piece beyond each
-    side, (K, W, 2), without those that lie beyond the stop.
+    """Return the part of the stop outside a convex counterclockwise polygon (V, 2), as convex pieces (K, W, 2).
+
+    There is one piece beyond each side; pieces beyond the stop are omitted.
     """
     lit = compact(lit[None])[0]
     if area(lit) < SMALLEST:
@@ -431,7 +442,7 @@ _THINNEST = 1e-6
 
 
 def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
-    """What the window has outside of all clear polygons (B, V, 2), as convex pieces."""
+    """Return the part of the window outside all clear polygons (B, V, 2), as convex pieces."""
     rest = [_window(count)]
     for polygon in clear:
         rest = [piece for part in rest for piece in without(part, polygon, fewest=True)]
@@ -439,20 +450,23 @@ def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
 
 
 ROUND = 1e-4
-"""By how much the second moment of a shadow may exceed that of a disk about the stop's middle with its area: of all
-shapes it has the least."""
+"""Relative excess of a shadow's second moment over that of a centred disk of its area up to which it counts as that
+disk.
+
+The disk has the smallest second moment of all shapes of its area.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class LitStop:
-    """Quadratures over the light of F beams.
+    """Quadratures over the illuminated parts of a stop for F beams.
 
     Attributes
     ----------
-    x, y : np.ndarray
-        Nodes, in units of the stop's radius, (F, N).
-    weight : np.ndarray
-        Of the area, (F, N); negative in shadows, 0 for what only fills the rows.
+    x, y : (F, N) ndarray
+        Nodes, in units of the stop's radius.
+    weight : (F, N) ndarray
+        Area weights; negative in shadows, 0 for padding.
     """
 
     x: np.ndarray
@@ -461,16 +475,16 @@ class LitStop:
 
     @classmethod
     def of(cls, pieces: np.ndarray, rings: int, count: int) -> LitStop:
-        """The stop without shadows.
+        """Return the quadrature over the stop without shadows.
 
         Parameters
         ----------
-        pieces : np.ndarray
-            Convex polygons on the unit disk that do not overlap, (F, K, V, 2).
+        pieces : (F, K, V, 2) ndarray
+            Convex polygons on the unit disk that do not overlap.
         rings : int
-            Of the rule over the whole stop.
+            Number of rings of the rule over the whole stop.
         count : int
-            Nodes along each side of a shadow's box.
+            Number of nodes along each side of a shadow's box.
         """
         nodes = quadrature.disk(rings)
         points, dark, _ = nodes_in_shadows(pieces, count)
@@ -483,18 +497,19 @@ class LitStop:
 
     @property
     def light(self) -> np.ndarray:
-        """Share of the stop that light comes through, (F,)."""
+        """Fraction of the stop that is illuminated, (F,)."""
         return np.asarray(np.sum(self.weight, axis=1) / np.pi)
 
 
 def holes(pieces: np.ndarray) -> np.ndarray:
-    """Radius of the hole of each stop whose shadow is one disk about its middle, in units of the stop's, (F,); 0 where
-    there is no shadow, NaN where it is another.
+    """Return the radius of the central obscuration of each stop, in units of the stop's radius, (F,).
+
+    It is 0 where there is no shadow, and NaN where the shadow is not one disk about the stop's middle.
 
     Parameters
     ----------
-    pieces : np.ndarray
-        Convex polygons that do not overlap, (F, K, V, 2).
+    pieces : (F, K, V, 2) ndarray
+        Convex polygons that do not overlap.
     """
     points, weight, _ = nodes_in_shadows(pieces, 4)
     taken = np.sum(weight, axis=1)

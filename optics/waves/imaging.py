@@ -1,14 +1,15 @@
-"""The pupil field of a camera that looks at a far point: what ``optics.waves.diffraction.image`` turns into its image.
+"""Pupil fields and wavefronts of a camera that looks at a far point.
 
-The beam is collimated and evenly lit. Rays are aimed at quadrature nodes of the stop, so that its edge is exact in
-every state. With p the launch point on the incoming plane wavefront, s the point of the stop and (u, v) the direction
-cosines at the detector, power conservation |a|^2 du dv = dp / A makes the amplitude of a node
+The beam is collimated and of uniform irradiance. Rays are aimed at quadrature nodes of the stop, so that its edge is
+exact in every state. With p the launch point on the incoming plane wavefront, s the point of the stop and (u, v) the
+direction cosines at the detector, power conservation |a|^2 du dv = dp / A makes the amplitude of a node
 
     a du dv = sqrt(|d(u, v)/dp| / A) * |dp/ds| * ds,    A = sum |dp/ds| ds,
 
-with both Jacobians by forward-mode AD through the trace. Paths count from the incoming wavefront.
+with both Jacobians by forward-mode AD through the trace. Paths count from the incoming wavefront. The pupil field is
+what ``optics.waves.diffraction.image`` turns into an image.
 
-Wavefront of a traced bundle: eikonal at the image point, optical path difference on the exit pupil, Zernike fit.
+Wavefronts of a traced bundle: eikonal at the image point, optical path difference on the exit pupil, Zernike fits.
 """
 
 from __future__ import annotations
@@ -25,28 +26,28 @@ from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.system import SystemBatch
-from optics.raytrace.trace import jvp, require_some
+from optics.raytrace.trace import jvp, require_rays
 from optics.waves.diffraction import PupilField
 
 
 def eikonal(position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Optical path of each ray's plane wave through ``origin``: path - d . (position - origin).
+    """Return the optical path of each ray's plane wave through ``origin``: path - d . (position - origin).
 
     Parameters
     ----------
-    position : np.ndarray
-        Where the path was measured, (..., N, 3), metres (image space, index 1).
-    direction : np.ndarray
-        Unit directions, (..., N, 3).
-    path : np.ndarray
-        Optical paths, (..., N).
-    origin : np.ndarray
-        The image point, broadcastable to (..., 1, 3).
+    position : (..., N, 3) ndarray
+        Points at which the paths are given, metres (image space, index 1).
+    direction : (..., N, 3) ndarray
+        Unit directions.
+    path : (..., N) ndarray
+        Optical paths, metres.
+    origin : ndarray
+        Image point, broadcastable to (..., 1, 3), metres.
 
     Returns
     -------
-    np.ndarray
-        (..., N), metres.
+    (..., N) ndarray
+        Eikonal, metres.
     """
     return np.asarray(path - np.sum(direction * (position - origin), axis=-1))
 
@@ -54,25 +55,26 @@ def eikonal(position: np.ndarray, direction: np.ndarray, path: np.ndarray, origi
 def path_to_sphere(
     position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray, radius: float = np.inf
 ) -> np.ndarray:
-    """Optical path of each ray to the sphere of a radius about ``origin``, plus that radius.
+    """Return the optical path of each ray to a sphere about ``origin``, plus the sphere's radius.
 
     Parameters
     ----------
-    position : np.ndarray
-        Rays near the image, (..., N, 3), metres.
-    direction : np.ndarray
+    position : (..., N, 3) ndarray
+        Points of the rays near the image, metres.
+    direction : (..., N, 3) ndarray
         Unit directions there.
-    path : np.ndarray
-        Optical paths to ``position``, (..., N).
-    origin : np.ndarray
-        The image point, broadcastable to (..., 1, 3).
+    path : (..., N) ndarray
+        Optical paths to ``position``, metres.
+    origin : ndarray
+        Image point, broadcastable to (..., 1, 3), metres.
     radius : float
-        Of the sphere, metres, positive when the exit pupil lies upstream; for an infinite one this is the ``eikonal``.
+        Radius of the sphere, metres, positive when the exit pupil lies upstream; for an infinite one the result is the
+        ``eikonal``.
 
     Returns
     -------
-    np.ndarray
-        (..., N) metres.
+    (..., N) ndarray
+        Optical path, metres.
     """
     offset = position - origin
     along = np.sum(direction * offset, axis=-1)
@@ -84,16 +86,16 @@ def path_to_sphere(
 
 @dataclass(frozen=True, eq=False)
 class WavefrontFit:
-    """Zernike coefficients of a wavefront (Noll order, index 0 = Z1), metres rms each, and the rms that remains.
+    """Zernike coefficients of a wavefront (Noll order, index 0 = Z1), metres rms each, and the remaining rms.
 
     Attributes
     ----------
-    coefficients : np.ndarray
-        (..., last).
-    rms : np.ndarray
-        (...,) rms wavefront error after piston and tilt are taken out, metres.
-    residual_rms : np.ndarray
-        (...,) rms left by the fit.
+    coefficients : (..., last) ndarray
+        Coefficients, metres rms.
+    rms : (...) ndarray
+        Rms wavefront error after removal of piston and tilt, metres.
+    residual_rms : (...) ndarray
+        Rms of the wavefront minus the fit, metres.
     """
 
     coefficients: np.ndarray
@@ -110,14 +112,12 @@ def fit_wavefront(
 
     Parameters
     ----------
-    x : np.ndarray
-        On the unit disk, (N,).
-    y : np.ndarray
-        likewise.
-    weight : np.ndarray
-        Of a quadrature, (N,).
-    difference : np.ndarray
-        Of optical paths, (..., N), metres.
+    x, y : (N,) ndarray
+        Pupil coordinates on the unit disk.
+    weight : (N,) ndarray
+        Quadrature weights.
+    difference : (..., N) ndarray
+        Optical path differences, metres.
     last : int
         Highest Noll index.
     """
@@ -135,29 +135,27 @@ def fit_wavefront(
 def orthonormal_parts(
     x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int
 ) -> np.ndarray:
-    """What Zernike terms make of the rms of path differences over any part of the unit disk, in Noll's order.
+    """Return the contributions of Zernike terms to the rms of path differences over a part of the unit disk.
 
-    The terms are made orthonormal over the weight one after the other (Gram and Schmidt, as of annular pupils: Mahajan,
-    J. Opt. Soc. Am. 71, 75, 1981). Over the whole disk they are themselves; over a part of it fitted coefficients are
-    no parts of the rms: two terms that are alike there may each be larger than the whole.
+    The terms are made orthonormal over the weight one after the other (Gram-Schmidt, as for annular pupils: Mahajan, J.
+    Opt. Soc. Am. 71, 75, 1981). Over the whole disk they are the Zernike terms themselves. Over a part of it fitted
+    coefficients are not contributions to the rms: two terms that are similar there may each be larger than the whole.
 
     Parameters
     ----------
-    x : np.ndarray
-        On the unit disk, (N,).
-    y : np.ndarray
-        likewise.
-    weight : np.ndarray
-        Of a quadrature over what is lit, (N,); 0 where no light is.
-    difference : np.ndarray
-        Of optical paths, (N,).
+    x, y : (N,) ndarray
+        Pupil coordinates on the unit disk.
+    weight : (N,) ndarray
+        Quadrature weights over the illuminated part; 0 where there is no light.
+    difference : (N,) ndarray
+        Optical path differences.
     last : int
         Highest Noll index.
 
     Returns
     -------
-    np.ndarray
-        (last,), in the unit of ``difference``, with the signs of the terms.
+    (last,) ndarray
+        Contributions, in the unit of ``difference``, with the signs of the terms.
     """
     lit = weight > 0.0
     root = np.sqrt(weight[lit] / np.sum(weight))
@@ -167,22 +165,23 @@ def orthonormal_parts(
 
 @dataclass(frozen=True, eq=False)
 class PartFit:
-    """A wavefront over a part of the unit disk, piston and tilt taken out.
+    """Wavefront fit over a part of the unit disk, piston and tilt removed.
 
     Attributes
     ----------
-    level : np.ndarray
-        Piston and the two tilts that were taken out, coefficients of Z1 to Z3, (3,).
-    coefficients : np.ndarray
-        Of Zernike terms in Noll's order, (last,), by least squares; they share among them what is alike over the part.
-    parts : np.ndarray
-        As of ``orthonormal_parts``, (last,).
+    level : (3,) ndarray
+        Piston and the two tilts that were removed, coefficients of Z1 to Z3.
+    coefficients : (last,) ndarray
+        Least-squares coefficients of the Zernike terms in Noll's order; terms that are similar over the part are
+        correlated.
+    parts : (last,) ndarray
+        Contributions to the rms, as from ``orthonormal_parts``.
     rms : float
-        Of the path differences.
+        Rms of the path differences.
     residual_rms : float
-        That the terms leave.
+        Rms of the path differences minus the fit.
     strehl : float
-        Square of the mean phasor, for path differences in waves.
+        Square of the modulus of the mean phasor, for path differences in waves.
     """
 
     level: np.ndarray
@@ -194,26 +193,25 @@ class PartFit:
 
 
 def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int) -> PartFit:
-    """Fit Z1..Z_last to a wavefront over a part of the unit disk by a quadrature whose weights may be negative, as of
-    what shadows take off again.
+    """Fit Z1..Z_last to a wavefront over a part of the unit disk.
+
+    The quadrature weights may be negative, where shadows are subtracted.
 
     Parameters
     ----------
-    x : np.ndarray
-        Near the unit disk, (N,).
-    y : np.ndarray
-        likewise.
-    weight : np.ndarray
-        Of the area, (N,), with a positive sum.
-    difference : np.ndarray
-        Of optical paths, waves, (N,).
+    x, y : (N,) ndarray
+        Pupil coordinates near the unit disk.
+    weight : (N,) ndarray
+        Area weights, with a positive sum.
+    difference : (N,) ndarray
+        Optical path differences, waves.
     last : int
         Highest Noll index.
 
     Raises
     ------
     UnphysicalError
-        a quadrature over which the terms have no squares above zero: too few nodes, or next to no area.
+        The terms are not positive definite over the quadrature: too few nodes, or almost no area.
     """
     share = weight / np.sum(weight)
     basis = zernike.basis(last, x, y)
@@ -246,7 +244,7 @@ def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.nd
 
 
 AIM_TOLERANCE = 1e-12
-"""Distance of a ray from its node on the stop, metres."""
+"""Largest distance of an aimed ray from its node on the stop, metres."""
 
 
 def aim_collimated(
@@ -257,29 +255,30 @@ def aim_collimated(
     target: np.ndarray,
     first: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of collimated beams that meet given points of the stop.
+    """Aim rays of collimated beams at given points of the stop.
 
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the trace.
     to_stop : SystemBatch
         B systems from the scene to the stop, their last element.
-    direction : np.ndarray
-        Of the light, world, unit, (3,) or (B, 3).
-    launch : np.ndarray
-        a world point of the beam before the first mirror, (3,) or (B, 3), metres; rays start on the plane wavefront
-        through it.
-    target : np.ndarray
-        Stop coordinates, (N, 2) or of each system (B, N, 2), metres of its nominal size.
-    first : np.ndarray | None
-        World vector (3,) near which the first axis of the wavefront lies, not along the beam; by default the coordinate
-        axis least along it, which is not the same for all directions.
+    direction : (3,) or (B, 3) ndarray
+        Unit direction of the light in the world frame.
+    launch : (3,) or (B, 3) ndarray
+        World point of the beam before the first mirror, metres; rays start on the plane wavefront through it.
+    target : (N, 2) or (B, N, 2) ndarray
+        Stop coordinates, common or of each system, metres at its nominal size.
+    first : (3,) ndarray, optional
+        World vector near which the first axis of the wavefront lies, not along the beam; by default the coordinate axis
+        least aligned with it, which is not the same for all directions.
 
     Returns
     -------
-    tuple[np.ndarray, np.ndarray]
-        Launch points (B, N, 3) and the two axes of the wavefront (B, 2, 3).
+    launched : (B, N, 3) ndarray
+        Launch points in the world frame, metres.
+    axes : (B, 2, 3) ndarray
+        The two axes of the wavefront.
 
     Raises
     ------
@@ -307,18 +306,18 @@ class ImagingRays:
 
     Attributes
     ----------
-    position, direction : np.ndarray
-        In the detector's frame, (B, N, 3), metres and unit.
-    path : np.ndarray
-        Optical path from the incoming wavefront, (B, N), metres.
-    amplitude : np.ndarray
-        a du dv of the module's formula, (B, N); 0 where another aperture stops the ray.
-    launched : np.ndarray
-        Points of the incoming wavefront, world, (B, N, 3), metres.
-    launch_area : np.ndarray
-        |dp/ds| ds, area of the wavefront that belongs to each node, (B, N), m^2.
-    axes : np.ndarray
-        Of the wavefront, world, (B, 2, 3).
+    position, direction : (B, N, 3) ndarray
+        Positions (metres) and unit directions in the detector's frame.
+    path : (B, N) ndarray
+        Optical path from the incoming wavefront, metres.
+    amplitude : (B, N) ndarray
+        a du dv of the module's formula; 0 where another aperture blocks the ray.
+    launched : (B, N, 3) ndarray
+        Points of the incoming wavefront in the world frame, metres.
+    launch_area : (B, N) ndarray
+        Area |dp/ds| ds of the wavefront that belongs to each node, m^2.
+    axes : (B, 2, 3) ndarray
+        Axes of the wavefront in the world frame.
     """
 
     position: np.ndarray
@@ -345,21 +344,21 @@ def imaging_rays(
     Parameters
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the trace.
     systems : SystemBatch
         B systems from the scene to the detector.
     to_stop : SystemBatch
         The same systems, only as far as the stop.
-    direction : np.ndarray
-        Of the light, world, unit, (3,) or (B, 3).
-    launch : np.ndarray
-        a world point of the beam before the first mirror, (3,) or (B, 3), metres.
+    direction : (3,) or (B, 3) ndarray
+        Unit direction of the light in the world frame.
+    launch : (3,) or (B, 3) ndarray
+        World point of the beam before the first mirror, metres.
     stop : Circle
         Clear aperture of the stop.
     nodes : PupilNodes
         N nodes of a quadrature over the unit disk.
-    first : np.ndarray | None
-        As for ``aim_collimated``.
+    first : (3,) ndarray, optional
+        World vector near which the first axis of the wavefront lies, as for ``aim_collimated``.
 
     Raises
     ------
@@ -382,7 +381,7 @@ def imaging_rays(
         for step in (out.hits[stop_index], out.direction)
     )
     place, leaving, path, valid = (array[:, ::2] for array in out.traced.numpy())
-    require_some(valid, "the imaging path")
+    require_rays(valid, "the imaging path")
     launch_area = (to_stop.size[:, None] * stop.radius) ** 2 * nodes.weight / np.abs(np.linalg.det(hit))
     amplitude = np.sqrt(np.abs(np.linalg.det(turn)) / np.sum(launch_area, axis=-1, keepdims=True)) * launch_area * valid
     return ImagingRays(place, leaving, path, amplitude, launched, launch_area, axes)
@@ -401,17 +400,18 @@ def pupil_field(
     rays : ImagingRays
         B traced beams.
     wavelength : float
-        metres.
-    origin : np.ndarray | None
-        Image point about which the field is wanted, in the detector's frame, (3,) or (B, 3), metres; default 0.
-    incoming : Callable[[np.ndarray], np.ndarray] | None
-        Optical path that the beam brings along beyond that of a plane wave, (B, N) metres, at transverse coordinates
-        (B, N, 2) from the middle of the entrance pupil along the two axes of ``aim_collimated``.
+        Wavelength, metres.
+    origin : (3,) or (B, 3) ndarray, optional
+        Image point about which the field is computed, in the detector's frame, metres; 0 by default.
+    incoming : callable, optional
+        Optical path of the incoming beam beyond that of a plane wave, (B, N) metres, at transverse coordinates (B, N,
+        2) from the middle of the entrance pupil along the two axes of ``aim_collimated``.
 
     Returns
     -------
     PupilField
-        Unit power through the stop if no other aperture cuts the beam; nodes that another aperture stops carry nothing.
+        Field of unit power through the stop if no other aperture vignettes the beam; nodes that another aperture blocks
+        have zero amplitude.
     """
     centre = np.zeros((1, 1, 3)) if origin is None else np.broadcast_to(origin, (len(rays.path), 3))[:, None]
     leaving = rays.direction

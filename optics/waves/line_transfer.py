@@ -1,15 +1,15 @@
-"""Transfer function of a pupil that edges cut, at even steps of frequency along a direction, by lines along the shift.
+"""Transfer function of a vignetted pupil at evenly spaced frequencies along a direction, by lines along the shift.
 
-Every line of the pupil along the shift is light from one edge to the next. The pupil's autocorrelation is the sum over
-lines of the autocorrelations along them. These are worked out on cells as long as one step of the shift, so that all
-shifts together are one Fourier transform of a line; the cells that edges cut get the weights of Gauss' rule between
-edge and cell, for every pair of edges. Edges are therefore exact along the lines, wherever they stand, and neither are
-shadows cut to pieces nor is a wavefront continued into the dark.
+On every line of the pupil along the shift, light extends from one edge to the next. The pupil's autocorrelation is the
+sum over lines of the autocorrelations along them. These are computed on cells as long as one step of the shift, so that
+all shifts together are one Fourier transform of a line; cells that contain an edge get the weights of Gauss' rule
+between edge and cell, for every pair of edges. Edges are therefore exact along the lines, wherever they are; shadows
+need not be divided into pieces, and no wavefront is extrapolated into the dark.
 
-Across the lines stands Fejer's rule between the places where outlines begin, end or have a corner. Where edges of the
-two pupils cross, which is at another place for every shift, the integrand has a kink, and the error falls with the
-square of the number of lines. A third of the lines is a rule of its own; with other nodes on the cells it tells the
-error, and lines are added until it is small.
+Across the lines the rule is Fejer's, between the positions where outlines begin, end or have a corner. Where edges of
+the two pupils cross, at another position for every shift, the integrand has a kink, and the error falls with the square
+of the number of lines. A third of the lines is a rule of its own; with other nodes on the cells it gives an error
+estimate, and lines are added until the error is small.
 
 ``optics.waves.optical_transfer`` serves any frequencies and defocus.
 """
@@ -37,55 +37,65 @@ from optics.waves.pupil_stack import EVENLY, PupilFunction
 from optics.waves.pupil_terms import polynomials, products, smooth_terms
 
 RIM_SIDES = 2048
-"""Of the polygon with the area of the pupil that stands for its edge: within 4e-7 of it, to both sides alike."""
+"""Number of sides of the polygon of equal area that represents the pupil's edge: within 4e-7 of it, inside and outside.
+"""
 
 LINE_SIDES = 192
-"""Of the polygon that stands for a round edge, has its area and is within 1e-4 of its radius of it, to both sides."""
+"""Number of sides of the polygon of equal area that represents a round edge: within 1e-4 of its radius, on both sides.
+"""
 
 LINES = (400, 720, 1440, 3240)
-"""Across the pupil, the first that do."""
+"""Numbers of lines across the pupil, tried in this order until the error is small enough."""
 
 SETTLED = 1e-4
-"""Change of a transfer function from a third of the lines below which there are enough: they are right to a tenth."""
+"""Change of a transfer function from a third of the lines below which there are enough: the error is then a tenth of
+it.
+"""
 
 FEW_OUTLINES = 2
-"""Beside the pupil's own edge, for which the fewest lines are tried at all."""
+"""Largest number of outlines, besides the pupil's own edge, for which the smallest number of lines is tried."""
 
 _LEAST = 9
-"""Lines between two places where outlines begin or end."""
+"""Smallest number of lines between two positions where outlines begin or end."""
 
 _CORNER = 0.3
-"""Angle by which an outline turns at a corner, radians; that of a round one turns less from side to side."""
+"""Smallest change of direction of an outline at a corner, radians; that of a round outline from side to side is
+smaller.
+"""
 
 _SHORT_CELLS = 0.005, 0.04
-"""Lengths of cells up to which one and two nodes do; three for longer ones."""
+"""Lengths of cells up to which one and two nodes suffice; three for longer ones."""
 
 _TURNS = 0.2
-"""Radians of phase over a cell beyond which it gets a further node: near the cut-off little else than cells that edges
-cut is left."""
+"""Phase over a cell, radians, beyond which it gets a further node.
+
+Near the cut-off there are few cells without an edge.
+"""
 
 _AT_ONCE = 2**14
-"""Nodes worked on together: some arrays of 200 kB that stay in the cache."""
+"""Number of nodes processed in one block: some arrays of 200 kB that stay in the cache."""
 
 _APART = 1e-6
-"""Distance of two places between which there are lines, of the pupil's radius."""
+"""Smallest distance of two positions between which there are lines, in radii of the pupil."""
 
 _LONGEST_CELL = 0.06
-"""Of the pupil's radius: longer steps of a shift are several cells, which end little beyond the pupil."""
+"""Largest length of a cell, in radii of the pupil: longer steps of a shift are several cells, so that the last one ends
+little beyond the pupil.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class CutPupil:
-    """Exit pupil that edges cut.
+    """Exit pupil vignetted by edges.
 
     Attributes
     ----------
     pupil : PupilFunction
-        Its wavefront and its own edge, without shadows.
-    clear : tuple[np.ndarray, ...]
-        Light comes through inside of all of these only, convex polygons in p, complex, counterclockwise, (V,).
-    blocked : tuple[np.ndarray, ...]
-        Light is stopped in any of these, likewise.
+        Wavefront and own edge of the pupil, without shadows.
+    clear : tuple of (V,) ndarray
+        Convex polygons in p, complex, counterclockwise, inside all of which light passes.
+    blocked : tuple of (V,) ndarray
+        Convex polygons in p, complex, counterclockwise, inside any of which light is blocked.
     """
 
     pupil: PupilFunction
@@ -95,16 +105,16 @@ class CutPupil:
 
 @dataclass(frozen=True, eq=False)
 class LineTransfer:
-    """Transfer function at even steps of frequency.
+    """Transfer function at evenly spaced frequencies.
 
     Attributes
     ----------
-    values : np.ndarray
-        Complex, (M,), 1 at zero frequency.
-    perfect : np.ndarray
-        Of the same light with a perfect wavefront, (M,).
+    values : (M,) ndarray
+        Complex transfer function, 1 at zero frequency.
+    perfect : (M,) ndarray
+        Transfer function of the same pupil with a perfect wavefront.
     error : float
-        Largest change of either from a third of the lines and other nodes on the cells.
+        Largest change of either when a third of the lines and other nodes on the cells are used.
     """
 
     values: np.ndarray
@@ -120,22 +130,20 @@ def cut_pupils(
     outlines: StopOutlines,
     lit: np.ndarray,
 ) -> tuple[CutPupil, ...]:
-    """Pupils with the outlines of edges in them.
+    """Return the pupils with the outlines of edges in them.
 
     Parameters
     ----------
-    pupils : Sequence[PupilFunction]
-        B, without shadows.
-    u : np.ndarray
-        Direction cosines along the detector's first axis at nodes of the stop, (B, N).
-    v : np.ndarray
-        Likewise along the second.
+    pupils : sequence of PupilFunction
+        B pupils without shadows.
+    u, v : (B, N) ndarray
+        Direction cosines along the detector's two axes at nodes of the stop.
     nodes : PupilNodes
-        Of the stop.
+        Nodes of the stop.
     outlines : StopOutlines
-        Of the edges on the stop's unit disk, as B images see them.
-    lit : np.ndarray
-        Which nodes carry light, (B, N); those alone tell where the edges are seen.
+        Outlines of the edges on the stop's unit disk, for B images.
+    lit : (B, N) ndarray of bool
+        Mask of the illuminated nodes; only these determine the positions of the edges.
     """
     degree = pupils[0].eikonal_terms.shape[-1] - 1
     on_stop = products(nodes.x, nodes.y, degree)
@@ -157,7 +165,7 @@ def cut_pupils(
 
 
 def lit_at(cut: CutPupil, points: np.ndarray) -> np.ndarray:
-    """Which points p, complex (N,), of the pupil no edge but its own lets light miss, (N,)."""
+    """Return the mask of points p, complex (N,), that no edge except the pupil's own blocks."""
     out = np.ones(len(points), bool)
     for polygons, clear in ((cut.clear, True), (cut.blocked, False)):
         for polygon in polygons:
@@ -174,32 +182,33 @@ def line_transfers(
     count: int,
     lines: Sequence[int] = (),
 ) -> list[list[LineTransfer]]:
-    """Transfer functions at the frequencies 0, step .. (count - 1) step along some directions.
+    """Return transfer functions at the frequencies 0, step .. (count - 1) step along some directions.
 
     Parameters
     ----------
-    cut : Sequence[CutPupil]
+    cut : sequence of CutPupil
         Pupils of B images.
-    wavelengths : Sequence[float]
-        Of their light, metres, B.
-    directions : np.ndarray
-        Unit vectors in detector x, y, (A, 2).
+    wavelengths : sequence of float
+        Wavelength of each image, metres.
+    directions : (A, 2) ndarray
+        Unit vectors in detector x, y.
     step : float
-        Of the frequency, cycles/m, positive.
+        Step of the frequency, cycles/m, positive.
     count : int
-        M.
-    lines : Sequence[int]
-        Across the pupil, tried one after the other; by default those of LINES that this kind of pupil needs.
+        Number M of frequencies.
+    lines : sequence of int
+        Numbers of lines across the pupil, tried one after the other; by default those of LINES that this kind of pupil
+        needs.
 
     Returns
     -------
-    list[list[LineTransfer]]
-        Of every image those along every direction.
+    list of list of LineTransfer
+        For every image the transfer functions along every direction.
 
     Raises
     ------
     UnphysicalError
-        Even the most lines tell another value than a third of them.
+        Even with the largest number of lines the result differs from that of a third of them.
     """
     tasks = [(one, wave, way) for one, wave in zip(cut, wavelengths, strict=True) for way in np.asarray(directions)]
 
@@ -216,7 +225,7 @@ def line_transfers(
 def _line_transfer(
     cut: CutPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int]
 ) -> LineTransfer:
-    """``line_transfers`` of one image along one direction."""
+    """Return ``line_transfers`` of one image along one direction."""
     way = complex(cut.pupil.normalised(*direction))
     pitch, turn = wavelength * step * abs(way), way / abs(way)
     every = int(np.ceil(pitch / _LONGEST_CELL))
@@ -242,13 +251,13 @@ def _line_transfer(
 
 
 def _sensed(polygon: np.ndarray) -> np.ndarray:
-    """A polygon (V,), complex, counterclockwise."""
+    """Return a polygon (V,), complex, counterclockwise."""
     turned = np.sum((np.conj(polygon) * np.roll(polygon, -1)).imag) < 0.0
     return polygon[::-1] if turned else polygon
 
 
 def _turned(cut: CutPupil, turn: complex) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Clear outlines, the pupil's own edge first, and blocked ones, with ``turn`` along x."""
+    """Return clear outlines, the pupil's own edge first, and blocked ones, rotated so that ``turn`` is along x."""
     angle = 2.0 * np.pi * np.arange(RIM_SIDES) / RIM_SIDES
     rim = _sensed(np.sqrt(angle[1] / np.sin(angle[1])) * cut.pupil.edge.boundary(angle)[0])
     back = np.conj(turn)
@@ -256,7 +265,7 @@ def _turned(cut: CutPupil, turn: complex) -> tuple[list[np.ndarray], list[np.nda
 
 
 def _turned_tables(pupil: PupilFunction, turn: complex) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients of eikonal and amplitude as polynomials in coordinates whose x is ``turn``, (D + 1, D + 1) each."""
+    """Return the coefficients of eikonal and amplitude in coordinates whose x is ``turn``, (D + 1, D + 1) each."""
     count = len(pupil.eikonal_terms)
     node, to_table = _chebyshev_nodes(count)
     points = (node[:, None] + 1j * node).reshape(1, -1) * turn
@@ -269,7 +278,7 @@ def _turned_tables(pupil: PupilFunction, turn: complex) -> tuple[np.ndarray, np.
 
 @cache
 def _chebyshev_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Chebyshev's nodes, (count,), and the matrix from values there to coefficients."""
+    """Return Chebyshev nodes, (count,), and the matrix from values there to coefficients."""
     node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
     matrix = chebyshev.chebvander(node, count - 1).T * (2.0 / count)
     matrix[0] *= 0.5
@@ -277,15 +286,13 @@ def _chebyshev_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _first_nodes(pitch: float, turn: float) -> int:
-    """Nodes on cells of a length, over which the phase runs by up to ``turn`` radians: where these do not do, more
-    follow.
-    """
+    """Return the initial number of nodes on a cell over which the phase changes by up to ``turn`` radians."""
     more = nodes_for(turn, 0) if turn > 1.0 else int(turn > _TURNS)
     return int(np.searchsorted(_SHORT_CELLS, pitch)) + 1 + more
 
 
 def _steepest(table: np.ndarray) -> float:
-    """Largest derivative along x, over the unit disk, of a polynomial with coefficients (D + 1, D + 1)."""
+    """Return the largest derivative along x, over the unit disk, of a polynomial with coefficients (D + 1, D + 1)."""
     axis = np.linspace(-1.0, 1.0, 33)
     slope = chebyshev.chebgrid2d(axis, axis, chebyshev.chebder(table, axis=0))
     inside = np.hypot(axis[:, None], axis) <= 1.0
@@ -293,8 +300,9 @@ def _steepest(table: np.ndarray) -> float:
 
 
 def _chords(polygon: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both ends, (N,) each, of the chords of a convex counterclockwise polygon (V,) at y (N,); where there is none the
-    left end is infinite and the right one minus that.
+    """Return both ends, (N,) each, of the chords of a convex counterclockwise polygon (V,) at y (N,).
+
+    Where there is none, the left end is infinite and the right one minus infinite.
     """
     around = np.roll(polygon, -int(np.argmin(polygon.imag)))
     top = int(np.argmax(around.imag))
@@ -306,22 +314,22 @@ def _chords(polygon: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """N lines along the shift, and where light begins and ends on them.
+    """N lines along the shift, and the positions where light begins and ends on them.
 
     Attributes
     ----------
-    y : np.ndarray
-        Of the lines, (N,).
-    weight : np.ndarray
-        Of the rule across them, (N,).
-    coarse : np.ndarray
-        Of that on a third of the lines, 0 for the others, (N,).
-    begins, ends : np.ndarray
-        Of the light, (N, K) each; places alike where there is none.
-    lit : np.ndarray
-        Whether there is some, (N, K).
+    y : (N,) ndarray
+        Positions of the lines.
+    weight : (N,) ndarray
+        Weights of the rule across them.
+    coarse : (N,) ndarray
+        Weights of the rule on a third of the lines, 0 for the others.
+    begins, ends : (N, K) ndarray
+        Ends of the illuminated intervals; both equal where there is none.
+    lit : (N, K) ndarray of bool
+        True where there is an interval.
     low, high : float
-        Between which all lines lie along x.
+        Limits of all lines along x.
     """
 
     y: np.ndarray
@@ -335,7 +343,7 @@ class _Lines:
 
     @classmethod
     def across(cls, clear: Sequence[np.ndarray], blocked: Sequence[np.ndarray], number: int) -> _Lines:
-        """Some ``number`` lines across what clear outlines leave, the first of which is the pupil's own edge."""
+        """Return some ``number`` lines across the clear outlines, the first of which is the pupil's own edge."""
         parts = [_rule(a, b, number) for a, b in _between(clear, blocked)]
         y, weight, coarse = (np.concatenate(part) for part in zip(*parts, strict=True))
         chords = [_chords(polygon, y) for polygon in clear]
@@ -360,14 +368,14 @@ class _Lines:
         return cls(y, weight, coarse, begins, ends, lit, float(np.min(rim)), float(np.max(rim)))
 
     def third(self) -> _Lines:
-        """The third of the lines that is a rule of its own."""
+        """Return the third of the lines that is a rule of its own."""
         some = self.coarse != 0.0
         y, weight, begins, ends, lit = (a[some] for a in (self.y, self.coarse, self.begins, self.ends, self.lit))
         return _Lines(y, weight, weight, begins, ends, lit, self.low, self.high)
 
 
 def _between(clear: Sequence[np.ndarray], blocked: Sequence[np.ndarray]) -> list[tuple[float, float]]:
-    """Stretches of y between the places where outlines begin, end or have a corner."""
+    """Return intervals of y between the positions where outlines begin, end or have a corner."""
     rim = clear[0].imag
     low, high = float(np.min(rim)), float(np.max(rim))
     places = [low, high]
@@ -381,8 +389,9 @@ def _between(clear: Sequence[np.ndarray], blocked: Sequence[np.ndarray]) -> list
 
 
 def _rule(low: float, high: float, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fejer's rule over a stretch that gets its share of ``number`` lines over [-1, 1]: places, weights, and weights of
-    the rule on every third place.
+    """Return Fejer's rule over an interval that gets its part of ``number`` lines over [-1, 1].
+
+    The result is positions, weights, and weights of the rule on every third position.
     """
     count = max(_LEAST, 3 * int(np.ceil(number * (high - low) / 6.0)))
     half = 0.5 * (high - low)
@@ -394,7 +403,10 @@ def _rule(low: float, high: float, number: int) -> tuple[np.ndarray, np.ndarray,
 
 @lru_cache(maxsize=256)
 def _fejer(count: int) -> np.ndarray:
-    """Weights of Fejer's first rule on [-1, 1], whose places are the cosines of odd multiples of pi / 2 count."""
+    """Return the weights of Fejer's first rule on [-1, 1].
+
+    Its nodes are the cosines of odd multiples of pi / (2 count).
+    """
     angle = np.pi * (np.arange(count) + 0.5) / count
     order = np.arange(1, count // 2 + 1)
     return np.asarray((2.0 / count) * (1.0 - 2.0 * np.cos(2.0 * np.outer(angle, order)) @ (1.0 / (4.0 * order**2 - 1))))
@@ -402,8 +414,10 @@ def _fejer(count: int) -> np.ndarray:
 
 @cache
 def _cell_weights(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gauss' places and weights on a cell [0, 1], (I,) each, and polynomials, coefficients of Legendre's over [-1, 1]
-    (I + 1, I), of the integrals of Lagrange's from a place to the cell's end.
+    """Return Gauss nodes and weights on a cell [0, 1], (I,) each, and polynomials of partial integrals.
+
+    The polynomials, Legendre coefficients over [-1, 1] of shape (I + 1, I), are the integrals of the Lagrange
+    polynomials from a position to the cell's end.
     """
     node, weight = gauss(count)
     order = np.arange(count)
@@ -417,22 +431,22 @@ def _cell_weights(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _autocorrelation(
     rows: _Lines, tables: tuple[np.ndarray, np.ndarray], wave: float, pitch: float, count: int, nodes: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Autocorrelations at shifts 0 .. (count - 1) ``pitch`` along x with the wavefront and without, of 1 at 0.
+    """Return autocorrelations at shifts 0 .. (count - 1) ``pitch`` along x with and without the wavefront, 1 at 0.
 
     Parameters
     ----------
     rows : _Lines
-        lines.
-    tables : tuple[np.ndarray, np.ndarray]
-        Eikonal and amplitude in their coordinates.
+        Lines along the shift.
+    tables : (ndarray, ndarray)
+        Polynomial coefficients of eikonal and amplitude in their coordinates.
     wave : float
-        Number, 1/m.
+        Wave number, 1/m.
     pitch : float
         Length of a cell.
     count : int
-        Of shifts.
+        Number of shifts.
     nodes : int
-        On a cell.
+        Number of nodes on a cell.
     """
     place, weight, rest = _cell_weights(nodes)
     cells = int((rows.high - rows.low) / pitch) + 2
@@ -476,18 +490,18 @@ class _Edges:
 
     Attributes
     ----------
-    row : np.ndarray
-        Their lines.
-    cell : np.ndarray
-        In which they stand.
-    bent : np.ndarray
-        Where in the cell, from 0 to 1.
-    sign : np.ndarray
+    row : (P,) ndarray of int
+        Line of each edge.
+    cell : (P,) ndarray of int
+        Cell that contains it.
+    bent : (P,) ndarray
+        Position in the cell, from 0 to 1.
+    sign : (P,) ndarray
         1 where light begins, -1 where it ends.
-    behind : np.ndarray
-        Weights of the cell's nodes behind them, (I, P).
-    rest : np.ndarray
-        From which ``behind`` comes, as ``_cell_weights`` gives it.
+    behind : (I, P) ndarray
+        Weights of the cell's nodes behind the edge.
+    rest : ndarray
+        Polynomials of partial integrals that give ``behind``, as from ``_cell_weights``.
     """
 
     row: np.ndarray
@@ -499,7 +513,7 @@ class _Edges:
 
     @classmethod
     def of(cls, rows: _Lines, pitch: float, cells: int, rest: np.ndarray) -> _Edges:
-        """Those of lines."""
+        """Return the edges of lines."""
         there = np.concatenate([rows.lit, rows.lit], axis=1)
         row, number = np.nonzero(there)
         sign = np.where(number < rows.lit.shape[1], 1.0, -1.0)
@@ -508,8 +522,11 @@ class _Edges:
         return cls(row, cell, place - cell, sign, _rest(place - cell, rest), rest)
 
     def counted(self, start: int, lines: int, cells: int, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What of each node of some lines counts, (lines, I, cells): steps up and down at the edges, and in their cells
-        the share behind the edge; and where in these the nodes of edges' cells are, (I, P).
+        """Return the illuminated share of each node of some lines, and the indices of the nodes of edge cells.
+
+        The shapes are (lines, I, cells) and (I, P).
+
+        The share steps up and down at the edges; in their cells it is the share behind the edge.
         """
         some = slice(*np.searchsorted(self.row, [start, start + lines]))
         at, many, nodes = (self.row[some] - start) * cells + self.cell[some], lines * cells, len(weight)
@@ -524,21 +541,27 @@ class _Edges:
     def pairs(
         self, lines: np.ndarray, count: int, weight: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Two edges of a line whose cells meet at a shift: what both leave is not the product of their shares.
+        """Return corrections for pairs of edges of one line whose cells coincide at a shift.
+
+        The illuminated share of such a pair is not the product of the two shares.
 
         Parameters
         ----------
-        lines : np.ndarray
+        lines : ndarray
             Weights of the lines.
         count : int
-            Of shifts, in cells.
-        weight : np.ndarray
-            Of the nodes of a cell.
+            Number of shifts, in cells.
+        weight : ndarray
+            Weights of the nodes of a cell.
 
         Returns
         -------
-        tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-            Numbers of both and the shift, (Q,) each, and what the nodes of the cells weigh more, (I, Q).
+        first, second : (Q,) ndarray of int
+            Indices of the two edges.
+        step : (Q,) ndarray of int
+            Shift.
+        more : (I, Q) ndarray
+            Additional weights of the cells' nodes.
         """
         first, second = _same_rows(self.row)
         step = self.cell[first] - self.cell[second]
@@ -551,12 +574,12 @@ class _Edges:
 
 
 def _rest(place: np.ndarray, polynomials_of_rest: np.ndarray) -> np.ndarray:
-    """Weights of a cell's nodes behind places (P,) from 0 to 1 in it, (I, P)."""
+    """Return the weights (I, P) of a cell's nodes behind positions (P,) from 0 to 1 in it."""
     return np.asarray(polynomials_of_rest.T @ legendre.legvander(2.0 * place - 1.0, len(polynomials_of_rest) - 1).T)
 
 
 def _same_rows(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All ordered pairs of things that are of one row, by the rows of all, (P,), ascending."""
+    """Return all ordered pairs of items with the same row, from the ascending rows (P,) of all items."""
     many = np.bincount(row)
     start = np.cumsum(many) - many
     own = many[row]

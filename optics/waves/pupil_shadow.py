@@ -13,17 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from optics.geometry.polygon import (
-    area,
-    clip,
-    compact,
-    difference,
-    from_boundary,
-    intersect,
-    quadrature,
-    sides,
-    widened,
-)
+from optics.geometry.polygon import area, clip, compact, difference, from_boundary, intersect, padded, quadrature, sides
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.quadrature import gauss
 from optics.waves.pupil_terms import PupilEdge
@@ -274,7 +264,7 @@ def separate(polygons: list[np.ndarray], fewest: bool = False) -> tuple[np.ndarr
         done += parts
         owners += [number] * len(parts)
     width = max((part.shape[1] for part in done), default=3)
-    pieces = np.stack([widened(part, width) for part in done], axis=1) if done else np.zeros((0, 0, 3, 2))
+    pieces = np.stack([padded(part, width) for part in done], axis=1) if done else np.zeros((0, 0, 3, 2))
     return pieces, owners
 
 
@@ -329,7 +319,7 @@ def tiled(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             numbers += [owner] * parts
         width = max((part.shape[1] for part in done), default=pieces.shape[2])
         if done:
-            pieces, owners = np.stack([widened(part, width) for part in done], axis=1), np.array(numbers)
+            pieces, owners = np.stack([padded(part, width) for part in done], axis=1), np.array(numbers)
     return pieces, owners
 
 
@@ -387,8 +377,8 @@ def cut(polygons: np.ndarray, radius: np.ndarray, rim_sides: int) -> np.ndarray:
         rim = turn * _radius(radius, turn) * np.sqrt(step / np.sin(step))
         # a polygon has few sides inside of the rim
         inner = compact(intersect(np.stack([rim.real, rim.imag], axis=-1)[beyond // number], *sides(flat[beyond])))
-        flat = widened(flat, inner.shape[1]).copy()
-        flat[beyond] = widened(inner, flat.shape[1])
+        flat = padded(flat, inner.shape[1]).copy()
+        flat[beyond] = padded(inner, flat.shape[1])
     flat = compact(flat)
     return flat.reshape(*polygons.shape[:2], *flat.shape[1:])
 

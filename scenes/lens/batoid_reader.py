@@ -159,7 +159,7 @@ class _Reader:
             below = (*key, "obscuration")
             edges = self.edges(self.mapping(given["obscuration"], below), below, name)
         clear, rest = None, edges
-        if edges and not edges[0].blocks and not edges[0].turn and isinstance(edges[0].shape, Aperture):
+        if edges and not edges[0].blocks and not edges[0].rotation and isinstance(edges[0].shape, Aperture):
             clear, rest = edges[0].shape, edges[1:]
         if given.get("type") == "Baffle" and not (shape.is_plane and edges):
             self.notes.append(Note(self.line(key), name, "a baffle that is no plane, or without an edge: not carried"))

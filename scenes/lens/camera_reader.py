@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optics.geometry.aperture import Circle, turned_over
+from optics.geometry.aperture import Circle, flipped_y
 from optics.geometry.pose import Pose, rotation_vector
 from optics.geometry.sag_terms import LAST_NOLL, SAG_TERMS, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure, plane
@@ -70,7 +70,7 @@ def unfolded(lens: Prescription) -> Prescription:
             edge = surface.aperture and replace(
                 surface.aperture, centre=(surface.aperture.centre[0], -surface.aperture.centre[1])
             )
-            surface = replace(surface, aperture=edge, edges=tuple(map(turned_over, surface.edges)))
+            surface = replace(surface, aperture=edge, edges=tuple(map(flipped_y, surface.edges)))
         surface = replace(surface, pose=Pose(rotation, place))
         if surface.interaction is Interaction.REFLECT and shape.is_plane and shape.figure is None:
             mirror = np.eye(3) - 2.0 * np.outer(rotation[:, 2], rotation[:, 2])

@@ -202,7 +202,7 @@ def turned_over(surface: LensSurface) -> LensSurface:
         pose=surface.pose @ OVER,
         surface=Surface(-shape.curvature, shape.conic, even, figure, tuple(terms)),
         aperture=edge,
-        edges=tuple(map(aperture.turned_over, surface.edges)),
+        edges=tuple(map(aperture.flipped_y, surface.edges)),
     )
 
 
@@ -292,8 +292,8 @@ def _entry(edge: Edge) -> dict[str, Any]:
             out["corners"] = [metres(*corner) for corner in corners]
         case _:
             out["half"] = metres(shape.half_x, shape.half_y)
-    if edge.turn and not isinstance(shape, Circle | Polygon):
-        out["turn"] = written(remainder(edge.turn, 2.0 * pi), ANGLE)
+    if edge.rotation and not isinstance(shape, Circle | Polygon):
+        out["turn"] = written(remainder(edge.rotation, 2.0 * pi), ANGLE)
     return out
 
 

@@ -32,7 +32,7 @@ from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Body, RigidTree, State
 from optics.materials.glass import ABBE_LINES
-from optics.numerics.array_math import PhysicalError, norm, turned
+from optics.numerics.array_math import PhysicalError, norm, matvec
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError, transverse_axes
@@ -47,7 +47,7 @@ from optics.raytrace.first_order import (
     ray_matrix,
 )
 from optics.raytrace.system import SystemBatch, assemble
-from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
+from optics.raytrace.trace import BeamMissedError, make_rays, require_rays, trace
 from optics.waves.imaging import aim_collimated
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
@@ -658,7 +658,7 @@ class CameraModel:
         """Direction from the line's centre along its chief ray, upstream, for rotations (..., 3, 3) of the focal plane
         in the world.
         """
-        return turned(focal_plane, turned(self.focal_plane.rotation.T, -self.image_direction))
+        return matvec(focal_plane, matvec(self.focal_plane.rotation.T, -self.image_direction))
 
     def bare_assembly(self, apertures: bool = True) -> Assembly:
         """The camera alone, in the prescription frame: mirrors and image plane."""
@@ -788,7 +788,7 @@ def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     traced = trace(backend, imaging, make_rays(backend, launch, centre), keep=range(len(names)), world=True)
     assert traced.world is not None
     position, direction, _, valid = traced.numpy(traced.world)
-    require_some(valid, f"camera {spec.name}")
+    require_rays(valid, f"camera {spec.name}")
     image_centre, image_direction = position[0, 0], direction[0, 0]
 
     sight = -centre
@@ -946,7 +946,7 @@ def _apertures(
     rays = make_rays(backend, launch.reshape(-1, 3), np.repeat(directions, _RIM_POINTS, axis=0))
     traced = trace(backend, imaging, rays, keep=range(len(spec.mirrors)))
     valid = traced.numpy()[3]
-    require_some(valid, f"camera {spec.name} at its field edges")
+    require_rays(valid, f"camera {spec.name} at its field edges")
     out: dict[str, Aperture] = {}
     for i, name in enumerate(spec.mirrors):
         if name == spec.stop:

@@ -19,7 +19,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import AimError
 from optics.raytrace.system import assemble
-from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
+from optics.raytrace.trace import BeamMissedError, make_rays, require_rays, trace
 from optics.waves.imaging import path_to_sphere
 from scenes.models.camera_model import CameraModel, collimated, coloured, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
@@ -191,7 +191,7 @@ class FieldBeams:
         if cut is not None:
             free = ~cut(np.array(fields), points[1:] / radius)
             lit = free if lit is None else lit & free
-        require_some(valid.reshape(shape), f"camera {spec.name}")
+        require_rays(valid.reshape(shape), f"camera {spec.name}")
         position, direction = position.reshape(*shape, 3), direction.reshape(*shape, 3)
         way = position[:, 0] - model.mirror_pose(model.mirrors[last]).apply(traced.hit(last).reshape(*shape, 3)[:, 0])
         return cls(

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from optics.geometry.tree import ORIGIN, Motion, State, each_composed
+from optics.geometry.tree import ORIGIN, Motion, State, compose_each
 from optics.numerics.array_math import covariance_root
 from optics.thermal.heat import Temperature, Temperatures
 from scenes.models.instrument_model import Instrument
@@ -310,8 +310,8 @@ def states_of(
         for s, motion in enumerate(_motions(values, pivot)):
             moves[s].append({body: motion})
     if heat:
-        moves = [[state] for state in thermal.states(heat, each_composed(moves, bodies))]
-    return each_composed([[*own, motions or {}] for own in moves], bodies)
+        moves = [[state] for state in thermal.states(heat, compose_each(moves, bodies))]
+    return compose_each([[*own, motions or {}] for own in moves], bodies)
 
 
 def _groups(components: Sequence[Component]) -> Iterator[tuple[tuple[str, str, str], list[int]]]:

@@ -76,7 +76,7 @@ def as_built(drawn: Instrument) -> Instrument:
     if issues:
         raise InputError(*issues)
     state = FrozenMap({path: what.motion() for path, what in named.items()})
-    return replace(drawn, assembly=drawn.assembly.standing(state), as_built=state)
+    return replace(drawn, assembly=drawn.assembly.with_nominal(state), as_built=state)
 
 
 def squared_facets(instrument: Instrument, backend: Backend) -> State:

@@ -20,10 +20,10 @@ from optics.geometry.solid import Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, RigidTree
 from optics.materials.glass import glass
-from optics.numerics.array_math import inner, norm, turned
+from optics.numerics.array_math import inner, norm, matvec
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
-from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
+from optics.raytrace.aim import AimError, RayFan, aim, surviving_rays, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.reflectors import Mount, Reflector, ReflectorParts
 from optics.raytrace.system import SystemBatch, assemble
@@ -167,7 +167,7 @@ def _traced_out(
     beams = []
     for i, centre in enumerate(centres):
         along = leaving[2 * i] + leaving[2 * i + 1]
-        along = turned(in_base.rotation, along / norm(along))
+        along = matvec(in_base.rotation, along / norm(along))
         beams.append(LeavingBeam(in_base.apply(reference.apply(np.array([*centre, 0.0]))), along))
     return beams
 
@@ -257,7 +257,7 @@ def monitor_chain(
     whole = float(norm(across))
     toward = across / whole
     transfer = whole - small.shift
-    off = made.reflector.sideways(made.width)
+    off = made.reflector.lateral_offset(made.width)
     shortest = 2.0 * off + made.width
     if transfer < shortest:
         raise spec.error(
@@ -311,7 +311,7 @@ def _made(
 def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
     """A turn about x and y that leaves a point in place."""
     turn = rotation_matrix(np.array([*tilt, 0.0]))
-    return Pose(turn, np.array(about) - turned(turn, np.array(about)))
+    return Pose(turn, np.array(about) - matvec(turn, np.array(about)))
 
 
 def check_prisms(spec: InstrumentSpec) -> None:
@@ -391,7 +391,7 @@ def square_facets(
             raise _missed(assembly, channel, backend, position, direction)
         normal = -leaving[0].sum(axis=0)
         block = placed.pose(CENTRAL_PRISM)
-        local = turned(block.rotation.T, normal / norm(normal))
+        local = matvec(block.rotation.T, normal / norm(normal))
         poses[channel.face_body] = Pose(_facet_axes(local), assembly.tree[channel.face_body].pose.translation)
     bodies = tuple(Body(b.path, poses.get(b.path, b.pose), b.pivots, b.scales) for b in assembly.tree.bodies)
     return Assembly(RigidTree(bodies), assembly.elements, assembly.sequences, assembly.media, assembly.above_d)
@@ -420,7 +420,7 @@ def _missed(
 ) -> MisplacedError:
     """Which element of a channel's way out rays (1, N, 3) from the pinhole and from the CCD miss first."""
     names = assembly.sequences[f"{channel.key}/outgoing"]
-    for count, (element, alive) in enumerate(alive_along(backend, assembly, names, position, direction), 1):
+    for count, (element, alive) in enumerate(surviving_rays(backend, assembly, names, position, direction), 1):
         if alive.all():
             continue
         what = f"the middle of the beam {channel.key} misses {element.name} on {element.body}"
@@ -472,7 +472,7 @@ def beside(
     traced = trace(backend, assemble(bare, [tuple(names)]), make_rays(backend, position, direction))
     if element.aperture is None or not traced.numpy()[3][0][lost].all():
         return None
-    gap = element.aperture.outline(_OUTLINE)[:, None] - traced.place()[0][lost]
+    gap = element.aperture.outline(_OUTLINE)[:, None] - traced.xy()[0][lost]
     return float(np.max(np.min(np.linalg.norm(gap, axis=-1), axis=0)))
 
 

@@ -24,7 +24,7 @@ from optics.geometry.solid import Face, Solid, SolidError, face_plane, solid_mes
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import even_disk
-from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
+from optics.raytrace.aim import AimError, RayFan, aim, surviving_rays, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, points_to_world
 from optics.raytrace.element_numbers import media_along
 from optics.raytrace.system import SystemBatch, assemble
@@ -672,7 +672,7 @@ def _cut(instrument: Instrument, backend: Backend, beam: MonitorBeam) -> Issue:
     """At which element a beam loses its first rays, and by how much."""
     assembly, channel = instrument.assembly, beam.channel
     names = assembly.sequences[f"{channel.key}/monitor"]
-    steps = enumerate(alive_along(backend, assembly, names, beam.position, beam.direction), 1)
+    steps = enumerate(surviving_rays(backend, assembly, names, beam.position, beam.direction), 1)
     count, element, alive = next((n, element, alive) for n, (element, alive) in steps if not alive.all())
     off = beside(assembly, backend, names[:count], beam.position, beam.direction, ~alive)
     how = "" if off is None else f": it reaches {1e3 * off:.3g} mm beyond the clear aperture"

@@ -187,7 +187,7 @@ def mirror_surface(
     if element.aperture is None:
         raise ValueError(f"{element.name}: a mirror without a clear aperture cannot stand in a scene")
     size = float(placed.size(element.body)[0])
-    surface, aperture = element.figured(motion).grown(size), element.aperture.grown(size)
+    surface, aperture = element.figured(motion).scaled(size), element.aperture.scaled(size)
     vertices, triangles, apart = sheet_mesh(surface, aperture)
     optical, rear = finishes.mirror, finishes.mirror_back
     return SceneSurface(
@@ -228,7 +228,7 @@ def solid_surfaces(
             continue
         on_it = _elements_on(face, solid, assembly, nominal)
         scale = float(placed.size(face.body)[0])
-        apertures = tuple(dict.fromkeys(aperture.grown(scale) for _, aperture in on_it if aperture is not None))
+        apertures = tuple(dict.fromkeys(aperture.scaled(scale) for _, aperture in on_it if aperture is not None))
         if len(apertures) > 2:
             raise ValueError(f"{solid.path}: face {face.name!r} has {len(apertures)} clear apertures; at most two")
         pose = placed.pose(face.body) @ Pose(face.pose.rotation, scale * face.pose.translation)

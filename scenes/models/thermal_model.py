@@ -28,10 +28,10 @@ from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose, rotation_matrix, triple
 from optics.geometry.solid import Solid, solid_mesh
 from optics.geometry.surface import Surface
-from optics.geometry.tree import ORIGIN, Body, Motion, State, each_composed
+from optics.geometry.tree import ORIGIN, Body, Motion, State, compose_each
 from optics.materials.glass import WarmGlass, glass
 from optics.materials.material import Material, TemperatureRange, material
-from optics.numerics.array_math import PhysicalError, turned
+from optics.numerics.array_math import PhysicalError, matvec
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
 from optics.thermal.heat import Temperature, Temperatures, carried_motion
 from optics.thermal.thermo_elastic import (
@@ -84,7 +84,7 @@ class Lens:
     def grown(self, stretch: float) -> dict[str, Motion]:
         """What a relative growth of the lens about its middle does to its faces."""
         return {
-            face: Motion(shift=triple(stretch * (pose.rotation.T @ (pose.translation - self.middle))), stretch=stretch)
+            face: Motion(shift=triple(stretch * (pose.rotation.T @ (pose.translation - self.middle))), expansion=stretch)
             for face, pose in self.faces.items()
         }
 
@@ -179,7 +179,7 @@ class _Response:
 
     def to(self, gradient: np.ndarray) -> dict[str, list[Motion | None]]:
         """The motions of the faces by gradients (S, 3), K/m; none in a state without one."""
-        rows, bent = turned(self.numbers, gradient).tolist(), np.any(gradient, axis=1).tolist()
+        rows, bent = matvec(self.numbers, gradient).tolist(), np.any(gradient, axis=1).tolist()
         out: dict[str, list[Motion | None]] = {}
         start = 0
         for face, terms in self.terms.items():
@@ -456,7 +456,7 @@ class ThermalModel:
             for part in self._warmed(path, field[own], progress) if len(own) else ():
                 for k, s in enumerate(own.tolist()):
                     thermal[s].append({moved: m for moved, each in part.items() if (m := each[k]) is not None})
-        return each_composed([[*heat, more] for heat, more in zip(thermal, motions, strict=True)], self._bodies)
+        return compose_each([[*heat, more] for heat, more in zip(thermal, motions, strict=True)], self._bodies)
 
     def _warmed(self, path: str, field: Temperatures, progress: Callable[[str], None]) -> list[_Moves]:
         """What a body's fields do to the body itself, to its faces and to what it carries: the last one first."""
@@ -471,13 +471,13 @@ class ThermalModel:
         indices = self._indices(path, field) if glassy else repeat((0.0, (0.0, 0.0, 0.0)), len(stretches))
         out: dict[str, Sequence[Motion | None]] = {
             path: [
-                Motion(pivot=pivot, stretch=grown, index=change, index_gradient=slope)
+                Motion(pivot=pivot, expansion=grown, index=change, index_gradient=slope)
                 for grown, (change, slope) in zip(stretches, indices, strict=True)
             ]
         }
         if path in self.solids or path in self.mirrors:
             # the tree's stretch carries what stands on a body and does not enlarge it; faces and footprints are its own
-            inside = tuple(Motion(stretch=grown) for grown in stretches)
+            inside = tuple(Motion(expansion=grown) for grown in stretches)
             out.update(dict.fromkeys(self._within(path), inside))
             return [*self._bent(path, field.gradient, progress), out]
         carried = self._carried_by(path)
@@ -487,8 +487,8 @@ class ThermalModel:
             out.update({face: [own.get(face) for own in faces] for face in lens.faces})
         turn, move = carried_motion(stuff.expansion, field.gradient[:, None], carried.place - about)
         # the tree's stretch carries the child's origin, but what moves with this body is the child's mount
-        rotate = turned(carried.inward, turn)
-        shift = turned(carried.inward, move) + stretch[:, None, None] * carried.mount
+        rotate = matvec(carried.inward, turn)
+        shift = matvec(carried.inward, move) + stretch[:, None, None] * carried.mount
         moved = np.any(turn, axis=2) | np.any(shift, axis=2)
         for k in np.flatnonzero(np.any(moved, axis=0)).tolist():
             child, places = carried.bodies[k], zip(*(a[:, k].tolist() for a in (moved, rotate, shift)), strict=True)

@@ -67,7 +67,7 @@ FEWEST, MOST = 2, 1000
 
 def _some_times(times: tuple[float, ...]) -> tuple[float, ...]:
     if not FEWEST <= len(times) <= MOST:
-        raise Problem("not the number of times of a course", f"{len(times)} of them", f"{FEWEST} to {MOST} times")
+        raise Problem("wrong number of times in a course", f"{len(times)} of them", f"{FEWEST} to {MOST} times")
     return times
 
 
@@ -204,11 +204,11 @@ class CourseSpec(Spec):
     def _only_a_table(self) -> "CourseSpec":
         for name in ("times", "temperature"):
             if getattr(self, name):
-                raise Problem("the table has them", name, "the table, or what it has, not both", within=(name,))
+                raise Problem("given in the table already", name, "the table, or what it has, not both", within=(name,))
         for path, moves in self.motion.items():
             for name, values in moves.given.items():
                 if values is not None:
-                    raise Problem("the table has them", name, "pivot", within=("motion", path, name))
+                    raise Problem("given in the table already", name, "pivot", within=("motion", path, name))
         return self
 
     def _one_for_each_time(self, key: KeyPath, given: Mapping[str, tuple[Any, ...] | None]) -> None:
@@ -306,7 +306,7 @@ def read_course(path: Path, named: CourseSpec) -> CourseSpec:
     file, rows = str(path), rows_of(path, LARGEST_BYTES)
     if len(rows) < 2:
         line = rows[0][0] if rows else 1
-        raise InputError(Issue("a table has a row of heads and a row for each time", file, line, allowed=HEADS))
+        raise InputError(Issue("a table needs a row of heads and a row for each time", file, line, allowed=HEADS))
     (head_line, heads), body = rows[0], rows[1:]
     columns = [_column(head, file, head_line) for head in heads]
     places = [(*column.place, column.axis) for column in columns]
@@ -314,7 +314,7 @@ def read_course(path: Path, named: CourseSpec) -> CourseSpec:
     if twice is not None:
         raise InputError(Issue("a second column with this head", file, head_line, (twice.strip(),)))
     if TIME not in [column.what for column in columns]:
-        text, found = "no column has the times", names_text(heads)
+        text, found = "there is no column of times", names_text(heads)
         raise InputError(Issue(text, file, head_line, found=found, allowed="time [min]"))
     data: dict[str, Any] = {"times": [None] * len(body), "temperature": {}, "motion": {}}
     lines: dict[KeyPath, int] = {(): head_line, ("temperature",): head_line, ("motion",): head_line}

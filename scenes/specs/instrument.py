@@ -157,7 +157,7 @@ def check_made(made_of: str, reflector: Reflector) -> None:
     if made_of not in names:
         what = "no such glass" if reflector.transparent else "no such material"
         if made_of in MATERIALS:
-            what += ": light goes through this kind; of other materials are the kinds without glass"
+            what += ": this kind transmits light and must be made of glass"
         raise unknown(what, made_of, names, ("material",))
 
 
@@ -554,12 +554,12 @@ class InstrumentSpec(TitledSpec):
     def _monitor_is_whole(self) -> InstrumentSpec:
         if (self.monitor is None) != (self.central_prism is None):
             missing = "monitor" if self.monitor is None else CENTRAL_KEY
-            text = "a monitor needs both its description and the central prism that its beams return from"
+            text = "a monitor needs both the section `monitor` and a central prism"
             raise Problem(text, f"no {missing}", f"{missing}, or neither of the two", within=())
         for name, site in self.cameras.items():
             if self.monitor is not None:
                 allowed = "one of pupil_offset and channels"
-                asked = "which channels does its monitor have?"
+                asked = "the monitor's channels must be given in exactly one way"
                 require_one(site, ("pupil_offset", "channels"), asked, allowed, ("cameras", name))
                 continue
             given = [key for key in ("pupil_offset", "channels") if getattr(site, key) is not None]
@@ -603,7 +603,7 @@ class InstrumentSpec(TitledSpec):
         return self.central_prism
 
     def _without_monitor(self) -> InputError:
-        text = f"{self.name} has no monitor, so that no spot tells of its changes"
+        text = f"{self.name} has no monitor, so that its changes cannot be measured"
         return self.error(text, ("monitor",), allowed="an instrument with a monitor and a central_prism")
 
     def key_of(self, camera: str, channel: str, key: KeyPath) -> KeyPath:

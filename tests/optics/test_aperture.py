@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
 
-from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Polygon, Ray, Rectangle, turned_over
+from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Polygon, Ray, Rectangle, flipped_y
 from optics.geometry.surface import Surface, plane
 from optics.numerics.backend import Backend
 from tests.optics.bench import PASS, Stage, beam, build, run
@@ -79,18 +79,18 @@ def test_a_turn_is_right_handed_about_the_shape_s_own_centre(shape) -> None:
         cx + np.cos(turn) * (x - cx) - np.sin(turn) * (y - cy),
         cy + np.sin(turn) * (x - cx) + np.cos(turn) * (y - cy),
     )
-    same = Edge(shape, turn=turn).passes(*moved) == Edge(shape).passes(x, y)
+    same = Edge(shape, rotation=turn).passes(*moved) == Edge(shape).passes(x, y)
     assert np.mean(same) == 1.0
     if not isinstance(shape, Circle):
-        assert np.mean(Edge(shape, turn=turn).passes(x, y) == Edge(shape).passes(x, y)) < 0.999
+        assert np.mean(Edge(shape, rotation=turn).passes(x, y) == Edge(shape).passes(x, y)) < 0.999
 
 
 @pytest.mark.parametrize("shape", [shape for shape, _ in SHAPES], ids=lambda one: type(one).__name__)
 def test_turned_over_it_is_the_same_edge_at_minus_y(shape) -> None:
     x, y = field(20_000)
-    edge = Edge(shape, blocks=True, turn=0.0 if isinstance(shape, Polygon) else 0.4)
-    np.testing.assert_array_equal(turned_over(edge).passes(x, -y), edge.passes(x, y))
-    assert turned_over(turned_over(edge)) == edge
+    edge = Edge(shape, blocks=True, rotation=0.0 if isinstance(shape, Polygon) else 0.4)
+    np.testing.assert_array_equal(flipped_y(edge).passes(x, -y), edge.passes(x, y))
+    assert flipped_y(flipped_y(edge)) == edge
 
 
 def test_a_polygon_is_matplotlibs() -> None:

@@ -44,12 +44,12 @@ def ends(backend, systems, rays, keep=(0, 2), **how) -> list[np.ndarray]:
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("section", [2, trace_module.SECTION])
+@pytest.mark.parametrize("section", [2, trace_module.KERNEL_ELEMENTS])
 def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, section: int, monkeypatch) -> None:
     """The same recording serves any number of systems and rays."""
     bare = gf7.bare_assembly()
-    monkeypatch.setattr(trace_module, "SECTION", section)
-    monkeypatch.setattr(trace_module, "FEWEST_IN_LANES", 1)
+    monkeypatch.setattr(trace_module, "KERNEL_ELEMENTS", section)
+    monkeypatch.setattr(trace_module, "MIN_LANE_RAYS", 1)
     position, direction = launch(gf7, 800)
     for count, size in ((37, 5), (8, 100), (100, 8), (33, 1), (1, 33), (16, 43)):
         states = some_states(count, count, ("M1", "M2", "M3", "image"))
@@ -59,7 +59,7 @@ def test_lanes_that_take_one_system_each_trace_the_same(backend, gf7, section: i
         for start, heading in ((own, np.broadcast_to(direction, own.shape)), (own, direction), (own[0], direction)):
             found = []
             for fewest in (1, 10**9):
-                monkeypatch.setattr(trace_module, "FEWEST_LANES", fewest)
+                monkeypatch.setattr(trace_module, "MIN_LANE_SYSTEMS", fewest)
                 found.append(ends(backend, systems, make_rays(backend, start, heading)))
             for lanes, looked_up in zip(*found, strict=True):
                 # the same operations; the compiler may contract other products into fma

@@ -44,7 +44,7 @@ STAR = Polygon(((0.05, 0.0), (0.015, 0.015), (0.0, 0.06), (-0.015, 0.015), (-0.0
 EDGES = {
     "spider": [Edge(Circle(0.05), True), *VANES],
     "annulus": [Edge(Circle(0.16, inner=0.04))],
-    "mixed": [Edge(Rectangle(0.1, 0.13), turn=0.3), Edge(Ellipse(0.03, 0.06), True, 0.7)],
+    "mixed": [Edge(Rectangle(0.1, 0.13), rotation=0.3), Edge(Ellipse(0.03, 0.06), True, 0.7)],
     "star-hole": [Edge(STAR)],
     "obscured": [Edge(Circle(0.05), True)],
     "vignetted": [Edge(Circle(0.14, (0.02, 0.0)))],
@@ -114,7 +114,7 @@ def test_circles_that_nearly_coincide_get_more_sides() -> None:
     assert error < 1e-6
     assert edge_shadow.shares_of_stop(one)[0] == pytest.approx(0.25, abs=1e-6)
     # one circle twice, by polygons whose corners are not the same: what both let through is smaller than either
-    twice = [Edge(Circle(0.8)), Edge(Circle(0.8), turn=np.pi / edge_shadow.ROUND_SIDES[0])]
+    twice = [Edge(Circle(0.8)), Edge(Circle(0.8), rotation=np.pi / edge_shadow.ROUND_SIDES[0])]
     few = edge_shadow.shares_of_stop(by_sides(twice)(edge_shadow.ROUND_SIDES[0]).shadows(1))[0]
     many, error = edge_shadow.settled_shadows(by_sides(twice), 1)
     assert few - 0.36 > edge_shadow.FINE_SHARE > error > 0.0

@@ -223,13 +223,13 @@ def test_index_and_growth_change_the_path(backend) -> None:
     assert nominal == pytest.approx(0.15 + N * thick, rel=1e-15)
     for motion, change in (
         (Motion(index=1e-3), 1e-3 * thick),
-        (Motion(stretch=1e-3), (N - 1.0) * thick * 1e-3),
+        (Motion(expansion=1e-3), (N - 1.0) * thick * 1e-3),
         (Motion(scale=1e-3), (N - 1.0) * thick * 1e-3),
-        (Motion(stretch=1e-3, index=-1e-3), (N - 1.0) * thick * 1e-3 - 1e-3 * thick * 1.001),
+        (Motion(expansion=1e-3, index=-1e-3), (N - 1.0) * thick * 1e-3 - 1e-3 * thick * 1.001),
         (Motion(index=1e-3, index_gradient=(0.0, 0.0, 2e-3)), 1e-3 * thick + 1e-3 * thick**2),
     ):
         assert run(backend, plate, start, along, {"glass": motion})[2][0] - nominal == pytest.approx(change, abs=1e-15)
-    placed = plate.place([{"glass": Motion(stretch=0.5)}, {"glass": Motion(scale=0.5)}])
+    placed = plate.place([{"glass": Motion(expansion=0.5)}, {"glass": Motion(scale=0.5)}])
     back = placed.index["glass/back"]
     assert placed.translation[:, back, 2] == pytest.approx(1.5 * thick)
     assert placed.scale[:, back] == pytest.approx([1.0, 1.5])
@@ -241,11 +241,11 @@ def test_what_an_assembly_refuses() -> None:
     for arguments, words in (
         (({"face": face}, {}), "'glass', which has no refractive index"),
         (({}, {}, {"prism": 1.5}), "unknown body 'prism'"),
-        (({"other": face}, {}, {"glass": 1.5}), "'face' is filed under 'other'"),
-        (({"e": Element("e", "nowhere", plane(), PASS)}, {}), "stands on unknown body 'nowhere'"),
+        (({"other": face}, {}, {"glass": 1.5}), "'face' has the key 'other'"),
+        (({"e": Element("e", "nowhere", plane(), PASS)}, {}), "is on unknown body 'nowhere'"),
         (({}, {"all": ("e",)}), "names unknown element 'e'"),
     ):
         with pytest.raises(ValueError, match=words):
             Assembly(tree, *arguments)
-    with pytest.raises(ValueError, match="no gradients of refractive indices by itself"):
-        Assembly(tree, {}, {}, {"glass": 1.5}).standing({"glass": Motion(index_gradient=(1e-6, 0.0, 0.0))})
+    with pytest.raises(ValueError, match="cannot have a gradient of the refractive index"):
+        Assembly(tree, {}, {}, {"glass": 1.5}).with_nominal({"glass": Motion(index_gradient=(1e-6, 0.0, 0.0))})

@@ -47,9 +47,9 @@ def test_a_library_that_cannot_be_used_is_refused_with_a_remedy(monkeypatch, tmp
 
 
 def test_cores_are_those_given_or_fewer(monkeypatch) -> None:
-    monkeypatch.setattr(threads, "_given", lambda: 4)
+    monkeypatch.setattr(threads, "_assigned_cores", lambda: 4)
     for named, count in (("", 4), ("1", 1), ("3", 3), ("4", 4), ("9", 4), ("0", 4), ("-2", 4), ("two", 4)):
-        monkeypatch.setenv(threads.LIMIT, named)
+        monkeypatch.setenv(threads.THREADS_VARIABLE, named)
         assert threads.cores() == count, named
 
 

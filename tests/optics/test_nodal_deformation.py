@@ -133,10 +133,10 @@ def test_a_mesh_that_prints_through_is_told() -> None:
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        (lambda p: lifted_by(p, 0.01), "stand on the clear aperture"),
-        (lambda p: 1e3 * p, "stand on the clear aperture"),
-        (lambda p: p * [1.0, 1.0, -1.0], "stand on the clear aperture"),
-        (lambda p: p[:10], "stand on the clear aperture"),
+        (lambda p: lifted_by(p, 0.01), "lie on the clear aperture"),
+        (lambda p: 1e3 * p, "lie on the clear aperture"),
+        (lambda p: p * [1.0, 1.0, -1.0], "lie on the clear aperture"),
+        (lambda p: p[:10], "lie on the clear aperture"),
         (lambda p: p[np.hypot(p[:, 0] - 0.1, p[:, 1] + 0.4) > 0.08], "no node within"),
         (lambda p: p[p[:, 0] < 0.15], "no node within"),
         (lambda p: p[::30], "Zernike terms|no node within"),
@@ -152,7 +152,7 @@ def test_nodes_that_do_not_describe_the_face(change, problem: str) -> None:
 
 def test_displacements_of_another_unit() -> None:
     points = mesh(DISK, 40)
-    with pytest.raises(NodesError, match="grow the face"):
+    with pytest.raises(NodesError, match="scale the face"):
         nodal_deformation(points, 0.1 * points, BOWL, DISK)
     bend = np.stack([0 * points[:, 0], 0 * points[:, 0], 0.3 * points[:, 0] ** 2], axis=-1)
     with pytest.raises(NodesError, match="more than 1 mm"):

@@ -62,7 +62,7 @@ def test_what_cannot_be_is_refused() -> None:
     turned = SimpleNamespace(mapping=lambda: SimpleNamespace(detDF=lambda _: np.array([1.0, -1.0])))
     glass = CatalogueGlass("F0", 2, (-5.0, 0.01, 0.0, 0.0, 0.0, 0.0), 400e-9, 700e-9)
     for make, words in (
-        (lambda: glass(500e-9), "F0: no index comes out of its dispersion formula at 500 nm"),
+        (lambda: glass(500e-9), "F0: its dispersion formula gives no valid index at 500 nm"),
         (lambda: ScatterTable([0.0], azimuth, radial, np.zeros((1, 181, 1001))), "1000 x 180 cells are more"),
         (lambda: NodalTemperature(NODE, np.zeros(39)), r"nodes must be \(N, 3\) and temperatures \(N,\)"),
         (lambda: NodalTemperature(NODE, np.full(40, np.nan)), "nodes and temperatures must be finite"),
@@ -123,5 +123,5 @@ def test_an_interaction_that_the_trace_does_not_know_is_refused(backend) -> None
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("optics.raytrace.trace.level", lambda *_: (0.0, *vector))
         patch.setattr("optics.raytrace.trace._index_at", lambda *_: 1.0)
-        with pytest.raises(ValueError, match="the trace knows no interaction bend"):
+        with pytest.raises(ValueError, match="the trace does not support the interaction bend"):
             _redirect(backend, vector, vector, element, "bend", None)

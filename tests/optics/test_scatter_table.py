@@ -111,7 +111,7 @@ def test_reciprocity() -> None:
 
 
 def test_shares_of_drawn_cells_are_those_of_the_table() -> None:
-    drawn = lambert(0.5).drawn
+    drawn = lambert(0.5).sampling
     assert drawn.share.shape == (STEPS + 1,)
     np.testing.assert_allclose(drawn.share, 0.5, rtol=2e-3)
     # at normal incidence a ring up to r has sin^2 r of the light
@@ -129,7 +129,7 @@ def test_coatings() -> None:
     bare = finishes.CoatingTable(np.radians([0.0, 40.0]), np.array([0.1, 0.3]))
     assert bare.at(np.radians(20.0), True) == pytest.approx((0.2, 0.8))
     assert bare.at(np.radians(20.0), False) == pytest.approx((0.2, 0.0))
-    np.testing.assert_allclose(bare.drawn(False)[80], [0.2, 0.0])
+    np.testing.assert_allclose(bare.sampled(False)[80], [0.2, 0.0])
 
 
 FALSE_ALARM = 1e-3

@@ -95,7 +95,7 @@ def test_a_turned_face_makes_a_wedge() -> None:
 
 def test_a_grown_body_grows_its_own_faces() -> None:
     tree = RigidTree((Body("glass", Pose(np.eye(3), np.array([1.0, 0.0, 0.0]))),))
-    states = [{"glass": motion} for motion in (Motion(), Motion(scale=0.01), Motion(stretch=0.01))]
+    states = [{"glass": motion} for motion in (Motion(), Motion(scale=0.01), Motion(expansion=0.01))]
     volumes = np.array([solids.solid_mesh(solid_of(*BOX), tree.place([state])).mesh.volume for state in states])
     np.testing.assert_allclose(volumes[1:] / volumes[0], 1.01**3, rtol=1e-9)
 
@@ -106,8 +106,8 @@ def test_a_grown_body_grows_its_own_faces() -> None:
         (BOX[:5], "open"),
         (BOX[:2], "open"),
         (BOX[1:5], "open|do not enclose"),
-        ([*BOX[:4], ((0, 0, 1), (0, 0, -0.01)), BOX[5]], "no room"),
-        ([*BOX[:4], ((0, 0, 1), (0, 0, 1e-10)), BOX[5]], "no room"),
+        ([*BOX[:4], ((0, 0, 1), (0, 0, -0.01)), BOX[5]], "enclose no volume"),
+        ([*BOX[:4], ((0, 0, 1), (0, 0, 1e-10)), BOX[5]], "enclose no volume"),
         ([*BOX, ((1, 0, 1), (0.5, 0, 0.5))], "'face6' is cut off"),
     ],
     ids=["no bottom", "two parallel faces", "a corner only", "inside out", "thinner than a nanometre", "face beyond"],
@@ -136,7 +136,7 @@ def mesh_of(body: solids.Polyhedron) -> trimesh.Trimesh:
 
 def checked(normals: np.ndarray, offsets: np.ndarray) -> tuple[solids.Polyhedron, float]:
     """The body after a check of all that holds for every body, and its volume."""
-    body = solids.enclosed(normals, offsets)
+    body = solids.half_space_intersection(normals, offsets)
     mesh = mesh_of(body)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
@@ -146,7 +146,7 @@ def checked(normals: np.ndarray, offsets: np.ndarray) -> tuple[solids.Polyhedron
     for k, ring in enumerate(body.rings):
         assert len(set(ring)) == len(ring) != 1
         # where an edge went, one end has moved by its length; hardly ever several in a row
-        assert np.all(heights[list(ring), k] > -3.0 * solids.MERGED)
+        assert np.all(heights[list(ring), k] > -3.0 * solids.MERGE_LENGTH)
     return body, float(mesh.volume)
 
 
@@ -196,11 +196,11 @@ def random_bodies(count: int, seed: int) -> int:
             body, volume = checked(normals, offsets)
         except solids.EmptyBodyError:
             with pytest.raises(solids.EmptyBodyError):
-                solids.enclosed(normals[::-1], offsets[::-1])
+                solids.half_space_intersection(normals[::-1], offsets[::-1])
             continue
         bodies += 1
         # edges of that length were taken out, on a body of that much surface
-        slack = solids.MERGED * mesh_of(body).area
+        slack = solids.MERGE_LENGTH * mesh_of(body).area
         assert volume == pytest.approx(volume_by_triples(normals, offsets), abs=slack)
         order = rng.permutation(len(offsets))
         assert checked(normals[order], offsets[order])[1] == pytest.approx(volume, abs=slack)
@@ -225,9 +225,9 @@ def test_planes_that_nearly_meet_in_a_point(size) -> None:
         offsets = np.array([*size * rng.uniform(-1.0, 1.0, 4), height])
         body, volume = checked(normals, offsets)
         area = (2 * half) ** 2 + 4 * half * np.hypot(half, height)
-        assert volume == pytest.approx((2 * half) ** 2 * height / 3.0, abs=(3.0 * size + solids.MERGED) * area)
+        assert volume == pytest.approx((2 * half) ** 2 * height / 3.0, abs=(3.0 * size + solids.MERGE_LENGTH) * area)
         assert all(body.rings)
-        if size < 0.1 * solids.MERGED:
+        if size < 0.1 * solids.MERGE_LENGTH:
             assert len(body.vertices) == 5  # one apex
 
 
@@ -236,9 +236,9 @@ def test_a_chamfer_that_shrinks_to_nothing(width) -> None:
     """V = 1 - t^2 / 2 for edges cut by t; narrower than what counts, the face is none and the cube is whole."""
     normals = np.concatenate([CUBE[0], unit([[1, 1, 0]])])
     body, volume = checked(normals, np.append(CUBE[1], (1.0 - width) / np.sqrt(2.0)))
-    assert volume == pytest.approx(1.0 - 0.5 * width**2, abs=2.0 * solids.MERGED if width < solids.MERGED else 1e-14)
-    assert len(body.rings[6]) == (0 if width * np.sqrt(2.0) < solids.MERGED else 4)
-    assert len(body.vertices) == (8 if width * np.sqrt(2.0) < solids.MERGED else 10)
+    assert volume == pytest.approx(1.0 - 0.5 * width**2, abs=2.0 * solids.MERGE_LENGTH if width < solids.MERGE_LENGTH else 1e-14)
+    assert len(body.rings[6]) == (0 if width * np.sqrt(2.0) < solids.MERGE_LENGTH else 4)
+    assert len(body.vertices) == (8 if width * np.sqrt(2.0) < solids.MERGE_LENGTH else 10)
 
 
 def test_planes_that_cut_nothing_leave_no_face() -> None:
@@ -252,7 +252,7 @@ def test_planes_that_cut_nothing_leave_no_face() -> None:
 def test_corners_are_exact() -> None:
     """Not the rounding of a solver: 1/3 is the double nearest to it."""
     normals = np.array([[1.0, 0, 0], [-3, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
-    body = solids.enclosed(normals, np.array([1.0, 1.0, 1, 0, 1, 0]))
+    body = solids.half_space_intersection(normals, np.array([1.0, 1.0, 1, 0, 1, 0]))
     assert body.vertices[:, 0].min() == -1.0 / 3.0
 
 
@@ -260,14 +260,14 @@ def test_corners_are_exact() -> None:
     ("normals", "offsets", "error"),
     [
         (CUBE[0][:5], CUBE[1][:5], solids.OpenBodyError),
-        (CUBE[0], np.full(6, 2.0 * solids.REACH), solids.OpenBodyError),
+        (CUBE[0], np.full(6, 2.0 * solids.MAX_EXTENT), solids.OpenBodyError),
         (unit([[-1, 0, 0], [1e-3, 1, 0], [1e-3, -1, 0], [0, 0, 1], [0, 0, -1]]), np.full(5, 0.5), solids.OpenBodyError),
         (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5]), solids.EmptyBodyError),
-        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5 + 0.9 * solids.MERGED]), solids.EmptyBodyError),
+        (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.5 + 0.9 * solids.MERGE_LENGTH]), solids.EmptyBodyError),
         (CUBE[0], np.array([0.5, 0.5, 0.5, 0.5, 0.5, -0.6]), solids.EmptyBodyError),
     ],
     ids=["five", "too large", "a wedge far too long", "flat", "thin", "inside out"],
 )
 def test_half_spaces_that_hold_no_body(normals, offsets, error) -> None:
     with pytest.raises(error):
-        solids.enclosed(normals, offsets)
+        solids.half_space_intersection(normals, offsets)

@@ -128,7 +128,7 @@ def shapes() -> Assembly:
 
 def test_every_kind_of_number_goes_with_a_power_of_its_bodys_size() -> None:
     assembly = shapes()
-    states = some_states(assembly, ["scale", "stretch", "index", "abbe", "figure", "radius", "conic"], 5)
+    states = some_states(assembly, ["scale", "expansion", "index", "abbe", "figure", "radius", "conic"], 5)
     found, exact = assemble(assembly, ["all"], states), one_by_one(assembly, ["all"], states)
     kinds = {path[2:] for path in leaves(found.form[0])}
     assert {("surface", "even", 2), ("surface", "terms", 0, "x2y"), ("surface", "grid", "first")} <= {

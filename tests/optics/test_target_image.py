@@ -72,7 +72,7 @@ def test_profile_is_reused_for_other_offsets() -> None:
         np.testing.assert_allclose(profile.image(edge, x, x), want, rtol=0, atol=1e-8)
     with pytest.raises(ValueError, match="normal"):
         profile.image(HalfPlane((0.0, 0.0), (1.0, 0.0)), x, x)
-    with pytest.raises(ValueError, match="the edge profile reaches"):
+    with pytest.raises(ValueError, match="the edge profile extends to"):
         profile.image(HalfPlane((1e-3, 0.0), normal), x, x)
 
 

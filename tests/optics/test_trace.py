@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.surface import Surface, plane
-from optics.raytrace.trace import BeamMissedError, require_some
+from optics.raytrace.trace import BeamMissedError, require_rays
 from tests.optics.bench import PASS, REFLECT, REFRACT, Stage, at, beam, build, disk_points, run, unit
 from tests.optics.test_tree import motions, poses, vectors
 
@@ -80,9 +80,9 @@ def test_a_ray_that_misses_is_invalid(backend) -> None:
 
 
 def test_a_beam_that_misses_everything_is_an_explained_error() -> None:
-    with pytest.raises(BeamMissedError, match="no ray gets through the test in 1 of 2 cases"):
-        require_some(np.array([[True, False], [False, False]]), "the test")
-    require_some(np.array([[True, False]]), "the test")
+    with pytest.raises(BeamMissedError, match="no ray passes through the test in 1 of 2 cases"):
+        require_rays(np.array([[True, False], [False, False]]), "the test")
+    require_rays(np.array([[True, False]]), "the test")
 
 
 POINTS = disk_points(30, 0.1)

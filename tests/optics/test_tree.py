@@ -77,8 +77,8 @@ def test_numbers_of_a_motion_by_name() -> None:
     found = [motion.component(*which) for which in (("rotate", 1), ("shift", 2), ("scale", 0), ("figure", 8))]
     assert found == [2.0, 6.0, 7.0, 9.0]
     assert motion.component("figure", 5) == 0.0
-    with pytest.raises(ValueError, match="not a 'stretch'"):
-        motion.component("stretch", 0)
+    with pytest.raises(ValueError, match="not a 'expansion'"):
+        motion.component("expansion", 0)
 
 
 def test_a_tree_stands_by_itself_as_another_does_in_a_state() -> None:
@@ -97,7 +97,7 @@ def test_a_tree_stands_by_itself_as_another_does_in_a_state() -> None:
         "a/b": Motion((0.0, 0.03, -0.01), (0.002, 0.0, 0.001), "far", scale=0.01),
         "a/b/c": Motion(shift=(0.1, 0.0, 0.0)),
     }
-    standing, paths = tree.standing(first), {body.path: body for body in bodies}
+    standing, paths = tree.with_nominal(first), {body.path: body for body in bodies}
     for there, here in ((first, {}), (compose(first, then, paths), then)):
         expected, found = tree.place([there]), standing.place([here])
         np.testing.assert_allclose(found.rotation, expected.rotation, rtol=0.0, atol=1e-15)
@@ -107,10 +107,10 @@ def test_a_tree_stands_by_itself_as_another_does_in_a_state() -> None:
         ({"a/d": Motion()}, KeyError),
         ({"a": Motion(pivot="far")}, KeyError),
         ({"a": Motion(scale=1e-6)}, ValueError),
-        ({"a": Motion(stretch=1e-6)}, ValueError),
+        ({"a": Motion(expansion=1e-6)}, ValueError),
     ):
         with pytest.raises(error):
-            tree.standing(state)
+            tree.with_nominal(state)
 
 
 def test_a_pose_turns_then_shifts() -> None:

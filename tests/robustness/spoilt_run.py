@@ -28,7 +28,7 @@ import matplotlib.font_manager  # noqa: F401 - makes its folders at home when it
 import psutil
 from typer.testing import CliRunner
 
-from optics.numerics.backend import LIMIT
+from optics.numerics.backend import THREADS_VARIABLE
 from tests.robustness.case import Case, Reached, cut
 from tests.robustness.mutate import Mutant, mutate
 from twin.framework.run_folder import is_run_folder
@@ -238,7 +238,7 @@ def run_mutant(case: Case, number: int, root: Path, spoilt: Mutant | None = None
             nullcontext() if depth == "whole" else cut(soon=depth == "soon"),
             mock.patch.object(tempfile, "tempdir", str(folder / "tmp")),
             # one core is no reason for a second process
-            mock.patch.dict(os.environ, {LIMIT: "1", "TMPDIR": str(folder / "tmp"), "TWIN_CALIBRATIONS": "off"}),
+            mock.patch.dict(os.environ, {THREADS_VARIABLE: "1", "TMPDIR": str(folder / "tmp"), "TWIN_CALIBRATIONS": "off"}),
             _stderr_into(raw) as errors,
             warnings.catch_warnings(record=True) as told,
             _watching(folder, case.starts and depth == "whole") as seen,

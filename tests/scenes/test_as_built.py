@@ -88,7 +88,7 @@ def test_a_camera_as_built_in_the_laboratory(backend, tmp_path) -> None:
     state = build_camera_under_test(setup.test, setup.camera, backend).as_built
     assert state["camera/focal_plane"].shift == (0.0, 0.0, 30e-6)
     read(tmp_path, "name: own\ndesign: gf7\nas_built: [base/gf7/M2 shift z 30 um]\n")
-    with pytest.raises(InputError, match=r"focus.yaml:\d+: as_built.M2: .*own.yaml says how this body was built"):
+    with pytest.raises(InputError, match=r"focus.yaml:\d+: as_built.M2: .*own.yaml already has the deviations of this body"):
         FocusSetup.read(tmp_path / "focus.yaml")
     read(tmp_path, HEAD + "  forward/M2: {shift: 0 0 3 um}\n")
     with pytest.raises(
@@ -131,7 +131,7 @@ def test_a_written_state_is_read_back_to_the_last_bit(tmp_path) -> None:
 
 
 def test_what_no_file_can_say_is_not_written() -> None:
-    for motion in (Motion(scale=1e-6), Motion(stretch=1e-6), Motion(index_gradient=(1e-6, 0.0, 0.0))):
+    for motion in (Motion(scale=1e-6), Motion(expansion=1e-6), Motion(index_gradient=(1e-6, 0.0, 0.0))):
         with pytest.raises(ValueError, match="base/forward: only rigid motions"):
             as_built_file("own", "gf7_pair", {"base/forward": motion})
 

@@ -135,7 +135,7 @@ def test_states_add_what_several_causes_do_to_a_body(pair) -> None:
     warm = thermal.state({"base/central_prism": Temperature(3.0, (0.0, 0.0, 0.02))})
     # the second shift is in the frame of what has grown by 0.5 ppm/K
     assert state["base/central_prism"].shift[2] - warm["base/central_prism"].shift[2] == pytest.approx(3e-6, rel=1e-5)
-    assert state["base/central_prism"].stretch == pytest.approx(warm["base/central_prism"].stretch, rel=1e-9)
+    assert state["base/central_prism"].expansion == pytest.approx(warm["base/central_prism"].expansion, rel=1e-9)
 
 
 # --- what a job says instead ------------------------------------------------------------------------------------------

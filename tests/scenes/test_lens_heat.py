@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from optics.geometry.tree import Motion, State, compose, each_composed
+from optics.geometry.tree import Motion, State, compose, compose_each
 from optics.materials.glass import glass
 from optics.thermal.heat import Temperature, Temperatures
 from scenes.models.disturbances import HEAT, UNITS, Component, stated_motions, states_of
@@ -134,8 +134,8 @@ def test_a_singlet_refocuses_as_first_order_says(singlet, backend) -> None:
 def test_the_parts_of_a_singlets_heat_are_where_they_belong(singlet) -> None:
     state = warmed(singlet, {"base/achromat/L1": Temperature(WARM)})
     first, second = state["base/achromat/L1"], state["base/achromat/L2"]
-    assert first.stretch == pytest.approx(CTE * WARM, rel=1e-12)
-    assert second.stretch == first.stretch
+    assert first.expansion == pytest.approx(CTE * WARM, rel=1e-12)
+    assert second.expansion == first.expansion
     assert first.index == pytest.approx(index_change(WARM), rel=1e-9)
     assert second.index == 0.0  # the lens is called by its first face
     placed = singlet.assembly.tree.place([{}, state])
@@ -201,7 +201,7 @@ def test_a_lens_beyond_what_is_known_is_refused(singlet) -> None:
 
 ROUNDING = 1e-13
 """Of a motion's parts that are sums of products of some ten numbers."""
-NUMBERS = ("scale", "stretch", "index", "radius", "conic", "abbe")
+NUMBERS = ("scale", "expansion", "index", "radius", "conic", "abbe")
 
 
 def agree(one: State, other: State) -> None:
@@ -241,7 +241,7 @@ def test_stated_states(stated) -> None:
         agree(state, states_of(row[None], motions.components, heat, extra)[0])
     # a state at rest but for what is on top of it
     agree({path: m for path, m in together[0].items() if any(m.rotate) or any(m.shift)}, extra)
-    assert all(m.figure == dict.fromkeys(m.figure, 0.0) and m.stretch == m.index == 0.0 for m in together[0].values())
+    assert all(m.figure == dict.fromkeys(m.figure, 0.0) and m.expansion == m.index == 0.0 for m in together[0].values())
     # and they differ
     assert together[4] != together[5]
 
@@ -277,7 +277,7 @@ def test_sequences_are_composed_each_by_itself(stated) -> None:
     bodies = {body.path: body for body in heat.instrument.assembly.tree.bodies}
     turn, move = Motion(rotate=(1e-3, 0.0, 2e-3), pivot="origin"), Motion(shift=(1e-3, 0.0, 0.0), scale=1e-4)
     several = [[], [{"base": turn}], [{"base": turn}, {"base": move}, {"base": turn}], [{"base": move}, {}]]
-    found = each_composed(several, bodies)
+    found = compose_each(several, bodies)
     assert found[:2] == [{}, {"base": turn}]
     agree(found[2], compose(compose({"base": turn}, {"base": move}, bodies), {"base": turn}, bodies))
     assert found[3] == {"base": move}

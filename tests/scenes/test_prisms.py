@@ -191,7 +191,7 @@ def test_rhomboid(backend, turn, slant) -> None:
     w, x = own @ UP, own @ np.array([1.0, 0.0, 0.0])
     across = into - (into @ w) * w
     cos_j = np.sqrt(1.0 - across @ across / N**2)
-    thick = WIDTH + 2.0 * reflectors.EDGE + SHIFT
+    thick = WIDTH + 2.0 * reflectors.EDGE_MARGIN + SHIFT
     lean = across / (N * cos_j)
     aside = thick * (w + lean) + SHIFT * (x - w)
     straight = aside - (aside @ into) * into
@@ -226,8 +226,8 @@ def test_bodies(hand, width) -> None:
             edge = np.roll(corners[:, :2], -1, axis=0) - corners[:, :2]
             inward = np.stack([-edge[:, 1], edge[:, 0]], axis=-1) / np.linalg.norm(edge, axis=-1, keepdims=True)
             room = np.einsum("rek,ek->re", rim[:, None] - corners[:, :2], inward)
-            assert room.min() > reflectors.EDGE / np.sqrt(3.0) - 1e-9
-    box = (SHIFT + width) * (width + 2.0 * reflectors.EDGE) * (width + 2.0 * reflectors.EDGE)
+            assert room.min() > reflectors.EDGE_MARGIN / np.sqrt(3.0) - 1e-9
+    box = (SHIFT + width) * (width + 2.0 * reflectors.EDGE_MARGIN) * (width + 2.0 * reflectors.EDGE_MARGIN)
     placed = RigidTree(small.bodies).place()
     assert solid_mesh(small.solids[0], placed).mesh.volume == pytest.approx(box, rel=1e-9)
 
@@ -333,7 +333,7 @@ def test_plates_and_frame_leave_room_to_the_beam_and_to_each_other(kind, width, 
         # the whole beam meets every mirror within its clear aperture, which its plate surrounds
         for element, at in zip(parts.elements, places[1:-1], strict=True):
             local = placed.pose(element.body).inverse().apply(at)
-            assert element.aperture.grown(1.0 + 1e-9).contains(local[:, 0], local[:, 1]).all()
+            assert element.aperture.scaled(1.0 + 1e-9).contains(local[:, 0], local[:, 1]).all()
             rim = placed.pose(element.body).apply(
                 np.column_stack([element.aperture.outline(), np.zeros(len(element.aperture.outline()))])
             )

@@ -326,7 +326,7 @@ def test_the_job_knows_the_table_that_it_was_read_with(tmp_path, nodes) -> None:
     config.write_text(resolved.to_yaml())
     assert resolve(config) == resolved
     place.write_text(place.read_text().replace("e-", "e-0", 1) + "# changed\n")
-    with pytest.raises(InputError, match="checksum is another"):
+    with pytest.raises(InputError, match="checksum differs"):
         resolve(config)
 
 

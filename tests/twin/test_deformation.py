@@ -180,7 +180,7 @@ def test_one_material_evenly_heated_keeps_its_angles(silica, tmp_path) -> None:
     points = np.random.default_rng(2).uniform(-1.0, 1.0, (40, 3))
     write(tmp_path / "even.csv", points, np.full(40, 298.15), "T [K]")
     state = silica.state(job_of(tmp_path, "instrument: gf7_pair\nperturb:\n  base: {temperature: even.csv}\n"))
-    assert state[M1].stretch == pytest.approx(5.0 * 0.52e-6, rel=1e-9)
+    assert state[M1].expansion == pytest.approx(5.0 * 0.52e-6, rel=1e-9)
     truth = trace_truth(silica.instrument, silica.backend, [{}, state])
     for name in silica.instrument.cameras:
         change = truth.cameras[name]
@@ -228,9 +228,9 @@ course:
     read = job_of(tmp_path, text)
     first, second = series_states(silica, read)
     field = silica.heated(read)[M1].linear
-    assert first[M1].stretch == pytest.approx(0.52e-6 * silica.fields(read, 0)[M1].at(_mount(silica)), rel=1e-12)
+    assert first[M1].expansion == pytest.approx(0.52e-6 * silica.fields(read, 0)[M1].at(_mount(silica)), rel=1e-12)
     assert silica.fields(read, 0)[M1].change == pytest.approx(field.change, rel=1e-12)
-    assert second[M1].stretch - first[M1].stretch == pytest.approx(0.52e-6, rel=1e-9)
+    assert second[M1].expansion - first[M1].expansion == pytest.approx(0.52e-6, rel=1e-9)
 
 
 def _mount(experiment: MonitorExperiment) -> np.ndarray:

@@ -230,7 +230,7 @@ def test_what_has_moved_into_a_monitors_beam_is_told(gf7_pair, backend) -> None:
     small = {
         "base/forward/M2": Motion(shift=(5e-6, 5e-6, 40e-6), rotate=(1e-5, 0.0, 0.0)),
         "base/forward/focal_plane": Motion(rotate=(1e-5, 1e-5, 5e-5)),
-        "base/forward": Motion(stretch=1e-4),
+        "base/forward": Motion(expansion=1e-4),
         "base/forward/monitor/left/prism_180/exit": Motion(figure={4: 1e-6}),
     }
     known = {body.path for body in gf7_pair.assembly.tree.bodies}

@@ -187,7 +187,7 @@ CASES: dict[str, tuple[Surface, Figure | None, State]] = {
     "grid": (BOWL, WAVY, {}),
     "flat": (plane(), ASTIGMATIC, HEAT),
     "flat grid": (plane(), WAVY, {}),
-    "grid of a state": (BOWL, None, {"mirror": Motion(grid=WAVY, stretch=2e-5)}),
+    "grid of a state": (BOWL, None, {"mirror": Motion(grid=WAVY, expansion=2e-5)}),
     "all of a state": (BOWL, ASTIGMATIC, {"mirror": replace(HEAT["mirror"], grid=WAVY)}),
     "two grids": (BOWL, WAVY, {"mirror": Motion(figure={4: 3e-7}, grid=WAVY)}),
     "terms": (FREEFORM, ASTIGMATIC, HEAT),

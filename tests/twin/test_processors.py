@@ -91,7 +91,7 @@ def test_small_products_are_summed_in_one_order() -> None:
     np.testing.assert_array_equal(array_math.product(a, b), parts[0] + parts[1] + parts[2])
     # two numbers at a time, as all processors of today can
     parts = [a[:, :, k] * b[:, 0, k][:, None] for k in range(3)]
-    np.testing.assert_array_equal(array_math.turned(a, b[:, 0]), parts[0] + parts[2] + parts[1])
+    np.testing.assert_array_equal(array_math.matvec(a, b[:, 0]), parts[0] + parts[2] + parts[1])
     parts = [a[:, 0, k] * b[:, 0, k] for k in range(3)]
     np.testing.assert_array_equal(array_math.inner(a[:, 0], b[:, 0]), parts[0] + parts[2] + parts[1])
 

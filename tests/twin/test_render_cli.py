@@ -23,7 +23,7 @@ from rich.console import Console
 import twin.main_job.render_command
 import twin.main_job.render_folder
 import twin.render as command
-from optics.numerics.backend import LIMIT
+from optics.numerics.backend import THREADS_VARIABLE
 from scenes.specs.load import EXAMPLES
 from tests.tiers import quick
 from tests.twin.commands import files, invoke
@@ -73,7 +73,7 @@ def computed(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(twin.main_job.render_command, "render_job", keep)
-        patch.setenv(LIMIT, "1")  # without a second process, which imports once more what is here already
+        patch.setenv(THREADS_VARIABLE, "1")  # without a second process, which imports once more what is here already
         done = run(EXAMPLE, "--out", place / "run", "--frames", FRAMES, "--seed", 5, "--json")
     assert done.exit_code == 0, done.stderr
     return place / "run", done.stdout, done.stderr, kept[0]

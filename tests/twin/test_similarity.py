@@ -151,7 +151,7 @@ def test_detectors_of_the_path_tracer_have_grown_pixels(with_camera, backend) ->
     for surface in optics:
         other = warm.surfaces[warm.of_element(surface.elements[0])]
         for mine, its in zip(surface.apertures, other.apertures, strict=True):
-            np.testing.assert_allclose(its.bounds, mine.grown(grown).bounds, rtol=1e-12, atol=1e-15)
+            np.testing.assert_allclose(its.bounds, mine.scaled(grown).bounds, rtol=1e-12, atol=1e-15)
 
 
 # --- what a CCD does by itself ----------------------------------------------------------------------------------------

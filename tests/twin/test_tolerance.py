@@ -332,7 +332,7 @@ def test_a_body_warmed_within_what_is_known_grows_by_its_expansion(bench, tmp_pa
     setup = budget(tmp_path, tolerances={"a": {"motion": "focal_plane temperature", "limit": "5 K"}})
     thermal = bench.experiment.thermal
     (number,) = tolerance_numbers(setup, bench.instrument, thermal)
-    grown = {body: move.shape["stretch"] for body, move in number.moves.items()}
+    grown = {body: move.shape["expansion"] for body, move in number.moves.items()}
     assert grown.keys() == {"base/gf7/focal_plane", "base/gf7/focal_plane/line"}
     assert grown == pytest.approx({body: thermal.materials[body].expansion for body in grown})
 

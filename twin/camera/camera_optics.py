@@ -22,7 +22,7 @@ from analysis.arrays import shows
 from optics.geometry import zernike
 from optics.geometry.polygon import area, covered
 from optics.geometry.tree import State
-from optics.numerics.array_math import UnphysicalError, hold_within
+from optics.numerics.array_math import UnphysicalError, check_range
 from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.assembly import Assembly
@@ -371,7 +371,7 @@ class CameraOptics:
         light = self.directions(fields)
         places = self.path.places(self.state, light)
         pupils = self.path.pupils(self.state, light, places, wavelength=self.wavelength)
-        hold_within("the light that a pupil's shadow leaves", np.array([p.light for p in pupils]), 0.0, 1.0, ROUNDING)
+        check_range("the light that a pupil's shadow leaves", np.array([p.light for p in pupils]), 0.0, 1.0, ROUNDING)
         if self.model.edges:
             nodes = stop_nodes(self.model, RINGS, True)
             lit = self.rays(fields, np.stack([nodes.x, nodes.y], axis=-1)).valid @ nodes.share

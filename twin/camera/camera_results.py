@@ -9,7 +9,7 @@ import numpy as np
 
 from analysis.arrays import shows
 from optics.geometry import zernike
-from optics.numerics.array_math import hold_below, hold_equal, hold_within
+from optics.numerics.array_math import check_at_most, check_close, check_range
 from twin.framework.reference_frames import frames_text
 
 if TYPE_CHECKING:  # takes half a second with pandas, and only who asks for a data set needs it
@@ -265,11 +265,11 @@ def hold_wavefront(wave: Wavefront) -> None:
     UnphysicalError
         One cannot be; with what it is.
     """
-    hold_within("the share of a stop that is vignetted", wave.vignetted, 0.0, 1.0, ROUNDING)
-    hold_within("a Strehl ratio", wave.strehl, 0.0, 1.0, ROUNDING)
-    hold_within("an rms wavefront error in waves", wave.rms, 0.0, MOST_ERROR, 0.0)
+    check_range("the share of a stop that is vignetted", wave.vignetted, 0.0, 1.0, ROUNDING)
+    check_range("a Strehl ratio", wave.strehl, 0.0, 1.0, ROUNDING)
+    check_range("an rms wavefront error in waves", wave.rms, 0.0, MOST_ERROR, 0.0)
     square = float(np.sum(wave.parts**2)) + wave.residual**2
-    hold_equal(
+    check_close(
         "the squares of the parts of a wavefront error and of what they leave",
         square,
         wave.rms**2,
@@ -286,8 +286,8 @@ def hold_mtf(mtf: Mtf) -> None:
     UnphysicalError
         It cannot be; with what it is.
     """
-    hold_within("an MTF", mtf.values, 0.0, 1.0, MTF_ROUNDING)
-    hold_within("the MTF of a perfect wavefront", mtf.limit, 0.0, 1.0, MTF_ROUNDING)
-    hold_below("an MTF", mtf.values, mtf.limit, "that of the perfect wavefront", MTF_ROUNDING)
+    check_range("an MTF", mtf.values, 0.0, 1.0, MTF_ROUNDING)
+    check_range("the MTF of a perfect wavefront", mtf.limit, 0.0, 1.0, MTF_ROUNDING)
+    check_at_most("an MTF", mtf.values, mtf.limit, "that of the perfect wavefront", MTF_ROUNDING)
     still = mtf.frequency == 0.0
-    hold_equal("the MTF at zero frequency", mtf.values[:, still], 1.0, "all of the light", MTF_ROUNDING)
+    check_close("the MTF at zero frequency", mtf.values[:, still], 1.0, "all of the light", MTF_ROUNDING)

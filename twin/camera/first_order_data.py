@@ -110,7 +110,7 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
 def _body(model: CameraModel, name: str, edge: Aperture) -> Aperture:
     """A surface with the outer edge and the hole that its file says, else with ``edge``."""
     given = model.edges.get(name, ())
-    stated = [one.shape for one in given if not one.blocks and not one.turn and isinstance(one.shape, Aperture)]
+    stated = [one.shape for one in given if not one.blocks and not one.rotation and isinstance(one.shape, Aperture)]
     if stated:
         edge = stated[0]
     holes = [one.shape for one in given if one.blocks and isinstance(one.shape, Circle) and not any(one.shape.centre)]

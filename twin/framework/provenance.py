@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from threadpoolctl import threadpool_info
 
-from optics.numerics.backend import LIMIT, cores
+from optics.numerics.backend import THREADS_VARIABLE, cores
 from optics.numerics.extension_table import entries
 from twin.framework.owned_files import digest
 
@@ -145,7 +145,7 @@ def program_digest() -> str:
 
 Checksum = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
-SETTINGS = (LIMIT, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES")
+SETTINGS = (THREADS_VARIABLE, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES")
 """Variables of the environment that change how numbers are rounded or how fast they come."""
 
 

@@ -50,7 +50,7 @@ from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import SystemBatch, assemble
-from optics.raytrace.trace import BeamMissedError, Traced, make_rays, require_some, trace
+from optics.raytrace.trace import BeamMissedError, Traced, make_rays, require_rays, trace
 from optics.waves.diffraction import Grid, PixelResponse, PupilField, UnsampledImageError, image
 from optics.waves.imaging import eikonal
 from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec, LensSpec
@@ -325,7 +325,7 @@ class AutocollimatorPath:
             The light of a spot does not come back.
         """
         rays = self._traced(self.bench.assembly.place(states), states)[1].numpy()
-        require_some(rays[3], "the autocollimators")
+        require_rays(rays[3], "the autocollimators")
         return rays
 
     def _traced(

@@ -231,7 +231,7 @@ _WARMED_FACE: Record[HeatedFace] = Record(
     "What temperatures that are not linear do to an optical face, in its own nominal axes.",
     Quantity("rotate_arcsec", lambda face: face.motion.rotate, "rotation about X, Y and Z"),
     Quantity("shift_nm", lambda face: face.motion.shift, "shift along X, Y and Z"),
-    Quantity("growth_ppm", lambda face: face.motion.stretch, "relative growth"),
+    Quantity("growth_ppm", lambda face: face.motion.expansion, "relative growth"),
     Quantity("figure_nm", lambda face: {f"Z{j}": a for j, a in face.motion.figure.items()}, "Zernike terms of its sag"),
     Quantity("not_carried_rms_nm", lambda face: face.lost, "what the Zernike terms do not carry"),
     Quantity("coarser_elements_rms_nm", lambda face: face.unmeshed, "by how much coarser finite elements differ"),

@@ -137,7 +137,7 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
         if path not in (own, CENTRAL_PRISM) and not path.startswith((f"{own}/", f"{CENTRAL_PRISM}/{camera}_")):
             continue
         deformed = path in given and given[path].deformation is not None
-        if (motion.stretch and not deformed) or motion.index or any(motion.index_gradient):
+        if (motion.expansion and not deformed) or motion.index or any(motion.index_gradient):
             out.append(HEAT)
         if path not in given:
             continue

@@ -129,7 +129,7 @@ def recovered_numbers(run: RenderRun) -> dict[str, Any]:
 
 
 def _moves(motion: Motion) -> bool:
-    moved = (*motion.rotate, *motion.shift, motion.scale, motion.stretch, motion.index, *motion.index_gradient)
+    moved = (*motion.rotate, *motion.shift, motion.scale, motion.expansion, motion.index, *motion.index_gradient)
     return any(moved) or any(motion.figure.values()) or motion.grid is not None
 
 

@@ -27,7 +27,7 @@ from optics.geometry.aperture import Circle
 from optics.geometry.polygon import covered
 from optics.geometry.tree import State
 from optics.numerics import quadrature
-from optics.numerics.array_math import UnphysicalError, hold_below, hold_equal, hold_within
+from optics.numerics.array_math import UnphysicalError, check_at_most, check_close, check_range
 from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from optics.numerics.quadrature import PupilNodes
@@ -564,7 +564,7 @@ class _CameraBench:
                     seen = tuple(part[good] for part in cosines)
                     otf, known = self._transfer(traced, lit[good], own, seen, self.colours, self.weights)
                 good, otf = good[known], otf[known]
-                hold_within(f"an MTF of the optics of camera {self.name}", np.abs(otf), 0.0, 1.0, _MTF_ROUNDING)
+                check_range(f"an MTF of the optics of camera {self.name}", np.abs(otf), 0.0, 1.0, _MTF_ROUNDING)
                 mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
             self._note(pupils, lit, which)
         if shadows is not None:
@@ -641,21 +641,21 @@ class _CameraBench:
         told = (dark == 0.0) & (values[0] <= _DARKEST)
         lost, wfe, refocused, _, along, track, *_ = values[:, told]
         of = f"of camera {self.name}"
-        hold_within(f"the share of the light {of} that bodies take", lost, 0.0, 1.0, _ROUNDING)
-        hold_within(f"a wavefront error {of} in waves", wfe, 0.0, _MOST_WAVES, 0.0)
+        check_range(f"the share of the light {of} that bodies take", lost, 0.0, 1.0, _ROUNDING)
+        check_range(f"a wavefront error {of} in waves", wfe, 0.0, _MOST_WAVES, 0.0)
         most = wfe * (1.0 + _ROUNDING)
-        hold_below(f"a wavefront error {of} at best focus", refocused, most, "that on the line CCD", _ROUNDING)
-        hold_within(f"an MTF {of}", np.array([along, track]), 0.0, 1.0, _MTF_ROUNDING)
+        check_at_most(f"a wavefront error {of} at best focus", refocused, most, "that on the line CCD", _ROUNDING)
+        check_range(f"an MTF {of}", np.array([along, track]), 0.0, 1.0, _MTF_ROUNDING)
         if shadows is None or not shadows.owners:
             return
         shares = np.array(list(shadows.shares().values()))
-        hold_within(f"the share of the stop {of} that a body takes", shares, 0.0, 1.0, _ROUNDING)
+        check_range(f"the share of the stop {of} that a body takes", shares, 0.0, 1.0, _ROUNDING)
         together = np.sum(shares, axis=0)
-        hold_within(f"the share of the stop {of} that bodies take together", together, 0.0, 1.0, _ROUNDING)
+        check_range(f"the share of the stop {of} that bodies take together", together, 0.0, 1.0, _ROUNDING)
         points = np.stack([_FEW.x, _FEW.y], axis=-1)
         counted = np.mean(covered(shadows.pieces, points, SMALLEST), axis=-1)
-        hold_equal(f"the share of the stop {of} that bodies take", together, counted, "that of points in it", _APART)
-        hold_equal(f"the share of the stop {of} that bodies take", together[told], lost, "that of the light", _APART)
+        check_close(f"the share of the stop {of} that bodies take", together, counted, "that of points in it", _APART)
+        check_close(f"the share of the stop {of} that bodies take", together[told], lost, "that of the light", _APART)
 
     def _note(self, pupils: PupilStack, lit: np.ndarray, which: np.ndarray) -> None:
         """Keep how the pupils of states look of which all fields are lit."""

@@ -18,7 +18,7 @@ from optics.numerics import quadrature
 from optics.numerics.array_math import inverse, product
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
-from optics.raytrace.aim import RayFan, aim, alive_along, transverse_axes
+from optics.raytrace.aim import RayFan, aim, surviving_rays, transverse_axes
 from optics.raytrace.system import SystemBatch, UploadedSystems, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.diffraction import Grid, PupilField
@@ -361,7 +361,7 @@ class MonitorBeams:
         face = len(known.outgoing.structure) - 1
         traced = trace(self.backend, known.uploaded, make_rays(self.backend, *launch), keep=(face,))
         goal = self.targets(len(states))
-        if not np.max(np.abs(traced.place(face) - known.outgoing.size[:, None, None] * goal)) <= AIM_TOLERANCE:
+        if not np.max(np.abs(traced.xy(face) - known.outgoing.size[:, None, None] * goal)) <= AIM_TOLERANCE:
             # a change that is not smooth enough for its few terms
             q, _ = aim(self.backend, known.outgoing, known.fan, goal, q, slope, AIM_TOLERANCE)
             launch = known.fan.at(q)
@@ -382,7 +382,7 @@ class MonitorBeams:
     def _where_lost(self, channel: Channel, state: State, position: np.ndarray, direction: np.ndarray) -> str:
         """The element, and its body, at which the last of a channel's rays (N, 3) are lost."""
         names = self.instrument.assembly.sequences[f"{channel.key}/monitor"]
-        steps = alive_along(self.backend, self.instrument.assembly, names, position, direction, state)
+        steps = surviving_rays(self.backend, self.instrument.assembly, names, position, direction, state)
         count, element = next((i, element) for i, (element, alive) in enumerate(steps, 1) if not alive.any())
         return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its way"
 

@@ -28,7 +28,7 @@ from analysis.monitor.parameters import CameraCalibration
 from analysis.monitor.recovery import MotionModel, Retraced
 from optics.geometry.pose import triple
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, Motion, PlacedBodies, State, compose
-from optics.numerics.array_math import PhysicalError, inverse, turned
+from optics.numerics.array_math import PhysicalError, inverse, matvec
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import Path, leaves
 from optics.raytrace.aim import RayFan, aim, transverse_axes
@@ -79,7 +79,7 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
     axes, slopes = hit_slopes(path.backend, outgoing, start, nominal.direction)
     faces = _size_steps(placed, [channel.face_body for channel in path.channels]).reshape(-1, 1, 1)
-    q_step = turned(np.repeat(inverse(slopes), m, axis=0), faces * path.targets(m) - drift)
+    q_step = matvec(np.repeat(inverse(slopes), m, axis=0), faces * path.targets(m) - drift)
     sizes = _size_steps(placed, [channel.ccd_body for channel in path.channels]).ravel()
     return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0))), sizes
 
@@ -222,7 +222,7 @@ def spot_gradient(
         ridden = np.einsum("bnx,bnx->b", back, goal).reshape(-1, 2)
         out -= ridden[:, :, None] * face_steps[:, None]
         start_rays = make_rays(path.backend, launch[:, piece], launched[:, piece])
-        hit = trace(path.backend, monitor.take(once), start_rays).place()[..., ::-1]
+        hit = trace(path.backend, monitor.take(once), start_rays).xy()[..., ::-1]
         spot = np.einsum("n,bnk->bk", path.nodes.share[piece], hit) / (path.pitch * size[:, None] ** 2)
         out -= spot[:, :, None] * chip_steps[:, None]
     return out

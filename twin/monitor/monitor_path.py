@@ -17,7 +17,7 @@ import numpy as np
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend, one_blas_thread
 from optics.numerics.quadrature import PupilNodes
-from optics.raytrace.system import touched_bodies
+from optics.raytrace.system import changed_bodies
 from optics.waves.diffraction import PixelResponse, UnsampledImageError, image
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE, Channel
@@ -262,7 +262,7 @@ class MonitorPath(MonitorBeams):
             Its bodies, when already placed.
         """
         assembly = self.instrument.assembly
-        touched = touched_bodies(assembly, [state], assembly.place([state]) if placed is None else placed)
+        touched = changed_bodies(assembly, [state], assembly.place([state]) if placed is None else placed)
         return tuple(name for name in self.cameras if not touched.isdisjoint(self._bodies[name]))
 
     @cached_property

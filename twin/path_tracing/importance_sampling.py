@@ -28,17 +28,17 @@ NEAREST = 1e-6
 
 
 def near_distance(u: Any) -> Any:
-    """Distance between ``NEAREST`` and ``scatter.WIDEST``, even in its logarithm, from u in [0, 1)."""
+    """Distance between ``NEAREST`` and ``scatter.MAX_DISTANCE``, even in its logarithm, from u in [0, 1)."""
     import drjit as dr
 
-    return NEAREST * dr.exp(u * log(fresnel_scatter.WIDEST / NEAREST))
+    return NEAREST * dr.exp(u * log(fresnel_scatter.MAX_DISTANCE / NEAREST))
 
 
 def near_density(distance: Any) -> Any:
     """Density of the square of ``near_distance``."""
     import drjit as dr
 
-    return dr.select(distance >= NEAREST, 0.5 / (log(fresnel_scatter.WIDEST / NEAREST) * distance * distance), 0.0)
+    return dr.select(distance >= NEAREST, 0.5 / (log(fresnel_scatter.MAX_DISTANCE / NEAREST) * distance * distance), 0.0)
 
 
 @dataclass(frozen=True, eq=False)

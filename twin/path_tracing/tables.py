@@ -14,7 +14,7 @@ from optics.geometry.sag_terms import SagTerm, kinds_of, of_kinds
 from optics.geometry.surface import FigureNumbers, GridNumbers, SurfaceNumbers
 from optics.geometry.zernike import triangle_size
 from optics.materials import fresnel_scatter
-from optics.materials.fresnel_scatter import DrawnScatter, Finish
+from optics.materials.fresnel_scatter import ScatterSampling, Finish
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import leaves
 from scenes.models.scenery import Scenery, SceneSurface
@@ -174,13 +174,13 @@ def upload_finishes(backend: Backend, surfaces: Sequence[SceneSurface]) -> Finis
             marks[i, 2] = float(f.scattered_only)
     headers, numbers = np.zeros((max(len(tables), 1), _HEADER)), [np.zeros(1)]
     for i, table in enumerate(tables):
-        headers[i] = _header(table.drawn, sum(map(len, numbers)))
-        drawn = table.drawn
+        headers[i] = _header(table.sampling, sum(map(len, numbers)))
+        drawn = table.sampling
         numbers += [a.ravel() for a in (drawn.share, drawn.rings, drawn.sectors, drawn.cosines, drawn.azimuths)]
     return FinishTables(
         backend,
         backend.opaque(marks),
-        backend.opaque(np.concatenate([c.drawn(through).ravel() for c, through in coats]) if coats else np.zeros(2)),
+        backend.opaque(np.concatenate([c.sampled(through).ravel() for c, through in coats]) if coats else np.zeros(2)),
         backend.opaque(headers),
         backend.opaque(np.concatenate(numbers)),
         max((t.rings for t in tables), default=1),
@@ -188,7 +188,7 @@ def upload_finishes(backend: Backend, surfaces: Sequence[SceneSurface]) -> Finis
     )
 
 
-def _header(drawn: DrawnScatter, first: int) -> list[float]:
+def _header(drawn: ScatterSampling, first: int) -> list[float]:
     sizes = [drawn.share.size, drawn.rings.size, drawn.sectors.size, drawn.cosines.size]
     starts = first + np.concatenate([[0], np.cumsum(sizes)])
     rings, sectors = len(drawn.cosines) - 1, len(drawn.azimuths) - 1

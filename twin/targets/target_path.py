@@ -24,7 +24,7 @@ from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.first_order import chief_rays
 from optics.raytrace.system import SystemBatch, assemble
-from optics.raytrace.trace import make_rays, require_some, trace
+from optics.raytrace.trace import make_rays, require_rays, trace
 from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import StopOutlines, settled_shadows
@@ -244,7 +244,7 @@ class TargetPath:
             valid = valid & self.model.uncut(met)
         if edges and self.shadows is not None:
             valid = valid & ~covered(self.shadow_pieces(state, directions), points, SMALLEST)
-        require_some(valid, "the imaging path")
+        require_rays(valid, "the imaging path")
         return LineRays(position, leaving, path, valid, float(systems.size[0]))
 
     def shadow_pieces(self, state: State, directions: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.spec import Spec
 
 HEAT = ("temperature", "gradient")
-SHAPE = ("scale", "stretch", "radius", "conic", "index", "abbe")
+SHAPE = ("scale", "expansion", "radius", "conic", "index", "abbe")
 """Numbers of a motion that are neither rigid nor a figure."""
 
 
@@ -244,7 +244,7 @@ def heat_moves(
 
 def _per_unit(body: Body, motion: Motion, amount: float) -> BodyMove:
     about = np.array(body.pivots[motion.pivot])
-    growth = (1.0 + motion.scale) * (1.0 + motion.stretch) - 1.0
+    growth = (1.0 + motion.scale) * (1.0 + motion.expansion) - 1.0
     turned = rotation_matrix(np.array(motion.rotate))
     shift = about + np.array(motion.shift) - (1.0 + growth) * turned @ about
     return BodyMove(

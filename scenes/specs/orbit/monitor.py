@@ -82,7 +82,7 @@ class MotionSpec(Spec):
         if not (any(self.rotate) or any(self.shift)):
             raise Problem("nothing moves", None, "rotate, shift or both")
         if self.period is not None and self.duration:
-            raise Problem("both a ramp and a swing", None, "either duration or period", within=("period",))
+            raise Problem("both a ramp and an oscillation", None, "either duration or period", within=("period",))
         return self
 
     def share(self, time: float) -> float:
@@ -195,18 +195,18 @@ class CorrectionSpec(Spec):
     def _can_be(self) -> "CorrectionSpec":
         if self.mechanism is None and self.quantity == "defocus":
             allowed = "mechanism: the motion of a body, as forward/focal_plane shift z"
-            raise Problem("no processing corrects the focus", "no mechanism", allowed, within=("quantity",))
+            raise Problem("image processing cannot correct the focus", "no mechanism", allowed, within=("quantity",))
         if self.mechanism is None and self.response != 1.0:
             allowed = "no response, or a mechanism"
             raise Problem(
-                "a correction by processing does what it says", str(self.response), allowed, None, ("response",)
+                "a correction by image processing has no response", str(self.response), allowed, None, ("response",)
             )
         try:
             kind = self.motion[1]
         except Problem as problem:
             raise problem.below("mechanism") from None
         if self.mechanism is not None and kind not in _KINDS:
-            raise Problem("no motion of a mechanism", shown(kind), "rotate or shift, and an axis", None, ("mechanism",))
+            raise Problem("not a motion of a mechanism", shown(kind), "rotate or shift, and an axis", None, ("mechanism",))
         for key in ("step", "range", "dead_band"):
             self._size(key)
         if self.largest == 0.0:
@@ -299,7 +299,7 @@ class LoopImagesSpec(Spec):
     @model_validator(mode="after")
     def _has_ties(self) -> "LoopImagesSpec":
         if not self.points.tie:
-            raise Problem("no points of one image are sought in the other", "tie: 0", "some", None, ("points", "tie"))
+            raise Problem("there are no tie points", "tie: 0", "some", None, ("points", "tie"))
         return self
 
 
@@ -428,20 +428,20 @@ class OrbitMonitorSpec(TitledSpec):
         loop = self.mechanisms
         for key in ("course", "reference", "interval"):
             if loop is None and getattr(self, key) is None:
-                raise Problem(f"'{key}' is missing", None, f"{key}, or mechanisms where the loop is closed")
+                raise Problem(f"'{key}' is missing", None, f"{key}, or mechanisms for a closed loop")
         if loop is None:
             return
         for key in ("reference", "interval", "intervals", "apply", "repeats"):
             if getattr(self, key) != type(self).model_fields[key].default:
-                problem = f"mechanisms act on every reading, and a loop has no {key}"
+                problem = f"a test with mechanisms has no {key}, since they act on every reading"
                 raise Problem(problem, None, f"{key} or mechanisms, not both", within=(key,))
         if self.perturb and self.course is None:
-            problem = "drawn amounts are those of the instrument as designed, without a perturbation"
+            problem = "a perturbation needs a course: random motions start from the nominal instrument"
             raise Problem(problem, None, "perturb with a course", within=("perturb",))
         if (self.course is None) is (loop.readings is None):
             found = "neither" if loop.readings is None else "both"
             allowed = "readings: {every: 4 min, count: 25}, or the file's course"
-            raise Problem("the times of the readings", found, allowed, within=("mechanisms",))
+            raise Problem("the times of the readings must be given in exactly one way", found, allowed, within=("mechanisms",))
 
     def _check_course(self, course: CourseSpec) -> None:
         """Raise `Problem` unless the times are evenly spaced and all motions are in the test's `motion`."""
@@ -463,7 +463,7 @@ class OrbitMonitorSpec(TitledSpec):
         if abs(interval - step * round(interval / step)) > _EVEN or interval < step - _EVEN:
             near = moment(step * max(round(interval / step), 1))
             raise Problem(
-                "no multiple of the course's step", moment(interval), f"multiples of {moment(step)}", near, key
+                "not a multiple of the course's step", moment(interval), f"multiples of {moment(step)}", near, key
             )
 
     @property

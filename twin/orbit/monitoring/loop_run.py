@@ -24,9 +24,9 @@ from scipy.stats import norm
 from analysis.monitor import control_loop
 from analysis.monitor.control_loop import DECAYING, LimitCycle, Margins
 from analysis.monitor.disturbances import FALSE_ALARM
-from analysis.monitor.model_fit import UnseenMode, floor, unseen_modes
+from analysis.monitor.model_fit import UnobservableMode, error_floor, unobservable_modes
 from analysis.orbit.forward_intersection import check_errors, intersect_pair
-from optics.numerics.array_math import number_of
+from optics.numerics.array_math import index_of_value
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS
 from scenes.specs.orbit.scene import ControlSpec, LineImageSpec
@@ -46,10 +46,10 @@ from twin.orbit.monitoring.closed_loop import FOCUS_FIELDS, Corrector, LoopCours
 from twin.orbit.monitoring.pair_flight import (
     HALF_SPAN,
     CaseErrors,
-    Flown,
+    OrbitAndAttitude,
     PairFlight,
     fly,
-    look_down,
+    view_check_points,
     rms,
     second_view,
     sightings,
@@ -104,7 +104,7 @@ def imaged_pair(
     nominal: Mapping[str, LineCamera],
     changes: Mapping[str, np.ndarray],
     foci: Mapping[str, float],
-    flown: Flown,
+    flown: OrbitAndAttitude,
     seed: np.random.SeedSequence,
 ) -> ImagedPair:
     """Render, match and intersect.
@@ -135,7 +135,7 @@ def imaged_pair(
     """
     spec, pair, images = setup.test, setup.pair, setup.test.loop.images
     assert images is not None
-    time, lines, known = spec.times[moment], flight.lines[moment], flight.calibrated
+    time, lines, calibrated = spec.times[moment], flight.lines[moment], flight.calibrated
     begin, count = time - HALF_SPAN, int(2.0 * HALF_SPAN / spec.line_time)
 
     def sensor(line: LineCamera, measured: bool) -> Sensor:
@@ -143,7 +143,7 @@ def imaged_pair(
         return Sensor(line, trajectory, flown.earth, spec.line_time, begin, count, NO_EFFECTS)
 
     true = {name: sensor(lines[name], False) for name in pair}
-    users = {name: sensor(corrected_line(nominal[name], known[name], changes[name]), True) for name in pair}
+    users = {name: sensor(corrected_line(nominal[name], calibrated[name], changes[name]), True) for name in pair}
     optics = {name: _optics(setup, name, foci[name]) for name in pair}
     middle = 0.5 * (spec.ground.first + spec.ground.last)
     height = images.ground.terrain.height
@@ -152,8 +152,8 @@ def imaged_pair(
     longitude, latitude, _ = flown.earth.geodetic(point[0])
     recording = imaged_lines(true, users, optics, stream(seed, 0))
     try:
-        place, size = (float(longitude), float(latitude)), (images.side, images.side)
-        patch = fly_patch(recording, place, size, images.ground, ControlSpec(), stream(seed, 1))
+        position, size = (float(longitude), float(latitude)), (images.side, images.side)
+        patch = fly_patch(recording, position, size, images.ground, ControlSpec(), stream(seed, 1))
         ties = tie_points(patch, images.points, source=pair[1])
     except (PatchError, PointsError) as error:
         raise BenchError(f"line images: {error}", ("mechanisms", "images"), POINTS_REMEDY) from error
@@ -163,13 +163,13 @@ def imaged_pair(
         raise BenchError(problem, ("mechanisms", "images"), POINTS_REMEDY)
     ground = patch.true_point(pair[1], *ties.lines[pair[1]].place[good].T)
     should = np.stack(true[pair[0]].image(ground), axis=1)
-    one, two = ((known[name].corrected(changes[name]), ties.lines[name].image[good]) for name in pair)
+    first_points, second_points = ((calibrated[name].corrected(changes[name]), ties.lines[name].image[good]) for name in pair)
     first, second = (
         sightings(users[name], users[name].trajectory, *places.T)
-        for name, (_, places) in zip(pair, (one, two), strict=True)
+        for name, (_, places) in zip(pair, (first_points, second_points), strict=True)
     )
-    errors = check_errors(intersect_pair(one[0], two[0], first, second).ground, ground).error
-    return ImagedPair(moment, errors, one[1] - should, ties.lines[pair[0]].usual_sigma, len(good))
+    errors = check_errors(intersect_pair(first_points[0], second_points[0], first, second).ground, ground).error
+    return ImagedPair(moment, errors, first_points[1] - should, ties.lines[pair[0]].median_sigma, len(good))
 
 
 _FEWEST = 8
@@ -215,7 +215,7 @@ FOCUS_SCALE = 10e-6
 
 
 @dataclass(frozen=True, eq=False)
-class LoopPass:
+class LoopOutcome:
     """One course with what it truly leaves.
 
     Attributes
@@ -267,12 +267,12 @@ class LoopPass:
     def ratio(self, rows: np.ndarray) -> float:
         """Largest error of what the posterior says of a quantity over its sigma; arguments as of `posterior`."""
         value, sigma = self.posterior(rows)
-        known = sigma > 0.0
-        return float(np.max(np.abs(value - self.true(rows))[known] / sigma[known], initial=0.0))
+        positive = sigma > 0.0
+        return float(np.max(np.abs(value - self.true(rows))[positive] / sigma[positive], initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
-class LoopFacts:
+class LoopAnalysis:
     """One correction as a loop.
 
     Attributes
@@ -325,13 +325,13 @@ class LoopRun:
     setup: MonitorSetup
     seed: int
     model: LoopModel
-    closed: LoopPass
-    open: LoopPass
-    loops: Mapping[str, LoopFacts]
+    closed: LoopOutcome
+    open: LoopOutcome
+    loops: Mapping[str, LoopAnalysis]
     radius: float
     margin: float
-    modes: tuple[UnseenMode, ...]
-    unseen: np.ndarray
+    modes: tuple[UnobservableMode, ...]
+    unobservable_sigma: np.ndarray
 
     @property
     def stable(self) -> bool:
@@ -348,14 +348,14 @@ class LoopRun:
         """Return the errors that the loop makes larger, RMS over the moments with the loop open and closed: angle and
         quantities in rad and m, height in m, and of the MTF at Nyquist what it lacks to 1.
         """
-        free, left = self._errors(self.open), self._errors(self.closed)
-        return {n: (free[n], v) for n, v in left.items() if v > max((1.0 + WORSE) * free[n], _NOTHING)}
+        open_errors, closed_errors = self._errors(self.open), self._errors(self.closed)
+        return {n: (open_errors[n], v) for n, v in closed_errors.items() if v > max((1.0 + WORSE) * open_errors[n], _NOTHING)}
 
-    def _errors(self, one: LoopPass) -> dict[str, float]:
+    def _errors(self, outcome: LoopOutcome) -> dict[str, float]:
         places = [(name, key) for name in self.model.cameras for key in (*PARAMETERS, "defocus")]
-        own = {f"{key} of {name}": rms(one.truth[:, self.model.row(name, key)]) for name, key in places}
-        soft = {f"MTF of {name}": 1.0 - float(mtf.min()) for name, mtf in one.mtf.items()}
-        return {"angle": rms(one.true(one.angle)), "height": height_rms(one), **own, **soft}
+        quantities = {f"{key} of {name}": rms(outcome.truth[:, self.model.row(name, key)]) for name, key in places}
+        soft = {f"MTF of {name}": 1.0 - float(mtf.min()) for name, mtf in outcome.mtf.items()}
+        return {"angle": rms(outcome.true(outcome.angle)), "height": height_rms(outcome), **quantities, **soft}
 
     @property
     def pair(self) -> tuple[str, str]:
@@ -366,9 +366,9 @@ class LoopRun:
     def ratios(self) -> dict[str, float]:
         """Quantity -> largest error of what the posterior says of it over its sigma, both courses together."""
         rows = {f"defocus of {name}": self.model.unit(name, "defocus") for name in self.pair}
-        every = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
-        every |= {name: (row, row) for name, row in rows.items()}
-        return {name: max(self.closed.ratio(one), self.open.ratio(two)) for name, (one, two) in every.items()}
+        rows_of = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
+        rows_of |= {name: (row, row) for name, row in rows.items()}
+        return {name: max(self.closed.ratio(closed_rows), self.open.ratio(open_rows)) for name, (closed_rows, open_rows) in rows_of.items()}
 
     @property
     def ratio_limit(self) -> float:
@@ -378,8 +378,8 @@ class LoopRun:
     @property
     def phase_deg(self) -> float:
         """Smallest phase margin of the loops; NaN where none has one."""
-        known = [one.margins.phase_deg for one in self.loops.values() if math.isfinite(one.margins.phase_deg)]
-        return min(known, default=math.nan)
+        margins = [analysis.margins.phase_deg for analysis in self.loops.values() if math.isfinite(analysis.margins.phase_deg)]
+        return min(margins, default=math.nan)
 
 
 _SCALE = np.array([1.0, FOCUS_SCALE, FOCUS_SCALE])
@@ -414,14 +414,14 @@ def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance)
         def report(done: int, part: str = part) -> None:
             advance(part, done, len(states))
 
-        courses.append(closed_loop.gone_through(model, spec, states, read, still, report))
+        courses.append(closed_loop.simulate_course(model, spec, states, read, still, report))
     nominal = traced_pair(experiment, {}, pair)
-    closed, free = (_passed(setup, course, nominal, ground_seed, advance) for course in courses)
+    closed, opened = (_outcome_of(setup, course, nominal, ground_seed, advance) for course in courses)
     # height and foci of the pair
-    rows = np.stack([free.slopes.mean(axis=0), *(model.unit(name, "defocus") for name in pair)])
-    facts = {one.name: _facts(model, k, closed.course) for k, one in enumerate(model.correctors)}
+    rows = np.stack([opened.slopes.mean(axis=0), *(model.unit(name, "defocus") for name in pair)])
+    analyses = {one.name: _analyse_loop(model, k, closed.course) for k, one in enumerate(model.correctors)}
     loops = (
-        [one.loop_gain for one in facts.values()],
+        [one.loop_gain for one in analyses.values()],
         [one.spec.delay for one in model.correctors],
         [one.row for one in model.correctors],
     )
@@ -430,45 +430,45 @@ def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance)
         seed,
         model,
         closed,
-        free,
-        FrozenMap(facts),
+        opened,
+        FrozenMap(analyses),
         control_loop.spectral_radius(model.coupling, *loops),
         control_loop.common_margin(model.coupling, *loops),
-        unseen_modes(model.stated, rows, _SCALE),
+        unobservable_modes(model.prior, rows, _SCALE),
         np.stack(
-            [_floor(model, free.slopes), *(np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])]
+            [_floor(model, opened.slopes), *(np.full(len(states), _floor(model, row[None])[0]) for row in rows[1:])]
         ),
     )
 
 
-def _facts(model: LoopModel, k: int, course: LoopCourse) -> LoopFacts:
-    one = model.correctors[k]
-    spec, step = one.spec, one.spec.smallest
-    gain = spec.gain * (1.0 + float(model.seen[k]) * (spec.response - 1.0))
+def _analyse_loop(model: LoopModel, k: int, course: LoopCourse) -> LoopAnalysis:
+    corrector = model.correctors[k]
+    spec, step = corrector.spec, corrector.spec.smallest
+    gain = spec.gain * (1.0 + float(model.observed_share[k]) * (spec.response - 1.0))
     cycle = None
     if step is not None and spec.gain:
-        cycle = control_loop.limit_cycle(spec.gain, spec.delay, spec.band / abs(step * one.own))
-    return LoopFacts(
-        one, gain, control_loop.margins(gain, spec.delay), cycle, tuple(np.flatnonzero(course.held[:, k]).tolist())
+        cycle = control_loop.limit_cycle(spec.gain, spec.delay, spec.band / abs(step * corrector.sensitivity))
+    return LoopAnalysis(
+        corrector, gain, control_loop.margins(gain, spec.delay), cycle, tuple(np.flatnonzero(course.held[:, k]).tolist())
     )
 
 
 def _floor(model: LoopModel, rows: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.maximum(np.diag(floor(model.stated, rows)), 0.0))
+    return np.sqrt(np.maximum(np.diag(error_floor(model.prior, rows)), 0.0))
 
 
-def _passed(
+def _outcome_of(
     setup: MonitorSetup,
     course: LoopCourse,
     nominal: Mapping[str, LineCamera],
     seed: np.random.SeedSequence,
     advance: Advance,
-) -> LoopPass:
+) -> LoopOutcome:
     """A course with its truth and heights."""
     model, pair, experiment, test = course.model, setup.pair, course.model.experiment, setup.test
     axes, distance = experiment.sight.axes, experiment.nominal_truth.principal_distance
     lines = tuple(traced_pair(experiment, state, pair) for state in course.states)
-    views = look_down(test, pair, lines, seed, advance)
+    views = view_check_points(test, pair, lines, seed, advance)
     calibrated = FrozenMap({name: calibrated_line(nominal[name], axes[name], distance[name]) for name in pair})
     flight = PairFlight(pair, course.times, lines, calibrated, views)
     changes = {name: np.array([model.on_ground(name, row) for row in course.positions]) for name in model.cameras}
@@ -478,32 +478,32 @@ def _passed(
         experiment.instrument, experiment.backend, list(course.states), FOCUS_FIELDS, obstruction=False
     )
     # what processing undoes is no error of a camera any more
-    left = [truth.vector(name) - changes[name] for name in model.cameras]
-    quantities = np.concatenate([*left, defocus(quality).T], axis=1)
+    errors = [truth.vector(name) - changes[name] for name in model.cameras]
+    quantities = np.concatenate([*errors, defocus(quality).T], axis=1)
     slopes = np.zeros(quantities.shape)
     for name in pair:
-        own = model.row(name, PARAMETERS[0])
+        first = model.row(name, PARAMETERS[0])
         # what the analysis is told too little of, the height is wrong by the other way
-        slopes[:, own : own + len(PARAMETERS)] = -flight.slopes[name]
+        slopes[:, first : first + len(PARAMETERS)] = -flight.slopes[name]
     looks = [experiment.instrument.spec.cameras[name].look for name in pair]
     angle = np.zeros(quantities.shape[1])
     angle[[model.row(name, "d_alpha") for name in pair]] = [1.0, -1.0] if looks[0] > looks[1] else [-1.0, 1.0]
     mtf = {
-        name: np.stack([one.mtf_along_line.mean(axis=1), one.mtf_along_track.mean(axis=1)], axis=1)
-        for name, one in quality.cameras.items()
+        name: np.stack([camera_quality.mtf_along_line.mean(axis=1), camera_quality.mtf_along_track.mean(axis=1)], axis=1)
+        for name, camera_quality in quality.cameras.items()
     }
     images = []
     times = test.loop.images.times if test.loop.images is not None else ()
     for done, time in enumerate(times):
         advance("line images", done, len(times))
-        k = number_of(time, test.times)
+        k = index_of_value(time, test.times)
         assert k is not None  # the file was checked
         now = {name: values[k] for name, values in changes.items()}
         foci = {name: float(quantities[k, model.row(name, "defocus")]) for name in pair}
         images.append(imaged_pair(setup, flight, k, nominal, now, foci, fly(test, seed), stream(seed, _IMAGES, k)))
-    return LoopPass(course, flight, quantities, flight.case(changes), slopes, angle, FrozenMap(mtf), tuple(images))
+    return LoopOutcome(course, flight, quantities, flight.case(changes), slopes, angle, FrozenMap(mtf), tuple(images))
 
 
-def height_rms(one: LoopPass) -> float:
+def height_rms(outcome: LoopOutcome) -> float:
     """RMS over the moments of the mean height error that the cameras alone make, metres."""
-    return rms(one.heights.camera)
+    return rms(outcome.heights.camera)

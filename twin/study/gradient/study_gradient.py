@@ -23,7 +23,7 @@ import numpy as np
 
 from analysis.monitor.recovery import Recovery, estimates
 from optics.geometry.tree import COMPLEX_STEP, FIGURE, Motion, State
-from optics.numerics.array_math import inverse, turned
+from optics.numerics.array_math import inverse, matvec
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError
@@ -231,7 +231,7 @@ def sight_gradient(
         return assemble(assembly, [f"{name}/{sequence}" for name in names], states, steps, stepped)
 
     drift = jvp(backend, systems("image_to_stop"), place, heading, moved, 0.0).position[..., :2]
-    turn = -turned(np.repeat(inverse(slope), m, axis=0), drift)
+    turn = -matvec(np.repeat(inverse(slope), m, axis=0), drift)
     to_object = systems("image_to_object")
     heading_step = np.einsum("bnk,bnkx->bnx", turn, np.repeat(axes, m, axis=0))
     pushed = jvp(backend, to_object, place, heading, moved, heading_step)
