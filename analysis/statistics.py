@@ -110,6 +110,11 @@ def proportion_interval(successes: int, trials: int, confidence: float) -> tuple
     low, high : float
         Limits of the interval.
 
+    Raises
+    ------
+    ValueError
+        More successes than trials, or a confidence out of range.
+
     Notes
     -----
     Clopper and Pearson, Biometrika 26, 404 (1934).
@@ -123,6 +128,11 @@ def proportion_interval(successes: int, trials: int, confidence: float) -> tuple
     >>> low, round(high, 4)
     (0.0, 0.0487)
     """
+    if not (0 <= successes <= trials and 0.0 < confidence < 1.0):
+        raise ValueError(
+            f"proportion: need 0 <= successes <= trials and a confidence between 0 and 1, found {successes},"
+            f" {trials}, {confidence}"
+        )
     if trials == 0:
         return 0.0, 1.0
     # imported here, as the import takes longer than a short command
@@ -156,7 +166,10 @@ def robust_sigma(residuals: ArrayLike) -> float:
     >>> round(float(np.std(residuals))), round(analysis.robust_sigma(residuals), 1)
     (140, 2.0)
     """
-    return _NORMAL_SIZE * float(np.median(np.abs(np.asarray(residuals))))
+    values = np.asarray(residuals)
+    if not values.size:
+        raise ValueError("robust sigma: need at least one residual")
+    return _NORMAL_SIZE * float(np.median(np.abs(values)))
 
 
 def robust_variance(squares: ArrayLike) -> float:

@@ -1,30 +1,28 @@
-"""From the defocus at many places to the rigid motion that brings a focal-plane assembly into focus.
+"""Fit of a focal plane to measured defocus, the rigid motion that corrects it, and the shims that realise the motion.
 
-The frame is the assembly's own, O'-X'Y'Z': X' flight direction, Y' along the line CCD, Z' along the normal, with the
-light; O' is the line's centre. The defocus of a place is how far the best focus lies from the CCD along +Z', so the
-assembly has to move onto the plane
+**Plane.** The frame is the assembly's own, O'-X'Y'Z': X' flight direction, Y' along the line CCD, Z' along the normal,
+in the direction of the light; O' is the line's centre. The defocus of a position is the distance of the best focus from
+the CCD along +Z', so the assembly has to move onto the plane
 
     defocus = piston + slope_x X' + slope_y Y'.
 
-A small rotation (wx, wy, wz) lifts a point by wx Y' - wy X'; the correction is therefore wx = +slope_y,
-wy = -slope_x, the shift (0, 0, piston), and wz = -(measured level of the line). `FocalPlaneFit.correction` is the
-finite rotation for which this holds exactly. Metres and radians.
+A small rotation (wx, wy, wz) lifts a point by wx Y' - wy X'; the correction is therefore wx = +slope_y, wy = -slope_x,
+the shift (0, 0, piston), and wz = -(measured level of the line). `FocalPlaneFit.correction` is the finite rotation for
+which this holds exactly.
 
-Shims under a focal-plane assembly: from a wanted rigid motion to the thickness at each mounting hole (paper 004,
-section 2).
+**Shims** under a focal-plane assembly (paper 004, section 2). The assembly rests on pads at its mounting holes. The
+pads' normal n points from the camera's structure into the assembly, so a thicker shim moves the assembly along +n.
+Shims realise the part of a rigid motion that they can: the lift along n and the tilts about axes in the mounting
+surface. The rotation about n and the slide in the surface are set by hand, within the clearance of the screws in their
+holes.
 
-The assembly stands on pads at its mounting holes. The pads' normal n points from the camera's structure into the
-assembly, so a thicker shim moves the assembly along +n. Of a rigid motion the shims make what they can: the lift along
-n and the tilts about axes in the mounting surface. The turn about n and the slide in the surface are set by hand,
-within the clearance of the screws in their holes.
+In an off-axis camera n is inclined against the focal plane's normal Z' by an angle i, and the two parts mix. With the
+inclination about X', n = (0, sin i, cos i), and a required tilt w about Y', a rotation of w sin i about n is needed.
+Without it, the shims alone give a tilt of w cos^2 i, and the line loses its level by -w sin i cos i; shims that force
+the whole tilt without a rotation (another w / cos^2 i) would lose w tan i. A tilt about the axis of the inclination
+itself does not mix. `ShimPlan.shims_only` includes these effects.
 
-In an off-axis camera n is inclined against the focal plane's normal Z' by an angle i, and the two parts mix. Take the
-inclination about X', n = (0, sin i, cos i), and a wanted tilt w about Y'. It needs a turn of w sin i about n. If that
-is left out, the shims alone give a tilt of w cos^2 i, and the line loses its level by -w sin i cos i; shims that force
-the whole tilt without a turn (another w / cos^2 i) would lose w tan i. A tilt about the axis of the inclination itself
-does not mix. All this comes out of `ShimPlan.shims_only`.
-
-Frame O'-X'Y'Z' of the assembly, metres and radians; see analysis.focal_plane.plane_fit.
+All quantities are in metres and radians.
 """
 
 from __future__ import annotations
@@ -41,14 +39,21 @@ from analysis.arrays import Array, MeasurementError
 
 # Two directions are told apart when the places spread across them by more than this part of their largest spread.
 _LEAST_SPREAD = 1e-6
+"""Smallest spread of the positions in one direction, relative to their largest, that determines a slope."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
-    """Rotation about O' and then a shift, both in the frame from before the motion.
+    """Rotation about O' followed by a shift, both in the frame before the motion.
 
-    rotation: (3,) rotation vector, radians, right-handed. shift: (3,) metres.
-    covariance: (6, 6) of rotation and shift together, rad and m; zero when nothing is known of it.
+    Attributes
+    ----------
+    rotation : (3,) ndarray
+        Rotation vector, right-handed, in radians.
+    shift : (3,) ndarray
+        Shift, in metres.
+    covariance : (6, 6) ndarray
+        Covariance of rotation and shift together, in rad and m; zero if unknown.
     """
 
     rotation: Array
@@ -57,16 +62,21 @@ class RigidMotion:
 
     @classmethod
     def of(cls, rotation: ArrayLike, shift: ArrayLike, covariance: ArrayLike | None = None) -> RigidMotion:
-        """The motion, with its input checked. Raises ValueError for wrong shapes or numbers that are not finite.
+        """Return a validated motion.
 
         Parameters
         ----------
-        rotation : ArrayLike
-            Small, about X', Y', Z', (3,), radians.
-        shift : ArrayLike
-            (3,), metres.
-        covariance : ArrayLike | None
-            (6, 6) of both, radians and metres; exact by default.
+        rotation : (3,) array_like
+            Small rotation about X', Y', Z', in radians.
+        shift : (3,) array_like
+            Shift, in metres.
+        covariance : (6, 6) array_like, optional
+            Covariance of both, in radians and metres; zero by default.
+
+        Raises
+        ------
+        ValueError
+            A shape is wrong, or a value is not finite.
         """
         turn, move = np.asarray(rotation, np.float64), np.asarray(shift, np.float64)
         spread = np.zeros((6, 6)) if covariance is None else np.asarray(covariance, np.float64)
@@ -81,26 +91,27 @@ class RigidMotion:
 
     @property
     def matrix(self) -> Array:
-        """(3, 3) rotation matrix."""
+        """Rotation matrix (3, 3)."""
         return np.asarray(Rotation.from_rotvec(self.rotation).as_matrix())
 
     @property
     def line_turn(self) -> float:
-        """Angle, radians, by which the projection of the line CCD (the Y' axis) turns in the X'Y' plane, about +Z'."""
+        """Angle about +Z', in radians, by which the line CCD (the Y' axis) rotates in its projection on the X'Y' plane.
+        """
         line = self.matrix[:, 1]
         return float(np.arctan2(-line[0], line[1]))
 
     def moved(self, point: ArrayLike) -> Array:
-        """Points (..., 3), metres, after the motion."""
+        """Return points (..., 3) after the motion, in metres."""
         return np.asarray(np.asarray(point, np.float64) @ self.matrix.T + self.shift)
 
     def displacement(self, point: ArrayLike) -> Array:
-        """How far points (..., 3) go, metres."""
+        """Return the displacements of points (..., 3), in metres."""
         return self.moved(point) - np.asarray(point, np.float64)
 
 
 class ObservabilityError(MeasurementError, ValueError):
-    """The places measured cannot tell one of the rotations."""
+    """Measured positions that do not determine piston and both slopes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +121,9 @@ class LineLevel:
     Attributes
     ----------
     angle : float
-        Radians, right-handed about +Z'.
+        Rotation, right-handed about +Z', in radians.
     sigma : float
-        Standard deviation of the angle, radians.
+        Standard deviation of the angle, in radians.
     """
 
     angle: float
@@ -121,31 +132,32 @@ class LineLevel:
 
 @dataclass(frozen=True, eq=False)
 class FocalPlaneFit:
-    """A weighted plane through the defocus of N places.
+    """Weighted plane through the defocus at N positions.
 
     Attributes
     ----------
     piston : float
-        metres.
+        Height of the plane at O', in metres.
     slope_x, slope_y : float
-        Rises of the best focus along +X' and +Y', radians.
-    covariance : Array
-        Of piston, slope_x and slope_y, (3, 3).
-    place : Array
-        (N, 2), metres.
-    residual : Array
-        Defocus minus plane, (N,), metres.
-    sigma : Array
-        Of the defocus as given, (N,), metres.
-    chi_square, degrees_of_freedom : float
-        With the sigmas as given.
+        Slopes of the best focus along +X' and +Y', in radians.
+    covariance : (3, 3) ndarray
+        Covariance of piston, slope_x and slope_y.
+    place : (N, 2) ndarray
+        Positions X', Y', in metres.
+    residual : (N,) ndarray
+        Defocus minus plane, in metres.
+    sigma : (N,) ndarray
+        A-priori standard deviations of the defocus, in metres.
+    chi_square : float
+        Chi-square with the a-priori sigmas.
+    degrees_of_freedom : int
+        Degrees of freedom of the chi-square.
     p_value : float
-        Chance of such a chi-square or a larger one, if the best foci lie on a plane and the sigmas are right; 1 without
-        redundancy.
+        p-value of the chi-square, if the best foci lie on a plane and the sigmas are right; 1 without redundancy.
     extra_sigma : float
-        Scatter of the places about the plane beyond their sigmas (chips that are not coplanar, curvature of field),
-        metres, for which the weighted chi-square equals the degrees of freedom; 0 when it was not asked for or is not
-        there. The weights and all covariances include it.
+        Scatter of the positions about the plane beyond their sigmas (chips that are not coplanar, field curvature), in
+        metres, for which the weighted chi-square equals the degrees of freedom; 0 if not estimated or not present.
+        Weights and all covariances include it.
     """
 
     piston: float
@@ -162,26 +174,26 @@ class FocalPlaneFit:
 
     @property
     def noise_covariance(self) -> Array:
-        """(3, 3) of piston, slope_x, slope_y from the places' own sigmas alone.
+        """Covariance (3, 3) of piston, slope_x, slope_y from the a-priori sigmas alone.
 
-        How much another measurement of the same assembly would scatter: chips that are not coplanar stay as they are.
+        It describes the scatter of repeated measurements of the same assembly, whose chips keep their heights.
         """
         weight = 1.0 / (self.sigma**2 + self.extra_sigma**2)
         gain = self.covariance @ (_design(self.place) * weight[:, None]).T
         return np.asarray((gain * self.sigma**2) @ gain.T)
 
     def plane(self, place: ArrayLike) -> tuple[Array, Array]:
-        """Height (...) of the fitted plane at places (..., 2), and its sigma (...); metres."""
+        """Return the height (...) of the fitted plane at positions (..., 2), and its sigma (...), in metres."""
         design = _design(np.asarray(place, np.float64))
         height = design @ np.array([self.piston, self.slope_x, self.slope_y])
         return np.asarray(height), np.sqrt(np.einsum("...i,ij,...j->...", design, self.covariance, design))
 
     def predicted_defocus(self) -> tuple[Array, Array]:
-        """What defocus the places will really have after an exact correction: (N,) metres, and (N, N) covariance.
+        """Return the predicted defocus (N,) after an exact correction, in metres, and its covariance (N, N).
 
         True heights are the plane plus independent deviations of extra_sigma. The prediction is the best linear one:
-        each residual shrunk by extra_sigma^2 / (extra_sigma^2 + sigma^2), so zero for a true plane, and the covariance
-        has what the plane was misjudged by. A measurement afterwards adds its own sigma.
+        each residual is multiplied by extra_sigma^2 / (extra_sigma^2 + sigma^2), so it is zero for a true plane, and
+        the covariance includes the error of the fitted plane. A measurement after the correction adds its own sigma.
         """
         design = _design(self.place)
         weight = 1.0 / (self.sigma**2 + self.extra_sigma**2)
@@ -194,11 +206,17 @@ class FocalPlaneFit:
         return self.extra_sigma**2 * weight * self.residual, spread
 
     def correction(self, level: LineLevel | None = None) -> RigidMotion:
-        """The motion of the assembly about O' that puts every place on the fitted plane and levels the line.
+        """Return the motion of the assembly about O' that brings every position to the fitted plane and levels the
+        line.
 
-        level: the measured level of the line; without it the line's projection on X'Y' keeps its direction to second
-            order of the tilt.
-        The finite rotation first turns the line by -level about Z' and then tilts the plane about the horizontal axis.
+        The finite rotation first rotates the line by -level about Z' and then tilts the plane about the horizontal
+        axis.
+
+        Parameters
+        ----------
+        level : LineLevel, optional
+            Measured level of the line; without it the line's projection on X'Y' keeps its direction to second order
+            of the tilt.
         """
         steepness = float(np.hypot(self.slope_x, self.slope_y))
         ratio = np.arctan(steepness) / steepness if steepness > 0 else 1.0
@@ -306,12 +324,12 @@ def fit_focal_plane(
 
 
 def _design(place: Array) -> Array:
-    """Columns 1, X', Y', (..., 3)."""
+    """Return the columns 1, X', Y' as (..., 3)."""
     return np.stack([np.ones(place.shape[:-1]), place[..., 0], place[..., 1]], axis=-1)
 
 
 def _check_places(place: Array) -> None:
-    """ObservabilityError when the places do not determine both slopes, with the reason in terms of where they lie."""
+    """Raise ObservabilityError, with the geometric reason, if the positions do not determine both slopes."""
     if len(place) < 3:
         raise ObservabilityError(
             f"focal plane: {len(place)} places cannot tell piston, slope_x, slope_y; measure at least 3"
@@ -338,13 +356,18 @@ def _check_places(place: Array) -> None:
 
 # Holes carry a tilt when the smaller spread of their places is at least this part of the larger: 0.3 mm in 0.3 m.
 _LEAST_WIDTH = 1e-3
+"""Smallest spread of the holes, relative to their largest, that supports a tilt: 0.3 mm in 0.3 m."""
 
 
 class ShimError(MeasurementError, ValueError):
-    """The motion cannot be made with this mount and these shims.
+    """Motion that cannot be realised with this mount and these shims.
 
-    holes: indices of the holes at fault, empty when it is the mount as a whole. The message counts them from 1.
-    slides: by how much these holes would slide, metres; empty when that is not what is wrong.
+    Attributes
+    ----------
+    holes : tuple of int
+        Indices of the holes at fault, empty for the mount as a whole. The message counts them from 1.
+    slides : tuple of float
+        Displacements of these holes, in metres; empty if these are not the reason.
     """
 
     def __init__(self, message: str, holes: tuple[int, ...] = (), slides: tuple[float, ...] = ()) -> None:
@@ -355,11 +378,18 @@ class ShimError(MeasurementError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """Where and how the assembly is screwed down.
+    """Mounting of the assembly on its pads.
 
-    holes: (H, 3) centres of the pads in O'-X'Y'Z', metres. normal: (3,) unit vector from the structure into the
-    assembly. clearance: how far a hole may slide against its screw, radius, metres. step: the workshop grinds shims to
-    multiples of this, metres.
+    Attributes
+    ----------
+    holes : (H, 3) ndarray
+        Centres of the pads in O'-X'Y'Z', in metres.
+    normal : (3,) ndarray
+        Unit vector from the structure into the assembly.
+    clearance : float
+        Largest slide of a hole against its screw, a radius in metres.
+    step : float
+        Resolution to which the workshop grinds shims, in metres.
     """
 
     holes: Array
@@ -369,20 +399,25 @@ class Mount:
 
     @classmethod
     def of(cls, holes: ArrayLike, normal: ArrayLike, clearance: float, step: float) -> Mount:
-        """The mount, checked; the normal of any length.
-
-        Raises ShimError when the holes cannot carry a tilt; ValueError for bad input.
+        """Return a validated mount with a normal of unit length.
 
         Parameters
         ----------
-        holes : ArrayLike
-            Centres of the pads in O'-X'Y'Z', (H, 3), metres.
-        normal : ArrayLike
-            From the structure into the assembly, (3,), of any length.
+        holes : (H, 3) array_like
+            Centres of the pads in O'-X'Y'Z', in metres.
+        normal : (3,) array_like
+            Direction from the structure into the assembly, of any length.
         clearance : float
-            How far a hole may slide against its screw, radius, metres.
+            Largest slide of a hole against its screw, a radius in metres.
         step : float
-            The workshop grinds shims to multiples of this, metres.
+            Resolution to which the workshop grinds shims, in metres.
+
+        Raises
+        ------
+        ShimError
+            The holes cannot support a tilt.
+        ValueError
+            Other input is invalid.
         """
         place, up = np.asarray(holes, np.float64), np.asarray(normal, np.float64)
         if place.ndim != 2 or place.shape[1] != 3 or up.shape != (3,):
@@ -407,17 +442,31 @@ class Mount:
 
 @dataclass(frozen=True, eq=False)
 class ShimPlan:
-    """What to grind, what to set by hand, and what comes of it.
+    """Shims to grind, adjustments by hand, and the resulting motion.
 
-    mount, wanted: as given.
-    change: (H,) exact change of thickness at each hole, metres; + is thicker.
-    change_covariance: (H, H), from the covariance of the wanted motion; without the rounding.
-    rounded_change: (H,) what is ground. thickness: (H,) the new shims, multiples of the step.
-    slide: (H, 3) displacement of each hole in the mounting surface that is set by hand.
-    turn: rotation about the normal that is set by hand, right-handed; the twist of the wanted rotation.
-    achieved: the motion with the rounded shims and turn and slide as wanted. With more than three holes, the plane that
-        fits the pads best.
-    shims_only: the motion when turn and slide are *not* made and the holes' centre only moves along the normal.
+    Attributes
+    ----------
+    mount : Mount
+        Mounting of the assembly.
+    wanted : RigidMotion
+        Required motion.
+    change : (H,) ndarray
+        Exact change of thickness at each hole, in metres; positive is thicker.
+    change_covariance : (H, H) ndarray
+        Covariance of the changes from that of the required motion, without rounding, in m^2.
+    rounded_change : (H,) ndarray
+        Changes that are ground, in metres.
+    thickness : (H,) ndarray
+        Thicknesses of the new shims, multiples of the step, in metres.
+    slide : (H, 3) ndarray
+        Displacement of each hole in the mounting surface that is set by hand, in metres.
+    turn : float
+        Rotation about the normal that is set by hand, right-handed, in radians; the twist of the required rotation.
+    achieved : RigidMotion
+        Motion with the rounded shims and the required rotation and slide; with more than three holes, that of the plane
+        that fits the pads best.
+    shims_only : RigidMotion
+        Motion *without* rotation and slide, with the holes' centre moving only along the normal.
     """
 
     mount: Mount
@@ -433,41 +482,41 @@ class ShimPlan:
 
     @property
     def change_sigma(self) -> Array:
-        """(H,) sigma of the exact changes, metres."""
+        """Standard deviations (H,) of the exact changes, in metres."""
         return np.sqrt(np.diag(self.change_covariance))
 
     @property
     def level_coupling(self) -> float:
-        """By how much the line would be off its wanted level without turn and slide, radians about +Z'."""
+        """Error of the line's level without rotation and slide, about +Z', in radians."""
         return self.shims_only.line_turn - self.wanted.line_turn
 
     def focus_error(self, place: ArrayLike) -> Array:
-        """Defocus that rounding leaves at places (..., 2) of the focal plane, metres: focus minus CCD along +Z'."""
+        """Return the defocus (focus minus CCD along +Z') that rounding leaves at positions (..., 2), in metres."""
         spots = np.asarray(place, np.float64)
         point = np.concatenate([spots, np.zeros((*spots.shape[:-1], 1))], axis=-1)
         return np.asarray((self.wanted.moved(point) - self.achieved.moved(point))[..., 2])
 
 
 def shim_plan(correction: RigidMotion, mount: Mount, present: ArrayLike) -> ShimPlan:
-    """Shims for a rigid motion of the assembly about O'.
+    """Return the shims that realise a rigid motion of the assembly about O'.
 
-    A hole that moves by d needs n . d more shim; what is left of d lies in the mounting surface.
+    A hole that moves by d needs n . d more shim; the rest of d lies in the mounting surface.
 
     Parameters
     ----------
     correction : RigidMotion
-        For example FocalPlaneFit.correction().
+        Required motion, for example `FocalPlaneFit.correction()`.
     mount : Mount
-        Where the shims are.
-    present : ArrayLike
-        (H,) or a number, thickness of the shims now, metres.
+        Mounting of the assembly.
+    present : float or (H,) array_like
+        Present thickness of the shims, in metres.
 
     Raises
     ------
     ShimError
-        a hole would slide beyond its clearance, or a shim would be thinner than nothing.
+        A hole would slide beyond its clearance, or a shim would have a negative thickness.
     ValueError
-        a thickness that is not finite.
+        A thickness is not finite.
     """
     up, holes = mount.normal, mount.holes
     move = correction.displacement(holes)
@@ -505,11 +554,11 @@ def shim_plan(correction: RigidMotion, mount: Mount, present: ArrayLike) -> Shim
 
 
 def _seated(motion: RigidMotion, mount: Mount, change: Array) -> RigidMotion:
-    """The motion after the assembly has settled on shims changed by (H,): the nearest one whose holes rise by `change`
-    in least squares.
+    """Return the motion after the assembly has settled on shims changed by (H,), in metres.
 
-    It settles by tilts about axes in the mounting surface through the holes' centre and a lift along the normal, so
-    turn and slide stay what they were.
+    It is the nearest motion whose holes rise by `change` in the least-squares sense. The assembly settles by tilts
+    about axes in the mounting surface through the holes' centre and a lift along the normal, so rotation and slide stay
+    the same.
     """
     up = mount.normal
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
@@ -531,7 +580,7 @@ def _seated(motion: RigidMotion, mount: Mount, change: Array) -> RigidMotion:
 
 
 def _check_clearance(slide: Array, clearance: float) -> None:
-    """ShimError naming the holes that would slide beyond the clearance, and by how much."""
+    """Raise ShimError, naming the holes and their slides, if holes would slide beyond the clearance."""
     size = np.linalg.norm(slide, axis=1)
     over = np.flatnonzero(size > clearance)
     if not over.size:
@@ -546,7 +595,7 @@ def _check_clearance(slide: Array, clearance: float) -> None:
 
 
 def _check_thickness(thickness: Array, now: Array, step: float) -> None:
-    """ShimError naming the holes whose shims would be thinner than nothing, and what to start from."""
+    """Raise ShimError, naming the holes and a remedy, if shims would have a negative thickness."""
     thin = np.flatnonzero(thickness < -1e-9 * step)
     if not thin.size:
         return

@@ -1,26 +1,28 @@
-"""Best focus from an MTF through focus: the main lobe, its vertex, and the sigma of its place.
+"""Best focus from an MTF through focus: the main lobe, its vertex, and the sigma of its position.
 
-The MTF at one frequency against defocus z is a main peak between dark zeros and lower peaks of reversed contrast
-beyond them (spurious resolution; for a round pupil up to 13% of the main one). Near the peak it is a parabola, farther
-out it is flatter. To fourth order every one of these curves has nearly the same form,
+The MTF at one frequency against defocus z has a main peak between zeros, with lower peaks of reversed contrast beyond
+them (spurious resolution; for a round pupil up to 13 % of the main one). Near the peak it is a parabola, farther out it
+is flatter. To fourth order all these curves have nearly the same form,
 
     v = p (1 - u + q u^2),    u = a (z - z0)^2,
 
 with q = 0.30 for a slit pupil (a sinc), 1/3 for a round pupil at low frequencies (2 J1(x)/x), and 0.29 to 0.33 for
 Hopkins' exact curves of an F/9.2 pupil at 650 nm, 71.4 and 17.9 cycles/mm (first zeros at 0.29 and 0.71 mm of defocus).
-So q is a constant and not a fourth unknown: a free one would cost precision, and none at all (q = 0, the parabola)
-leaves a bias where the points lie lopsided about the peak. Largest bias over the phases of the steps, in um, with
-points down to half of the peak, and sigma for values good to 2% of the peak:
+So q is a constant and not a fourth unknown: a free q would cost precision, and q = 0 (the parabola) causes a bias where
+the points are asymmetric about the peak. Largest bias over the phases of the steps, in um, with points down to half of
+the peak, and sigma for values accurate to 2 % of the peak:
 
-    scan                                              parabola    q = 0.3    sigma
-    71.4 cycles/mm, steps of 50 um (75 um)            0.9 (2.4)   0.04 (0.4)   2.3
-    17.9 cycles/mm, steps of 50 um (100 um)           1.3 (2.5)   0.04 (0.06)  3.7 (5.2)
-    17.9 cycles/mm, +-0.3 mm, focus at +0.2 mm        14          0.15         14
+| scan | parabola | q = 0.3 | sigma |
+|---|---|---|---|
+| 71.4 cycles/mm, steps of 50 um (75 um) | 0.9 (2.4) | 0.04 (0.4) | 2.3 |
+| 17.9 cycles/mm, steps of 50 um (100 um) | 1.3 (2.5) | 0.04 (0.06) | 3.7 (5.2) |
+| 17.9 cycles/mm, +-0.3 mm, focus at +0.2 mm | 14 | 0.15 | 14 |
 
-With fewer points (0.7 of the peak) sigma is 1.3 to 1.5 times larger; with more (0.3) the neglected sixth order shows.
-Coma leaves the curve even; 0.4 waves of spherical aberration make its maximum and this vertex differ by 1.2 um.
+With fewer points (down to 0.7 of the peak) sigma is 1.3 to 1.5 times larger; with more (0.3) the neglected sixth order
+appears. Coma leaves the curve even; with 0.4 waves of spherical aberration its maximum and this vertex differ by 1.2
+um.
 
-All positions in one unit of length (metres elsewhere in this program), values in any unit (MTF).
+All positions are in one unit of length (metres elsewhere in this program), values in any unit (MTF).
 """
 
 from __future__ import annotations
@@ -35,30 +37,33 @@ from analysis.arrays import Array, MeasurementError
 from analysis.statistics import chance_beyond
 
 QUARTIC = 0.3
-"""q of the formula."""
+"""Fourth-order coefficient q of the fitted form."""
 FRACTION = 0.5
-"""Points count where the fitted curve is above this part of its peak."""
+"""Fraction of the peak above which the fitted curve uses points."""
 LEAST_POINTS = 5
+"""Smallest number of positions of a fit."""
 # Where the window holds too few points it may reach down to this part of the peak.
 WIDEST_FRACTION = 0.3
+"""Fraction of the peak to which the window may extend if it holds too few points."""
 _ROUNDS, _NEWTON_STEPS = 12, 4
 # Relative change in a step below which a curve rests: a round more would change it by rounding.
 _AT_REST = 1e-6
+"""Relative change in a step below which a curve has converged; further rounds would change it only by rounding."""
 
 
 def _main_peak(z: Array, v: Array, weight: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Where the smoothed curve is largest, (B,), and the points from there on that stay above `FRACTION`, (B, Z).
+    """Return the index (B,) of the largest smoothed value, and a mask (B, Z) of its neighbours above `FRACTION`.
 
     The smoothing is a binomial of a twelfth of the scan's points, at least 1-2-1, weighted by the inverse variances.
 
     Parameters
     ----------
-    z : Array
-        Positions in rising order, (B, Z).
-    v : Array
-        Values there, (B, Z).
-    weight : Array
-        Inverse variances, (B, Z).
+    z : (B, Z) ndarray
+        Positions in ascending order.
+    v : (B, Z) ndarray
+        Values at the positions.
+    weight : (B, Z) ndarray
+        Inverse variances.
     """
     count, size = z.shape
     top, bottom = v * weight, weight
@@ -82,7 +87,7 @@ def _main_peak(z: Array, v: Array, weight: Array) -> tuple[NDArray[np.intp], NDA
 
 
 class _Lobe:
-    """The fit v = p (1 - u + q u^2), u = a (x - x0)^2, of B curves; x is z about a centre in units of a scale."""
+    """Fit v = p (1 - u + q u^2), u = a (x - x0)^2, of B curves; x is z about a centre in units of a scale."""
 
     def __init__(self, z: Array, v: Array, weight: Array, start: NDArray[np.intp], mask: NDArray[np.bool_]) -> None:
         rows = np.arange(len(z))
@@ -108,9 +113,9 @@ class _Lobe:
         self.x0 = x0
 
     def settle(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Fit, choose the points within reach of the fitted vertex, and again, until both rest: (B, Z).
+        """Fit and select the points near the vertex in turn until both converge; return their mask (B, Z).
 
-        A curve that does not come to rest gets all rounds, alone as in company.
+        A curve that does not converge gets all rounds, whether alone or among others.
         """
         for _ in range(_ROUNDS):
             moved = self._newton(mask, _NEWTON_STEPS)
@@ -124,24 +129,24 @@ class _Lobe:
         return mask
 
     def window(self, fraction: float) -> NDArray[np.bool_]:
-        """Measured points where the fitted curve is above a fraction of its peak, (B, Z)."""
+        """Return a mask (B, Z) of measured points where the fitted curve exceeds a fraction of its peak."""
         away = np.abs(self.x - self.x0[:, None]) * self.scale[:, None]
         return (away <= self.reach(fraction)[:, None]) & (self.weight > 0)
 
     def reach(self, fraction: float) -> Array:
-        """Distance from the vertex, (B,), at which the fitted curve has fallen to a fraction of its peak."""
+        """Return the distance (B,) from the vertex at which the fitted curve has fallen to a fraction of its peak."""
         u = (1.0 - np.sqrt(1.0 - 4 * QUARTIC * (1.0 - fraction))) / (2 * QUARTIC)
         return np.asarray(np.sqrt(u / self.a) * self.scale)
 
     def positions(self, mask: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """How many different positions a choice of points has, (B,)."""
+        """Return the number (B,) of different positions among selected points."""
         present = np.zeros(mask.shape, dtype=bool)
         rows = np.broadcast_to(np.arange(len(mask))[:, None], mask.shape)
         present[rows[mask], self.group[mask]] = True
         return np.asarray(present.sum(axis=1))
 
     def _values(self) -> tuple[Array, Array]:
-        """The curve (B, Z) and its derivatives with respect to p, x0 and a, (B, Z, 3)."""
+        """Return the curve (B, Z) and its derivatives with respect to p, x0 and a, (B, Z, 3)."""
         away = self.x - self.x0[:, None]
         p, a = self.p[:, None], self.a[:, None]
         u = a * away**2
@@ -149,9 +154,12 @@ class _Lobe:
         return p * form, np.stack([form, -2 * a * away * p * slope, p * slope * away**2], axis=2)
 
     def _newton(self, mask: NDArray[np.bool_], steps: int) -> Array:
-        """Gauss-Newton steps with the points of the mask; bounded, so that a bad curve cannot run away.
+        """Take bounded Gauss-Newton steps with the points of the mask.
 
-        Returns the last one's largest relative change, (B,), of x0 in widths of the lobe.
+        Returns
+        -------
+        (B,) ndarray
+            Largest relative change in the last step; that of x0 in widths of the lobe.
         """
         weight = np.where(mask, self.weight, 0.0)
         moved = np.full(len(mask), np.inf)
@@ -169,7 +177,7 @@ class _Lobe:
         return moved
 
     def result(self, mask: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
-        """Peak, position, second derivative, each (B,), and their covariance (B, 3, 3)."""
+        """Return peak, position and second derivative, each (B,), and their covariance (B, 3, 3)."""
         covariance = _covariance(self._values()[1], np.where(mask, self.weight, 0.0))
         turn = np.zeros_like(covariance)
         turn[:, 0, 0], turn[:, 1, 1] = 1.0, self.scale
@@ -178,9 +186,9 @@ class _Lobe:
         return self.p, self.centre + self.x0 * self.scale, -2 * self.p * self.a / self.scale**2, covariance
 
     def skew(self, mask: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return by how much the vertex moves where the curve may be skewed, (B,), and the sigma of that.
+        """Return the shift of the vertex (B,) if the curve may be skewed, and the sigma of the shift.
 
-        The curve has another width on either side of its peak, u = a (z - z0)^2 (1 +- k), to the first order of k.
+        The skewed curve has different widths on both sides of its peak, u = a (z - z0)^2 (1 +- k), to first order of k.
         """
         value, slope = self._values()
         odd = slope[:, :, 2] * np.sign(self.x - self.x0[:, None])
@@ -189,7 +197,7 @@ class _Lobe:
         return _solve(design, weight, self.v - value)[:, 1] * self.scale, np.sqrt(np.maximum(more, 0.0)) * self.scale
 
     def chi_square(self, mask: NDArray[np.bool_]) -> Array:
-        """Weighted sum of squared residuals, (B,)."""
+        """Return the weighted sum (B,) of squared residuals."""
         return np.asarray(np.sum(np.where(mask, self.weight, 0.0) * (self.v - self._values()[0]) ** 2, axis=1))
 
 
@@ -203,7 +211,10 @@ def _covariance(design: Array, weight: Array) -> Array:
 
 
 def _solve(design: Array, weight: Array, data: Array) -> Array:
-    """Weighted least squares of B curves, (B, P), from (B, Z, P), (B, Z), (B, Z); what is not observable stays zero."""
+    """Return the weighted least-squares solutions (B, P) of B curves; unobservable parameters stay zero.
+
+    Input are designs (B, Z, P), weights (B, Z) and data (B, Z).
+    """
     normal = np.einsum("bzi,bz,bzj->bij", design, weight, design)
     right = np.einsum("bzi,bz->bi", design, weight * data)
     size = np.sqrt(np.einsum("bii->bi", normal))
@@ -216,12 +227,18 @@ def _solve(design: Array, weight: Array, data: Array) -> Array:
 # A curvature, a slope or a contrast is there above this many sigma. The highest of many places is looked at, so this
 # is more than for a single one.
 _SIGNIFICANT = 5.0
+"""Significance, in sigmas, of a curvature, a slope or a contrast. It is higher than for a single test because the
+highest of many positions is tested.
+"""
 # A curvature of this many sigma is enough where the peak stands out from the rest of the scan as well.
 _HINT = 3.0
+"""Significance, in sigmas, of a curvature that suffices if the peak exceeds the rest of the scan as well."""
 # Near an end of the scan a chi-square this many times the degrees of freedom means a flank and not a peak.
 _MISFIT = 10.0
+"""Chi-square per degree of freedom that, near an end of the scan, means a flank and not a peak."""
 # What curves of pupils may differ from the fitted form by, as a share of the peak: 1.8 % half way down.
 _FORM = 0.02
+"""Largest deviation of real pupils' curves from the fitted form, as a share of the peak: 1.8 % half way down."""
 # A curve with outliers has this many points for each of them at least; one with a larger chance has none. Pairs that
 # hide each other are sought among so many points at most.
 _SOUND_TO_BAD, _EXPLAINED, _MOST_PAIRED = 4, 0.01, 50
@@ -232,13 +249,17 @@ _REMEDY = {
     "flat": "no curvature above the noise; scan a wider range or lower the noise (more frames or edge rows)",
     "not finite": "a position or a value is not finite; leave the point out or give it an infinite sigma",
 }
+"""Message for each reason, with the remedy."""
 
 
 class FocusError(MeasurementError, ValueError):
-    """No vertex can be given.
+    """Curve without a usable vertex; the message says what to change.
 
-    faults: index of the curve, an empty tuple for a single one -> reason: "peak below", "peak above", "few points",
-    "flat" or "not finite". The message says what to change.
+    Attributes
+    ----------
+    faults : dict of tuple of int to str
+        Reason for each faulty curve, by its index (an empty tuple for a single curve): "peak below", "peak above", "few
+        points", "flat" or "not finite".
     """
 
     def __init__(self, message: str, faults: dict[tuple[int, ...], str]) -> None:
@@ -247,7 +268,7 @@ class FocusError(MeasurementError, ValueError):
 
     @property
     def reason(self) -> str:
-        """The first curve's reason."""
+        """Reason of the first faulty curve."""
         return next(iter(self.faults.values()))
 
 
@@ -255,10 +276,24 @@ class FocusError(MeasurementError, ValueError):
 class FocusVertex:
     """Vertex of one through-focus curve.
 
-    position, sigma: of the vertex, and its standard deviation from the sigmas given (not scaled by chi-square).
-    peak, peak_sigma: value at the vertex. curvature: second derivative there, negative.
-    skew, skew_sigma: by how much the vertex moves where the curve may be skewed, and the sigma of that.
-    chi_square, degrees_of_freedom: of the fit. used: (Z,) which points took part, in the order given.
+    Attributes
+    ----------
+    position : float
+        Position of the vertex.
+    sigma : float
+        Standard deviation of the position from the given sigmas, not scaled by chi-square.
+    peak, peak_sigma : float
+        Value at the vertex and its standard deviation.
+    curvature : float
+        Second derivative at the vertex, negative.
+    skew, skew_sigma : float
+        Shift of the vertex if the curve may be skewed, and its standard deviation.
+    chi_square : float
+        Chi-square of the fit.
+    degrees_of_freedom : int
+        Degrees of freedom of the fit.
+    used : (Z,) ndarray of bool
+        True for points that were used, in the order of the input.
     """
 
     position: float
@@ -275,10 +310,16 @@ class FocusVertex:
 
 @dataclass(frozen=True, eq=False)
 class FocusVertices:
-    """Vertices of many curves: the fields of FocusVertex with the leading axes of the input, (...).
+    """Vertices of many curves: the fields of `FocusVertex` with the leading axes (...) of the input.
 
-    used: (..., Z). fault: (...) empty text, or why there is no vertex; there the numbers are NaN.
-    covariance: (..., 3, 3) of peak, position and curvature.
+    Attributes
+    ----------
+    used : (..., Z) ndarray of bool
+        True for points that were used.
+    fault : (...) ndarray of str
+        Reason for a missing vertex, whose numbers are NaN; empty otherwise.
+    covariance : (..., 3, 3) ndarray
+        Covariance of peak, position and curvature.
     """
 
     position: Array
@@ -295,7 +336,7 @@ class FocusVertices:
     covariance: Array
 
     def at(self, *index: int) -> FocusVertex:
-        """Return one of the vertices."""
+        """Return the vertex of one curve."""
         values = {field.name: getattr(self, field.name)[index] for field in fields(FocusVertex)}
         return FocusVertex(**{name: value if value.ndim else value.item() for name, value in values.items()})
 
@@ -345,20 +386,27 @@ def focus_vertex(position: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> Foc
 
 
 def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, strict: bool = True) -> FocusVertices:
-    """Vertices of many through-focus curves at once.
+    """Find the vertices of many through-focus curves at once.
 
-    Within a scan the highest smoothed value decides which peak is the main one.
+    The highest smoothed value of a scan decides which peak is the main one.
 
     Parameters
     ----------
-    position : ArrayLike
-        (..., Z) or (Z,), length.
-    value : ArrayLike
-        (..., Z), MTF.
-    sigma : ArrayLike
-        Of the values, broadcast to them, positive; infinite for a point that was not measured.
+    position : (Z,) or (..., Z) array_like
+        Focus positions, in any unit of length.
+    value : (..., Z) array_like
+        Values, such as the MTF.
+    sigma : array_like
+        Positive standard deviations, broadcast to the values; infinite for a point that was not measured.
     strict : bool
-        Raise FocusError for the first faults found; else return them in `fault`.
+        True to raise FocusError for the first faulty curves; False to report them in `fault`.
+
+    Raises
+    ------
+    FocusError
+        A curve has no vertex.
+    ValueError
+        Shapes do not match, or a sigma is not positive.
     """
     where, data, spread = (np.asarray(item, dtype=np.float64) for item in (position, value, sigma))
     _check(where, data, spread)
@@ -407,22 +455,22 @@ def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, s
 
 
 def outlying_points(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, limit: float) -> Array:
-    """Return by how much points of one curve disagree with the curve through all others, (Z,); 0 where they agree.
+    """Return the deviations (Z,) of outliers of one curve from the curve through all other points; 0 for good points.
 
-    A curve that its sigmas explain has none. Else the point is sought that stands out most from the fit without it, and
-    where there is none, the two that together do, which hide each other. Sigmas that are too small for the others'
-    scatter are enlarged. A point beyond half of the peak disagrees only if it is higher than that.
+    A curve that its sigmas explain has no outliers. Otherwise, the point that deviates most from the fit without it is
+    sought, or, if there is none, the two that do together and mask each other. Sigmas that are too small for the
+    others' scatter are enlarged. A point below half of the peak is an outlier only if it is higher than that.
 
     Parameters
     ----------
-    position : ArrayLike
-        (Z,), a length.
-    value : ArrayLike
-        (Z,), MTF.
-    sigma : ArrayLike
-        Of the values, (Z,), infinite for a point that was not measured.
+    position : (Z,) array_like
+        Focus positions, in any unit of length.
+    value : (Z,) array_like
+        Values, such as the MTF.
+    sigma : (Z,) array_like
+        Standard deviations of the values; infinite for a point that was not measured.
     limit : float
-        In sigmas, from which a point disagrees.
+        Deviation, in sigmas, from which a point is an outlier.
     """
     z, v, s = (np.array(item, np.float64) for item in (position, value, sigma))
     out = np.zeros(z.size)
@@ -447,7 +495,9 @@ def outlying_points(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, lim
 
 
 def _deviations(z: Array, v: Array, s: Array, groups: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Return how far groups (G, K) of points are from the curves without them, also in sigmas; 0 without a curve."""
+    """Return the deviations of point groups (G, K) from the curves without them, and those in sigmas; 0 without a
+    curve.
+    """
     spread = np.tile(s, (len(groups), 1))
     np.put_along_axis(spread, groups, np.inf, axis=1)
     fits = focus_vertices(z, np.broadcast_to(v, spread.shape), spread, strict=False)
@@ -466,7 +516,7 @@ def _deviations(z: Array, v: Array, s: Array, groups: NDArray[np.intp]) -> tuple
 
 
 def _faults(model: _Lobe, mask: NDArray[np.bool_], place: Array, bend: Array, covariance: Array) -> NDArray[np.str_]:
-    """(B,) empty, or why a curve has no vertex."""
+    """Return the reason (B,) why a curve has no vertex; empty if it has one."""
     fault = np.full(len(place), "", dtype="<U12")
     scarce = model.positions(model.window(WIDEST_FRACTION)) < LEAST_POINTS
     enough = model.positions(model.weight > 0) >= LEAST_POINTS
@@ -490,7 +540,7 @@ def _faults(model: _Lobe, mask: NDArray[np.bool_], place: Array, bend: Array, co
 
 
 def _contrast(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
-    """By how many sigma the mean of the chosen points is above the mean of all others, (B,)."""
+    """Return the difference (B,) of the mean of the selected points from that of all others, in sigmas."""
     inside, outside = np.where(mask, model.weight, 0.0), np.where(mask, 0.0, model.weight)
     sums = [np.maximum(part.sum(axis=1), 1e-300) for part in (inside, outside)]
     means = [(part * model.v).sum(axis=1) / total for part, total in zip((inside, outside), sums, strict=True)]
@@ -498,7 +548,7 @@ def _contrast(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
 
 
 def _trend(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
-    """Slope of the straight line through the chosen points in units of its sigma, (B,)."""
+    """Return the slope (B,) of the straight line through the selected points, in sigmas."""
     weight = np.where(mask, model.weight, 0.0)
     middle = (weight * model.x).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
     arm = model.x - middle[:, None]
@@ -509,7 +559,7 @@ def _trend(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
 def _raise(
     fault: NDArray[np.str_], shape: tuple[int, ...], z: Array, weight: Array, place: Array, reach: Array
 ) -> None:
-    """FocusError when a curve has a fault; the message names the first few."""
+    """Raise FocusError, naming the first few, if curves are faulty."""
     bad = np.flatnonzero(fault != "")
     if not bad.size:
         return
@@ -534,7 +584,7 @@ def _raise(
 
 
 def _check(where: Array, data: Array, spread: Array) -> None:
-    """ValueError for arguments that cannot be meant."""
+    """Raise ValueError for invalid arguments."""
     if data.ndim < 1 or where.shape[-1:] != data.shape[-1:]:
         raise ValueError(f"through focus: position {where.shape} and value {data.shape} must end in the same Z points")
     try:

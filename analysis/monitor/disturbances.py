@@ -1,8 +1,8 @@
-"""What is stated to move between two measurements, as the analysis needs it: what one standard deviation of each motion
-does to the spots and to the cameras, and how motions go together.
+"""Prior of the disturbances for the analysis: effects of each motion on spots and cameras, and correlations.
 
-Spots and parameters are linear in the M motions, s = A x and p = B x with x ~ N(0, C); a column of A and B is of one
-standard deviation, so that C is a correlation matrix. The prior of p is B C B', that of s is A C A' + R, R the noise.
+Spots and parameters are linear in the M motions, s = A x and p = B x with x ~ N(0, C); a column of A and B is for one
+standard deviation, so that C is a correlation matrix. The prior of p is B C B', that of s is A C A' + R, with the noise
+R.
 """
 
 from __future__ import annotations
@@ -20,42 +20,43 @@ from analysis.statistics import chance_beyond, density, limit_of
 from optics.numerics.array_math import covariance_root
 
 FALSE_ALARM = 1e-3
-"""Chance that shifts within what is stated are called a contradiction."""
+"""Probability that shifts in accordance with the prior are called a contradiction."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
-"""By how much the variance of a body is tried to be larger than stated."""
+"""Factors by which the variance of a body is increased when a contradiction is explained."""
 
 
 @dataclass(frozen=True)
 class TimeLaw:
-    """Covariance of a disturbance at two times, where 1 is the square of its stated standard deviation.
+    """Covariance of a disturbance at two times, in units of the square of its prior standard deviation.
 
-    The law is g(t) g(t') rho(t - t') C(t, t'): an amplitude that is known but for its size, a correlation over the gap,
-    and the chance that a step has come by both times. Each factor is positive semidefinite, and so is their product.
+    The law is g(t) g(t') rho(t - t') C(t, t'): an amplitude that is known but for its size, a correlation over the
+    interval, and the probability that a step has occurred by both times. Each factor is positive semidefinite, and so
+    is their product.
 
     Attributes
     ----------
     white : bool
-        Independent at different times; all others are then None.
-    drift_s : float | None
-        Time in which it forgets where it was, seconds, None for never.
-    period_s : float | None
-        It comes back with, seconds, None for none.
-    trend_s : float | None
-        It grows linearly, g = (t - since) / trend_s; seconds, None for no growth.
-    relaxation_s : float | None
-        It goes to a new value, g = 1 - exp(-(t - since) / relaxation_s) and 0 before; None for none.
+        True if values at different times are independent; all others are then None.
+    drift_s : float or None
+        Correlation time, s; None for a constant.
+    period_s : float or None
+        Period of an oscillation, s; None for none.
+    trend_s : float or None
+        Time of a linear growth to one standard deviation, g = (t - since) / trend_s, s; None for none.
+    relaxation_s : float or None
+        Time constant of a relaxation to a new value, g = 1 - exp(-(t - since) / relaxation_s) and 0 before, s; None for
+        none.
     since_s : float
-        Where trend and relaxation start, seconds.
-    event : tuple[tuple[float, float], ...]
-        a step, (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a
-        known moment; above 1 it is the mean number of steps of many. C is the chance at the earlier of two times: at a
-        time that is not sure to be after the step the motion is known the less. Empty for no step.
+        Start of trend and relaxation, s.
+    event : tuple of (float, float)
+        Step: pairs (time, probability that it has occurred by then) in the order of time, linear between; one pair
+        (time, 1) for a known time; above 1 it is the mean number of many steps. C is the probability at the earlier of
+        two times: at a time that may be before the step the motion is known less well. Empty for no step.
     jump : bool
-        a step whose time nobody knows: it counts as not there until it is found (`jump_detection`), and is then an
-        event. All others but ``every_s`` are then as by default.
-    every_s : float | None
-        Mean time between two such steps, seconds; None where nothing is stated, and what is too small to be found then
-        counts as not there.
+        True for a step at an unknown time: it counts as absent until it is detected (`jump_detection`), and is then an
+        event. All other attributes but ``every_s`` then have their defaults.
+    every_s : float or None
+        Mean time between two such steps, s; None if unknown, and steps too small to be detected then count as absent.
 
     Examples
     --------
@@ -79,8 +80,15 @@ class TimeLaw:
     jump: bool = False
     every_s: float | None = None
 
+    def __post_init__(self) -> None:
+        """Check the times. Raises ValueError."""
+        for name in ("drift_s", "period_s", "trend_s", "relaxation_s", "every_s"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"time law: {name} must be positive, found {value}")
+
     def covariance(self, one: ArrayLike, two: ArrayLike) -> Array:
-        """Between times, seconds, of shapes that broadcast; of the shape that both have together."""
+        """Return the covariance between times, s, of shapes that broadcast; the result has their common shape."""
         first, second = np.asarray(one, np.float64), np.asarray(two, np.float64)
         away = np.abs(first - second)
         if self.jump:
@@ -95,26 +103,28 @@ class TimeLaw:
         if self.trend_s is not None or self.relaxation_s is not None:
             out = out * (self.amplitude(first) * self.amplitude(second))
         if self.event:
-            out = out * self.come(np.minimum(first, second))
+            out = out * self.step_probability(np.minimum(first, second))
         return np.asarray(out)
 
-    def come(self, time: ArrayLike) -> Array:
-        """Chance that the step of an event has come by times, seconds, of any shape."""
+    def step_probability(self, time: ArrayLike) -> Array:
+        """Return the probability that the step of an event has occurred by a time, s, of any shape."""
         at, chance = np.array(self.event).T
         when = np.asarray(time, np.float64)
         if len(at) == 1:
             return np.asarray((when >= at[0]) * chance[0])
         return np.asarray(np.interp(when, at, chance))
 
-    def over(self, then: float, now: float) -> tuple[float, float, float]:
-        """Variance at one time, covariance with a later one and variance there; a jump may have come between them.
+    def two_time_moments(self, then: float, now: float) -> tuple[float, float, float]:
+        """Return the variance at one time, the covariance with a later one, and the variance there.
+
+        A jump may have occurred between the times.
 
         Parameters
         ----------
         then : float
-            The earlier time, seconds.
+            Earlier time, s.
         now : float
-            The later one.
+            Later time, s.
         """
         if self.jump:
             return 0.0, 0.0, 1.0
@@ -123,7 +133,7 @@ class TimeLaw:
         return before, across, after
 
     def amplitude(self, time: Array) -> Array:
-        """g(t) of a trend and of a relaxation; 1 without them."""
+        """Return the amplitude g(t) of trend and relaxation; 1 without them."""
         out, since = np.ones_like(time), time - self.since_s
         if self.trend_s is not None:
             out = out * since / self.trend_s
@@ -135,30 +145,32 @@ class TimeLaw:
 @shows("name", "labels", "spots [px]")
 @dataclass(frozen=True, eq=False)
 class Disturbances:
-    """Stated disturbances of K cameras with D spot coordinates together.
+    """Prior of the motions of K cameras with D spot coordinates together.
 
     Attributes
     ----------
     name : str
-        Of the statement.
-    labels : tuple[str, ...]
-        (M,) names of the motions: ``base/forward/M2 shift z``.
-    bodies : tuple[str, ...]
-        (M,) whose they are.
-    causes : tuple[str, ...]
-        (M,) to which of the stated causes they belong.
-    sigmas : Array
-        (M,) standard deviations in units for people; units: (M,) these units.
-    spots : Array
-        (D, M) px for one standard deviation, spots in the order of the calibration, each row then column.
-    parameters : Array
-        (4 K, M) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other, likewise.
-    correlation : Array
-        (M, M), positive semidefinite.
-    laws : tuple[TimeLaw, ...]
-        (M,) in time.
+        Name of the prior.
+    labels : tuple of str
+        Names of the M motions: ``base/forward/M2 shift z``.
+    bodies : tuple of str
+        Body of each motion.
+    causes : tuple of str
+        Cause of the prior that each motion belongs to.
+    sigmas : (M,) ndarray
+        Standard deviations in the units of `units`.
+    units : tuple of str
+        Unit of each standard deviation, for readers.
+    spots : (D, M) ndarray
+        Spot shifts for one standard deviation, px, spots in the order of the calibration, each row then column.
+    parameters : (4 K, M) ndarray
+        Changes d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other for one standard deviation.
+    correlation : (M, M) ndarray
+        Correlation matrix, positive semidefinite.
+    laws : tuple of TimeLaw
+        Law in time of each motion.
     jump_false_alarm : float
-        Chance that a series without a jump has one reported, over all times and motions together.
+        Probability that a jump is reported in a series without one, over all times and motions together.
 
     Examples
     --------
@@ -187,7 +199,7 @@ class Disturbances:
     jump_false_alarm: float = FALSE_ALARM
 
     def __post_init__(self) -> None:
-        """Check shapes. Raises ValueError."""
+        """Raise ValueError if shapes do not match."""
         count = len(self.labels)
         shapes = {
             "spots": (self.spots.shape[0], count),
@@ -244,57 +256,58 @@ class Disturbances:
 
     @cached_property
     def root(self) -> Array:
-        """(M, M) with root root' = correlation: what independent numbers of unit variance make of the motions."""
+        """Root of the correlation matrix, (M, M): root root' = correlation."""
         return covariance_root(self.correlation)
 
     @cached_property
     def spot_covariance(self) -> Array:
-        """(D, D) px^2 of the shifts without noise."""
+        """Covariance of the shifts without noise, (D, D) px^2."""
         root = self.spots @ self.root
         return np.asarray(root @ root.T)
 
     @cached_property
     def parameter_covariance(self) -> Array:
-        """(4 K, 4 K) rad^2, rad m, m^2, before any measurement."""
+        """Covariance of the parameters before any measurement, (4 K, 4 K) rad^2, rad m, m^2."""
         root = self.parameters @ self.root
         return np.asarray(root @ root.T)
 
     def scaled(self, factors: Sequence[float] | Array) -> Disturbances:
-        """Disturbances whose motions have their standard deviations times factors (M,).
+        """Return the prior with its standard deviations multiplied by factors (M,).
 
         Parameters
         ----------
-        factors : Sequence[float] | Array
-            One for each motion; 0 takes it out.
+        factors : (M,) sequence of float
+            Factor of each motion; 0 removes it.
         """
         f = np.asarray(factors, np.float64)
         return replace(self, sigmas=self.sigmas * f, spots=self.spots * f, parameters=self.parameters * f)
 
     def between(self, then: float, now: float) -> Disturbances:
-        """Disturbances from one time to another, in place of those from what the instrument is meant to be.
+        """Return the prior of the changes from one time to another, instead of those from the nominal instrument.
 
         Parameters
         ----------
         then : float
-            The earlier time, seconds.
+            Earlier time, s.
         now : float
-            The later one.
+            Later time, s.
         """
-        over = np.array([law.over(then, now) for law in self.laws]).reshape(-1, 3)
-        return self.scaled(np.sqrt(np.maximum(over[:, 0] + over[:, 2] - 2.0 * over[:, 1], 0.0)))
+        moments = np.array([law.two_time_moments(then, now) for law in self.laws]).reshape(-1, 3)
+        return self.scaled(np.sqrt(np.maximum(moments[:, 0] + moments[:, 2] - 2.0 * moments[:, 1], 0.0)))
 
     def with_copies(self, which: Sequence[int], times: float, law: TimeLaw) -> Disturbances:
-        """Disturbances with copies of some motions beside them, which go together as those do and are independent of
-        them.
+        """Return the prior with independent copies of some motions added.
+
+        The copies are correlated among each other as the originals are.
 
         Parameters
         ----------
-        which : Sequence[int]
-            Numbers of the motions.
+        which : sequence of int
+            Indices of the motions.
         times : float
-            Standard deviations of the copies over those of the motions.
+            Ratio of the standard deviations of the copies to those of the motions.
         law : TimeLaw
-            Of the copies in time.
+            Law in time of the copies.
         """
         own = list(which)
         count = len(self.labels)
@@ -320,22 +333,26 @@ class Disturbances:
         )
 
     def best_gain(self, noise: Array) -> Array:
-        """Parameters per pixel of the best linear unbiased prediction, B C A' (A C A' + R)^-1, (..., 4 K, D).
+        """Return the gain of the best linear unbiased prediction, (..., 4 K, D) parameters per px.
+
+        It is B C A' (A C A' + R)^-1.
 
         Parameters
         ----------
-        noise : Array
-            R, (..., D, D) of the shifts, px^2.
+        noise : (..., D, D) ndarray
+            Covariance R of the shifts, px^2.
         """
         return self._best(self.parameters, noise)
 
     def best_amounts(self, noise: Array) -> Array:
-        """Motions of the best prediction in standard deviations per pixel, C A' (A C A' + R)^-1, (..., M, D).
+        """Return the gain of the best prediction for the motions, (..., M, D) standard deviations per px.
+
+        It is C A' (A C A' + R)^-1.
 
         Parameters
         ----------
-        noise : Array
-            R, (..., D, D) of the shifts, px^2.
+        noise : (..., D, D) ndarray
+            Covariance R of the shifts, px^2.
         """
         return self._best(np.eye(len(self.labels)), noise)
 
@@ -348,12 +365,12 @@ class Disturbances:
         return np.asarray(across @ np.linalg.pinv(spread, rcond=1e-13, hermitian=True))
 
     def misfit(self, gain: Array) -> Array:
-        """(..., 4 K, 4 K) covariance of what an estimator makes wrong of the motions themselves.
+        """Return the covariance of an estimator's error by the motions themselves, (..., 4 K, 4 K).
 
         Parameters
         ----------
-        gain : Array
-            Parameters per pixel of an estimator, (..., 4 K, D).
+        gain : (..., 4 K, D) ndarray
+            Gain of the estimator, parameters per px.
         """
         left = (gain @ self.spots - self.parameters) @ self.root
         return np.asarray(left @ np.swapaxes(left, -1, -2))
@@ -361,16 +378,16 @@ class Disturbances:
 
 @dataclass(frozen=True)
 class Suspect:
-    """A body whose motion would explain shifts that contradict the statement.
+    """Body whose motion would explain shifts that contradict the prior.
 
     Attributes
     ----------
     body : str
-        Its path.
+        Path of the body.
     times : float
-        How many times its stated standard deviations would have to be larger.
+        Factor of its prior standard deviations that explains the shifts best.
     gain : float
-        Of the log likelihood by that.
+        Increase of the log likelihood by that.
     """
 
     body: str
@@ -381,22 +398,22 @@ class Suspect:
 @shows()
 @dataclass(frozen=True)
 class Consistency:
-    """Do the measured shifts agree with disturbances and noise?
+    """Test of the measured shifts against the prior and the noise (predictive chi-square).
 
     Attributes
     ----------
     chi_square : float
-        s' (A C A' + R)^-1 s.
+        Chi-square, s' (A C A' + R)^-1 s.
     degrees : int
-        Of freedom, the number of spot coordinates.
+        Degrees of freedom, the number of spot coordinates.
     limit : float
-        Of ``chi_square``, exceeded with a chance of ``false_alarm`` by shifts that are as stated.
-    suspects : tuple[Suspect, ...]
+        Limit of ``chi_square``, exceeded with probability ``false_alarm`` by shifts in accordance with the prior.
+    suspects : tuple of Suspect
         Bodies that would explain a contradiction, the best first; empty where there is none.
     false_alarm : float
-        The chance that ``limit`` is for.
+        Probability for which ``limit`` holds.
     sigma_noise : float
-        By how much the noise of the images moves ``chi_square``, one standard deviation, to first order.
+        Standard deviation of ``chi_square`` by the noise of the images, to first order.
     """
 
     chi_square: float
@@ -408,12 +425,12 @@ class Consistency:
 
     @property
     def agrees(self) -> bool:
-        """Below the limit."""
+        """True if chi-square does not exceed the limit."""
         return self.chi_square <= self.limit
 
     @property
     def chance(self) -> float:
-        """Probability of so large a chi-square by shifts that are as stated."""
+        """Probability of so large a chi-square under the prior (p-value)."""
         return float(chance_beyond(self.chi_square, self.degrees))
 
     @property
@@ -423,12 +440,14 @@ class Consistency:
 
     @staticmethod
     def power(times: float, degrees: int) -> float:
-        """Chance to find disturbances that are all so many times larger than stated, where noise is small.
+        """Return the probability of detecting disturbances larger than the prior by a common factor.
+
+        The noise is assumed to be small.
 
         Parameters
         ----------
         times : float
-            Larger standard deviations.
+            Factor of the standard deviations.
         degrees : int
             Number of spot coordinates.
         """
@@ -436,16 +455,16 @@ class Consistency:
 
 
 def chi_squares(shifts: Array, noise: Array, stated: Disturbances) -> Array:
-    """Return (T,) the predictive chi-square of each of T measurements by itself; no suspects are looked for.
+    """Return the predictive chi-square of each of T measurements, (T,), without a search for suspects.
 
     Parameters
     ----------
-    shifts : Array
-        (T, D) measured, px.
-    noise : Array
-        (T, D, D) their covariance, px^2.
+    shifts : (T, D) ndarray
+        Measured shifts, px.
+    noise : (T, D, D) ndarray
+        Covariance of the shifts, px^2.
     stated : Disturbances
-        What was to be expected.
+        Prior.
     """
     return np.array([consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(shifts, noise, strict=True)])
 
@@ -457,21 +476,22 @@ def consistency(
     others: Mapping[str, Array] | None = None,
     false_alarm: float = FALSE_ALARM,
 ) -> Consistency:
-    """Predictive chi-square of one measurement.
+    """Test one measurement against the prior by its predictive chi-square.
 
     Parameters
     ----------
-    shift : Array
-        (D,) measured, px.
-    noise : Array
-        (D, D) its covariance, px^2.
+    shift : (D,) ndarray
+        Measured shifts, px.
+    noise : (D, D) ndarray
+        Covariance of the shifts, px^2.
     stated : Disturbances
-        What was to be expected.
-    others : Mapping[str, Array] | None
-        Bodies of which nothing is stated -> what motions of theirs do to the spots, (D, k) px, to be suspected too.
+        Prior.
+    others : mapping of str to (D, k) ndarray, or None
+        Further bodies that the prior does not contain, with the spot shifts of their motions, px, that are tested as
+        suspects too.
     false_alarm : float
-        Chance that shifts as stated are called a contradiction; of one of T measurements that are tested together a
-        T-th of what all may have.
+        Probability that shifts in accordance with the prior are called a contradiction; for one of T measurements that
+        are tested together, a T-th of the common probability.
     """
     spread = stated.spot_covariance + noise
     root = np.linalg.cholesky(spread)

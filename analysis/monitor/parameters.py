@@ -1,10 +1,11 @@
-"""What a monitor reads of an instrument, declared once: the one place to which a further reading is added.
+"""Calibration of a monitor, and the quantities that are read from it.
 
-Files, tables, figures, the terminal, scripts, studies and the live page take keys, symbols, meanings and digits from
-here (`twin.monitor.reading_table`), and budgets take the rows (`analysis.monitor.limits.quantities`).
+The quantities are declared here once; a further one is added here. Files, tables, figures, the terminal, scripts,
+studies and the live page take keys, symbols, meanings and digits from here (`twin.monitor.reading_table`), and budgets
+take the rows (`analysis.monitor.limits.quantities`).
 
-What the ground knows of the nominal instrument before it is launched: all that the analysis of the images may
-use.
+The calibration contains what is known of the nominal instrument on the ground before launch: all that the analysis of
+the images may use.
 """
 
 from __future__ import annotations
@@ -31,16 +32,24 @@ PAIR = ("left", "right")
 class CameraCalibration:
     """Calibration of one camera's monitor.
 
-    geometry: what the formulas of paper 001 need.
-    look_rad: nominal look angle about the base's Y, rad.
-    spot_jacobian: (2 n, P) px per unit of motion for the camera's n spots, row and column of one after the other.
-    parameter_jacobian: (4, P) d_alpha, d_beta, d_gamma (rad), d_f (m) per unit of motion.
-    motions: names of the P motions that the `model` estimator assumes.
-    channels: names of the camera's channels, in the order of its spots.
+    Attributes
+    ----------
+    geometry : MonitorGeometry
+        Geometry for the formulas of paper 001.
+    look_rad : float
+        Nominal look angle about the base's Y, rad.
+    spot_jacobian : (2 n, P) ndarray
+        Shift of the camera's n spots, row and column of one after the other, px per unit of motion.
+    parameter_jacobian : (4, P) ndarray
+        Change of d_alpha, d_beta, d_gamma (rad), d_f (m) per unit of motion.
+    motions : tuple of str
+        Names of the P motions that the `model` estimator assumes.
+    channels : tuple of str
+        Names of the camera's channels, in the order of its spots.
 
     Examples
     --------
-    Both spots move by one column when the camera turns by -2.5 urad about its Y:
+    Both spots move by one column when the camera rotates by -2.5 urad about its Y:
 
     >>> import numpy as np
     >>> import analysis
@@ -76,9 +85,7 @@ class CameraCalibration:
 
     @property
     def pair(self) -> tuple[int, int] | None:
-        """Numbers of the left and of the right spot among the camera's own, which the printed formulas are about; None
-        where it has no such pair.
-        """
+        """Indices of the left and the right spot, which the printed formulas use; None without such a pair."""
         if not set(PAIR) <= set(self.channels):
             return None
         left, right = (self.channels.index(name) for name in PAIR)
@@ -90,10 +97,16 @@ class CameraCalibration:
 class MonitorCalibration:
     """Calibration of an instrument's monitor.
 
-    cameras: name -> calibration, in the order of the spots, camera by camera.
-    template: calibrated shapes of all spots, in that order.
-    noise: of the area CCDs.
-    ground: of a pair whose altitude is known, else None.
+    Attributes
+    ----------
+    cameras : mapping of str to CameraCalibration
+        Calibration of each camera, in the order of the spots, camera by camera.
+    template : SpotTemplate
+        Calibrated shapes of all spots, in that order.
+    noise : NoiseModel
+        Noise of the area CCDs.
+    ground : GroundGeometry or None
+        Geometry of a pair whose altitude is known.
 
     Examples
     --------
@@ -119,12 +132,12 @@ class MonitorCalibration:
 
     @property
     def spots(self) -> int:
-        """Number of spots, C."""
+        """Number of spots C."""
         return sum(len(camera.channels) for camera in self.cameras.values())
 
 
 ANGLE_GROUP, GROUND_GROUP = "intersection_angle", "ground"
-"""Keys of files under which the readings of two cameras together stand; those of a camera stand under its name."""
+"""Keys of files for the readings of two cameras together; those of one camera are under its name."""
 _PER_SI: Mapping[str, float] = MappingProxyType(
     {"arcsec": 1 / ARCSEC, "m": 1.0, "mm": 1e3, "um": UM_PER_M, "nm": 1e9, "ppm": 1e6, "percent": 1e2}
 )
@@ -132,21 +145,21 @@ _PER_SI: Mapping[str, float] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Parameter:
-    """A change that is read and whose truth is traced.
+    """Change of a camera, a pair or a ground point that the monitor reads and that is traced as truth.
 
     Attributes
     ----------
     key : str
-        Its name in files, which ends in its unit.
+        Name in files, which ends in the unit.
     symbol : str
-        Its name in tables, figures and sentences.
+        Name in tables, figures and sentences.
     meaning : str
-        What it is, with its sign.
+        Definition with its sign.
     decimals : int
-        That the terminal shows.
-    of : Callable[[CameraCalibration], ArrayLike] | tuple[float, ...] | None
-        Of a camera: what it is made of, (4,) SI units per rad and m of d_alpha, d_beta, d_gamma and d_f, or those given
-        the camera's calibration; None for a reading of two cameras together.
+        Number of decimals shown in the terminal.
+    of : callable, tuple of float or None
+        For a reading of one camera, its coefficients (4,) on d_alpha, d_beta, d_gamma and d_f, SI units per rad and m,
+        or a function of the camera's calibration that returns them; None for a reading of two cameras together.
     """
 
     key: str
@@ -157,36 +170,36 @@ class Parameter:
 
     @property
     def file_unit(self) -> str:
-        """Unit as keys write it: ``um``."""
+        """Unit as written in keys: ``um``."""
         return self.key.rpartition("_")[2]
 
     @property
     def unit(self) -> str:
-        """Unit as readers see it: ``µm``."""
+        """Unit as shown to readers: ``µm``."""
         return self.file_unit.replace("um", "µm")
 
     @property
     def label(self) -> str:
-        """Head of its column: ``Δα [arcsec]``."""
+        """Column head: ``Δα [arcsec]``."""
         return f"{self.symbol} [{self.unit}]"
 
     @property
     def per_si(self) -> float:
-        """How many of its unit make one SI unit."""
+        """Number of its units in one SI unit."""
         return _PER_SI[self.file_unit]
 
 
 ESTIMATED = (
     Parameter(
-        "d_alpha_arcsec", "Δα", "turn of the camera about its Y, right-handed, perturbed minus nominal", 4,
+        "d_alpha_arcsec", "Δα", "rotation of the camera about its Y, right-handed, perturbed minus nominal", 4,
         (1.0, 0.0, 0.0, 0.0),
     ),
     Parameter(
-        "d_beta_arcsec", "Δβ", "turn of the camera about its X, right-handed, perturbed minus nominal", 4,
+        "d_beta_arcsec", "Δβ", "rotation of the camera about its X, right-handed, perturbed minus nominal", 4,
         (0.0, 1.0, 0.0, 0.0),
     ),
     Parameter(
-        "d_gamma_arcsec", "Δγ", "turn of the camera about its Z, the line of sight, perturbed minus nominal", 3,
+        "d_gamma_arcsec", "Δγ", "rotation of the camera about its Z, the line of sight, perturbed minus nominal", 3,
         (0.0, 0.0, 1.0, 0.0),
     ),
     Parameter(
@@ -194,28 +207,28 @@ ESTIMATED = (
         (0.0, 0.0, 0.0, 1.0),
     ),
 )  # fmt: skip
-"""Those that estimators estimate, in the order of a camera's vector of changes."""
+"""Parameters that the estimators determine, in the order of a camera's vector of changes."""
 CAMERA_PARAMETERS = ExtensionTable("camera_parameters", {one.key: one for one in ESTIMATED}, Parameter)
-"""What is read of every camera, by its key. The first four are what estimators estimate; a further one is a combination
-of them, and its name here is its key.
+"""Readings of every camera by their key. The first four are the parameters that estimators determine; a further one is
+a linear combination of them, and its name here is its key.
 """
 ANGLE = Parameter("change_arcsec", "Δθ", "change of the angle between the cameras' lines of sight, opening positive", 4)
-"""What is read of the angle between two cameras."""
+"""Change of the angle between two cameras' lines of sight."""
 GROUND = (
     Parameter("along_m", "along", "error on the ground along the track", 3),
     Parameter("across_m", "across", "error on the ground across the track, to the right", 3),
     Parameter("height_m", "height", "error in height, up", 3),
 )
-"""Errors of a pair's points on the ground that are located as if the cameras had not changed."""
+"""Errors of a pair's ground points that are located as if the cameras had not changed."""
 
 
 def rows_of(camera: CameraCalibration) -> Array:
-    """What the readings of a camera are made of, (P, 4): each in its unit per rad and m of the four parameters.
+    """Return the coefficients of a camera's readings, (P, 4), in their units per rad and m of the four parameters.
 
     Parameters
     ----------
     camera : CameraCalibration
-        Its calibration.
+        Calibration of the camera.
     """
     made_of = ((one.per_si, one.of) for one in CAMERA_PARAMETERS.values() if one.of is not None)
     return np.array([unit * np.array(of(camera) if callable(of) else of) for unit, of in made_of])

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from analysis.arrays import Array, StateArrays, shows
 from analysis.monitor.disturbances import Consistency, Disturbances, consistency
-from analysis.monitor.estimators import PARAMETERS_EACH, Shifts, applicable
+from analysis.monitor.estimators import PARAMETERS_PER_CAMERA, Shifts, applicable
 from analysis.monitor.limits import quantities
 from analysis.monitor.monitor_formulas import (
     CameraParameters,
@@ -54,7 +54,7 @@ NOISE, BEFORE, AFTER = "noise", "before", "shape"
 
 
 @dataclass(frozen=True)
-class SpotDoubt:
+class SpotWarning:
     """Why sigma does not hold for a state.
 
     Attributes
@@ -140,7 +140,7 @@ class SpotEvidence:
         told, bad = self.doubt(self.worst, names), int(np.count_nonzero(~self.holds))
         return None if told is None else f"at {moments[self.worst]}, the worst of {bad} times: {told.text}"
 
-    def doubt(self, state: int = 0, names: Sequence[str] = ()) -> SpotDoubt | None:
+    def doubt(self, state: int = 0, names: Sequence[str] = ()) -> SpotWarning | None:
         """Why sigma does not hold for a state; None where it does.
 
         Parameters
@@ -191,7 +191,7 @@ class SpotEvidence:
             else f"σ does not hold: the fit of the spots {named} is not good, {size}; {why}. The noise of "
             f"their positions was widened up to {_number(worst[0])} times"
         )
-        return SpotDoubt(cause, spots, worst[0], text)
+        return SpotWarning(cause, spots, worst[0], text)
 
 
 def _noisy(one: FitStates, k: int) -> bool:
@@ -750,7 +750,7 @@ def estimates_of(
     parameters: dict[str, dict[str, CameraParameters]] = {name: {} for name in cameras}
     angle: dict[str, IntersectionAngleChange] = {}
     errors: dict[str, GroundError] = {}
-    own = [slice(PARAMETERS_EACH * k, PARAMETERS_EACH * (k + 1)) for k in range(len(cameras))]
+    own = [slice(PARAMETERS_PER_CAMERA * k, PARAMETERS_PER_CAMERA * (k + 1)) for k in range(len(cameras))]
     for title, (values, noise, total) in found.items():
         for name, part in zip(cameras, own, strict=True):
             whole = None if total is None else total[..., part, part]

@@ -40,11 +40,11 @@ from analysis.monitor.jump_detection import (
     Jump,
     Steps,
     candidates,
-    likeliest,
-    sized,
+    most_likely_jump,
+    with_sizes,
     steps,
     with_jumps,
-    with_unfound,
+    with_subthreshold_jumps,
 )
 from analysis.statistics import limit_of
 
@@ -364,7 +364,7 @@ class _Search:
         if any(law.every_s is not None for law in self.stated.laws):
             every = self._steps(model)
             looks = len(self.may) * sum(len(one.until) for one in every)
-            model = with_unfound(model, every, self.stated, looks, float(self.when[-1]))
+            model = with_subthreshold_jumps(model, every, self.stated, looks, float(self.when[-1]))
         return tuple(self._sized(one, model) for one in found), model
 
     def _further(self, found: list[Jump]) -> list[Jump]:
@@ -374,7 +374,7 @@ class _Search:
 
     def _look(self, known: list[Jump]) -> Jump | None:
         """The likeliest jump beside those known, if chance does not explain it."""
-        one = likeliest(self._steps(with_jumps(self.stated, known)), self.may, self.stated)
+        one = most_likely_jump(self._steps(with_jumps(self.stated, known)), self.may, self.stated)
         return one if one is not None and one.chance <= self.stated.jump_false_alarm else None
 
     def _steps(self, model: Disturbances) -> list[Steps]:
@@ -383,7 +383,7 @@ class _Search:
     def _sized(self, one: Jump, model: Disturbances) -> Jump:
         for part, piece in self._factors(model):
             if one.until in part.when[piece]:
-                return sized(one, self.stated, part.root, part.white, part.when, self.reference)
+                return with_sizes(one, self.stated, part.root, part.white, part.when, self.reference)
         raise AssertionError(f"a jump at {one.until} s is at no measurement")
 
     def _factors(self, model: Disturbances) -> Iterator[tuple[_Factor, slice]]:

@@ -589,6 +589,11 @@ def linear_error(variance: ArrayLike, probability: float = _SHARE) -> Array:
     ndarray
         Half widths in the unit of the standard deviation; for 0.9 they are 1.645 sigma.
 
+    Raises
+    ------
+    ValueError
+        A negative variance, or a probability out of range.
+
     Examples
     --------
     LE90 of a height with a standard deviation of 2 m is 1.645 x 2 m:
@@ -597,7 +602,10 @@ def linear_error(variance: ArrayLike, probability: float = _SHARE) -> Array:
     >>> round(float(analysis.linear_error(2.0**2)), 3)
     3.29
     """
-    return np.asarray(float(ndtri(0.5 + 0.5 * probability)) * np.sqrt(variance))
+    variances = np.asarray(variance, np.float64)
+    if not 0.0 < probability < 1.0 or not np.all(variances >= 0.0):
+        raise ValueError(f"linear error: need variances >= 0 and a probability between 0 and 1, found {probability}")
+    return np.asarray(float(ndtri(0.5 + 0.5 * probability)) * np.sqrt(variances))
 
 
 def circular_error(covariance: ArrayLike, probability: float = _SHARE) -> Array:
@@ -609,7 +617,7 @@ def circular_error(covariance: ArrayLike, probability: float = _SHARE) -> Array:
     ----------
     covariance : (..., 2, 2) array_like
         Covariance of the errors.
-    share : float
+    probability : float
         Share of the errors, between 0 and 1.
 
     Returns

@@ -89,7 +89,7 @@ class PixelCorrection:
     dark : (H, W) ndarray
         Dark level that is subtracted, DN; its mean is kept.
     response : (H, W) ndarray
-        Relative response that is divided by; its mean is 1.
+        Response of each pixel relative to the mean response, by which frames are divided.
     bad : (H, W) ndarray of bool
         Pixels that are excluded instead of corrected.
     noise : NoiseModel

@@ -1,48 +1,45 @@
-"""A turntable's dividing error from a regional comparison, after Chauvenet's criterion (paper 004, section 3.3).
-
-Of n readings one is rejected when so large a deviation from their mean is expected fewer than half a time:
-
-    n P(|z| > |x - mean| / s) < 1/2,    s^2 = sum (x - mean)^2 / (n - 1),
-
-with the two-sided tail P of the normal distribution. The rule is applied once, as in textbooks. Applied again to what
-is left it would find errors that hid behind a larger one, but it would also take more of the good readings.
-
-The rule always takes some good readings (of ten normal ones 0.28 on average), and takes the outermost, so that the RMS
-of those it leaves is too small. `normal_reduction` says by how much.
+"""Dividing error of a turntable from repeated comparisons with a reference: outliers, curve fits, and compensation.
 
 Sign, everywhere: **dividing error = reading - true angle**, e(R) = R - phi. A corrected angle is R - e(R).
 
-The table is stopped at a set of readings; at each a reference (indexed polygon and autocollimator) gives the true
-angle, so that every comparison reads e(R) + the error of the reference at that position + noise. The comparisons are
-repeated.
+The table is stopped at a set of readings; at each of them a reference (indexed polygon and autocollimator) gives the
+true angle, so that every comparison gives e(R) + the error of the reference at that position + noise. The comparisons
+are repeated (paper 004, section 3.3).
 
-1. `CalibrationSeries`: gross errors out by Chauvenet's criterion; mean, RMS of the repeats before and after, sigma.
-2. `choose`: five fits (analysis.turntable.dividing_error), the one with the smallest cross-validation error.
-3. `DividingCompensation`: corrects readings and states the covariance of what it corrected.
+1. `CalibrationSeries`: gross errors are rejected by Chauvenet's criterion; mean, RMS of the repeats before and after, sigma.
+2. `choose`: five fits, of which the one with the smallest cross-validation error is chosen.
+3. `DividingCompensation`: corrects readings and gives the covariance of the corrected angles.
 
-The paper gives a largest RMS of ten repeats of 0.081 arcsec, and after Chauvenet's criterion 0.037 arcsec. The second
+**Chauvenet's criterion.** Of n readings one is rejected if fewer than half a reading is expected at its deviation from
+the mean or beyond:
+
+    n P(|z| > |x - mean| / s) < 1/2,    s^2 = sum (x - mean)^2 / (n - 1),
+
+with the two-sided tail P of the normal distribution. The rule is applied once, as in textbooks. Applied again to the
+rest, it would find errors masked by a larger one, but also reject more good readings. The rule always rejects some good
+readings (of ten normal ones 0.28 on average), and those the outermost, so that the RMS of the rest is too small.
+`normal_reduction` gives this factor.
+
+The paper reports a largest RMS of ten repeats of 0.081 arcsec, and after Chauvenet's criterion 0.037 arcsec. The second
 is the RMS of single readings that were kept, not of their mean: without any rejection the mean of ten readings has at
 most 0.081 / sqrt(10) = 0.026 arcsec, less than 0.037, and with it some 0.037 / sqrt(9) = 0.012 arcsec.
 
-Radians. Nothing here knows the turntable's true error.
+**Fits** of a curve over a range of angles, with a common interface and cross-validation:
 
-Five fits of a curve over a range of angles under one interface, and their cross-validation (paper 004, section 3.3).
+- `piecewise_linear`: straight lines through the points.
+- `polynomial`: weighted least squares in Chebyshev polynomials; the order by leave-one-out.
+- `cubic_spline`: natural cubic smoothing spline, the smoothing by leave-one-out; without smoothing it interpolates.
+- `fourier`: weighted least squares in a Fourier series whose fundamental period is longer than the range, since an arc is
+  not a full circle and the curve's ends need not meet; period and order by leave-one-out.
+- `network`: the paper's back-propagation network: one hidden layer of tanh, standardised, with weight decay; mean of
+  several trainings from random starts.
 
-    piecewise_linear   straight lines through the points
-    polynomial         weighted least squares in Chebyshev polynomials; the order by leave-one-out
-    cubic_spline       natural cubic smoothing spline, the smoothing by leave-one-out; it interpolates if that is none
-    fourier            weighted least squares in a Fourier series whose fundamental period is longer than the range,
-                       since an arc is no full circle and the curve's ends need not meet; period and order by
-                       leave-one-out
-    network            the paper's back-propagation network: one hidden layer of tanh, standardised, with weight decay;
-                       mean of several trainings from random starts
+Every fit gives its dependence on the points, `AngleFit.weights` (M, N), the derivative of the M predictions with
+respect to the N values. For the first four the prediction is `weights @ value` (for the selected order). The network is
+linearised at its minimum. So noise propagates to any combination of predictions.
 
-Every fit knows how it depends on its points: `AngleFit.weights` (M, N), the derivative of the M predictions with
-respect to the N values. For the first four the prediction is `weights @ value` (the order that was selected is taken
-as given). The network is linearised at the minimum that was found. So noise propagates to any combination of
-predictions.
-
-Angles in radians; values in any unit, their sigmas in the same one.
+Angles are in radians; values are in any unit, their sigmas in the same one. The module does not know the turntable's
+true error.
 """
 
 from __future__ import annotations
@@ -60,35 +57,35 @@ from analysis.arrays import Array, UndeterminedError
 from analysis.turntable.angle_network import Curve, NotConvergedError, network
 
 MOST_ORDER = 30
-"""Polynomial order, and number of Fourier harmonics, that are tried at most."""
+"""Largest polynomial order and number of Fourier harmonics that are tried."""
 PERIODS = (1.05, 1.1, 1.25, 1.5, 2.0)
 """Fundamental periods of the Fourier series that are tried, in lengths of the range."""
 SMOOTHINGS = (0.0, *np.logspace(-8.0, 1.0, 46))
 """Smoothing parameters that are tried, for angles in units of the mean step and weights of mean one."""
 SLACK = 1e-9
-"""Radians within which an angle is that of a point."""
+"""Tolerance, in radians, within which an angle equals that of a point."""
 GAP_ORDER = {"piecewise_linear": 2, "polynomial": 0, "cubic_spline": 4, "fourier": 0, "network": 0}
-"""With which power of the step the error between points falls for a smooth curve: h^2 and h^4 for the local fits. The
-others miss what they have no terms for, wherever the points are.
+"""Power of the step with which the error between points falls for a smooth curve: h^2 and h^4 for the local fits. The
+error of the others comes from missing terms and does not depend on the step.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class AngleFit:
-    """A fitted curve.
+    """Fitted curve.
 
     Attributes
     ----------
     name : str
-        One of `FITS`.
-    angle, value, sigma : Array
-        The points, (N,) each; angles increase.
-    settings : Mapping[str, float]
-        What was selected, for people (order, period, smoothing, trainings).
-    curve : Curve
-        Angles (M,) -> predictions (M,).
-    derivative : Curve
-        Angles (M,) -> weights (M, N).
+        Name of the fit, a key of `FITS`.
+    angle, value, sigma : (N,) ndarray
+        Points of the fit; angles increase.
+    settings : mapping of str to float
+        Selected parameters, for display (order, period, smoothing, trainings).
+    curve : callable
+        Function from angles (M,) to predictions (M,).
+    derivative : callable
+        Function from angles (M,) to weights (M, N).
     """
 
     name: str
@@ -101,22 +98,29 @@ class AngleFit:
 
     @property
     def range(self) -> tuple[float, float]:
-        """First and last angle of the points, radians."""
+        """First and last angle of the points, in radians."""
         return float(self.angle[0]), float(self.angle[-1])
 
     def __call__(self, angle: ArrayLike) -> Array:
-        """Predictions, in the shape of the angles. Raises ValueError outside of the range of the points."""
+        """Return the predictions, in the shape of the angles.
+
+        Raises
+        ------
+        UndeterminedError
+            An angle lies outside the range of the points.
+        """
         at = np.asarray(angle, np.float64)
         return self.curve(self._inside(at).ravel()).reshape(at.shape)
 
     def weights(self, angle: ArrayLike) -> Array:
-        """Derivative of the predictions at angles (M,) with respect to the points' values, (M, N)."""
+        """Return the derivatives (M, N) of the predictions at angles (M,) with respect to the points' values."""
         return self.derivative(self._inside(np.atleast_1d(np.asarray(angle, np.float64))))
 
     def covariance(self, angle: ArrayLike, other: ArrayLike | None = None) -> Array:
-        """Covariance (M, L) of the predictions at angles (M,) and (L,), or (M, M), from the points' independent sigmas.
+        """Return the covariance of the predictions at angles (M,) and (L,), or (M, M), from the points' independent
+        sigmas.
 
-        It holds the noise alone: not what the fit misses of the curve (see `analysis.turntable.dividing_error`).
+        It includes the noise alone, not the error of the fitted form; see `DividingCompensation.covariance`.
         """
         first = self.weights(angle)
         second = first if other is None else self.weights(other)
@@ -124,11 +128,12 @@ class AngleFit:
 
     @property
     def effective_parameters(self) -> float:
-        """Trace of the weights at the points: how many unknowns the fit in effect has."""
+        """Effective number of parameters, the trace of the weights at the points."""
         return float(np.trace(self.weights(self.angle)))
 
     def step_at(self, angle: ArrayLike) -> Array:
-        """Return the distance of the two points between which each angle lies, in the shape of the angles, radians."""
+        """Return the distance of the two points between which each angle lies, in the shape of the angles, in radians.
+        """
         at = np.asarray(angle, np.float64)
         steps = np.diff(self.angle)
         # a point belongs to the smaller of its two steps
@@ -136,6 +141,7 @@ class AngleFit:
         return np.asarray(np.minimum(*(steps[np.clip(k, 1, len(steps)) - 1] for k in (below, above))))
 
     def _inside(self, angle: Array) -> Array:
+        """Return the angles; raise UndeterminedError if one lies outside the range of the points."""
         low, high = self.range
         slack = 1e-9 * (high - low)
         if not np.all((angle >= low - slack) & (angle <= high + slack)):
@@ -148,18 +154,18 @@ class AngleFit:
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """How well a fit predicts points that it has not seen.
+    """Prediction errors of a fit at points that it has not used.
 
     Attributes
     ----------
     name : str
-        Of the fit.
-    angle : Array
-        Of the left-out points, (K,), radians.
-    residual : Array
-        Left-out value - prediction from the others, (K,).
-    variance : Array
-        Of the residual by noise alone, (K,): the point's own and the prediction's.
+        Name of the fit.
+    angle : (K,) ndarray
+        Angles of the excluded points, in radians.
+    residual : (K,) ndarray
+        Value of an excluded point minus its prediction from the others.
+    variance : (K,) ndarray
+        Variance of the residual by noise alone, that of the point and of the prediction.
     """
 
     name: str
@@ -169,25 +175,25 @@ class CrossValidation:
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residuals."""
+        """RMS of the residuals."""
         return float(np.sqrt(np.mean(self.residual**2)))
 
     @property
     def excess(self) -> float:
-        """Mean square of the residuals beyond the noise, not below zero."""
+        """Mean square of the residuals beyond the noise, at least zero."""
         return max(0.0, float(np.mean(self.residual**2 - self.variance)))
 
 
 def widest_step(angle: ArrayLike) -> float:
-    """Return the widest distance of neighbouring points, radians, over which a fit has been tried on its own points.
+    """Return the widest distance of neighbouring points, in radians, over which cross-validation has tested a fit.
 
-    Cross-validation bridges the two steps beside a point that it leaves out. Nothing was tried over a wider gap, and
-    no sigma holds in it. A quarter of the points may lie beside such gaps.
+    Cross-validation bridges the two steps beside a point that it excludes. Wider gaps are untested, and no sigma is
+    valid in them. A quarter of the points may lie beside such gaps.
 
     Parameters
     ----------
     angle : (N,) array_like
-        Points of the fit, increasing, radians.
+        Points of the fit, increasing, in radians.
     """
     x = np.asarray(angle, np.float64)
     bridged = x[2:] - x[:-2]
@@ -256,37 +262,39 @@ def fit_dividing_error(
 
 
 def fewest(name: str) -> int:
-    """The fewest angles that a fit can use: its unknowns, and where its order is selected one more to judge by."""
+    """Return the smallest number of angles of a fit: its unknowns, plus one where its order is selected."""
     return {"piecewise_linear": 2, "polynomial": 4, "cubic_spline": 4, "fourier": 5, "network": 10}[name]
 
 
 def cross_validate(
     name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike, seed: int = 0, folds: int = 10
 ) -> CrossValidation:
-    """K-fold cross-validation; whatever a fit selects, it selects anew for each fold.
+    """Compute the K-fold cross-validation of a fit; every fold selects order or smoothing again.
 
-    Fold k leaves out the inner points k, k + folds, ...: the neighbours of a left-out point stay, and the gap that is
-    bridged is two steps. The first and the last point are never left out, for no fit is used outside of its points.
+    Fold k excludes the inner points k, k + folds, ...: the neighbours of an excluded point stay, and the gap that is
+    bridged is two steps. The first and the last point are never excluded, because no fit is used outside its points.
 
     Parameters
     ----------
     name : str
-        Of the fit.
-    angle : ArrayLike
-        Of the points, (N,).
-    value : ArrayLike
-        There, (N,).
-    sigma : ArrayLike
-        Of the values, (N,) or a number, in their unit.
+        Name of the fit.
+    angle : (N,) array_like
+        Angles of the points, in radians.
+    value : (N,) array_like
+        Values of the points.
+    sigma : float or (N,) array_like
+        Standard deviations of the values, in their unit.
     seed : int
-        Of fits that draw.
+        Seed of fits with random starts.
     folds : int
-        K.
+        Number of folds, K.
 
     Raises
     ------
-    ValueError, NotConvergedError
-        As `fit_dividing_error`; the fit needs enough points without a fold.
+    ValueError
+        The arguments are invalid, or too few points are left without a fold.
+    NotConvergedError
+        The network does not converge.
     """
     x, y, s = _points(name, angle, value, sigma)
     if not 2 <= folds:
@@ -310,11 +318,12 @@ def cross_validate(
 
 
 def angles_left(count: int, folds: int) -> int:
-    """How many of so many angles the largest fold of `cross_validate` leaves to fit."""
+    """Return the number of angles that the largest fold of `cross_validate` leaves to fit."""
     return count - -(-max(count - 2, 0) // folds)
 
 
 def _points(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return validated angles, values and sigmas as arrays (N,)."""
     x, y = np.asarray(angle, np.float64), np.asarray(value, np.float64)
     if x.ndim != 1 or y.shape != x.shape:
         raise ValueError(f"{name}: angles and values must be (N,) alike, found {x.shape} and {y.shape}")
@@ -338,15 +347,16 @@ _Made = tuple[dict[str, float], Curve, Curve]
 
 
 def _linear(basis: Curve, solve: Array, value: Array) -> tuple[Curve, Curve]:
-    """Curve and derivative of a linear fit: basis (M, K) at the angles, solve (K, N)."""
+    """Return curve and derivative of a linear fit with basis (M, K) at the angles and solution matrix (K, N)."""
     coefficients = solve @ value
     return lambda a: np.asarray(basis(a) @ coefficients), lambda a: np.asarray(basis(a) @ solve)
 
 
 def _left_out(hat: Array, value: Array) -> float:
-    """Mean square of the leave-one-out residuals of the inner points, from the fit's matrix (N, N) at its points.
+    """Return the mean square of the leave-one-out residuals of the inner points from the hat matrix (N, N).
 
-    Exact for least squares and smoothing splines: (y - H y) / (1 - H_ii). Infinite if a point is hit whatever it is.
+    It is exact for least squares and smoothing splines: (y - H y) / (1 - H_ii). Infinite if a point is always fitted
+    exactly.
     """
     free = 1.0 - np.diag(hat)[1:-1]
     if np.min(free) < 1e-9:
@@ -355,6 +365,7 @@ def _left_out(hat: Array, value: Array) -> float:
 
 
 def _piecewise_linear(x: Array, y: Array, s: Array, seed: int) -> _Made:
+    """Fit straight lines through the points."""
     def hats(a: Array) -> Array:
         return np.stack([np.interp(a, x, unit) for unit in np.eye(len(x))], axis=-1)
 
@@ -362,11 +373,12 @@ def _piecewise_linear(x: Array, y: Array, s: Array, seed: int) -> _Made:
 
 
 def _least_squares(design: Array, s: Array) -> Array:
-    """(K, N): coefficients = matrix @ values, weighted; directions that the points hardly see are left out."""
+    """Return the (K, N) weighted least-squares matrix; directions that the points hardly determine are omitted."""
     return np.linalg.pinv(design / s[:, None], rcond=1e-10) / s
 
 
 def _polynomial(x: Array, y: Array, s: Array, seed: int) -> _Made:
+    """Fit Chebyshev polynomials of the order with the smallest leave-one-out error."""
     middle, half = 0.5 * (x[0] + x[-1]), 0.5 * (x[-1] - x[0])
     best: tuple[float, int, Array] = (np.inf, 0, np.empty(0))
     for order in range(1, min(MOST_ORDER, len(x) - 2) + 1):
@@ -379,10 +391,12 @@ def _polynomial(x: Array, y: Array, s: Array, seed: int) -> _Made:
 
 
 def _chebyshev(middle: float, half: float, order: int) -> Curve:
+    """Return the Chebyshev basis on an interval."""
     return lambda a: np.asarray(np.polynomial.chebyshev.chebvander((a - middle) / half, order), np.float64)
 
 
 def _fourier(x: Array, y: Array, s: Array, seed: int) -> _Made:
+    """Fit a Fourier series of the period and order with the smallest leave-one-out error."""
     best: tuple[float, int, float, Array] = (np.inf, 0, 0.0, np.empty(0))
     for period in PERIODS:
         for order in range(1, min(MOST_ORDER, (len(x) - 2) // 2) + 1):
@@ -396,6 +410,7 @@ def _fourier(x: Array, y: Array, s: Array, seed: int) -> _Made:
 
 
 def _harmonics(first: float, period: float, order: int) -> Curve:
+    """Return the basis of a constant and of cosines and sines of a fundamental period."""
     def basis(a: Array) -> Array:
         phase = 2.0 * np.pi / period * np.outer(a - first, np.arange(1, order + 1))
         return np.concatenate([np.ones((len(a), 1)), np.cos(phase), np.sin(phase)], axis=-1)
@@ -404,8 +419,10 @@ def _harmonics(first: float, period: float, order: int) -> Curve:
 
 
 def _cubic_spline(x: Array, y: Array, s: Array, seed: int) -> _Made:
-    """Green and Silverman, Nonparametric Regression (1994), section 2.3: g = (W + a Q R^-1 Q^T)^-1 W y at the points,
-    and the natural cubic spline through g.
+    """Fit a natural cubic smoothing spline with the smallest leave-one-out error.
+
+    Green and Silverman, Nonparametric Regression (1994), section 2.3: g = (W + a Q R^-1 Q^T)^-1 W y at the points, and
+    the natural cubic spline through g.
     """
     step = (x[-1] - x[0]) / (len(x) - 1)
     h = np.diff(x) / step
@@ -435,15 +452,15 @@ FITS: Mapping[str, Callable[[Array, Array, Array, int], _Made]] = {
     "fourier": _fourier,
     "network": network,
 }
-"""Name -> fit."""
+"""Fits by name."""
 
 
 FEWEST = 3
-"""Fewest readings of which one can be rejected: two readings deviate by the same amount."""
+"""Smallest number of readings of which one can be rejected: two readings deviate by the same amount."""
 
 
 def limit(n: ArrayLike) -> Array:
-    """Largest deviation that stays, in units of s, for n readings."""
+    """Return the largest accepted deviation of n readings, in units of s."""
     return np.asarray(norm.isf(0.25 / np.asarray(n, np.float64)))
 
 
@@ -494,7 +511,7 @@ def chauvenet(readings: ArrayLike, present: NDArray[np.bool_] | None = None) -> 
 
 
 def rejection_rate(n: int) -> float:
-    """Probability that the single pass rejects a given one of n normal readings.
+    """Return the probability that Chauvenet's criterion rejects a particular one of n normal readings.
 
     (x - mean)^2 / s^2 times n / (n - 1)^2 has the beta distribution (1/2, (n - 2)/2).
     """
@@ -502,19 +519,23 @@ def rejection_rate(n: int) -> float:
 
 
 def expected_rejections(counts: NDArray[np.int64]) -> float:
-    """How many of series of so many normal readings, (N,), the single pass rejects on average."""
+    """Return the expected number of rejections in series of normal readings with the given counts (N,)."""
     sizes, times = np.unique(counts, return_counts=True)
     return float(sum(rejection_rate(int(n)) * (int(n) * int(many)) for n, many in zip(sizes, times, strict=True)))
 
 
 def normal_reduction(n: int | NDArray[np.int64]) -> float:
-    """E[sum of squares left] / E[degrees of freedom left] / sigma^2 for n normal readings after the single pass.
+    """Return the factor by which Chauvenet's criterion reduces the pooled variance of normal readings.
 
-    The pooled variance of cleaned series is divided by it. x - mean over s is independent of s (Basu), so a reading
-    outside the limit takes n/(n - 1) (x - mean)^2 out of the sum, on average sigma^2 times the tail of the beta
-    distribution (3/2, (n - 2)/2). That two readings of one series go at once is left out: rare for n below some 20.
+    It is E[sum of squares left] / E[degrees of freedom left] / sigma^2, by which the pooled variance of cleaned series
+    is divided. x - mean over s is independent of s (Basu), so a reading outside the limit takes n/(n - 1) (x - mean)^2
+    out of the sum, on average sigma^2 times the tail of the beta distribution (3/2, (n - 2)/2). Two rejections in one
+    series, rare for n below some 20, are neglected.
 
-    n: of every series, or (N,) of each of them.
+    Parameters
+    ----------
+    n : int or (N,) ndarray of int
+        Number of readings of every series, or of each of them.
     """
     sizes, times = np.unique(n, return_counts=True)
     parts = [_left(int(size)) for size in sizes]
@@ -525,7 +546,9 @@ def normal_reduction(n: int | NDArray[np.int64]) -> float:
 
 
 def _left(n: int) -> tuple[float, float]:
-    """Expected sum of squares in sigma^2, and degrees of freedom, that the pass leaves of n normal readings."""
+    """Return the expected sum of squares, in sigma^2, and degrees of freedom that the criterion leaves of n normal
+    readings.
+    """
     if n < FEWEST:
         return float(max(n - 1, 1)), float(max(n - 1, 1))
     square = float(beta.sf(_scaled(n), 1.5, 0.5 * (n - 2)))
@@ -533,6 +556,7 @@ def _left(n: int) -> tuple[float, float]:
 
 
 def _scaled(n: int) -> float:
+    """Return the squared limit as an argument of the beta distribution."""
     return min(float(limit(n)) ** 2 * n / (n - 1) ** 2, 1.0)
 
 
@@ -546,16 +570,16 @@ class CalibrationSeries:
 
     Attributes
     ----------
-    angle : Array
-        Readings of the table, (N,), increasing, radians.
-    comparisons : Array
-        Reading - angle of the reference, (N, repeats), radians.
+    angle : (N,) ndarray
+        Readings of the table, increasing, in radians.
+    comparisons : (N, repeats) ndarray
+        Reading minus angle of the reference, in radians.
     reference_sigma : float
-        Standard deviation of the reference's own error at one position, as its certificate states, radians. It is the
+        Standard deviation of the reference's error at one position from its certificate, in radians. The error is the
         same in all repeats.
-    present : NDArray[np.bool_] | None
-        Which comparisons were made, (N, repeats), where angles have different numbers of them; the others count for
-        nothing. None for all.
+    present : (N, repeats) ndarray of bool or None
+        True for comparisons that were made, if angles have different numbers of them; the others are ignored. None for
+        all.
     """
 
     angle: Array
@@ -564,7 +588,7 @@ class CalibrationSeries:
     present: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
-        """Raise ValueError for shapes and numbers that are no series."""
+        """Raise ValueError for invalid shapes and numbers."""
         x, y = np.asarray(self.angle, np.float64), np.asarray(self.comparisons, np.float64)
         if x.ndim != 1 or y.ndim != 2 or len(y) != len(x):
             raise ValueError(f"calibration: angles (N,) and comparisons (N, repeats), found {x.shape} and {y.shape}")
@@ -583,73 +607,75 @@ class CalibrationSeries:
 
     @cached_property
     def keep(self) -> NDArray[np.bool_]:
-        """Comparisons that Chauvenet's criterion keeps, (N, repeats)."""
+        """Mask (N, repeats) of the comparisons that Chauvenet's criterion keeps."""
         return chauvenet(self.comparisons, self.present)
 
     @property
     def taken(self) -> NDArray[np.bool_]:
-        """Comparisons that were made, (N, repeats)."""
+        """Mask (N, repeats) of the comparisons that were made."""
         return np.ones(self.comparisons.shape, bool) if self.present is None else self.present
 
     @property
     def counts(self) -> NDArray[np.int64]:
-        """How often each angle was compared, (N,)."""
+        """Number (N,) of comparisons of each angle."""
         return np.asarray(self.taken.sum(axis=1))
 
     @property
     def repeats(self) -> int:
-        """How often the angles were compared, at most."""
+        """Largest number of comparisons of an angle."""
         return self.comparisons.shape[1]
 
     @property
     def gone(self) -> NDArray[np.bool_]:
-        """Comparisons that Chauvenet's criterion takes out, (N, repeats)."""
+        """Mask (N, repeats) of the comparisons that Chauvenet's criterion rejects."""
         return self.taken & ~self.keep
 
     @property
     def from_mean(self) -> Array:
-        """Comparisons minus the mean of those that are kept at their angle, (N, repeats), radians."""
+        """Comparisons minus the mean of the kept ones at their angle, (N, repeats), in radians."""
         return self.comparisons - self.mean[:, None]
 
     @property
     def rejected(self) -> int:
-        """How many comparisons went."""
+        """Number of rejected comparisons."""
         return int(np.sum(self.gone))
 
     @cached_property
     def mean(self) -> Array:
-        """Dividing error at each angle, from the comparisons that are kept, (N,), radians."""
+        """Dividing error (N,) at each angle from the kept comparisons, in radians."""
         return np.asarray(np.mean(self.comparisons, axis=1, where=self.keep))
 
     @cached_property
     def rms_before(self) -> Array:
-        """RMS of all repeats about their mean, divisor n - 1, (N,), radians."""
+        """RMS (N,) of all repeats about their mean, divisor n - 1, in radians."""
         return np.asarray(
             np.std(self.comparisons, axis=1, ddof=1, where=True if self.present is None else self.present)
         )
 
     @cached_property
     def rms_after(self) -> Array:
-        """RMS of the kept repeats about their mean, divisor n - 1, (N,), radians: of single readings, not of means."""
+        """RMS (N,) of the kept repeats about their mean, divisor n - 1, in radians: of single readings, not of means.
+        """
         return np.asarray(np.std(self.comparisons, axis=1, ddof=1, where=self.keep))
 
     @property
     def averaging_alone(self) -> float:
-        """Largest RMS of a mean if nothing were rejected: max(rms_before / sqrt(n)), radians."""
+        """Largest RMS of a mean without rejection, max(rms_before / sqrt(n)), in radians."""
         if self.present is not None:
             return float(np.max(self.rms_before / np.sqrt(self.counts)))
         return float(np.max(self.rms_before) / np.sqrt(self.repeats))
 
     @property
     def mean_rms(self) -> float:
-        """Largest RMS of a mean of what is kept: max(rms_after / sqrt(n)), radians."""
+        """Largest RMS of a mean of the kept comparisons, max(rms_after / sqrt(n)), in radians."""
         return float(np.max(self.rms_after / np.sqrt(self.keep.sum(axis=1))))
 
     @cached_property
     def suspect(self) -> NDArray[np.bool_]:
-        """Angles whose kept repeats scatter more than those of all angles, (N,): two gross errors at one angle widen
-        its RMS so much that Chauvenet's criterion keeps both. Chi-square, false-alarm rate 0.1% for all angles
-        together.
+        """Mask (N,) of angles whose kept repeats scatter significantly more than those of all angles.
+
+        Two gross errors at one angle widen its RMS so much that Chauvenet's criterion keeps both. The test is a
+        chi-square test with a false-alarm rate of 0.1 % for all angles together.
         """
         freedom = self.keep.sum(axis=1) - 1
         most = chi2.isf(FALSE_ALARM / len(self.angle), freedom)
@@ -663,27 +689,32 @@ class CalibrationSeries:
 
     @cached_property
     def repeatability(self) -> float:
-        """Standard deviation of one good comparison, radians: of all angles together that are not suspect, for one
-        alone has few degrees of freedom, and corrected for what the criterion's single pass takes from normal noise.
+        """Standard deviation of one good comparison, in radians.
+
+        It is pooled over all angles that are not suspect, because one alone has few degrees of freedom, and corrected
+        for the effect of Chauvenet's criterion on normal noise.
         """
         return float(np.sqrt(self._pooled(~self.suspect) / normal_reduction(self.counts)))
 
     def _pooled(self, angles: NDArray[np.bool_]) -> float:
-        """Pooled variance of the kept repeats at these angles (N,), rad^2."""
+        """Return the pooled variance of the kept repeats at selected angles (N,), in rad^2."""
         freedom = (self.keep.sum(axis=1) - 1)[angles]
         return float(np.sum(freedom * self.rms_after[angles] ** 2) / np.sum(freedom))
 
     @property
     def noise_sigma(self) -> Array:
-        """Standard deviation of each mean from the scatter of the repeats, (N,), radians; of suspect angles from their
-        own RMS.
+        """Standard deviation (N,) of each mean from the scatter of the repeats, in radians.
+
+        Suspect angles use their own RMS.
         """
         single = np.where(self.suspect, self.rms_after, self.repeatability)
         return np.asarray(single / np.sqrt(self.keep.sum(axis=1)))
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation of each mean as a measure of the dividing error, (N,), radians: scatter and the reference.
+        """Standard deviation (N,) of each mean as a measure of the dividing error, in radians, from scatter and
+        reference.
+
         It is at least the rounding of the angles, which remains in a series without noise.
         """
         rounding = np.spacing(np.max(np.abs(self.angle)))
@@ -691,13 +722,13 @@ class CalibrationSeries:
 
     @property
     def step(self) -> float:
-        """Median distance of neighbouring angles, radians."""
+        """Median distance of neighbouring angles, in radians."""
         return float(np.median(np.diff(self.angle)))
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One fit with its cross-validation on the calibration points."""
+    """Fit with its cross-validation on the calibration points."""
 
     fit: AngleFit
     validation: CrossValidation
@@ -705,14 +736,14 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The fits that were tried, and which of them is chosen.
+    """Fits that were tried, and the chosen one.
 
     Attributes
     ----------
-    trials : Mapping[str, Trial]
-        Name of a fit -> its trial, in the order in which they were asked for.
-    failed : Mapping[str, str]
-        Name of a fit -> why it failed.
+    trials : mapping of str to Trial
+        Trials by the name of the fit, in the order of the request.
+    failed : mapping of str to str
+        Reasons of failed fits by name.
     chosen : str
         Name of the fit with the smallest cross-validation RMS.
     """
@@ -722,12 +753,12 @@ class Choice:
     chosen: str
 
     def __getitem__(self, name: str) -> Trial:
-        """The trial of a fit.
+        """Return the trial of a fit.
 
         Raises
         ------
         KeyError
-            There is none of that name, or it failed.
+            There is no fit of that name, or it failed.
         """
         return self.trials[name]
 
@@ -739,15 +770,28 @@ def choose(
     folds: int = 10,
     progress: Callable[[str], None] | None = None,
 ) -> Choice:
-    """Fit and cross-validate; the smallest cross-validation RMS is chosen.
+    """Fit and cross-validate several curves, and choose the one with the smallest cross-validation RMS.
 
-    Only the calibration points are used. The one-standard-error rule is not: the fits are of different families, so
-    that none is "the simpler one". A network that does not converge is reported as failed.
+    Only the calibration points are used. The one-standard-error rule is not applied: the fits are of different
+    families, so that none is "the simpler one". A network that does not converge is reported as failed.
+
+    Parameters
+    ----------
+    series : CalibrationSeries
+        Calibration series.
+    seed : int
+        Seed of fits with random starts.
+    names : sequence of str
+        Names of the fits to try.
+    folds : int
+        Number of folds of the cross-validation.
+    progress : callable, optional
+        Function that receives a text before each fit.
 
     Raises
     ------
     ValueError
-        Fewer angles than a fit needs, or no fit succeeded.
+        There are fewer angles than a fit needs, or no fit succeeded.
     """
     say = progress or (lambda text: None)
     trials: dict[str, Trial] = {}
@@ -766,34 +810,35 @@ def choose(
 
 @dataclass(frozen=True, eq=False)
 class DividingCompensation:
-    """Corrects readings of the table by a fitted dividing error.
+    """Correction of the table's readings by a fitted dividing error.
 
-    What is left of the error after correction is systematic, the same whenever the same reading comes back. Its
-    covariance has four parts:
+    The remaining error after correction is systematic, the same for every repetition of a reading. Its covariance has
+    four parts:
 
     - the noise of the calibration points, propagated: A diag(sigma^2) A^T with A = `fit.weights`;
-    - `common`^2 everywhere: a constant, as from calibration points that all lie at one phase of the grating's signal;
-      it has no influence on differences of angles;
-    - `smooth`^2 times `step_kernel`: what the fit misses between its points, correlated over one step. It grows with
-      the step of the calibration around the reading as the fit's error does (`GAP_ORDER`);
-    - `white`^2 on the diagonal: what changes from reading to reading, such as the subdivision error, whose period
+    - `common`^2 everywhere: a constant, for example if all calibration points lie at one phase of the grating's signal; it
+      cancels in differences of angles;
+    - `smooth`^2 times `step_kernel`: the error of the fit between its points, correlated over one step. It grows with the
+      step of the calibration around the reading as the fit's error does (`GAP_ORDER`);
+    - `white`^2 on the diagonal: independent errors from reading to reading, such as the subdivision error, whose period
       (arcseconds) is far below the distances of readings in use.
 
-    The repeatability of the readings in use is not in it: it is new in every reading, and averages out.
+    The repeatability of the readings in use is not included: it is independent in every reading, and averages out.
 
     Attributes
     ----------
     fit : AngleFit
-        Of the dividing error.
+        Fit of the dividing error.
     step : float
-        Of the calibration, radians.
+        Step of the calibration, in radians.
     common, smooth, white : float
-        Standard deviations of the three misfits, radians.
+        Standard deviations of the three misfits, in radians.
     repeatability : float
-        Of one comparison, radians; an upper limit of that of one reading, as it holds the reference's noise too.
+        Standard deviation of one comparison, in radians; an upper limit for one reading, because it includes the
+        reference's noise.
     bridged : float
-        Step over which `smooth` holds, radians: one step of the calibration, two where no held-out angles were there to
-        judge single steps by.
+        Step for which `smooth` is valid, in radians: one step of the calibration, or two if no held-out angles were
+        available to assess single steps.
     """
 
     fit: AngleFit
@@ -806,16 +851,16 @@ class DividingCompensation:
 
     @property
     def region(self) -> tuple[float, float]:
-        """First and last reading that can be corrected, radians."""
+        """First and last reading that can be corrected, in radians."""
         return self.fit.range
 
     def error(self, reading: ArrayLike) -> Array:
-        """Estimated dividing error at the readings, in their shape, radians.
+        """Return the estimated dividing error at the readings, in their shape, in radians.
 
         Raises
         ------
         UndeterminedError
-            A reading outside of the region, or in a gap of the calibration.
+            A reading lies outside the region, or in a gap of the calibration.
         """
         value = self.fit(reading)
         if not np.all(inside := covered(self.fit.angle, reading)):
@@ -827,13 +872,19 @@ class DividingCompensation:
         return value
 
     def correct(self, reading: ArrayLike) -> Array:
-        """True angles of the readings, in their shape, radians. UndeterminedError where `error` raises it."""
+        """Return the true angles of the readings, in their shape, in radians.
+
+        Raises
+        ------
+        UndeterminedError
+            A reading lies outside the region, or in a gap of the calibration.
+        """
         return np.asarray(reading, np.float64) - self.error(reading)
 
     def covariance(self, reading: ArrayLike, other: ArrayLike | None = None) -> Array:
-        """Covariance (M, L) of the corrected angles at readings (M,) and (L,), or (M, M), rad^2; see the class.
+        """Return the covariance of the corrected angles at readings (M,) and (L,), or (M, M), in rad^2; see the class.
 
-        The white part belongs to equal readings.
+        The white part applies to equal readings.
         """
         first = np.atleast_1d(np.asarray(reading, np.float64))
         second = first if other is None else np.atleast_1d(np.asarray(other, np.float64))
@@ -843,22 +894,26 @@ class DividingCompensation:
         return self.fit.covariance(first, second) + self.common**2 + misfit + same
 
     def _missed(self, reading: Array) -> Array:
+        """Return the sigma of the smooth misfit at readings, in radians."""
         wide = np.maximum(1.0, self.fit.step_at(reading) / self.bridged)
         return np.asarray(self.smooth * wide ** GAP_ORDER[self.fit.name])
 
     def sigma(self, reading: ArrayLike) -> Array:
-        """Standard deviation of each corrected angle, (M,), radians."""
+        """Return the standard deviation (M,) of each corrected angle, in radians."""
         return np.sqrt(np.diag(self.covariance(reading)))
 
 
 def gaps(angle: Array) -> Array:
-    """Return first and last angle of the gaps of a calibration at angles (N,), (K, 2): wider than was ever bridged."""
+    """Return first and last angle of each gap of a calibration at angles (N,), as (K, 2).
+
+    A gap is wider than any step that cross-validation has bridged.
+    """
     k = np.flatnonzero(np.diff(angle) > widest_step(angle))
     return np.stack([angle[k], angle[k + 1]], axis=-1)
 
 
 def covered(angle: Array, reading: ArrayLike) -> NDArray[np.bool_]:
-    """Return which readings a calibration at angles (N,) covers, in the shape of the readings.
+    """Return a mask of the readings that a calibration at angles (N,) covers, in their shape.
 
     They lie between its first and last angle, and in no gap.
     """
@@ -870,19 +925,20 @@ def covered(angle: Array, reading: ArrayLike) -> NDArray[np.bool_]:
 
 
 def step_kernel(first: Array, second: Array, step: float) -> Array:
-    """Correlation (M, L) of the misfit at readings (M,) and (L,): falls linearly to zero over one step.
+    """Return the correlation (M, L) of the misfit at readings (M,) and (L,), which falls linearly to zero over one
+    step.
 
-    A model, not a measurement: the error between two points says little about that between the next two. The triangle
-    is a valid correlation (its Fourier transform is not negative).
+    It is an assumption, not a measurement: the error between two points says little about that between the next two.
+    The triangle is a valid correlation (its Fourier transform is not negative).
 
     Parameters
     ----------
-    first : Array
-        (M,).
-    second : Array
-        (L,), in the same unit.
+    first : (M,) ndarray
+        Readings, in any unit.
+    second : (L,) ndarray
+        Readings, in the same unit.
     step : float
-        Of the readings, in that unit.
+        Step of the calibration, in the same unit.
     """
     return np.asarray(np.maximum(0.0, 1.0 - np.abs(first[:, None] - second) / step))
 
@@ -890,30 +946,30 @@ def step_kernel(first: Array, second: Array, step: float) -> Array:
 def compensate(
     series: CalibrationSeries, choice: Choice, held_out: CalibrationSeries | None = None
 ) -> DividingCompensation:
-    """The compensation of a chosen fit, with its misfit estimated from residuals beyond their noise.
+    """Return the compensation of a chosen fit, with its misfit estimated from residuals beyond their noise.
 
-    smooth: from the cross-validation on the calibration points. It bridges gaps of two steps and the compensation
-        gaps of one, so that for the local fits, whose error falls as h^p, the error is divided by 2^p (p = 2 for
-        lines, 4 for the spline, 0 for the others).
-    common: what the mean of the residuals at held-out angles has beyond its noise.
-    white: what their mean square has beyond noise, common and smooth misfit. Calibration points cannot see the
-        subdivision error if their step is a whole number of signal periods; held-out angles must lie at other phases.
+    - `smooth` comes from the cross-validation on the calibration points. Cross-validation bridges gaps of two steps and the
+      compensation gaps of one, so that for the local fits, whose error falls as h^p, the error is divided by 2^p (p = 2
+      for lines, 4 for the spline, 0 for the others).
+    - `common` is the mean of the residuals at held-out angles beyond its noise.
+    - `white` is their mean square beyond noise, common and smooth misfit. Calibration points do not show the subdivision
+      error if their step is a whole number of signal periods; held-out angles must lie at other phases.
 
     Without held-out angles common and white are zero, and the smooth part keeps its full excess.
 
     Parameters
     ----------
     series : CalibrationSeries
-        calibration.
+        Calibration series.
     choice : Choice
-        What `choose` made of it.
-    held_out : CalibrationSeries | None
-        a separate series at other angles within the region.
+        Result of `choose`.
+    held_out : CalibrationSeries, optional
+        Separate series at other angles within the region.
 
     Raises
     ------
     ValueError
-        Held-out angles outside of the region.
+        Held-out angles lie outside the region.
     """
     trial = choice[choice.chosen]
     excess = trial.validation.excess

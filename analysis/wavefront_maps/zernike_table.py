@@ -68,6 +68,11 @@ def nm_to_noll(n: int, m: int) -> int:
     int
         Noll's index, 1 for piston.
 
+    Raises
+    ------
+    ValueError
+        Orders of no term, or above 30.
+
     Examples
     --------
     Defocus, the two comas and primary spherical aberration (Noll, J. Opt. Soc. Am. 66, 207 (1976)):
@@ -76,6 +81,8 @@ def nm_to_noll(n: int, m: int) -> int:
     >>> [analysis.nm_to_noll(n, m) for n, m in ((2, 0), (3, -1), (3, 1), (4, 0))]
     [4, 7, 8, 11]
     """
+    if not (0 <= n <= HIGHEST_ORDER and abs(m) <= n and (n - m) % 2 == 0):
+        raise ValueError(f"Zernike terms have 0 <= n <= {HIGHEST_ORDER}, |m| <= n and n - m even, found {n}, {m}")
     first = n * (n + 1) // 2 + 1
     return next(j for j in range(first, first + n + 1) if noll_to_nm(j) == (n, m))
 
