@@ -113,12 +113,12 @@ class WavefrontReadingsSpec(ReadingsSpec):
         first, last = (noll(term) for term in self.terms)
         if not 4 <= first <= last <= MAX_NOLL:
             found = f"{self.terms[0]} to {self.terms[1]}"
-            raise Problem("no range of terms", found, f"Z4 to Z11, at most Z{MAX_NOLL}", within=("terms",))
+            raise Problem("not a range of Zernike terms", found, f"Z4 to Z11, at most Z{MAX_NOLL}", within=("terms",))
         if self.zernikes is not None and self.maps is not None:
             raise Problem("coefficients and maps", "zernikes and maps", "one of them", within=("maps",))
         if self.maps is not None and len(self.maps) != len(self.fields):
             found, allowed = f"{len(self.maps)} maps", f"{len(self.fields)}, one for each field"
-            raise Problem("another number of maps than of fields", found, allowed, within=("maps",))
+            raise Problem("the number of maps differs from the number of fields", found, allowed, within=("maps",))
         return self
 
     @property
@@ -195,7 +195,7 @@ class MtfReadingsSpec(ReadingsSpec):
     @model_validator(mode="after")
     def _as_many(self) -> MtfReadingsSpec:
         if (self.along_line is None) != (self.along_track is None):
-            raise Problem("one direction only", "along_line or along_track", "both", within=("along_line",))
+            raise Problem("MTF along one direction only", "along_line or along_track", "both", within=("along_line",))
         _one_for_each(self.fields, self.along_line, "along_line")
         _one_for_each(self.fields, self.along_track, "along_track")
         return self
@@ -385,7 +385,7 @@ class PositionReadingsSpec(ReadingsSpec):
 
 def _one_for_each(places: Any, values: Any, key: str) -> None:
     if places is not None and values is not None and len(values) != len(places):
-        raise Problem("another number of values than of places", str(len(values)), str(len(places)), within=(key,))
+        raise Problem("not one value for each position", str(len(values)), str(len(places)), within=(key,))
 
 
 class MeasurementsSpec(Spec):
@@ -425,7 +425,7 @@ class MeasurementsSpec(Spec):
         seen: dict[str, str] = {}
         for kind, name, _ in self.every():
             if name in seen:
-                raise Problem("two measurements have one name", name, "a name of its own", within=(kind, name))
+                raise Problem("two measurements have one name", name, "a different name for each", within=(kind, name))
             seen[name] = kind
         return self
 
@@ -550,7 +550,7 @@ class AsBuiltSpec(Spec):
             if self.simulate is None and not one.given:
                 raise Problem("no data", name, "values or files, or `simulate: {}` to draw them", within=where)
             if self.simulate is not None and one.given:
-                raise Problem("data beside `simulate`", name, "one of them", within=where)
+                raise Problem("both data and `simulate`", name, "one of them", within=where)
         for name, move in self.moves.items():
             for actuator, amount in move.by.items():
                 if actuator not in self.actuators:

@@ -105,7 +105,7 @@ class AutocollimatorSpec(Spec):
         if all(abs(o) < h + room for o, h in zip(self.area_ccd.offset, half, strict=True)):
             reach = format_quantity(max(half) + room, LENGTH)
             raise Problem(
-                "the pinhole stands on the area CCD",
+                "the pinhole lies on the area CCD",
                 ", ".join(format_quantity(o, LENGTH) for o in self.area_ccd.offset),
                 f"{reach} or more along one of the axes",
                 within=("area_ccd", "offset"),
@@ -216,18 +216,18 @@ class AutocollimatorTestSpec(TitledSpec):
     @model_validator(mode="after")
     def _mirrors_fit(self) -> AutocollimatorTestSpec:
         least = min(self.programme.narrow, *self._stand_angles())
-        # neighbouring rims touch where the mirrors' planes meet: at radius tan(theta) from either middle
+        # neighbouring rims touch where the mirrors' planes intersect: at radius tan(theta) from either centre
         from_middle = self.mirrors.radius * math.tan(least)
         if 0.5 * self.mirrors.aperture >= from_middle:
             raise Problem(
-                "the mirrors run into each other",
+                "the mirrors overlap",
                 format_quantity(self.mirrors.aperture, LENGTH),
                 f"below {format_quantity(round(2.0 * from_middle, 6), LENGTH)} at this radius and angle",
                 within=("mirrors", "aperture"),
             )
         if self.mirrors.radius >= self.autocollimator.distance:
             raise Problem(
-                "the mirrors stand behind the autocollimator's lens",
+                "the mirrors are behind the autocollimator's lens",
                 format_quantity(self.mirrors.radius, LENGTH),
                 f"less than the distance, {format_quantity(self.autocollimator.distance, LENGTH)}",
                 within=("mirrors", "radius"),

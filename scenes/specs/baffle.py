@@ -88,7 +88,7 @@ def tube(name: str, body: str, pose: Pose, radius: float, length: float) -> tupl
     plates = []
     for k in range(TUBE_SIDES):
         turn = about_axis(2, 2.0 * np.pi * k / TUBE_SIDES)
-        # the plate's z points to the axis, its x along the tube
+        # rotate each plate so that its z points to the axis and its x along the tube
         inner = Pose(turn @ about_axis(1, -0.5 * np.pi), turn @ np.array([radius, 0.0, 0.5 * length]))
         plates.append(Plate(name, body, pose @ inner, Rectangle(0.5 * length, half)))
     return tuple(plates)
@@ -151,7 +151,9 @@ class BaffleSpec(Spec):
             if given != needed:
                 what = "needs" if needed else "has no"
                 allowed = f"for a {self.shape}: {', '.join(_NEEDS[self.shape])}"
-                raise Problem(f"a {self.shape} {what} {name}", "it" if given else "nothing", allowed, within=(name,))
+                raise Problem(
+                    f"a {self.shape} {what} {name}", "a value" if given else "no value", allowed, within=(name,)
+                )
         if self.shape == "ring" and not self.hole < self.diameter:  # type: ignore[operator]
             problem = "the hole is not smaller than the ring"
             raise Problem(problem, f"{self.hole:g} m", "a smaller hole", within=("hole",))

@@ -240,7 +240,7 @@ class MonitorGoalSpec(Spec):
     @model_validator(mode="after")
     def _something(self) -> MonitorGoalSpec:
         if not self.wanted:
-            raise Problem("what is the layout to reach?", "nothing", "one or several of angle, d_f and height")
+            raise Problem("the goal of the layout is empty", "nothing", "one or several of angle, d_f and height")
         return self
 
     @property
@@ -418,12 +418,12 @@ class MirrorSpec(Spec):
     def _index_where_light_refracts(self) -> MirrorSpec:
         given = [key for key in ("index", "glass") if getattr(self, key) is not None]
         if (self.light == "refracts") != bool(given):
-            problem = "a face of a lens has an index behind it, and nothing else has"
+            problem = "an index or a glass belongs to a face of a lens (light: refracts), and to no other surface"
             found = f"{' and '.join(given)}, light: {self.light or 'reflected'}" if given else "no index"
             raise Problem(problem, found, "light: refracts with an index or a glass", within=("light",))
         if len(given) > 1:
             problem = "the index of a glass follows from its dispersion"
-            raise Problem(problem, "index and glass", "one of both", within=("index",))
+            raise Problem(problem, "index and glass", "only one of them", within=("index",))
         return self
 
     @property
@@ -543,7 +543,7 @@ class CameraSpec(TitledSpec):
             if mirror.light != "refracts":
                 continue
             if mirror.enters_glass == bool(inside):
-                problem = "a lens has a face into glass and a face out of it, with nothing cemented to it"
+                problem = "lens faces must alternate between into and out of glass; cemented lenses are not supported"
                 allowed = "index: 1 where light leaves glass" if inside else "an index above 1 where light enters glass"
                 key = "index" if mirror.glass is None else "glass"
                 found = f"{mirror.index:g}" if mirror.glass is None else mirror.glass.name
@@ -559,7 +559,7 @@ class CameraSpec(TitledSpec):
         plain = [name for name, mirror in self.mirrors.items() if mirror.enters_glass and mirror.glass is None]
         for key in ("bands", "spectrum"):
             if plain and getattr(self, key):
-                problem = "an index alone says nothing of other wavelengths than the design's"
+                problem = "a bare index is valid at the design wavelength only"
                 allowed = f"the glass of {plain[0]} by its name, or no {key}"
                 raise Problem(problem, f"index at {plain[0]}", allowed, within=(key,))
         return self
@@ -577,7 +577,7 @@ class CameraSpec(TitledSpec):
         if self.spectrum is not None:
             lights["spectrum",] = self.spectrum
         colours: dict[tuple[str, ...], tuple[float, ...]] = {("wavelength",): (self.wavelength,)}
-        # of a table that has not been read the wavelengths are not known yet
+        # the wavelengths of a table are not known before it has been read
         colours |= {key: light.ends for key, light in lights.items() if light.curve is not None or light.table is None}
         for name, mirror in self.mirrors.items():
             for key, wavelengths in colours.items() if mirror.glass is not None else ():
@@ -607,9 +607,9 @@ class CameraSpec(TitledSpec):
         if mirror.glass is not None:
             return mirror.glass.index(colour, self.medium or "vacuum")
         if mirror.index is None:
-            raise ValueError(f"{name} is no face of a lens")
+            raise ValueError(f"{name} is not a face of a lens")
         if mirror.enters_glass and colour != self.wavelength:
-            raise ValueError(f"{name}: its index is known at the design wavelength alone; name its glass")
+            raise ValueError(f"{name}: its bare index is valid at the design wavelength only; give its glass")
         return mirror.index
 
     def warm_glass(self, name: str) -> WarmGlass:
@@ -623,7 +623,7 @@ class CameraSpec(TitledSpec):
         mirror = self.mirrors[name]
         if mirror.glass is None:
             raise ValueError(
-                f"the index of {name} alone says nothing of heat; name its glass, with `expansion` and `thermal` where "
+                f"the index of {name} has no thermal properties; give its glass, with `expansion` and `thermal` where "
                 "no catalogue has them"
             )
         return mirror.glass.warm(self.wavelength, self.medium or "vacuum")
@@ -677,14 +677,14 @@ class CameraSpec(TitledSpec):
         """
         for name, mirror in self.mirrors.items():
             if mirror.edges:
-                problem = f"{where} has no edges of its own: its clear apertures follow from its beams"
+                problem = f"{where} cannot have explicit edges: its clear apertures follow from its beams"
                 raise self.error(problem, ("mirrors", name, "edges"), allowed="no edges")
             if mirror.light is not None:
-                problem = f"{where} is made of mirrors alone"
+                problem = f"{where} must consist of mirrors only"
                 raise self.error(problem, ("mirrors", name, "light"), found=mirror.light, allowed="mirrors")
             if on_axis and (mirror.decentre or mirror.rotate or isinf(mirror.radius)):
                 key = next(k for k in ("decentre", "rotate", "radius") if k == "radius" or getattr(mirror, k))
-                problem = f"{where} has curved mirrors about one axis"
+                problem = f"{where} must have curved mirrors about one axis"
                 raise self.error(problem, ("mirrors", name, key), allowed="mirrors without decentre and rotate")
 
 

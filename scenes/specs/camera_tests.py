@@ -326,7 +326,7 @@ class DistortionFiles(Spec):
 
     @model_validator(mode="after")
     def _one_source_of_sigmas(self) -> "DistortionFiles":
-        problem = "how good the angles are is told in one way"
+        problem = "the accuracy of the angles must be given in exactly one way"
         require_one(self, ("turntable", "angle_sigma"), problem, "turntable: or angle_sigma:")
         return self
 
@@ -428,10 +428,10 @@ class FocusFiles(Spec):
     def _one_table(self) -> "FocusFiles":
         require_one(self, ("mtf", "images"), "one table is needed", "mtf: or images:")
         if self.noise and self.images is None:
-            problem = "sigmas of MTF values stand in their table"
+            problem = "sigmas of MTF values are given in their table"
             raise Problem(problem, "noise", "images: in place of mtf:", within=("noise",))
         if self.per_shift is not None and self.moved != "target":
-            problem = "only a target's move is another than the image's"
+            problem = "a ratio per_shift is possible only if the target is moved"
             raise Problem(problem, allowed="moved: target", within=("per_shift",))
         return self
 
@@ -467,5 +467,5 @@ class MeasuredFocusSpec(TitledSpec):
     def _shim_for_each_hole(self) -> "MeasuredFocusSpec":
         if self.shims is not None and len(self.shims) != len(self.mount.holes):
             found, allowed = f"{len(self.shims)} of them", f"{len(self.mount.holes)}, one for each hole"
-            raise Problem("another number of shims than of holes", found, allowed, within=("shims",))
+            raise Problem("the number of shims differs from the number of holes", found, allowed, within=("shims",))
         return self

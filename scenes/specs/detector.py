@@ -57,7 +57,7 @@ class DetectorSpec(TitledSpec):
     dark_noise_e: Annotated[Number, Field(ge=0.0, le=1e5)]
     dark_current_e_per_s: Annotated[Number, Field(ge=0.0, le=1e9)]
     full_well_e: Annotated[Number, Field(ge=1.0, le=1e9)]
-    # above 20% some responses would be negative; no image sensor is that uneven
+    # above 20 % some responses would be negative; no image sensor is that non-uniform
     prnu: Annotated[Number, Field(ge=0.0, le=0.2)]
     dsnu_e: Annotated[Number, Field(ge=0.0, le=1e5)]
     bit_depth: Annotated[Whole, Field(ge=1, le=16)]

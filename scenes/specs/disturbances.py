@@ -46,7 +46,7 @@ def _spread(kind: units.Kind, largest: str) -> Quantity:
 
 def _something(value: Any) -> Any:
     if value is None:
-        raise Problem("nothing stands here", "nothing", "a value; leave the key out where there is none")
+        raise Problem("the value is empty", "nothing", "a value; omit the key if there is none")
     return value
 
 
@@ -132,12 +132,17 @@ class TimeLawSpec(Spec):
     def _one_way(self) -> "TimeLawSpec":
         given = {name for name in _TIMES if getattr(self, name) is not None}
         if (self.kind is not None) == bool(given):
-            raise Problem("no law of time", self.text, _LAWS)
+            raise Problem("not a time law", self.text, _LAWS)
         if given - {"drift", "period"} and given not in _PRODUCTS:
             allowed = "trend alone or with period, relaxation or jump alone, event alone or with drift and period"
-            raise Problem("no law of time: these do not multiply", self.text, allowed)
+            raise Problem("not a time law: these cannot be multiplied", self.text, allowed)
         if self.since is not None and not {"trend", "relaxation"} & given:
-            raise Problem("nothing starts then", self.text, "since beside trend or relaxation", within=("since",))
+            raise Problem(
+                "only trend and relaxation have a start",
+                self.text,
+                "since beside trend or relaxation",
+                within=("since",),
+            )
         return self
 
     @property
@@ -208,7 +213,9 @@ class CorrelationSpec(Spec):
     @model_validator(mode="after")
     def _is_a_matrix(self) -> "CorrelationSpec":
         if (self.correlation is None) == (self.matrix is None):
-            raise Problem("how much do they move together?", "correlation and matrix", "one of correlation and matrix")
+            raise Problem(
+                "the correlation must be given once", "correlation and matrix", "one of correlation and matrix"
+            )
         if len(set(self.between)) != len(self.between):
             raise Problem("a component is named twice", ", ".join(self.between), "each once", within=("between",))
         if self.matrix is not None:
@@ -248,7 +255,7 @@ def component_named(text: str) -> tuple[str, str, str, str]:
         The text is not of this form.
     """
     words = text.split()
-    if len(words) > 1 and words[1] == "index_gradient":  # no perturbation of a job
+    if len(words) > 1 and words[1] == "index_gradient":  # a job cannot perturb it, so motion_of does not know it
         if len(words) != 3 or words[2] not in _AXES:
             raise Problem("not a component", shown(text), "NODE index_gradient x, y or z")
         return words[0], words[1], words[2], ""
@@ -288,7 +295,7 @@ def _components(value: Any) -> Any:
     if not isinstance(value, Mapping) or not value:
         raise Problem("no components", shown(value), '{"base/forward/M2 shift z": 3 um, ...}')
     if len(value) > MOST_JOINT:
-        raise Problem("too many components", f"{len(value)} of them", f"at most {MOST_JOINT}, those that matter most")
+        raise Problem("too many components", f"{len(value)} of them", f"at most {MOST_JOINT}, the most important ones")
     out: dict[str, float] = {}
     said: dict[tuple[str, str, str], str] = {}
     for name, sigma in value.items():
@@ -296,7 +303,7 @@ def _components(value: Any) -> Any:
             out[name] = _sigma_of(str(name), sigma)
             parts = component_named(name)[:3]
             if parts in said:
-                raise Problem("a component is named twice", shown(name), f"once; it is {said[parts]} as well")
+                raise Problem("a component is named twice", shown(name), f"once; it is also named {said[parts]}")
             said[parts] = name
         except Problem as wrong:
             raise wrong.below(name) from None
@@ -359,7 +366,7 @@ class JointSpec(Spec):
     @model_validator(mode="after")
     def _is_a_matrix(self) -> "JointSpec":
         if self.correlation is not None and self.correlation_file is not None:
-            raise Problem("two matrices of correlations", "correlation and correlation_file", "one of them")
+            raise Problem("two correlation matrices", "correlation and correlation_file", "one of them")
         if self.correlation is not None:
             _check_matrix(self.correlation, len(self.components), ("correlation",))
         return self
@@ -383,7 +390,7 @@ class JointSpec(Spec):
             strange = [head for head in heads if head not in names]
             missing = [name for name in names if name not in heads]
             found = f"{names_text(strange[:3])} among the heads" if strange else f"no column {names_text(missing[:3])}"
-            found = found if strange or missing else "a column that stands twice"
+            found = found if strange or missing else "a repeated column"
             problem = f"not the components of {self.source.file or 'the file of disturbances'}"
             raise InputError(Issue(problem, str(path), line, (), found, f"their {len(names)} names, each once"))
         order = [heads.index(name) for name in names]
@@ -545,10 +552,10 @@ class DisturbancesSpec(TitledSpec):
     @model_validator(mode="after")
     def _states_something(self) -> "DisturbancesSpec":
         if not self.causes and self.joint is None:
-            raise Problem("nothing is stated to move", "no cause", "causes: at least one; or joint", within=("causes",))
+            raise Problem("there are no disturbances", "no cause", "causes: at least one; or joint", within=("causes",))
         if self.joint is not None and JOINT in self.causes:
-            text = "the components of the file's own `joint` are called so"
-            raise Problem(text, JOINT, "another name of the cause", within=("causes", JOINT))
+            text = "this name is reserved for the components of `joint`"
+            raise Problem(text, JOINT, "another name for the cause", within=("causes", JOINT))
         return self
 
     def with_tables(self) -> "DisturbancesSpec":
@@ -575,7 +582,7 @@ class DisturbancesSpec(TitledSpec):
             del causes[name]
         for name, change in changes.causes.items():
             if name == JOINT and self.joint is not None:
-                text = "the components of the file's `joint` stand one by one, and not by causes"
+                text = "the components of `joint` cannot be changed as a cause"
                 raise changes.error(text, ("causes", name), allowed="another file of disturbances")
             if name in causes:
                 causes[name] = change.made_to(causes[name])
@@ -586,7 +593,7 @@ class DisturbancesSpec(TitledSpec):
                 allowed = f"a change of {names_text(self.causes)}; or {new}"
                 wrong = unknown(f"no such cause in {self.name}", name, self.causes, allowed=allowed)
                 raise changes.error(wrong, ("causes", name))
-            # of checked parts: to validate them again would ask for quantities as text
+            # the parts are already validated; validating again would require quantities as text
             causes[name] = CauseSpec.model_construct(**change.given)
         if not causes and self.joint is None:
             raise changes.error("no cause is left", ("without",), allowed="`disturbances: none` for none at all")
@@ -615,10 +622,10 @@ class JobDisturbancesSpec(Spec):
     def _each_once(self) -> "JobDisturbancesSpec":
         for k, name in enumerate(self.without):
             if name in self.without[:k]:
-                raise Problem("a cause is left out twice", shown(name), "each once", within=("without", k))
+                raise Problem("a cause is excluded twice", shown(name), "each once", within=("without", k))
             if name in self.causes:
-                text = "a cause is both changed and left out"
-                raise Problem(text, shown(name), "one of both", within=("without", k))
+                text = "a cause is both changed and excluded"
+                raise Problem(text, shown(name), "only one of them", within=("without", k))
         return self
 
 

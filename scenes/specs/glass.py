@@ -81,7 +81,7 @@ class LensGlassSpec(Spec):
     def _is_known(self) -> LensGlassSpec:
         given = [key for key in ("formula", "coefficients", "range") if getattr(self, key) is not None]
         if given and len(given) < 3:
-            raise Problem("a glass of one's own has all of these", ", ".join(given), "formula, coefficients, range")
+            raise Problem("an incomplete definition of a glass", ", ".join(given), "formula, coefficients, range")
         if not given:
             try:
                 glass(self.name)
@@ -137,8 +137,8 @@ class LensGlassSpec(Spec):
         stuff = None if own is None else MATERIALS.get(own.name)
         if self.expansion is None and stuff is None:
             raise UnphysicalError(
-                f"nothing says how {self.name} expands; its glass has to say `expansion: 8.2 ppm/K`, the first number "
-                "of ED in its AGF catalogue"
+                f"the thermal expansion of {self.name} is unknown; its glass needs `expansion: 8.2 ppm/K`, the first "
+                "number of ED in its AGF catalogue"
             )
         thermal = own.thermal if own is not None else None
         if self.thermal is not None:
@@ -146,7 +146,7 @@ class LensGlassSpec(Spec):
             thermal = ThermalDispersion(d0, d1, d2, e0, e1, lambda_tk)
         if thermal is None:
             raise UnphysicalError(
-                f"nothing says how the index of {self.name} changes with temperature; its glass has to say `thermal: "
+                f"dn/dT of {self.name} is unknown; its glass needs `thermal: "
                 "[D0, D1, D2, E0, E1, Lambda_TK]`, the first six numbers of TD in its AGF catalogue"
             )
         if self.expansion is not None:

@@ -727,7 +727,7 @@ def as_built_of(state: State) -> FrozenMap[str, PlainPerturbationSpec]:
 def _built(path: str, motion: Motion) -> PlainPerturbationSpec:
     if motion.scale or motion.expansion or any(motion.index_gradient) or motion.grid is not None:
         raise ValueError(f"{path}: only rigid motions, Zernike terms, radius, conic constant and index are as built")
-    # of checked parts: to validate them would ask for quantities as text
+    # the parts are already validated; validating again would require quantities as text
     return PlainPerturbationSpec.model_construct(
         rotate=motion.rotate,
         shift=motion.shift,

@@ -215,7 +215,7 @@ def pivot_problem(
     for path, moves in course.motion.items():
         own = perturb.get(path)
         if own is not None and (any(own.rotate) or own.scale) and own.pivot != moves.pivot:
-            text = "another pivot than under perturb, to which the course is added"
+            text = "the pivot differs from that under perturb, to which the course is added"
             return Problem(text, shown(moves.pivot), own.pivot, within=(*within, "motion", path, "pivot"))
     return None
 
@@ -262,7 +262,7 @@ class JobSpec(Spec):
 
     @model_validator(mode="after")
     def _one_pivot(self) -> "JobSpec":
-        # a table is added to when it has been read
+        # a course in a table is checked when the table has been read
         problem = None
         if self.course is not None and self.course.table is None:
             problem = pivot_problem(self.perturb, self.course, ("course",))
@@ -364,7 +364,7 @@ def _course_issues(course: CourseSpec, nodes: Mapping[str, NodeInfo]) -> list[Is
         elif "temperature" not in nodes[path].allows:
             issues.append(not_allowed(course, nodes[path], "temperature", key))
     for path, moves in course.motion.items():
-        # what is given at any time counts, also where it is zero
+        # a quantity that the course has counts at every time, even where it is zero
         does: dict[str, Any] = {
             name: 1.0 if name == "scale" else (1.0, 1.0, 1.0) for name, v in moves.given.items() if v is not None
         }

@@ -93,7 +93,7 @@ class TableTemperatureSpec(TemperatureSpec):
     def _says_of_a_table(self) -> "TableTemperatureSpec":
         wrong = next((key for key in HEAT_KEYS[1:] if self.table is None and getattr(self, key) is not None), None)
         if wrong is not None:
-            raise Problem(f"{wrong} says how a table is read, and there is none", None, "table: FILE", within=(wrong,))
+            raise Problem(f"{wrong} applies to a table, and there is none", None, "table: FILE", within=(wrong,))
         return self
 
 
@@ -175,24 +175,26 @@ def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
     path = owner.file_at(place, spec.table, Path(owner.source.file).parent, f"a file ({names_text(known)})")
     ending = path.suffix.lower()
     if ending in node_table.INPUT_DECKS:
-        text = f"a {ending} file has no {'temperatures' if heat else 'displacements'} that can be read here"
+        text = f"a {ending} file has no {'temperatures' if heat else 'displacements'} that this program can read"
         raise owner.error(
             text, place, found=spec.table, allowed=node_table.HEAT_DECKS_NEED if heat else node_table.DECKS_NEED
         )
     if ending not in known:
-        text = "neither a table nor a mesh that is known"
+        text = "unknown type of table or mesh"
         raise owner.error(Problem(text, shown(spec.table), names_text(known), nearest(ending, known)), place)
     of_meshes = ("unit", "field", "values") if heat else ("unit", "field")
     if ending in node_table.TABLES:
         wrong = next((name for name in of_meshes if getattr(spec, name) is not None), None)
         if wrong is not None:
-            text = f"a table has its units in its heads and no {wrong} beside them"
+            text = f"a table has its units in its heads; {wrong} is for meshes only"
             raise owner.error(text, (*key, wrong), allowed=f"no {wrong}")
     elif spec.unit is None:
-        raise owner.error("a mesh's file does not say its unit", place, found=spec.table, allowed="unit: mm beside it")
+        raise owner.error(
+            "the file of a mesh does not contain its unit", place, found=spec.table, allowed="a key unit: mm"
+        )
     elif isinstance(spec, TableTemperatureSpec) and spec.values is None:
-        text = "a mesh's file does not say whether its temperatures are changes or absolute"
-        raise owner.error(text, place, found=spec.table, allowed="values: change, K or degC beside it")
+        text = "the file of a mesh does not say whether its temperatures are changes or absolute"
+        raise owner.error(text, place, found=spec.table, allowed="values: change, K or degC as a further key")
     if isinstance(spec, TableTemperatureSpec):
         node_table.read_temperatures(path, spec.unit, spec.field, spec.values, spec.sha256)
     else:
@@ -243,9 +245,9 @@ class FinishSpec(Spec):
     @model_validator(mode="after")
     def _says_something_once(self) -> "FinishSpec":
         if self.bsdf is None and self.coating is None and self.reflectance is None:
-            raise Problem("a finish that says nothing", "no keys", "bsdf, coating or reflectance")
+            raise Problem("a finish without any property", "no keys", "bsdf, coating or reflectance")
         if self.coating is not None and self.reflectance is not None:
-            text = "a coating's table has the reflectance"
+            text = "the table of the coating already has the reflectance"
             raise Problem(text, "both coating and reflectance", "one of them", within=("reflectance",))
         return self
 
@@ -304,7 +306,7 @@ class FinishesSpec(Spec):
             named = [what for what in FinishSpec.model_fields if getattr(spec, what) is not None]
             wrong = next((what for what in named if what not in ALLOWS[kind]), None)
             if wrong is not None:
-                text = f"{kind} surfaces do not take a {wrong} here"
+                text = f"{kind} surfaces cannot have a measured {wrong}"
                 raise Problem(text, None, names_text(ALLOWS[kind]), within=(kind, wrong))
         return self
 
@@ -351,7 +353,7 @@ def checked_finishes(owner: Spec, key: KeyPath, spec: FinishesSpec) -> FinishesS
         ending = path.suffix.lower()
         right = (ENDING,) if what == "bsdf" else node_table.TABLES
         if ending not in right:
-            text = f"not the ending of a {what}'s table"
+            text = f"not the file type of a {what} table"
             raise owner.error(text, place, found=table.table, allowed=names_text(right))
         digest = digest_of(path)
         if table.sha256 is not None and digest != table.sha256:

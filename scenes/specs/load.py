@@ -109,7 +109,7 @@ def _as_built(spec: AsBuiltInstrumentSpec) -> InstrumentSpec:
     data = _instrument_file(spec.design, spec, (DESIGN,)).data
     if isinstance(data, dict) and DESIGN in data:
         problem, its = "this design is itself an instrument as built", shown(data[DESIGN])
-        allowed = f"the drawing that it names, {its}, and all that departs from it below as_built"
+        allowed = f"its design, {its}, with all deviations below as_built"
         raise spec.error(problem, (DESIGN,), found=spec.design, allowed=allowed)
     stated = spec.disturbances
     if stated is not None and stated != NONE:
@@ -147,7 +147,7 @@ def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesS
         owner, reference, key = instrument, instrument.disturbances, ("disturbances",)
     if reference is None or reference == NONE:
         if asked is not None and (asked.causes or asked.without):
-            text = "there is no disturbances file that could be changed"
+            text = "there is no disturbances file to change"
             raise job.error(text, ("disturbances",), allowed="the name of one as file")
         return None
     stated = load_disturbances(reference, owner, key)
@@ -171,7 +171,7 @@ def load_cameras(instrument: InstrumentSpec) -> FrozenMap[str, CameraSpec]:
         key: KeyPath = ("cameras", name, "camera")
         camera = load_camera(mounted.camera, instrument, key)
         if cameras.setdefault(str(mounted.camera), camera) != camera:
-            raise instrument.error("another camera of this instrument has this name", (*key, "name"))
+            raise instrument.error("another camera of this instrument has the same name", (*key, "name"))
     return FrozenMap(cameras)
 
 
@@ -179,7 +179,7 @@ def load_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath =
     """Read a camera; arguments and errors as in `load_instrument`."""
     text = referred(CAMERAS, reference, owner, key)
     if isinstance(text.data, dict) and DESIGN in text.data:
-        problem = "an instrument as built is no prescription of a camera"
+        problem = "an instrument as built is not a prescription of a camera"
         line, place = text.lines.get((*text.prefix, DESIGN)), (*text.prefix, DESIGN)
         raise InputError(Issue(problem, text.file, line, place, None, "its design's camera"))
     return validate(CameraSpec, text).with_curves()
@@ -219,17 +219,17 @@ def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
         return test, load_camera(test.camera, test, key)
     instrument = load_instrument(test.camera, test, key)
     if len(instrument.cameras) > 1:
-        problem = f"one camera is tested, and {instrument.name} has {names_text(instrument.cameras)}"
+        problem = f"the test needs a single camera, but {instrument.name} has {names_text(instrument.cameras)}"
         raise test.error(problem, key, found=test.camera, allowed="an instrument as built to a camera's design")
     (name, mounted), *_ = instrument.cameras.items()
     built = dict(test.as_built)
     for node, what in (instrument.as_built or {}).items():
-        # where the whole camera stands makes no difference before a collimator
+        # the pose of the whole camera has no effect in front of a collimator
         if node in (f"{BASE}/{name}", name):
             continue
         own = node.removeprefix(f"{BASE}/").removeprefix(f"{name}/")
         if own in built:
-            raise test.error(f"{text.file} says how this body was built", ("as_built", own), allowed="one of the two")
+            raise test.error(f"{text.file} already has this body", ("as_built", own), allowed="one of the two")
         built[own] = what
     return test.model_copy(update={"as_built": FrozenMap(built)}), load_cameras(instrument)[mounted.camera]
 

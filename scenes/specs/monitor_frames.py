@@ -157,7 +157,7 @@ class MeasurementSpec(Spec):
             text = "without an instrument there is no model of the spots"
             raise Problem(text, "twin", "template: measured", within=("template",))
         if self.disturbances is not None:
-            text = "what disturbances do to the spots is known of an instrument's model only"
+            text = "disturbances need the model of an instrument"
             raise Problem(text, None, "no disturbances, or an instrument", within=("disturbances",))
         if self.detector is None:
             raise Problem("no data sheet of the area CCDs", None, "detector: NAME or FILE", within=("detector",))
@@ -167,13 +167,13 @@ class MeasurementSpec(Spec):
     def _has_what_it_needs(self) -> MeasurementSpec:
         if self.photon_transfer == "measured" and (self.dark is None or self.flat is None):
             missing = names_text(name for name in ("dark", "flat") if getattr(self, name) is None)
-            text = "photon transfer is measured in dark and in flat frames"
+            text = "a measured photon transfer needs dark and flat frames"
             raise Problem(text, f"no {missing}", "dark: FILES and flat: FILES", within=("photon_transfer",))
         if self.flat is not None and self.dark is None:
-            text = "flat frames are of no use without dark frames"
+            text = "flat frames need dark frames"
             raise Problem(text, None, "dark: FILES as well", within=("flat",))
         if self.vibration == "fitted" and self.analysis.centroid != "ml":
-            text = "smear is fitted with the calibrated shape of the spots"
+            text = "fitting of smear needs the centroid method ml"
             raise Problem(text, self.analysis.centroid, "centroid: ml", within=("analysis", "centroid"))
         return self
 
@@ -189,7 +189,7 @@ class MeasurementSpec(Spec):
                 found, allowed = f"{len(files.after)} of {len(self.times)} times", "one file or list of files a time"
                 raise Problem("not as many entries as times", found, allowed, within=where)
             if self.times is None and any(len(one) > 1 for one in files.after):
-                text = "lists of files are for several times"
+                text = "lists of files need several times"
                 raise Problem(text, None, "times: [...], or a plain list", within=where)
         return self
 
@@ -262,7 +262,7 @@ class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
 
 def _model(spec: MeasurementSpec, instrument: str) -> ResolvedJob:
     job = JobSpec.model_construct(instrument=instrument, disturbances=spec.disturbances, analysis=spec.analysis)
-    # its keys are called as the measurement's, so that faults are told at their lines
+    # the job's keys have the names of the measurement's, so that issues are reported at their lines
     model = resolve_job(job.with_source(spec.source))
     if spec.exposure is None:
         return model
@@ -306,7 +306,9 @@ def _located(spec: MeasurementSpec, channels: tuple[str, ...], base: Path) -> Me
         update[key] = FrozenMap({name: _paths(spec, (key, name), files, base) for name, files in given.items()})
         left = [name for name in channels if name not in given and ALL not in given]
         if left:
-            raise spec.error(f"none for {names_text(left)}", (key,), allowed=f"{ALL}: FILES, or files of every channel")
+            raise spec.error(
+                f"missing for {names_text(left)}", (key,), allowed=f"{ALL}: FILES, or files of every channel"
+            )
     return spec.model_copy(update=update)
 
 
@@ -348,7 +350,7 @@ def _found(
                 meant = None if present else nearest(f"{stem}.tiff", names)
                 text, others = f"no frames of {channel} {when} in {place}", ", ".join(ENDINGS[1:])
                 if present:
-                    text += f": {present[0]} is a picture with 8 bits to look at, not what was recorded"
+                    text += f": {present[0]} is an 8-bit preview, not a recorded frame"
                 allowed = f"{stem}.tiff (or {others}), or CAMERA/CHANNEL: {{before: FILE, after: FILE}}"
                 raise spec.error(text, ("frames",), allowed=allowed, suggestion=meant)
             files[when] = (str((place / file).absolute()),)
@@ -460,7 +462,7 @@ class _FrameTable:
                 corner.append(int(row[name]))
             key = (channel, when == BEFORE)
             if corners.setdefault(key, (corner[0], corner[1])) != (corner[0], corner[1]):
-                text = "another first pixel than in the rows before"
+                text = "the first pixel differs from that in earlier rows"
                 raise InputError(Issue(text, file, line, ("row",), shown(corner), "the same for all after a state"))
 
     def _frames(

@@ -73,7 +73,7 @@ def node_named(name: str, nodes: Iterable[str]) -> str:
     if len(found) == 1:
         return found[0]
     if found:
-        raise Problem("several nodes are called so", shown(name), names_text(found))
+        raise Problem("several nodes have this name", shown(name), names_text(found))
     raise unknown("no such node", name, sorted(nodes))
 
 
@@ -198,13 +198,13 @@ def perturbation_in_words(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
         if kind in PURE:
             amount = _pure(kind, quantity, text)
         elif split_quantity(quantity) is None:
-            raise Problem("no amount with a unit", shown(quantity or text), FORMS)
+            raise Problem("the amount with its unit is missing", shown(quantity or text), FORMS)
         if (node, kind, axis) in said:
-            raise Problem("said twice", shown(text), f"one {kind} {axis}".rstrip() + f" of {node}")
+            raise Problem("this component is set twice", shown(text), f"one {kind} {axis}".rstrip() + f" of {node}")
         said.add((node, kind, axis))
         what = out.setdefault(node, {})
         put(what, kind, axis, amount, NOTHING.get(kind))
         if pivot:
             if what.setdefault("pivot", pivot) != pivot:
-                raise Problem(f"{node} has one pivot for all its turns", shown(pivot), what["pivot"])
+                raise Problem(f"{node} can have only one pivot for all its rotations", shown(pivot), what["pivot"])
     return out

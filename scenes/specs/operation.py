@@ -181,7 +181,7 @@ class OperationSetup(Spec):
     @property
     def disturbances(self) -> DisturbancesSpec:
         """Expected disturbances."""
-        assert self.model.disturbances is not None  # a plan names them
+        assert self.model.disturbances is not None  # a plan requires them
         return self.model.disturbances
 
 
@@ -205,7 +205,7 @@ def resolve_operation(spec: OperationSpec) -> OperationSetup:
     for key, place, others in (("instrument", INSTRUMENTS, ("cameras",)), ("disturbances", DISTURBANCES, ())):
         reference = getattr(spec, key)
         if reference == NONE:
-            problem, allowed = "a plan needs what is expected to move", "the name of a file of disturbances"
+            problem, allowed = "a plan of operation needs disturbances", "the name of a file of disturbances"
             raise spec.error(problem, (key,), found=reference, allowed=allowed)
         update[key] = placed(place, reference, spec, (key,), others)
     spec = spec.model_copy(update=update)
@@ -299,7 +299,7 @@ class ReadingTableSpec(Spec):
         if numbers and not self.columns:
             raise Problem(f"no columns of a table of kind {self.kind}", None, "columns: {BODY: {column: HEAD, ...}}")
         if not numbers and self.name is None:
-            raise Problem(f"no column that says which {self.kind}", None, "name: HEAD", within=("name",))
+            raise Problem(f"no column with the {self.kind}", None, "name: HEAD", within=("name",))
         if not numbers and (self.columns or self.form != "csv"):
             key = "columns" if self.columns else "form"
             raise Problem(f"a table of kind {self.kind} has no {key}", None, "name: HEAD", within=(key,))
@@ -307,7 +307,7 @@ class ReadingTableSpec(Spec):
         for subject, one in self.columns.items():
             _is_measured(self.kind, one, ("columns", subject))
             if self.form == "keywords" and len(one.column) > 1:
-                problem = "several keywords of one reading"
+                problem = "several keywords for one reading"
                 raise Problem(problem, names_text(one.column), "one keyword", within=("columns", subject, "column"))
         return self
 
@@ -317,7 +317,7 @@ def _is_measured(kind: str, one: ReadingColumnSpec, where: tuple[str, ...]) -> N
     value, sigma = VALUES[kind]
     count = {QUATERNION: 4}.get(one.unit, 3) if kind == "attitude" else 1
     if len(one.column) != count:
-        text = f"{len(one.column)} columns of one {kind}"
+        text = f"{len(one.column)} columns for one {kind}"
         raise Problem(text, names_text(one.column), f"{count} of them", within=(*where, "column"))
     if not (kind == "attitude" and one.unit == QUATERNION):
         _measures(one.unit, value, (*where, "unit"))

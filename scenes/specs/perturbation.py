@@ -159,11 +159,11 @@ BUILT = ("shift", "rotate", "pivot", "figure", "radius", "conic", "index")
 def _standing(value: Mapping[str, PlainPerturbationSpec]) -> Mapping[str, PlainPerturbationSpec]:
     for path, what in value.items():
         if what.temperature is not None:
-            problem = "a body as built has no temperature: it stands so at the instrument's own"
+            problem = "a body as built has no temperature: its state is that at the instrument's temperature"
             allowed = f"{names_text(BUILT)}; a temperature below a job's perturb"
             raise Problem(problem, "temperature", allowed, within=(path, "temperature"))
         if what.scale:
-            problem = "a body as built has no scale: each of its parts has its own place and shape"
+            problem = "a body as built has no scale: position and shape are given for each part"
             raise Problem(problem, "scale", names_text(BUILT), within=(path, "scale"))
     return value
 
@@ -231,7 +231,7 @@ def perturbation_issues(
         return [no_such_node(owner, nodes, path, key)]
     info, issues = nodes[path], []
     for action in what.needs():
-        # nodes are displaced where a surface has a figure
+        # a surface that allows a figure also allows displaced nodes
         if ("figure" if action == "deformation" else action) not in info.allows:
             issues.append(not_allowed(owner, info, action, (*key, action)))
     if what.pivot not in info.known_pivots:

@@ -60,7 +60,7 @@ class ResolvedJob(Spec):
     @property
     def area_detector(self) -> DetectorSpec:
         """Data sheet of the monitor's area CCDs. Raises InputError if the instrument has no monitor."""
-        self.instrument.autocollimator  # noqa: B018 - says so where there is none
+        self.instrument.autocollimator  # noqa: B018 - raises if there is none
         assert self.detector is not None
         return self.detector
 
@@ -136,7 +136,7 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
     line_detectors = None
     if job.render.target_images:
         line_detectors = FrozenMap({name: line_detector(camera) for name, camera in cameras.items()})
-    # Built from checked parts: validating again would ask for quantities as text.
+    # The parts are already validated; validating again would require quantities as text.
     return ResolvedJob.model_construct(
         job=job,
         instrument=instrument,
@@ -157,7 +157,7 @@ def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
     """
     resolved = resolve_on(budget, budget.instrument, budget.disturbances)
     if resolved.disturbances is None:
-        text = "an error budget is one of disturbances"
+        text = "an error budget needs disturbances"
         raise budget.error(text, ("disturbances",), found=budget.disturbances, allowed="the name of a file of them")
     return resolved
 
@@ -221,7 +221,7 @@ def target_band(camera: CameraSpec) -> str:
         The camera has no bands.
     """
     if not camera.bands:
-        raise camera.error("images of targets need a line CCD, and this camera describes none", ("bands",))
+        raise camera.error("images of targets need a line CCD, but this camera has no bands", ("bands",))
     return PANCHROMATIC if PANCHROMATIC in camera.bands else next(iter(camera.bands))
 
 
@@ -372,7 +372,7 @@ class FocusSetup(CameraTestSetup[FocusTestSpec]):
         super().checked()
         if len({band.offset for band in self.camera.bands.values()}) < 2:
             text = (
-                f"all bands of the camera {self.camera.name} stand at one X', so the tilt about the line cannot be told"
+                f"all bands of {self.camera.name} have the same X', which leaves the tilt about the line undetermined"
             )
             raise self.test.error(text, ("camera",), allowed="a camera with bands at different offsets")
         return self
@@ -569,7 +569,7 @@ def _of_job(resolved: ResolvedJob, file: str, name: str | None) -> CameraSetup:
     job = resolved.job
     if job.course is not None:
         allowed = "a job without a course; python -m twin.render follows the course"
-        raise job.error("a camera is looked at in one state, and this job has a course", ("course",), allowed=allowed)
+        raise job.error("the camera is analysed in one state, not in a course", ("course",), allowed=allowed)
     chosen = _chosen(tuple(resolved.instrument.cameras), file, name)
     camera = resolved.cameras[resolved.instrument.cameras[chosen].camera]
     return CameraSetup.model_construct(
@@ -601,7 +601,7 @@ def _of_run(yaml: YamlFile, name: str | None) -> CameraSetup:
     if held and all("mirrors" in camera for camera in held.values()):
         camera = validate(CameraSpec, yaml.part("cameras", _chosen(tuple(held), yaml.file, name)))
         return CameraSetup.model_construct(camera=camera, mounted=None, instrument=None, cameras=FrozenMap())
-    raise InputError(Issue("there is no camera's prescription in this file", yaml.file, 1, allowed=ALLOWED))
+    raise InputError(Issue("this file contains no prescription of a camera", yaml.file, 1, allowed=ALLOWED))
 
 
 def _chosen(names: tuple[str, ...], file: str, name: str | None) -> str:
@@ -609,7 +609,7 @@ def _chosen(names: tuple[str, ...], file: str, name: str | None) -> str:
     if name is None:
         if len(names) == 1:
             return names[0]
-        raise InputError(Issue("which of its cameras is meant is not said", file, allowed=f"--camera {names[0]} ..."))
+        raise InputError(Issue("the file has several cameras", file, allowed=f"--camera {names[0]} ..."))
     if name not in names:
         raise InputError(unknown("no such camera", name, names).at(file))
     return name

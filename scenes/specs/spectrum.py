@@ -33,7 +33,7 @@ def black_body_photons(wavelength: np.ndarray, temperature: float) -> np.ndarray
     np.ndarray
         Photons/(s m^2 sr m), of the wavelength's shape.
     """
-    # messages about files wait for this module, and scipy's table of constants is long
+    # imported here because scipy's table of constants would delay every message about a file
     from scipy import constants
 
     x = constants.h * constants.c / (wavelength * constants.k * temperature)
@@ -86,15 +86,15 @@ class SpectrumSpec(Spec):
     def _one_form(self) -> SpectrumSpec:
         given = "table" if self.table is not None else "curve"
         allowed = "between, wavelengths or table"
-        require_one(self, ("between", "wavelengths", given), "a spectrum is given in one way", allowed)
+        require_one(self, ("between", "wavelengths", given), "the spectrum must be given in exactly one way", allowed)
         if self.weights is not None and len(self.weights) != len(self.wavelengths or ()):
-            problem, found = "one weight for each wavelength", f"{len(self.weights)} weights"
+            problem, found = ("not one weight for each wavelength", f"{len(self.weights)} weights")
             raise Problem(problem, found, f"{len(self.wavelengths or ())} of them", within=("weights",))
         if self.weights is not None and not any(self.weights):
             raise Problem("all weights are zero", None, "one above zero", within=("weights",))
         if self.black_body is not None and self.wavelengths is not None:
             raise Problem(
-                "the weights of lines are their signal", "black_body", "no black_body", within=("black_body",)
+                "lines have weights in place of a black body", "black_body", "no black_body", within=("black_body",)
             )
         return self
 
@@ -108,7 +108,7 @@ class SpectrumSpec(Spec):
             if late is not None:
                 raise Problem("the wavelengths do not ascend", None, "ascending wavelengths", within=(name, late))
         if self.curve is not None and not (all(r >= 0.0 for _, r in self.curve) and any(r for _, r in self.curve)):
-            raise Problem("a response below zero, or none at all", None, "a response", within=("curve",))
+            raise Problem("the response is negative, or zero everywhere", None, "a response", within=("curve",))
         return self
 
     @model_serializer(mode="wrap")
@@ -204,7 +204,7 @@ class SpectrumSpec(Spec):
         read = read_table(path, columns, least_rows=2)
         if len(read) > MOST_SAMPLES:
             raise owner.error(
-                "a table of too many rows", (*key, "table"), found=len(read), allowed=f"at most {MOST_SAMPLES}"
+                "the table has too many rows", (*key, "table"), found=len(read), allowed=f"at most {MOST_SAMPLES}"
             )
         along, response = read["wavelength"], read["response"]
         late = np.flatnonzero(np.diff(along) <= 0.0)
@@ -212,7 +212,7 @@ class SpectrumSpec(Spec):
             raise read.error(int(late[0]) + 1, "wavelength", "the wavelengths do not ascend")
         if not np.any(response > 0.0):
             raise read.error(0, "response", "no response at any wavelength")
-        # a table's numbers have fewer digits than their rounding to metres
+        # remove the rounding error of the conversion to metres
         curve = tuple((float(f"{w:.12g}"), float(r)) for w, r in zip(along, response, strict=True))
         return self.model_copy(update={"curve": curve})
 

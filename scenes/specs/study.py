@@ -64,7 +64,7 @@ SMALLEST = 2.0**-53
 
 
 def _latin_hypercube(runs: int, factors: int, generator: np.random.Generator) -> np.ndarray:
-    # takes a second to import, and a worker does not need it
+    # slow to import (one second), and a worker does not need it
     from scipy.stats import qmc
 
     return np.asarray(qmc.LatinHypercube(factors, rng=generator).random(runs))
@@ -74,7 +74,7 @@ def _sobol(runs: int, factors: int, generator: np.random.Generator) -> np.ndarra
     from scipy.stats import qmc
 
     with warnings.catch_warnings():
-        # the user chose the number of runs; the points are those of the sequence all the same
+        # the user chose the number of runs; the points are valid even if it is not a power of two
         warnings.filterwarnings("ignore", message="The balance properties")
         return np.asarray(qmc.Sobol(factors, scramble=True, rng=generator).random(runs))
 
@@ -254,7 +254,7 @@ class FactorSpec(Spec):
         if not isinstance(data, Mapping) or not isinstance(data.get("motion"), str):
             return data
         if "key" in data:
-            raise Problem("a factor has a key or a motion", "both", "motion: M2 shift z")
+            raise Problem("a factor has either a key or a motion", "both", "motion: M2 shift z")
         node, kind, axis, quantity, pivot = motion_of(data["motion"])
         if quantity or pivot:
             text = "a factor's motion has no amount and no pivot"
@@ -268,11 +268,11 @@ class FactorSpec(Spec):
             raise Problem("a factor has either a key or keys", "both", "key: [...], or keys: [[...], [...]]")
         if self.key is None and self.keys is None and not self.scales:
             allowed = "key: [...], keys: [[...], [...]], or scales: [{key: [...]}]"
-            raise Problem("a factor changes something", "no key", allowed)
+            raise Problem("a factor needs a key, a motion or scales", "no key", allowed)
         given = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(given) != 1:
             found = ", ".join(given) or "none of them"
-            raise Problem("a factor takes its values from one thing", found, f"one of {', '.join(KINDS)}")
+            raise Problem("a factor needs exactly one kind of values", found, f"one of {', '.join(KINDS)}")
         if self.values is not None and not self.values:
             raise Problem("the factor is empty", "an empty list", "one value or more", within=("values",))
         if self.count is not None and self.kind != "range":
@@ -323,7 +323,7 @@ class FactorSpec(Spec):
             return
         numbers = self.numbers()
         if not numbers.numeric:
-            raise Problem("not numbers", shown(list(self.scalars())), "numbers, since it scales", within=(self.kind,))
+            raise Problem("not numbers", shown(list(self.scalars())), "numbers, for scales", within=(self.kind,))
         if not self.places and numbers.unit is not None:
             found, allowed = f"a number with {numbers.unit}", "pure numbers: values: [0.5, 1, 2]"
             raise Problem("a factor without a key is a ratio", found, allowed, within=(self.kind,))
@@ -392,10 +392,10 @@ class Numbers(tuple[float, ...]):
         for scalar, part in zip(scalars, parts, strict=True):
             if part is None:
                 allowed = f"a number with {first}"
-                raise Problem("not a quantity among quantities", shown(scalar), allowed, within=(kind,))
+                raise Problem("a value without a unit among quantities", shown(scalar), allowed, within=(kind,))
             number, unit = part
             try:
-                # dividing keeps 300 mm / (1000 mm/m) at 0.3 where a product would not
+                # a division gives exactly 0.3 for 300 mm / (1000 mm/m); a product with 0.001 would not
                 numbers.append(number if unit == first else number / unit_ratio(first, unit))
             except Problem as problem:
                 raise Problem(problem.problem, problem.found, problem.allowed, within=(kind,)) from None
@@ -489,7 +489,7 @@ class BaseSpec(Spec):
 
 
 TOTAL, NOISE = "_sigma", "_sigma_noise"
-"""Endings of standard deviations: of all that is stated, and of that what noise does; in results and of columns."""
+"""Suffixes of the keys and columns of standard deviations: total, and by the noise alone."""
 
 
 class ResponseSpec(Spec):
@@ -560,7 +560,7 @@ class ThresholdSpec(Spec):
     @model_validator(mode="after")
     def _asks_something(self) -> ThresholdSpec:
         if self.at_most is None and self.at_least is None:
-            raise Problem("the requirement asks nothing", None, "at_most: 1.0, or at_least: 0.2")
+            raise Problem("a requirement without a limit", None, "at_most: 1.0, or at_least: 0.2")
         return self
 
 
@@ -656,7 +656,7 @@ class StudySpec(TitledSpec):
                 if place in taken:
                     text = f"the factor {taken[place]} already changes this value"
                     within = ("factors", name, *factor.key_of(k))
-                    raise Problem(text, key_text(place), "every value changed by one factor", within=within)
+                    raise Problem(text, key_text(place), "each value changed by one factor only", within=within)
                 taken[place] = name
             self._check_design(name, factor)
         clash = self._clash()
@@ -680,7 +680,7 @@ class StudySpec(TitledSpec):
             *others, last = SAMPLERS
             kinds = f"{', '.join(others)} or {last}" if others else last
             allowed = f"values, or range with count; or a design of kind {kinds}"
-            text = "a grid needs values that can be counted"
+            text = "a grid needs a finite number of values"
             raise Problem(text, factor.kind, allowed, within=("factors", name, factor.kind))
         elif factor.kind == "range" and factor.count is None:
             text = "a range in a grid needs the number of its values"

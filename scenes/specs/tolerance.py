@@ -72,9 +72,11 @@ class Varied(Spec):
     def _is_a_motion(self) -> Varied:
         node, kind, _, amount, _ = self.parts
         if amount:
-            raise Problem("a motion without an amount", shown(self.motion), f"{node} {kind} ...", within=("motion",))
+            raise Problem(
+                "a motion without an amount is needed", shown(self.motion), f"{node} {kind} ...", within=("motion",)
+            )
         if self.carrying and kind not in ("shift", "rotate"):
-            raise Problem("only what shifts or rotates carries others", kind, "shift or rotate", within=("carrying",))
+            raise Problem("only shift and rotate carry others", kind, "shift or rotate", within=("carrying",))
         return self
 
     @property
@@ -177,22 +179,24 @@ class ToleranceSpec(Varied):
     def _is_a_tolerance(self) -> ToleranceSpec:
         self.si(self.limit, "limit", positive=True)
         if self.parts[1] == "abbe" and self.limit_si >= MOST_ABBE:
-            problem = "no Abbe number is that uncertain; it is tried at ten times its limit"
+            problem = "the limit is too large: the program tries ten times the limit"
             raise Problem(problem, shown(self.limit), "less than 10 percent", within=("limit",))
         if self.mean is not None:
             self.si(self.mean, "mean")
         for value in self.measured or ():
             self.si(value, "measured")
         if self.measured is not None and (self.mean is not None or self.law != "normal"):
-            raise Problem("what was measured has no law and no mean", None, "measured: [...]", within=("measured",))
+            raise Problem("measured values have no law and no mean", None, "measured: [...]", within=("measured",))
         self._costs_fall()
         if self.terms is not None:
             if self.parts[1] != SPECTRUM:
-                raise Problem("only a figure has terms", self.motion, "M1 figure", within=("terms",))
+                raise Problem("only a figure error has terms", self.motion, "M1 figure", within=("terms",))
             first, last = (noll(term) for term in self.terms)
             if not 4 <= first < last <= MAX_NOLL:
                 found = f"{self.terms[0]} to {self.terms[1]}"
-                raise Problem("no range of terms", found, f"Z5 to Z36, at most Z{MAX_NOLL}", within=("terms",))
+                raise Problem(
+                    "not a range of Zernike terms", found, f"Z5 to Z36, at most Z{MAX_NOLL}", within=("terms",)
+                )
             if self.law != "normal" or self.mean is not None or self.measured is not None:
                 problem = "the terms of a figure error are distributed normally about zero"
                 raise Problem(problem, None, "no law, mean or measured", within=("law",))
@@ -203,11 +207,11 @@ class ToleranceSpec(Varied):
         if self.costs is None:
             return
         if (self.cost, self.exponent) != (1.0, 1.0):
-            raise Problem("costs stand in place of cost and exponent", None, "one of both", within=("costs",))
+            raise Problem("costs replace cost and exponent", None, "one of both", within=("costs",))
         points = sorted((self.si(limit, "costs", positive=True), cost) for limit, cost in self.costs)
         for (limit, cost), (looser, less) in pairwise(points):
             if not limit < looser or less > cost:
-                problem = "a looser limit costs no more than a tighter one, and each limit has one cost"
+                problem = "costs must decrease with the limit, with one cost for each limit"
                 raise Problem(problem, f"{cost:g} and {less:g}", "costs that fall with the limit", within=("costs",))
 
     @property
@@ -378,7 +382,7 @@ class MeritSpec(Spec):
         more = self.kind in MORE_IS_BETTER
         wanted, other = ("at_least", "at_most") if more else ("at_most", "at_least")
         if getattr(self, wanted) is None or getattr(self, other) is not None:
-            raise Problem(f"of {self.kind} it is asked what it is {wanted}", other, f"{wanted}: ...")
+            raise Problem(f"a merit of kind {self.kind} needs {wanted}, and only that", other, f"{wanted}: ...")
         for key in ("at_most", "loss"):
             value = getattr(self, key)
             if value is not None and not self._si(value, key) > 0.0:
@@ -395,7 +399,7 @@ class MeritSpec(Spec):
         unit = MERIT_UNITS[self.kind]
         if unit is None:
             if isinstance(value, str):
-                raise Problem(f"of {self.kind} a pure number", shown(value), "a number without a unit", within=(key,))
+                raise Problem(f"{self.kind} is a pure number", shown(value), "a number without a unit", within=(key,))
             return float(value)
         try:
             return parse_quantity(value, unit)
@@ -489,7 +493,7 @@ class ToleranceBudgetSpec(Spec):
     def _disturbances_have_readings(self) -> ToleranceBudgetSpec:
         if self.disturbances is not None and not any(one.kind in OF_MONITOR for one in self.merits.values()):
             allowed = f"a merit of kind {' or '.join(OF_MONITOR)}, or no disturbances"
-            raise Problem("no merit rests on disturbances", None, allowed, within=("disturbances",))
+            raise Problem("no merit depends on disturbances", None, allowed, within=("disturbances",))
         return self
 
 

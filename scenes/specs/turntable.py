@@ -178,18 +178,18 @@ class CalibrationPlanSpec(Spec):
             )
         steps = (self.last - self.first) / self.step
         if abs(steps - round(steps)) > 1e-6 or round(steps) < 1:
-            allowed = f"a whole part of the region, {math.degrees(self.last - self.first):.6g} deg"
-            raise Problem("the region is no whole number of steps", shown["step"], allowed, within=("step",))
+            allowed = f"a whole fraction of the region, {math.degrees(self.last - self.first):.6g} deg"
+            raise Problem("the region is not a whole number of steps", shown["step"], allowed, within=("step",))
         if self.repeats < 2:
             raise Problem(
-                "one repeat only: its noise cannot be told",
+                "a single repeat does not determine the noise",
                 str(self.repeats),
                 "2 or more, and 5 or more for Chauvenet's criterion to reject any",
                 within=("repeats",),
             )
         if self.held_out.spread >= 0.5 * self.step:
             raise Problem(
-                "held-out angles would reach the calibrated ones",
+                "held-out angles would overlap the calibrated ones",
                 format_quantity(self.held_out.spread, ANGLE),
                 f"below half a step, {format_quantity(0.5 * self.step, ANGLE)}",
                 within=("held_out", "spread"),

@@ -88,11 +88,11 @@ def test_a_camera_as_built_in_the_laboratory(backend, tmp_path) -> None:
     state = build_camera_under_test(setup.test, setup.camera, backend).as_built
     assert state["camera/focal_plane"].shift == (0.0, 0.0, 30e-6)
     read(tmp_path, "name: own\ndesign: gf7\nas_built: [base/gf7/M2 shift z 30 um]\n")
-    with pytest.raises(InputError, match=r"focus.yaml:\d+: as_built.M2: .*own.yaml already has the deviations of this body"):
+    with pytest.raises(InputError, match=r"focus.yaml:\d+: as_built.M2: .*own.yaml already has this body"):
         FocusSetup.read(tmp_path / "focus.yaml")
     read(tmp_path, HEAD + "  forward/M2: {shift: 0 0 3 um}\n")
     with pytest.raises(
-        InputError, match=r"focus.yaml:\d+: camera: one camera is tested, and own has forward, backward"
+        InputError, match=r"focus.yaml:\d+: camera: the test needs a single camera, but own has forward, backward"
     ):
         FocusSetup.read(tmp_path / "focus.yaml")
 

@@ -376,7 +376,7 @@ def test_light_of_a_cut_pupil_is_that_of_traced_rays(cut, monkeypatch) -> None:
 
 def test_instruments_take_no_camera_with_edges() -> None:
     spec = spec_of(CAMERA)
-    with pytest.raises(InputError, match=r"mirrors\.P1\.edges: a camera of an instrument has no edges"):
+    with pytest.raises(InputError, match=r"mirrors\.P1\.edges: a camera of an instrument cannot have explicit edges"):
         spec.require_mirrors("a camera of an instrument")
     load_camera("gf7").require_mirrors("a camera of an instrument")
 

@@ -164,16 +164,16 @@ def test_a_gradient_across_a_lens_is_a_prism(singlet, backend) -> None:
 @pytest.mark.parametrize(
     ("changed", "node", "said"),
     [
-        ({}, "base", "L3: nothing says how F2 expands.*`expansion: 8.2 ppm/K`"),
+        ({}, "base", "L3: the thermal expansion of F2 is unknown.*`expansion: 8.2 ppm/K`"),
         (
             {"mirrors": ACHROMAT.replace("{name: F2", "{name: F2, expansion: 8.2 ppm/K")},
             "L3",
-            "index of F2.*`thermal: ",
+            "dn/dT of F2.*`thermal: ",
         ),
         (
             {"mirrors": ACHROMAT.replace("glass: N-BK7", "glass: Zerodur"), "focal": "1.05 m"},
             "L1",
-            "index of Zerodur.*`thermal: ",
+            "dn/dT of Zerodur.*`thermal: ",
         ),
         ({"mirrors": LIKE_ALUMINIUM}, "L2", "a face of the lens that base/achromat/L1 stands for"),
     ],

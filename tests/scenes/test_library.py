@@ -158,7 +158,7 @@ def test_an_equal_instrument_is_built_once_and_that_of_another_file_anew(backend
 
 
 def test_a_camera_by_itself_has_no_monitor() -> None:
-    with pytest.raises(InputError, match="has no monitor, so that no spot tells"):
+    with pytest.raises(InputError, match="has no monitor, so that its changes"):
         _ = load.load_instrument("ritchey_chretien").autocollimator
 
 
@@ -212,8 +212,8 @@ def read(model: type[Spec], text: str) -> Spec:
 @pytest.mark.parametrize(
     ("call", "problem"),
     [
-        (lambda spec: spec.index_behind("M1"), "M1 is no face of a lens"),
-        (lambda spec: spec.warm_glass("M1"), "says nothing of heat; name its glass"),
+        (lambda spec: spec.index_behind("M1"), "M1 is not a face of a lens"),
+        (lambda spec: spec.warm_glass("M1"), "has no thermal properties; give its glass"),
         (lambda spec: sheet_mesh(Surface(2.0), Circle(1.0)), "ends before its clear aperture does"),
         (lambda spec: study.unit_cube("few", 4, 2, 0), r"must give points \(4, 2\)"),
     ],
@@ -300,7 +300,7 @@ def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
     data = parse_yaml(setup.to_yaml()).data
     whole = data.pop("instrument")
     for change, words in (
-        ({}, "one camera is tested; found 'neither'"),
+        ({}, "exactly one camera is needed; found 'neither'"),
         ({"camera": whole}, "camera"),
         ({"instrument": whole, "cameras": {"gf8": data["cameras"]["gf7"]}}, "camera 'gf7' of the instrument's forward"),
     ):
@@ -335,7 +335,7 @@ def test_a_monitored_orbit(tmp_path: Path) -> None:
     text = (LIBRARY / "instruments" / "gf7_pair.yaml").read_text("utf-8")
     kept = [row for row in text.splitlines() if not row.lstrip().startswith("backward")]
     (tmp_path / "own.yaml").write_text("\n".join(kept), "utf-8")
-    with pytest.raises(InputError, match=r"no stereo pair.*forward in gf7_pair.*two cameras"):
+    with pytest.raises(InputError, match=r"not a stereo pair.*forward in gf7_pair.*two cameras"):
         orbit_setup.MonitorSetup.read(write(tmp_path, good("monitor").replace("gf7_pair", "own.yaml")))
 
 

@@ -77,7 +77,7 @@ MESH = "heat.csv => {table: heat.vtu, unit: m, values: K, field: b}"
 LIMITS = (
     (node_table, "MOST_NODES", 15, "temperatures", "", "nodes; allowed: at most 15"),
     (node_table, "LARGEST_TABLE", 99, "heated", MESH, "heat.vtu: too large"),
-    (spectrum, "MOST_SAMPLES", 5, "filter", "", "table: a table of too many rows; found 6"),
+    (spectrum, "MOST_SAMPLES", 5, "filter", "", "table: the table has too many rows; found 6"),
     (disturbances, "MOST_JOINT", 2, "joint disturbances", "", "components: too many components; found 3"),
     (camera_reader, "SAME", 0.0, "camera of a prescription", "", "would not trace as this prescription does"),
 )

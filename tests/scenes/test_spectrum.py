@@ -134,5 +134,5 @@ def test_bands_of_a_camera_of_lenses() -> None:
     del plain["spectrum"]
     old = CameraSpec.model_validate(plain)
     assert old.light is None
-    with pytest.raises(ValueError, match="name its glass"):
+    with pytest.raises(ValueError, match="give its glass"):
         glass_indices(old, 500e-9)

@@ -297,7 +297,7 @@ def test_a_mesh_says_what_a_table_says(tmp_path, nodes, gf7_pair, ending: str) -
     read = read_nodes(place, unit="mm")
     np.testing.assert_allclose(read.points, nodes[:, :3], rtol=1e-15)
     np.testing.assert_allclose(read.moves, nodes[:, 3:], rtol=1e-15)
-    with pytest.raises(InputError, match="does not say its unit"):
+    with pytest.raises(InputError, match="does not contain its unit"):
         load_job(deformed(tmp_path, place.name))
     with pytest.raises(InputError, match="no such vectors"):
         read_nodes(place, unit="mm", field="displacement")

@@ -101,7 +101,7 @@ def test_the_units_that_are_suggested_are_those_of_pint() -> None:
     suggested = {unit for kind in kinds for unit in (*kind.units, *kind.writes, kind.si)} - {"", "degC"}
     assert suggested <= set(units._KNOWN)
     for unit, (factor, base) in units._KNOWN.items():
-        asked = units._asked(unit)
+        asked = units._look_up_by_pint(unit)
         assert asked is not None
         assert asked[1] == base
         assert abs(asked[0] / factor - 1) < 1e-26

@@ -85,7 +85,7 @@ NODES = dict.fromkeys(("base", "base/a", "base/a/M1", "base/b", "base/b/M1", "ba
 def test_short_names_mean_one_body() -> None:
     assert node_named("M2", NODES) == "base/b/M2"
     assert node_named("a/M1", NODES) == "base/a/M1"
-    with pytest.raises(Problem, match="several nodes are called so") as several:
+    with pytest.raises(Problem, match="several nodes have this name") as several:
         node_named("M1", NODES)
     assert several.value.allowed == "base/a/M1, base/b/M1"
     with pytest.raises(Problem, match="no such node"):

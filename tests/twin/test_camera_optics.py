@@ -197,7 +197,7 @@ def test_no_colours_without_named_glass(achromat, backend) -> None:
     lenses["L1"] = lenses["L1"].model_copy(update={"glass": None, "index": 1.5168})
     old = replace(achromat, path=CameraOptics.alone(
         achromat.model.spec.model_copy(update={"mirrors": lenses, "spectrum": None}), backend).path)  # fmt: skip
-    with pytest.raises(ValueError, match="name its glass"):
+    with pytest.raises(ValueError, match="give its glass"):
         old.at(500e-9)
-    with pytest.raises(ValueError, match="name its glass"):
+    with pytest.raises(ValueError, match="give its glass"):
         axial_colour(old, [(0.0, 0.0)], np.array([500e-9]))

@@ -107,7 +107,7 @@ def test_a_line_of_several_numbers_is_told_in_times_of_what_is_stated(backend, b
 @pytest.mark.parametrize(
     ("named", "message"),
     [
-        ("none", "an error budget is one of disturbances"),
+        ("none", "an error budget needs disturbances"),
         ("paper_01", "did you mean 'paper_001'"),
         ("./own.yaml", "centroid is the line of the centroid's own noise"),
     ],

@@ -194,7 +194,7 @@ def test_a_run_of_a_study_that_cannot_be_built_names_the_factor(tmp_path, monkey
 
 def test_targets_are_imaged_by_cameras_with_line_ccds():
     assert _with_targets(read_source("gf7_pair").resolved).line_detectors
-    with pytest.raises(ValueError, match=r"no targets can be imaged: .*this camera describes none"):
+    with pytest.raises(ValueError, match=r"no targets can be imaged: .*this camera has no bands"):
         _with_targets(read_source("cassegrain").resolved)
 
 

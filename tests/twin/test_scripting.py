@@ -204,7 +204,7 @@ def test_wrong_names_are_explained(pair: twin.InstrumentTwin) -> None:
         (lambda: twin.load("gf7_par"), "did you mean 'gf7_pair'"),
         (lambda: twin.load("no_such_file.yaml"), r"no_such_file\.yaml"),
         (lambda: pair.render(frame=3), "did you mean 'frames'"),
-        (lambda: pair.perturbed("M2 shift z"), "perturb: no amount with a unit"),
+        (lambda: pair.perturbed("M2 shift z"), "perturb: the amount with its unit is missing"),
         (lambda: twin.perform("orbit angel", "angle"), "did you mean 'orbit angle'"),
         (lambda: twin.perform("orbit angle", "angle", pases=20), "did you mean 'passes'"),
         (lambda: twin.perform("orbit angle", "angle", passes="many"), "test.passes"),

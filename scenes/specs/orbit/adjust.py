@@ -280,10 +280,10 @@ class CameraChangeSpec(Spec):
         both = (self.lasting, self.each_pass)
         for k, name in enumerate(("d_alpha", "d_beta", "d_gamma")):
             if not any(one.angles[k] for one in both):
-                problem = f"{name} may not change at all, which no camera keeps"
+                problem = f"{name} has a prior sigma of zero, which is not realistic"
                 raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
         if not any(one.principal_distance for one in both):
-            problem = "the principal distance may not change at all, which no camera keeps"
+            problem = "the principal distance has a prior sigma of zero, which is not realistic"
             raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
         return self
 
@@ -387,10 +387,10 @@ class OrbitAdjustSpec(PayloadTestSpec):
     @model_validator(mode="after")
     def _fits_together(self) -> OrbitAdjustSpec:
         if not self.lines or len(set(self.lines)) != len(self.lines):
-            raise Problem("no lines, or one twice", None, "each line once", within=("lines",))
+            raise Problem("no lines, or a repeated line", None, "each line once", within=("lines",))
         for name in self.lines:
             if name not in self.changes:
-                raise Problem(f"it is not said how {name} may have changed", None, f"`{name}:`", within=("changes",))
+                raise Problem(f"no change of {name} is given", None, f"`{name}:`", within=("changes",))
         for name in self.changes:
             if name not in self.lines:
                 raise unknown("no such line among `lines`", name, self.lines, ("changes", name))
@@ -509,7 +509,7 @@ class MeasuredAdjustSpec(MeasuredTestSpec):
                 raise unknown("no such group of variances", name, groups, ("components", k))
         one_monitor(self.monitor, self.monitor_record)
         if "monitor" in self.without and "monitor" not in self.sensors:
-            raise Problem("no monitor to do without", None, "a section `monitor:`", within=("without",))
+            raise Problem("there is no monitor to exclude", None, "a section `monitor:`", within=("without",))
         return self
 
     @property

@@ -31,10 +31,10 @@ Change = Annotated[PlainPerturbationSpec, short_for("rotate", list)]
 
 def _angles(angles: Mapping[str, tuple[str, str]] | None) -> Mapping[str, tuple[str, str]] | None:
     if angles is not None and not angles:
-        raise Problem("no angles", "an empty mapping", "alpha: [forward, nadir], or nothing for the usual ones")
+        raise Problem("no angles", "an empty mapping", "alpha: [forward, nadir], or no key for the default angles")
     for name, (first, second) in (angles or {}).items():
         if first == second:
-            problem = "a line makes no angle with itself"
+            problem = "an angle needs two different lines"
             raise Problem(problem, f"{first} twice", "two different lines", within=(name,))
     return angles
 

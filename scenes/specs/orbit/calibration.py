@@ -190,7 +190,7 @@ class CalibrationImagesSpec(Spec):
     def _are_enough(self) -> "CalibrationImagesSpec":
         if len(self.patches) < LEAST_PATCHES:
             found = f"{len(self.patches)}"
-            problem = "too few patches to tell principal distance from attitude"
+            problem = "too few patches to separate principal distance from attitude"
             raise Problem(problem, found, f"{LEAST_PATCHES} or more", within=("patches",))
         if self.points.control < 1 or self.points.check < 1:
             found = f"control {self.points.control}, check {self.points.check}"
@@ -271,7 +271,7 @@ def checked_schemes(schemes: Sequence[Sequence[str]], fields: Mapping[str, objec
                 raise unknown("no such field", name, fields, ("schemes",))
         if not scheme or len(set(scheme)) != len(scheme):
             found = names_text(scheme) or "none"
-            raise Problem("a scheme without fields, or with one twice", found, "each once", within=("schemes",))
+            raise Problem("a scheme without fields, or with a repeated field", found, "each once", within=("schemes",))
 
 
 class OrbitCalibrationSpec(TitledSpec):
@@ -348,22 +348,20 @@ class OrbitCalibrationSpec(TitledSpec):
 
     @model_validator(mode="after")
     def _has_points(self) -> "OrbitCalibrationSpec":
-        problem = "points are drawn or measured in images"
+        problem = "points must be given in exactly one way"
         require_one(self, ("points", "images"), problem, "`points:` or `images:`", ("points",))
         if self.images is not None and self.repeats:
-            problem = "campaigns from images are not repeated, for each is rendered anew"
+            problem = "campaigns from images cannot be repeated"
             raise Problem(problem, str(self.repeats), "0", within=("repeats",))
         return self
 
     @model_validator(mode="after")
     def _can_be_compared(self) -> "OrbitCalibrationSpec":
         if self.monitor is not None and not self.drift:
-            allowed = "a section `drift:`, with sigmas of zero for cameras that keep"
-            raise Problem("a monitor, but nothing that it reads", None, allowed, within=("monitor",))
+            allowed = "a section `drift:`, with sigmas of zero for stable cameras"
+            raise Problem("a monitor, but no changes that it could measure", None, allowed, within=("monitor",))
         if self.drift and self.images is not None:
-            problem = (
-                "cameras that drift are compared on drawn points only, for images would be rendered for every size"
-            )
+            problem = "a drift of the cameras needs simulated points: images cannot be rendered for it"
             raise Problem(problem, None, "`points:` instead of `images:`", within=("drift",))
         errors = self.errors
         noise = (*errors.star_tracker.noise, *errors.star_tracker.slow.noise, *errors.gps.noise)

@@ -102,7 +102,7 @@ def parse_utc(text: Any) -> str:
         raise Problem("not a date and time", shown(text), ALLOWED)
     stripped = text.strip()
     if re.fullmatch(PATTERN.replace("Z$", "$"), stripped):
-        raise Problem("a date and time without its zone", shown(text), ALLOWED)
+        raise Problem("a date and time without a time zone", shown(text), ALLOWED)
     if not re.fullmatch(PATTERN, stripped):
         raise Problem("not a date and time", shown(text), ALLOWED)
     try:
@@ -211,7 +211,7 @@ class ElementsSpec(Spec):
             found = str(self.eccentricity)
             raise Problem("outside the limits", found, "a number from 0 to 0.1", within=("eccentricity",))
         if (self.node is None) == (self.node_local_time is None):
-            raise Problem("the node is given twice or not at all", None, "either node or node_local_time")
+            raise Problem("the node must be given in exactly one way", None, "either node or node_local_time")
         return self
 
 
@@ -257,7 +257,7 @@ class OrbitSpec(Spec):
     @model_validator(mode="after")
     def _is_one_orbit(self) -> "OrbitSpec":
         names = ("passing", "elements", "state")
-        require_one(self, names, "the orbit is not given once", "one of passing, elements, state")
+        require_one(self, names, "the orbit must be given in exactly one way", "one of passing, elements, state")
         if self.before + self.after == 0.0:
             found = f"before and after are {format_quantity(0.0, MOMENT)}"
             raise Problem("the orbit has no length", found, "a time before or after the epoch", within=("after",))

@@ -23,13 +23,13 @@ AXES: tuple[Axis, ...] = ("roll", "pitch", "yaw")
 
 def _some_lines(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
     if names is not None and (len(names) < 2 or len(set(names)) < len(names)):
-        raise Problem("no two lines, or one twice", names_text(names) or "none", "two lines or more, each once")
+        raise Problem("too few lines, or a repeated line", names_text(names) or "none", "two lines or more, each once")
     return names
 
 
 def _some_axes(names: tuple[Axis, ...]) -> tuple[Axis, ...]:
     if not names or len(set(names)) < len(names):
-        raise Problem("no axis, or one twice", names_text(names) or "none", "roll, pitch, yaw, each once at most")
+        raise Problem("no axis, or a repeated axis", names_text(names) or "none", "roll, pitch, yaw, each once at most")
     return names
 
 
@@ -89,7 +89,7 @@ class JitterSearchSpec(Spec):
     def _looks_somewhere(self) -> "JitterSearchSpec":
         if not self.lowest < self.highest:
             found = f"{format_quantity(self.lowest, FREQUENCY)} to {format_quantity(self.highest, FREQUENCY)}"
-            raise Problem("no frequencies to look at", found, "`highest` above `lowest`", within=("highest",))
+            raise Problem("the range of frequencies is empty", found, "`highest` above `lowest`", within=("highest",))
         return self
 
 

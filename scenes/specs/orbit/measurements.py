@@ -47,8 +47,8 @@ def body_axes_matrix(axes: tuple[str, str, str]) -> tuple[tuple[int, int, int], 
 def _right_handed(axes: tuple[Toward, Toward, Toward]) -> tuple[Toward, Toward, Toward]:
     (a, b, c), (d, e, f), (g, h, i) = body_axes_matrix(axes)
     if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) != 1:
-        allowed = "three directions square to each other, z = x × y, as [forward, right, down]"
-        raise Problem("no right-handed axes", names_text(axes), allowed)
+        allowed = "three perpendicular directions, z = x × y, as [forward, right, down]"
+        raise Problem("axes that are not right-handed", names_text(axes), allowed)
     return axes
 
 
@@ -181,7 +181,7 @@ class _HeightsFileSpec(Spec):
     def _has_its_geoid(self) -> Self:
         if (self.heights == "geoid") != (self.geoid is not None):
             allowed = "heights: geoid with geoid: FILE, or heights: ellipsoid"
-            raise Problem("heights and geoid do not fit", None, allowed, within=("heights",))
+            raise Problem("heights and geoid do not fit together", None, allowed, within=("heights",))
         return self
 
 
@@ -361,7 +361,7 @@ class PassFilesSpec(Spec):
         if (self.platform is not None) == any(apart) or (any(apart) and not all(apart)):
             given = [k for k in ("platform", "orbit", "attitude") if getattr(self, k) is not None]
             allowed = "`platform: FILE`, `platform:` with files of other formats, or `orbit: FILE` and `attitude: FILE`"
-            raise Problem("orbit and attitude are not given once", " and ".join(given) or "none of them", allowed)
+            raise Problem("orbit and attitude must be given once", " and ".join(given) or "none of them", allowed)
         return self
 
     @property
@@ -501,7 +501,7 @@ class MeasuredTestSpec(FixedTestSpec):
             if ("data" in value) == bool(here) or len(here) == 1:
                 found = names_text([*(["data"] if "data" in value else []), *here]) or "none of them"
                 allowed = "`data: DIR`, or `conventions:` and `passes:`"
-                raise Problem("where the measurements are is not said once", found, allowed, within=("data",))
+                raise Problem("the measurements must be given in exactly one way", found, allowed, within=("data",))
         return value
 
 
@@ -559,7 +559,7 @@ class MeasuredAngleSpec(MeasuredTestSpec):
     def _knows_these_errors(self) -> MeasuredAngleSpec:
         tracker = self.errors.star_tracker
         if any(tracker.drift or ()) or any(tracker.walk):
-            problem = "angles know of readings and slow errors of the attitude, not of a drift or a walk"
+            problem = "the evaluation of angles has no model of a drift or a walk of the attitude"
             raise Problem(problem, None, "`slow:`", within=("errors", "star_tracker"))
         return self
 

@@ -206,7 +206,7 @@ class CorrectionSpec(Spec):
         except Problem as problem:
             raise problem.below("mechanism") from None
         if self.mechanism is not None and kind not in _KINDS:
-            raise Problem("not a motion of a mechanism", shown(kind), "rotate or shift, and an axis", None, ("mechanism",))
+            raise Problem("not a mechanism's motion", shown(kind), "rotate or shift, and an axis", None, ("mechanism",))
         for key in ("step", "range", "dead_band"):
             self._size(key)
         if self.largest == 0.0:
@@ -441,7 +441,7 @@ class OrbitMonitorSpec(TitledSpec):
         if (self.course is None) is (loop.readings is None):
             found = "neither" if loop.readings is None else "both"
             allowed = "readings: {every: 4 min, count: 25}, or the file's course"
-            raise Problem("the times of the readings must be given in exactly one way", found, allowed, within=("mechanisms",))
+            raise Problem("the readings' times must be given once", found, allowed, within=("mechanisms",))
 
     def _check_course(self, course: CourseSpec) -> None:
         """Raise `Problem` unless the times are evenly spaced and all motions are in the test's `motion`."""

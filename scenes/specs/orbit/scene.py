@@ -22,7 +22,7 @@ _EVEN_TERMS = ("Z4", "Z5", "Z6", "Z11", "Z12", "Z13", "Z14", "Z15", "Z22")
 
 def _is_even(term: str) -> str:
     if term not in _EVEN_TERMS:
-        allowed = f"{', '.join(_EVEN_TERMS)}; the others shift the image, which the interior orientation tells"
+        allowed = f"{', '.join(_EVEN_TERMS)}; other terms shift the image and are part of the interior orientation"
         raise Problem("not a wavefront term of a line", term, allowed)
     return term
 
@@ -45,7 +45,7 @@ def _is_convex(outline: tuple[Corner, ...]) -> tuple[Corner, ...]:
         or abs(area(corners)) < _SMALLEST
         or abs(area(hull(corners[None]))[0]) > abs(area(corners)) * (1.0 + 1e-9)
     ):
-        allowed = "three corners or more, in order, of a convex polygon; give others as several"
+        allowed = "three corners or more, in order, of a convex polygon; divide other shapes into several polygons"
         raise Problem("not a convex polygon", str([list(corner) for corner in outline]), allowed)
     return outline
 
@@ -65,7 +65,7 @@ def _apart(outlines: tuple[tuple[Corner, ...], ...]) -> tuple[tuple[Corner, ...]
     turn = 2.0 * np.pi * np.arange(64) / 64
     disk = np.stack([np.cos(turn), np.sin(turn)], axis=-1)[None]
     if sum(float(area(intersect(shape, *sides(disk)))[0]) for shape in shapes) > 0.9 * np.pi:
-        raise Problem("the pupil is covered", "", "outlines that leave a tenth of it")
+        raise Problem("the pupil is covered", "", "outlines that leave at least a tenth of it")
     return outlines
 
 
@@ -333,7 +333,7 @@ class ImagePointsSpec(Spec):
 
 def _each_once(lines: tuple[str, ...]) -> tuple[str, ...]:
     if not lines or len(set(lines)) != len(lines):
-        raise Problem("no lines, or one twice", names_text(lines) or "none", "each line once")
+        raise Problem("no lines, or a repeated line", names_text(lines) or "none", "each line once")
     return lines
 
 

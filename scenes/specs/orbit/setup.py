@@ -114,7 +114,9 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
         """Return the set-up with default angles, after a check that angles, changes and strips fit the lines."""
         if (self.camera is None) == (self.instrument is None):
             found = "neither" if self.camera is None else "both"
-            raise self.error("one camera is tested", ("camera",), found=found, allowed="`camera:` or `instrument:`")
+            raise self.error(
+                "exactly one camera is needed", ("camera",), found=found, allowed="`camera:` or `instrument:`"
+            )
         for name, mounted in self.instrument.cameras.items() if self.instrument is not None else ():
             if mounted.camera not in self.cameras:
                 problem = f"camera {mounted.camera!r} of the instrument's {name} is missing"
@@ -127,7 +129,7 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
             )
         angles = test.angles or usual_angles(lines)
         if angles is None:
-            problem = "which lines the angles lie between is not said"
+            problem = "the lines of the angles are missing"
             allowed = "`angles:` with a name and two lines for each, as alpha: [forward, nadir]"
             raise test.error(problem, ("camera",), found=has, allowed=allowed)
         for name, pair in angles.items():
@@ -192,7 +194,7 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
             raise test.error(
                 "the nadir line's principal point is the gauge",
                 ("perturb", "nadir", "principal_point"),
-                allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
+                allowed="no change; rotate the whole camera instead, by errors.star_tracker.bias",
             )
         fewest = min(camera.pixels_of(name) for name in LINES)
         if test.points is not None:
@@ -454,7 +456,7 @@ def data_of(test: measurements.MeasuredTestSpec) -> measurements.OrbitDataSpec:
     tables = any(not isinstance(one.platform, measurements.PlatformFilesSpec) for one in data.passes.values())
     for key in ("quaternion", "body_axes"):
         if tables and getattr(data.conventions, key) is None:
-            problem = f"{key} is missing: a table of an attitude does not say how it is to be read"
+            problem = f"{key} is missing: a table of an attitude does not contain this convention"
             raise data.error(problem, ("conventions",), allowed=f"`{key}:`")
     return measurements.with_absolute_files(data, file.parent, data)
 
@@ -518,7 +520,7 @@ def _require_mechanisms(setup: MonitorSetup, loop: MechanismsSpec) -> None:
     """Raise `InputError` unless there are disturbances, mechanisms act on the pair, and its images have data sheets."""
     test = setup.test
     if setup.disturbances is None:
-        problem = "nothing is stated to move, so that spots say nothing of what to correct"
+        problem = "there are no disturbances, so that spots say nothing of what to correct"
         raise test.error(problem, ("disturbances",), allowed="the name of a file in scenes/library/disturbances")
     if loop.images is not None:
         for name in setup.cameras:
@@ -542,7 +544,7 @@ def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: P
     if test.cameras is None and len(names) != 2:
         found = f"{names_text(names)} in {instrument.name}"
         allowed = "two cameras for a stereo pair; of more than two, name them as cameras: [first, second]"
-        raise test.error("the instrument is no stereo pair", ("instrument",), found=found, allowed=allowed)
+        raise test.error("the instrument is not a stereo pair", ("instrument",), found=found, allowed=allowed)
     pair = test.cameras or names
     for name in pair:
         if name not in names:
@@ -551,7 +553,7 @@ def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: P
     looks = [instrument.cameras[name].look for name in pair]
     if abs(looks[0] - looks[1]) < _LEAST_ANGLE:
         found = " and ".join(format_quantity(look, ANGLE) for look in looks)
-        raise test.error("the cameras look the same way", ("cameras",), found=found, allowed="1 deg apart or more")
+        raise test.error("equal look angles of the cameras", ("cameras",), found=found, allowed="1 deg apart or more")
     pixels = cameras[instrument.cameras[pair[1]].camera].line.pixels
     _require_ends(test, "ground", (test.ground.first, test.ground.last), pixels, f"the line of {pair[1]}")
 
@@ -569,7 +571,9 @@ def _require_several(test: Spec, named: tuple[str, ...] | None, camera: ThreeLin
             raise test.error(unknown("no such line", name, names, allowed=allowed), ("lines", k))
     if len(named or names) < 2:
         found = f"{names_text(names)} in {camera.name}"
-        raise test.error("jitter is seen by two lines or more", ("camera",), found=found, allowed="a camera of several")
+        raise test.error(
+            "a search for jitter needs two lines", ("camera",), found=found, allowed="a camera with several lines"
+        )
 
 
 _THREE_LINES = "a camera with lines forward, nadir and backward"
@@ -579,7 +583,7 @@ def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraS
     """Raise `InputError` for a change of a line that is defined by look angles."""
     for name in changes:
         if name in camera.lines and camera.lines[name].by_look_angles:
-            problem = f"{name} of {camera.name} is known by look angles, which say nothing of a changed lens"
+            problem = f"{name} of {camera.name} is defined by look angles, which have no lens that could change"
             raise test.error(problem, ("perturb", name), allowed="a line with `shift` and `rotate` of its CCDs")
 
 
@@ -587,7 +591,7 @@ def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCamera
     """Raise `InputError` unless the camera defines the image formation of each line."""
     for name in lines:
         if camera.image_of(name) is None:
-            problem = f"{camera.name} does not say how its line {name} forms an image"
+            problem = f"{camera.name} does not describe the image formation of its line {name}"
             raise test.error(problem, ("camera",), found=camera.name, allowed="a payload with a section `image`")
 
 

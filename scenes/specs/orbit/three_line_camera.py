@@ -61,7 +61,7 @@ class CcdSpec(Spec):
         if (self.psi_x is None) != (self.psi_y is None):
             raise Problem("look angles along one axis only", None, "both psi_x and psi_y")
         if self.psi_x is not None and (any(self.shift) or self.rotate):
-            raise Problem("look angles and a place", None, "psi_x and psi_y, or shift and rotate")
+            raise Problem("both look angles and a position", None, "psi_x and psi_y, or shift and rotate")
         return self
 
 
@@ -121,7 +121,7 @@ class LineCameraSpec(Spec):
     @model_validator(mode="after")
     def _is_distorted_once(self) -> "LineCameraSpec":
         if self.by_look_angles and (self.k1 or self.k2):
-            problem = "look angles contain the distortion"
+            problem = "look angles already include the distortion"
             raise Problem(problem, f"k1 {self.k1:g} 1/m^2, k2 {self.k2:g} 1/m^4", "neither", within=("k1",))
         return self
 

@@ -166,7 +166,7 @@ def experiment(folder: Path, fixture: Fixture) -> Read:
 
 
 def layout_search(folder: Path, fixture: Fixture) -> Read:
-    """A search for a layout; beside it an instrument as built, and one of which nothing is stated to move."""
+    """A search for a layout; beside it an instrument as built, and one of which there are no disturbances."""
     (folder / "built.yaml").write_text(good("as built"), "utf-8")
     (folder / "still.yaml").write_text(good("room in an instrument").replace("disturbances: orbit\n", ""), "utf-8")
     return MonitorDesignSetup.read
