@@ -216,7 +216,7 @@ def test_zernike_terms_that_cannot_be_joined() -> None:
 
 def test_an_instrument_takes_no_lenses(tmp_path: Path, backend) -> None:
     made = camera_of(singlet(tmp_path), "singlet", backend, Width(pupil=1e-4))
-    with pytest.raises(InputError, match="a camera with a monitor is made of mirrors alone"):
+    with pytest.raises(InputError, match="a camera with a monitor must consist of mirrors only"):
         build_instrument(load_instrument("gf7_pair"), {"gf7": made.camera}, backend)
 
 
