@@ -5,6 +5,7 @@ and a length in micrometres is ``length * UM_PER_M``; these two forms round only
 
 The decorator `shows` gives a class a ``__repr__`` of chosen fields with units, arrays by shape and range:
 
+>>> from dataclasses import dataclass
 >>> @shows("rms [um]", "rays [um]")
 ... @dataclass
 ... class Spot:

@@ -124,7 +124,7 @@ def test_places_that_cannot_tell():
         with pytest.raises(ObservabilityError, match=r"one straight line along.*place some of them off that line"):
             fit_focal_plane(FIELDS[:, None] * [np.cos(angle), np.sin(angle)], np.zeros(5), UM)
     refuses(ObservabilityError, "all places are one", fit_focal_plane, np.full((4, 2), 0.1), np.zeros(4), UM)
-    with pytest.raises(ObservabilityError, match="2 places cannot tell piston, slope_x, slope_y"):
+    with pytest.raises(ObservabilityError, match="2 positions do not determine piston, slope_x, slope_y"):
         fit_focal_plane(PLACE[:2], np.zeros(2), UM)
     three = fit_focal_plane([[0.0, 0.0], [0.01, 0.0], [0.0, 0.1]], [1e-4, 1e-4, 1e-4], UM)
     assert three.piston == pytest.approx(1e-4)
@@ -140,5 +140,5 @@ def test_places_that_cannot_tell():
     ],
 )
 def test_bad_input(change, message):
-    given = {"place": PLACE, "defocus": np.zeros(25), "sigma": UM} | change
+    given = {"position": PLACE, "defocus": np.zeros(25), "sigma": UM} | change
     refuses(ValueError, message, fit_focal_plane, **given)
