@@ -19,7 +19,7 @@ from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.measured.earth_orientation import EarthOrientation, rate_of, read_earth_orientation
+from twin.orbit.measured.earth_orientation import EarthOrientation, angular_velocity, read_earth_orientation
 from twin.orbit.measured.platform_files import platform_table, read_platform
 
 pytestmark = pytest.mark.oracle
@@ -84,7 +84,7 @@ def test_inertial_frames_against_orekit(orekit: Path, epoch: str, frame: str) ->
     turn = to_itrs("GCRS" if frame == "GCRF" else frame, rotation)
     velocity = 7500.0 * np.roll(places(), 1, axis=1) / 6.9e6
     position = np.einsum("nij,nj->ni", turn(SECONDS), places())
-    speed = np.einsum("nij,nj->ni", turn(SECONDS), velocity) - np.cross(rate_of(turn, SECONDS), position)
+    speed = np.einsum("nij,nj->ni", turn(SECONDS), velocity) - np.cross(angular_velocity(turn, SECONDS), position)
     for t, r, v, ours, rate in zip(SECONDS, places(), velocity, position, speed, strict=True):
         state = PVCoordinates(Vector3D(*map(float, r)), Vector3D(*map(float, v)))
         found = there.getTransformTo(itrf, date(epoch, t)).transformPVCoordinates(state)
@@ -107,7 +107,7 @@ def test_inertial_frames_against_astropy(epoch: str, frame: str) -> None:
     ours = EarthOrientation(ours.file, ours.mjd, ours.ut1_tai, ours.pole, 0.0 * ours.offsets)
     day = epoch[:11] + "00:00:00"
     rotation = ours.rotation(day + "Z", -10.0, 10.0)
-    matrix = rotation.matrix(np.zeros(1))[0] if frame == "GCRS" else rotation.mean_equinox(np.zeros(1))[0]
+    matrix = rotation.matrix(np.zeros(1))[0] if frame == "GCRS" else rotation.teme_to_itrs(np.zeros(1))[0]
     with tables.earth_orientation_table.set(tables.IERS_A.open(str(iers()))):
         time = Time(day, scale="utc")
         for place in places():
@@ -126,7 +126,7 @@ def test_teme_against_skyfield() -> None:
 
     time = load.timescale(builtin=True).utc(2011, 3, 5, 3, 5, 0.0)
     table = constant_orientation(EPOCHS[0], float(time.dut1), (0.0, 0.0))
-    ours = table.rotation(EPOCHS[0], -1.0, 1.0).mean_equinox(np.zeros(1))[0]
+    ours = table.rotation(EPOCHS[0], -1.0, 1.0).teme_to_itrs(np.zeros(1))[0]
     for place in places():
         theirs, _ = TEME_to_ITRF(time.ut1, place, np.zeros(3))
         # its UT1 is a Julian date in one float64: 2e-5 s of the Earth's turn, 1 cm

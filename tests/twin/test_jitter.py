@@ -11,7 +11,7 @@ from tests.tiers import quick
 from tests.twin.pushbroom_bench import LINE_TIME, PLACE, Ground, lines
 from twin.orbit.flight.trajectory import Jitter, Trajectory
 from twin.orbit.ground.grid import GroundFrame, Terrain
-from twin.orbit.images.line_optics import collected, exposures
+from twin.orbit.images.line_optics import with_mean_jitter, exposures
 from twin.orbit.images.patch import window_of
 from twin.orbit.images.pushbroom import PushbroomScene, render_patch
 from twin.sensors.line_ccd import Collection, Motion
@@ -190,7 +190,7 @@ def test_every_line_of_an_image_is_displaced_and_blurred_by_its_own_transfer(fre
     fade = np.hanning(side[1] + 2)[1:-1] * np.exp(-2j * np.pi * 0.3 * np.arange(side[1]))
     scene = PushbroomScene(frame, terrain, ground)
     still, shaken = (
-        render_patch(s, optics, scene, window, 3).photons @ fade for s in (one.sensor, collected(moved, optics))
+        render_patch(s, optics, scene, window, 3).photons @ fade for s in (one.sensor, with_mean_jitter(moved, optics))
     )
     time = one.sensor.time(window.first_line + np.arange(side[0]))
     light = Collection(32, LINE_TIME)
@@ -200,4 +200,4 @@ def test_every_line_of_an_image_is_displaced_and_blurred_by_its_own_transfer(fre
     np.testing.assert_allclose(shaken / still, expected, rtol=0, atol=0.008)
     assert np.ptp(np.angle(expected)) > 0.1  # displaced
     assert np.min(np.abs(expected)) < 0.96  # and blurred
-    assert len(exposures(collected(moved, optics), optics)) > 1
+    assert len(exposures(with_mean_jitter(moved, optics), optics)) > 1

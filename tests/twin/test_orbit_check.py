@@ -19,7 +19,7 @@ from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import invoke
 from tests.twin.orbit_files import REFUSALS
 from twin.orbit.conventions.check_run import DECIDED, Check, _bench, _tried, run_check
-from twin.orbit.conventions.pass_readings import QUESTIONS, read_pass, singles_and_pairs
+from twin.orbit.conventions.pass_readings import TESTED_CONVENTIONS, read_pass, singles_and_pairs
 
 run = partial(invoke, command.app)
 
@@ -81,7 +81,7 @@ def test_one_wrong_convention_is_found(files, what: str) -> None:
     found = checked(files, change)
     assert found.verdict == "another"
     assert found.best.changes == ((question, right),)
-    assert found.alike == ()
+    assert found.equally_likely == ()
     stated = found.stated_fit
     assert stated.fit is None or stated.cost - found.best.cost > 100.0 * DECIDED
 
@@ -109,7 +109,7 @@ def test_half_a_pixel_is_found_where_camera_and_platform_are_known_well_enough(
     found = checked((tmp_path, data), (("image_points", "centre"), "half"))
     assert found.verdict == "another"
     # the file's half pixel is one of lines, too, which is the same as a time of the line's begin: both are listed
-    both = [dict(found.best.changes), *map(dict, found.alike)]
+    both = [dict(found.best.changes), *map(dict, found.equally_likely)]
     assert {"pixel_origin": 0.0, "line_origin": 0.0} in both
     assert {"pixel_origin": 0.0, "line_moment": "start"} in both
     assert all(one["pixel_origin"] == 0.0 for one in both)
@@ -178,7 +178,7 @@ def test_what_is_exported_is_the_pass_that_was_read() -> None:
 
 
 def test_every_question_is_asked_with_every_other() -> None:
-    every = list(singles_and_pairs(dict.fromkeys(list(QUESTIONS)[:4], (1, 2))))
+    every = list(singles_and_pairs(dict.fromkeys(list(TESTED_CONVENTIONS)[:4], (1, 2))))
     assert every[0] == ()
     assert [sum(len(one) == k for one in every) for k in (1, 2)] == [8, 24]
     assert len(set(every)) == len(every)

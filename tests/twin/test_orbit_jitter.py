@@ -61,15 +61,15 @@ def test_every_warning_of_a_search_is_told_when_and_only_when_it_holds(oscillati
     one = oscillating.passes["jitter"]
 
     def told(**changes) -> tuple[str, ...]:
-        changed = replace(one, found=replace(one.found, **changes))
+        changed = replace(one, result=replace(one.result, **changes))
         return jitter_warnings(replace(oscillating, passes={"jitter": changed}))
 
-    lines, used = one.found.lines, np.arange(len(one.found.used)) / len(one.found.used)
-    for nothing in ({}, {"used": used < 0.71}, {"factors": 0.0 * one.found.factors + 1.29**2}):
+    lines, used = one.result.lines, np.arange(len(one.result.used)) / len(one.result.used)
+    for nothing in ({}, {"used": used < 0.71}, {"factors": 0.0 * one.result.factors + 1.29**2}):
         assert told(**nothing) == (), nothing
     assert any("31% of the observations of jitter were left out as wrong" in text for text in told(used=used < 0.69))
     assert any(
-        "what remains in jitter is the noise" in text for text in told(factors=0.0 * one.found.factors + 1.31**2)
+        "what remains in jitter is the noise" in text for text in told(factors=0.0 * one.result.factors + 1.31**2)
     )
     (text,) = told(lines=replace(lines, aliases=((8.5, 9.1),)))
     assert "jitter: 0.65 Hz may as well be 8.5, 9.1 Hz" in text.replace(f"{lines.frequency[0]:.4g}", "0.65")
@@ -81,16 +81,16 @@ def test_an_oscillation_of_the_body_is_found_about_its_axes(oscillating: JitterR
     """Frequency, amplitudes, phases and their sigmas, the gaps between the lines and where each pair is blind."""
     found = oscillating
     one = found.passes["jitter"]
-    lines = one.found.lines
+    lines = one.result.lines
     assert one.sights.lines == ("blue", "green", "red", "nir")
     # no match is wrong here: the oscillation itself must not make any seem so
-    assert one.found.used.mean() > 0.98
+    assert one.result.used.mean() > 0.98
     assert len(lines.frequency) == 1
     assert lines.frequency[0] == pytest.approx(0.65, abs=4.0 * lines.frequency_sigma[0])
     away = (lines.amplitude[0] / ARCSEC - [2.4, 1.0]) / (lines.amplitude_sigma[0] / ARCSEC)
     assert np.all(np.abs(away) < 4.0)
     np.testing.assert_allclose(np.degrees(lines.phase[0]), [40.0, 10.0], rtol=0, atol=8.0)
-    assert np.mean(one.found.factors[:-1]) == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / one.found.after.freedom))
+    assert np.mean(one.result.factors[:-1]) == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / one.result.after.freedom))
     gaps = {pair: gap[1] for pair, gap in one.sights.gaps.items()}
     assert gaps["blue", "green"] == pytest.approx(0.1216, abs=2e-4)
     assert gaps["green", "red"] == pytest.approx(0.1024, abs=2e-4)
@@ -158,10 +158,10 @@ def test_steady_readings_are_those_of_a_pass_without_noise() -> None:
     """Polynomials through exact readings: the orbit to a millimetre, the attitude to a thousandth of an arcsecond."""
     one = setup(attitude={"steering": "yaw"}, errors={})
     path = TabulatedTrajectory(fly_strip(one, 1)[0].platform)
-    steady = SteadyPlatform.of(path, -4.0, 4.0)
+    without_jitter = SteadyPlatform.of(path, -4.0, 4.0)
     t = np.linspace(-4.0, 4.0, 33)
-    np.testing.assert_allclose(steady.position(t), path.position(t), rtol=0, atol=1e-3)
-    turn = np.einsum("nji,njk->nik", path.body_to_itrs(t), steady.body_to_itrs(t))
+    np.testing.assert_allclose(without_jitter.position(t), path.position(t), rtol=0, atol=1e-3)
+    turn = np.einsum("nji,njk->nik", path.body_to_itrs(t), without_jitter.body_to_itrs(t))
     np.testing.assert_allclose(turn, np.broadcast_to(np.eye(3), turn.shape), rtol=0, atol=1e-3 * ARCSEC)
 
 

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from optics.numerics.array_math import ROUNDING, in_span, number_of
+from optics.numerics.array_math import ROUNDING, in_span, index_of_value
 from scenes.specs.course import CourseSpec
 from scenes.specs.orbit.measurements import PlatformFilesSpec
 from scenes.specs.orbit.setup import load_three_line_camera
@@ -256,8 +256,8 @@ def test_a_gap_keeps_its_ends_to_rounding() -> None:
     circle = CirclePlatform()
     time = np.concatenate([np.arange(-10.0, 0.0, 0.5), 4.0 + np.arange(0.0, 6.0, 0.5)])
     path = platform(np.arange(-10.0, 11.0), time, circle)
-    assert path.known(np.array([-0.5, -0.5 + 1e-9, 4.0 - 1e-9, 4.0])).all()
-    assert not path.known(np.array([-0.499, 2.0, 3.999])).any()
+    assert path.covers(np.array([-0.5, -0.5 + 1e-9, 4.0 - 1e-9, 4.0])).all()
+    assert not path.covers(np.array([-0.499, 2.0, 3.999])).any()
 
 
 def test_a_pixel_at_the_end_of_a_line_belongs_to_the_chip_that_ends_there() -> None:
@@ -279,7 +279,7 @@ def test_times_of_a_course_are_named_in_any_unit() -> None:
     for text in ("1.1 h", "66 min", "3960 s"):
         course = CourseSpec.model_validate({"times": times, "temperature": temperature, "detail": text})
         assert course.shown == 1
-    assert number_of(1.1 * 3600.0, course.times) == 1
+    assert index_of_value(1.1 * 3600.0, course.times) == 1
     with pytest.raises(ValidationError, match="not one of the course's times"):
         CourseSpec.model_validate({"times": times, "temperature": temperature, "detail": "66.1 min"})
 
@@ -417,8 +417,8 @@ def test_usable_times_are_kept_to(tmp_path: Path) -> None:
     segments(tmp_path / "a.oem", f"USEABLE_STOP_TIME = {bench.calendar(5.0, 'UTC')}")
     path = TabulatedTrajectory(read(tmp_path, {"file": "a.oem"}, CSV_ATTITUDE, earth=EARTH))
     assert path.last == pytest.approx(5.0, abs=1e-6)
-    assert np.all(path.known([4.0, 4.99]))
-    assert not np.any(path.known([5.5, 7.0]))
+    assert np.all(path.covers([4.0, 4.99]))
+    assert not np.any(path.covers([5.5, 7.0]))
 
 
 def test_older_and_unfinished_files_of_sp3(tmp_path: Path) -> None:

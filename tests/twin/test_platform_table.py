@@ -79,8 +79,8 @@ def test_what_is_not_known_is_refused(true) -> None:
             table.epoch, table.orbit_time, table.position, None, table.attitude_time[keep], table.quaternion[keep]
         )
     )
-    assert path.known([-601.0, 10.1, 19.9, 601.0]).tolist() == [False] * 4
-    assert path.known([9.5, 10.0, 20.0]).all()
+    assert path.covers([-601.0, 10.1, 19.9, 601.0]).tolist() == [False] * 4
+    assert path.covers([9.5, 10.0, 20.0]).all()
     with pytest.raises(ValueError, match="in a gap of"):
         path.position(15.0)
     with pytest.raises(ValueError, match="outside of"):

@@ -104,7 +104,7 @@ def _measured_angles(setup: MeasuredAngleSetup, measured: PassMeasurements) -> P
     path = TabulatedTrajectory(measured.platform)
     seconds = {name: measured.line_times[name].at(points[name].line) for name in used}
     moment = float(np.mean(seconds[next(iter(pairs.values()))[1]])) if test.time is None else test.time
-    if not path.known(moment):
+    if not path.covers(moment):
         allowed = (
             f"a moment within the readings of {measured.name}, {path.first:.9g} s to {path.last:.9g} s, and in no gap"
         )

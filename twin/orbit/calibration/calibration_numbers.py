@@ -30,7 +30,7 @@ from twin.orbit.calibration.schemes import (
     meets,
 )
 from twin.orbit.calibration.screening import ground_sample, intersection_fit
-from twin.orbit.images.patch import LineJudgement
+from twin.orbit.images.patch import LineComparison
 from twin.orbit.images.simulate_run import MATCH_COUNTS
 
 # --- errors at check points, by scheme -------------------------------------------------------------------
@@ -167,18 +167,18 @@ def _sums(meanings: Mapping[str, str], parts: Callable[[Any], Any] = lambda part
 SCREENED: Record[Screening] = Record("Image points of a field in the adjustment.", *_sums(_SCREENED, lambda one: [one]))
 
 
-def _degrees(parts: Sequence[LineJudgement]) -> Array:
+def _degrees(parts: Sequence[LineComparison]) -> Array:
     return np.array([j.degrees_of_freedom for j in parts], float)
 
 
-def _rms(parts: Sequence[LineJudgement]) -> Array:
+def _rms(parts: Sequence[LineComparison]) -> Array:
     """Return the (2,) RMS error of the correct positions, along the track and along the line, in pixels."""
     degrees = _degrees(parts)
     square = np.sum([np.nan_to_num(j.rms) ** 2 * n for j, n in zip(parts, degrees, strict=True)], axis=0)
     return np.asarray(np.sqrt(square / max(degrees.sum(), 1.0)))
 
 
-MATCHING: Record[Sequence[LineJudgement]] = Record(
+MATCHING: Record[Sequence[LineComparison]] = Record(
     "Matches of one sort of points in the images of one line, over the patches of a field.",
     *_sums(MATCH_COUNTS),
     Quantity("rms_lines_px", lambda parts: _rms(parts)[0], "RMS error along track of correct positions", "RMS track"),
@@ -192,9 +192,9 @@ MATCHING: Record[Sequence[LineJudgement]] = Record(
 )
 
 
-def _by_line(images: FieldImages) -> dict[str, dict[str, list[LineJudgement]]]:
+def _by_line(images: FieldImages) -> dict[str, dict[str, list[LineComparison]]]:
     """Return the judgements of all patches of a field: sort of points -> line -> one judgement per patch."""
-    parts: dict[str, dict[str, list[LineJudgement]]] = {}
+    parts: dict[str, dict[str, list[LineComparison]]] = {}
     for patch in images.patches:
         for sort, lines in patch.judgements.items():
             for line, judgement in lines.items():
@@ -202,7 +202,7 @@ def _by_line(images: FieldImages) -> dict[str, dict[str, list[LineJudgement]]]:
     return parts
 
 
-def _judgements(campaign: Campaign) -> list[LineJudgement]:
+def _judgements(campaign: Campaign) -> list[LineComparison]:
     by_line = [lines for images in campaign.images or () for lines in _by_line(images).values()]
     return [judgement for lines in by_line for parts in lines.values() for judgement in parts]
 

@@ -399,7 +399,7 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
 def third_differences(field_pass: FieldPass) -> tuple[ThirdDifference | None, ThirdDifference | None]:
     """Return the third differences of orbit and attitude of a pass; None for fewer than five evenly spaced readings."""
     measured, table = field_pass.measured, field_pass.measured.table
-    fixes, looks = _even(table.orbit_time), _even(table.attitude_time[measured.known(table.attitude_time)])
+    fixes, looks = _even(table.orbit_time), _even(table.attitude_time[measured.covers(table.attitude_time)])
     places = table.position[np.isin(table.orbit_time, fixes)]
     turned = np.swapaxes(measured.orbital_to_itrs(looks), 1, 2) @ measured.body_to_itrs(looks)
     # small angles: the skew part of the rotation

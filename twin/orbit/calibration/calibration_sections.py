@@ -24,7 +24,7 @@ from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, Calibrati
 from twin.orbit.calibration.influences import UNEXPECTED_SIGMAS, LightRow
 from twin.orbit.calibration.schemes import RMS, FieldErrors, SchemeMeans, meets, values_of
 from twin.orbit.calibration.screening import ground_sample, intersection_fit
-from twin.orbit.images.image_points import BEYOND
+from twin.orbit.images.image_points import UNMODELLED_SIGMA
 from twin.orbit.images.patch import WRONG
 from twin.orbit.images.point_report import SORTS, points_png
 
@@ -258,7 +258,7 @@ def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         f"{total['check_left']} check points. The test of the neighbours rejects "
         f"{total['right_rejected_by_consensus']} correct positions, the adjustment "
         f"{total['right_rejected_by_adjustment']}. {remaining} control points remain. Their image points are weighted "
-        f"by the covariances of the matching, with {BEYOND:g} px added for errors that the fit does not show.",
+        f"by the covariances of the matching, with {UNMODELLED_SIGMA:g} px added for errors that the fit does not show.",
     )
     first = campaign.images[0]
     figures = [

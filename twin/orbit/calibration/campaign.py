@@ -31,7 +31,7 @@ from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import LineTimes, line_cameras, pixel_places
+from twin.orbit.flight.line_camera import LineTimes, line_cameras, pixel_positions
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Platform, Sensor
 from twin.orbit.flight.trajectory import MeasurementErrors, Trajectory
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.measurements import MeasuredCalibrationSpec, ReadingErrorsSpec
     from scenes.specs.orbit.three_line_camera import LineCameraSpec
     from twin.orbit.images.image_points import PatchPoints
-    from twin.orbit.images.patch import LineJudgement, Patch
+    from twin.orbit.images.patch import LineComparison, Patch
 
 EFFECTS = ("light_time", "aberration", "refraction")
 """Names of the effects on the light, as attributes of `LightEffects`."""
@@ -153,7 +153,7 @@ class PassData:
 
     def places(self, name: str, pixel: np.ndarray) -> np.ndarray:
         """Return the (n, 2) positions of pixels (n,) of a line in its focal plane, in metres."""
-        return pixel_places(self.lines[name], pixel, self.sensors[name].camera.pixels, self.pitch[name])
+        return pixel_positions(self.lines[name], pixel, self.sensors[name].camera.pixels, self.pitch[name])
 
     @property
     def phase(self) -> float:
@@ -397,7 +397,7 @@ class PatchRecord:
     """
 
     points: PatchPoints
-    judgements: Mapping[str, Mapping[str, LineJudgement]]
+    judgements: Mapping[str, Mapping[str, LineComparison]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -557,7 +557,7 @@ class FieldPass:
         sensors = self.data.sensors
         times = np.concatenate([sensors[k].time(r.line) for k, r in self.control_images.items()])
         mean = np.mean(times)
-        return float(mean if self.measured.known(mean) else times[np.argmin(np.abs(times - mean))])
+        return float(mean if self.measured.covers(mean) else times[np.argmin(np.abs(times - mean))])
 
     @property
     def seconds_apart(self) -> float:
@@ -591,7 +591,7 @@ class FieldPass:
             for name, row in rays.items():
                 assert row.time is not None
                 time = row.time + self.data.phase
-                beyond = ~path.known(time + seconds)
+                beyond = ~path.covers(time + seconds)
                 there = time + np.where(beyond, -seconds, seconds)
                 station, attitude = path.position(there), path.body_to_itrs(there)
                 if np.any(beyond):  # the motion goes on as it came

@@ -49,7 +49,7 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import TERMS, Trajectory
 from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PointsError, measure_points
 from twin.orbit.images.line_optics import LineOptics, optics_of
-from twin.orbit.images.patch import LineJudgement, Patch, PatchError, fly_patch, imaged_lines, judged, true_ground
+from twin.orbit.images.patch import LineComparison, Patch, PatchError, fly_patch, imaged_lines, judged, true_ground
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements, point_names
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ class _SelectedPoints:
         return len(self.ground)
 
     @classmethod
-    def of(cls, points: MatchedPoints, chosen: np.ndarray, judgements: Mapping[str, LineJudgement]) -> _SelectedPoints:
+    def of(cls, points: MatchedPoints, chosen: np.ndarray, judgements: Mapping[str, LineComparison]) -> _SelectedPoints:
         images, wrong = {}, {}
         number = np.arange(int(chosen.sum()))
         for name, line in points.lines.items():

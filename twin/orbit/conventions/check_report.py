@@ -13,13 +13,13 @@ import numpy as np
 from twin.framework.artefact import Cell, Table
 from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
-from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
-from twin.orbit.conventions.pass_readings import QUESTIONS, Changes, Fit, changed
+from twin.orbit.conventions.check_run import DECIDED, Check, TriedReading, ValueTest
+from twin.orbit.conventions.pass_readings import TESTED_CONVENTIONS, Changes, Fit, changed
 from twin.orbit.flight.earth import Earth, east_north_up
 
-Ranked = tuple[Check, Tried]
+CheckedReading = tuple[Check, TriedReading]
 """A check with one of its readings."""
-Placed = tuple[Check, Changes]
+PlacedReading = tuple[Check, Changes]
 """A check with the changes of one of its readings."""
 
 
@@ -27,15 +27,16 @@ def changes_text(changes: Changes) -> str:
     """Return the conventions in which a reading differs from the stated one, for readers."""
     if not changes:
         return "as stated"
-    return "; ".join(f"{QUESTIONS[name].title} {QUESTIONS[name].text(value)}" for name, value in changes)
+    named = ((TESTED_CONVENTIONS[name], value) for name, value in changes)
+    return "; ".join(f"{convention.title} {convention.text(value)}" for convention, value in named)
 
 
-def _of_fit(get: Callable[[Fit], Any]) -> Callable[[Ranked], Any]:
+def _of_fit(get: Callable[[Fit], Any]) -> Callable[[CheckedReading], Any]:
     """Return a function that gets a quantity of a reading's fit; None for an impossible reading."""
     return lambda of: None if of[1].fit is None else get(of[1].fit)
 
 
-READING: Record[Ranked] = Record(
+READING: Record[CheckedReading] = Record(
     "A reading (set of conventions) and its fit to the ground points.",
     Quantity(
         "changes", lambda of: dict(of[1].changes), "conventions that differ from the stated ones, with their values"
@@ -56,28 +57,28 @@ READING: Record[Ranked] = Record(
         "minus twice the log of the likelihood over that of the best reading",
     ),
 )
-ANSWER: Record[Answer] = Record(
+VALUE_TEST: Record[ValueTest] = Record(
     "Test of one value of a convention, with the other conventions as in the best reading.",
     Quantity("value", lambda one: one.value, "tested value of the convention"),
     Quantity("stated", lambda one: one.stated, "true for the stated value"),
     Quantity("best", lambda one: one.best, "true for the value of the best reading"),
-    Quantity("open", lambda one: one.possible, "true if the points do not exclude the value"),
+    Quantity("possible", lambda one: one.possible, "true if the points do not exclude the value"),
     Quantity(
         "cost_above_best",
         lambda one: one.excess if np.isfinite(one.excess) else None,
         "minus twice the log of the likelihood over that of the best reading",
     ),
-    Quantity("moves_points_by_m", lambda one: one.moved, "root mean square displacement of the points on the ground"),
+    Quantity("displacement_m", lambda one: one.moved, "root mean square displacement of the points on the ground"),
     Quantity(
         "why_impossible", lambda one: one.why or None, "reason why the points cannot have been imaged under this value"
     ),
 )
-QUESTION: Record[tuple[Answer, ...]] = Record(
+CONVENTION: Record[tuple[ValueTest, ...]] = Record(
     "A convention: its stated and its best value, and whether the points determine it.",
     Quantity("stated", lambda answers: next(one.value for one in answers if one.stated), "value in the test's file"),
     Quantity("best", lambda answers: next(one.value for one in answers if one.best), "value in the best reading"),
     Quantity("determined", lambda answers: sum(one.possible for one in answers) == 1, "true if one value is possible"),
-    Quantity("values", lambda answers: answers, "test of each value", record=ANSWER),
+    Quantity("values", lambda answers: answers, "test of each value", record=VALUE_TEST),
 )
 
 
@@ -103,7 +104,7 @@ def places_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
     return rows
 
 
-PLACE: Record[Placed] = Record(
+PLACE: Record[PlacedReading] = Record(
     "Ground positions of the first image points under a reading, east and north of their ground points.",
     Quantity("changes", lambda of: dict(of[1]), "conventions that differ from the stated ones, with their values"),
     Quantity(
@@ -118,7 +119,7 @@ PLACE: Record[Placed] = Record(
 def _best(run: Check) -> dict[str, Any]:
     """Return every convention of the best reading."""
     reading = changed(run.stated, run.best.changes)
-    return {name: QUESTIONS[name].get(reading) for name in run.answers}
+    return {name: TESTED_CONVENTIONS[name].get(reading) for name in run.answers}
 
 
 CHECK: Record[Check] = Record(
@@ -130,7 +131,9 @@ CHECK: Record[Check] = Record(
         "best", lambda run: dict(run.best.changes), "conventions of the best reading that differ from the stated ones"
     ),
     Quantity(
-        "alike", lambda run: [dict(one) for one in run.alike], "changes of other readings that are equally likely"
+        "equally_likely",
+        lambda run: [dict(one) for one in run.equally_likely],
+        "changes of other readings that are equally likely",
     ),
     Quantity("reading", _best, "every convention of the best reading"),
     Quantity("readings_tried", lambda run: run.count, "number of readings that were tried"),
@@ -147,7 +150,7 @@ CHECK: Record[Check] = Record(
         "number of image points of each line",
     ),
     Quantity("gross_errors", lambda run: run.wrong, "rejected points of each line"),
-    Quantity("questions", lambda run: run.answers, "tests of each convention", record=QUESTION),
+    Quantity("conventions", lambda run: run.answers, "tests of each convention", record=CONVENTION),
     Quantity("ranking", lambda run: [(run, one) for one in run.tried], "readings, the likeliest first", record=READING),
     Quantity(
         "places", lambda run: [(run, one) for one in run.places], "ground positions of the first points", record=PLACE
@@ -155,7 +158,7 @@ CHECK: Record[Check] = Record(
 )
 
 
-ANOTHER, NONE = 3, 4
+OTHER_READING, NO_READING = 3, 4
 """Exit codes if another reading than the stated one explains the points, and if none does."""
 _LISTED = 12
 """Number of readings in the table of the report."""
@@ -165,7 +168,7 @@ _NAMED = 6
 
 def check_report(run: Check) -> Report:
     """Return the report of a check."""
-    code = {"confirmed": 0, "another": ANOTHER, "none": NONE}[run.verdict]
+    code = {"confirmed": 0, "another": OTHER_READING, "none": NO_READING}[run.verdict]
     verdict, more = _verdict(run)
     return Report(
         "Conventions of a pass",
@@ -173,7 +176,7 @@ def check_report(run: Check) -> Report:
         (*more, *_lead(run)),
         _facts(run),
         _ranking(run),
-        (_questions(run), _places(run)),
+        (_conventions(run), _places(run)),
         warnings=_warnings(run),
         code=code,
     )
@@ -193,10 +196,10 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
             "more than two conventions may be wrong at once, or the camera, the ground points or the uncertainty",
         )
     size = f"{_metres(best.rms)} rms on the ground ({best.rms_pixels:.3g} px)"
-    open_ones = [QUESTIONS[name].title for name, answers in run.answers.items() if _open(answers)]
+    undetermined = [TESTED_CONVENTIONS[name].title for name, answers in run.answers.items() if _undetermined(answers)]
     cannot = "the points determine every convention"
-    if open_ones:
-        cannot = f"the points do not determine these conventions: {', '.join(open_ones)}"
+    if undetermined:
+        cannot = f"the points do not determine these conventions: {', '.join(undetermined)}"
     if run.verdict == "confirmed":
         return answer(f"The stated conventions are confirmed: they fit the ground points to {size}", cannot)
     was = f"under them {stated.why}" if stated.fit is None else f"with residuals of {_metres(stated.fit.rms)} rms"
@@ -204,7 +207,7 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
     return answer(f"The stated conventions are wrong, {was}", right, cannot)
 
 
-def _open(answers: tuple[Answer, ...]) -> bool:
+def _undetermined(answers: tuple[ValueTest, ...]) -> bool:
     """Return whether more than one value of a convention is possible."""
     return sum(candidate.possible for candidate in answers) > 1
 
@@ -216,19 +219,21 @@ def _metres(value: float) -> str:
 
 def _lead(run: Check) -> tuple[str, ...]:
     """Return sentences on wrong and undetermined conventions."""
-    lines = [f"Equally likely: {changes_text(alternative)}." for alternative in run.alike]
+    lines = [f"Equally likely: {changes_text(alternative)}." for alternative in run.equally_likely]
     for name, answers in run.answers.items():
-        question = QUESTIONS[name]
+        convention = TESTED_CONVENTIONS[name]
         stated = next(alternative for alternative in answers if alternative.stated)
         best = next(alternative for alternative in answers if alternative.best)
         if run.verdict == "another" and not stated.possible:
-            lines.append(f"{question.title}: {question.text(best.value)} instead of {question.text(stated.value)}.")
-        elif _open(answers):
+            lines.append(
+                f"{convention.title}: {convention.text(best.value)} instead of {convention.text(stated.value)}."
+            )
+        elif _undetermined(answers):
             others = [alternative for alternative in answers if alternative.possible and not alternative.best]
             moved = max(alternative.moved or 0.0 for alternative in others)
-            texts = ", ".join(question.text(alternative.value) for alternative in (best, *others))
+            texts = ", ".join(convention.text(alternative.value) for alternative in (best, *others))
             lines.append(
-                f"{question.title}: {texts} fit equally well; they differ by {_metres(moved)}, within the uncertainty."
+                f"{convention.title}: {texts} fit equally; they differ by {_metres(moved)}, within the uncertainty."
             )
     return tuple(lines)
 
@@ -249,7 +254,7 @@ def _facts(run: Check) -> tuple[tuple[str, str], ...]:
     )
 
 
-def _row(tried: Tried, run: Check) -> tuple[Cell, ...]:
+def _row(tried: TriedReading, run: Check) -> tuple[Cell, ...]:
     """Return the table row of a reading."""
     if tried.fit is None:
         return changes_text(tried.changes), None, None, None, None, tried.why
@@ -262,7 +267,7 @@ def _row(tried: Tried, run: Check) -> tuple[Cell, ...]:
 def _ranking(run: Check) -> Table:
     """Return the table of the likeliest readings."""
     stated, single = run.stated_fit, [tried for tried in run.tried if len(tried.changes) <= 1 and tried is not run.best]
-    first = [run.best, *(tried for tried in run.tried if tried.changes in run.alike)]
+    first = [run.best, *(tried for tried in run.tried if tried.changes in run.equally_likely)]
     first += [stated] if stated not in first else []
     rest = [tried for tried in single if tried not in first][: _LISTED - len(first)]
     return Table(
@@ -277,11 +282,11 @@ def _ranking(run: Check) -> Table:
     )
 
 
-def _questions(run: Check) -> Section:
+def _conventions(run: Check) -> Section:
     """Return the report section on each convention by itself."""
     rows: list[tuple[Cell, ...]] = []
     for name, answers in run.answers.items():
-        question = QUESTIONS[name]
+        convention = TESTED_CONVENTIONS[name]
         for candidate in answers:
             verdict = (
                 "best" if candidate.best else "not excluded" if candidate.possible else candidate.why or "excluded"
@@ -289,8 +294,8 @@ def _questions(run: Check) -> Section:
             cost = max(candidate.excess, 0.0) if np.isfinite(candidate.excess) else None
             rows.append(
                 (
-                    question.title,
-                    question.text(candidate.value),
+                    convention.title,
+                    convention.text(candidate.value),
                     "yes" if candidate.stated else "",
                     candidate.moved,
                     cost,
@@ -303,7 +308,7 @@ def _questions(run: Check) -> Section:
         "calibration, or more points.",
     )
     table = Table(
-        "questions",
+        "conventions",
         "Conventions",
         "Moved: root mean square displacement of the points from the best reading.",
         ("convention", "value", "stated", "moved [m]", "cost", "verdict"),

@@ -18,7 +18,7 @@ from scenes.yaml.errors import InputError, Issue
 from twin.framework.procedure import Advance, silent
 from twin.orbit.conventions import pass_readings
 from twin.orbit.conventions.pass_readings import (
-    QUESTIONS,
+    TESTED_CONVENTIONS,
     Changes,
     Fit,
     ImpossibleError,
@@ -64,7 +64,7 @@ _MOST_WRONG = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
+class TriedReading:
     """Reading that was tried, with its fit.
 
     Attributes
@@ -88,7 +88,7 @@ class Tried:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class ValueTest:
     """Test of one value of a convention, with the others as in the best reading.
 
     Attributes
@@ -154,17 +154,17 @@ class Check:
     setup: CheckSetup
     readings: PassReadings
     stated: PassConventions
-    tried: tuple[Tried, ...]
-    best: Tried
+    tried: tuple[TriedReading, ...]
+    best: TriedReading
     verdict: Verdict
     factor: float
-    answers: dict[str, tuple[Answer, ...]]
+    answers: dict[str, tuple[ValueTest, ...]]
     first_points: dict[str, np.ndarray]
     places: dict[Changes, dict[str, np.ndarray] | str]
     count: int
     wrong: dict[str, tuple[str, ...]]
 
-    def excess(self, tried: Tried) -> float:
+    def excess(self, tried: TriedReading) -> float:
         """Return the cost of a reading beyond that of the best one, divided by the factor of the variances.
 
         It is infinite for an impossible reading.
@@ -172,7 +172,7 @@ class Check:
         return (tried.cost - self.best.cost) / self.factor
 
     @property
-    def alike(self) -> tuple[Changes, ...]:
+    def equally_likely(self) -> tuple[Changes, ...]:
         """Equally likely readings with no more changes than the best one, which the points do not separate."""
         return tuple(
             tried.changes
@@ -181,7 +181,7 @@ class Check:
         )
 
     @property
-    def stated_fit(self) -> Tried:
+    def stated_fit(self) -> TriedReading:
         """Stated reading with its fit."""
         return next(tried for tried in self.tried if not tried.changes)
 
@@ -197,8 +197,8 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
     advance("readings", 0, 3)
     readings, stated = pass_readings.read_pass(setup.test, setup.camera, Path())
     bench = _bench(setup, readings, stated)
-    others = pass_readings.asked(stated, readings.platform.attitude.quaternion is not None)
-    best, tried, count = _searched(bench, stated, others)
+    others = pass_readings.alternatives(stated, readings.platform.attitude.quaternion is not None)
+    best, tried, count = _best_reading(bench, stated, others)
     advance("readings", 1, 3)
     wrong: dict[str, tuple[str, ...]] = dict.fromkeys(readings.images, ())
     if best.fit is not None:
@@ -239,12 +239,12 @@ def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -
     return PassBench(part, cameras, setup.test.uncertainty, LightEffects.of(setup.test.effects), epoch)
 
 
-def _searched(
+def _best_reading(
     bench: PassBench, stated: PassConventions, others: dict[str, tuple[Any, ...]]
-) -> tuple[Tried, list[Tried], int]:
+) -> tuple[TriedReading, list[TriedReading], int]:
     """Return the best reading, those that were fitted, and the number of those that were compared."""
     start: Changes = ()
-    fitted: dict[frozenset[str], Tried] = {}
+    fitted: dict[frozenset[str], TriedReading] = {}
     seen: set[frozenset[str]] = set()
     for _ in range(_ROUNDS):
         rough = []
@@ -279,15 +279,15 @@ def _rough(bench: PassBench, meant: PassConventions) -> float:
         return np.inf
 
 
-def _tried(bench: PassBench, stated: PassConventions, changes: Changes) -> Tried:
+def _tried(bench: PassBench, stated: PassConventions, changes: Changes) -> TriedReading:
     """Fit a reading to the points."""
     try:
-        return Tried(changes, bench.fit(changed(stated, changes)))
+        return TriedReading(changes, bench.fit(changed(stated, changes)))
     except ImpossibleError as error:
-        return Tried(changes, None, str(error))
+        return TriedReading(changes, None, str(error))
 
 
-def _best(tried: Sequence[Tried]) -> Tried:
+def _best(tried: Sequence[TriedReading]) -> TriedReading:
     """Return the reading with the fewest changes among those that are as likely as any."""
     least = min(tried, key=lambda reading: reading.cost)
     if least.fit is None:
@@ -310,14 +310,14 @@ def _wrong(bench: PassBench, fit: Fit) -> dict[str, np.ndarray]:
 
 
 def _answers(
-    bench: PassBench, stated: PassConventions, best: Tried, name: str, values: tuple[Any, ...], factor: float
-) -> tuple[Answer, ...]:
+    bench: PassBench, stated: PassConventions, best: TriedReading, name: str, values: tuple[Any, ...], factor: float
+) -> tuple[ValueTest, ...]:
     """Test every value of a convention, with the others as in the best reading."""
-    question, reading = QUESTIONS[name], changed(stated, best.changes)
-    stated_value, best_value = question.get(stated), question.get(reading)
+    convention, reading = TESTED_CONVENTIONS[name], changed(stated, best.changes)
+    stated_value, best_value = convention.get(stated), convention.get(reading)
     answers = []
     for value in (stated_value, *values):
-        conventions = question.put(reading, value)
+        conventions = convention.put(reading, value)
         try:
             fit = bench.fit(conventions)
             moved = (
@@ -326,14 +326,14 @@ def _answers(
                 else float(np.sqrt(np.mean(np.sum((fit.residual - best.fit.residual) ** 2, 1))))
             )
             answers.append(
-                Answer(value, value == stated_value, value == best_value, (fit.cost - best.cost) / factor, moved, "")
+                ValueTest(value, value == stated_value, value == best_value, (fit.cost - best.cost) / factor, moved, "")
             )
         except ImpossibleError as error:
-            answers.append(Answer(value, value == stated_value, value == best_value, np.inf, None, str(error)))
+            answers.append(ValueTest(value, value == stated_value, value == best_value, np.inf, None, str(error)))
     return tuple(answers)
 
 
-def _shown(others: dict[str, tuple[Any, ...]], best: Tried) -> list[Changes]:
+def _shown(others: dict[str, tuple[Any, ...]], best: TriedReading) -> list[Changes]:
     """Return the readings whose ground positions are listed: stated, best, and those with one change."""
     singles = [((name, value),) for name, values in others.items() for value in values]
     return list(dict.fromkeys([(), best.changes, *singles]))
@@ -374,7 +374,7 @@ def measurements(run: Check) -> PassMeasurements:
         times[name] = LineTimes.of(clock.line - clock.line[0], middle)
         pixels = run.setup.camera.pixels_of(name)
         # A mirrored axis changes the sign of the correlation.
-        signs = np.array([-1.0 if meant.backward else 1.0, 1.0 if meant.sees == "right" else -1.0])
+        signs = np.array([-1.0 if meant.backward else 1.0, 1.0 if meant.first_pixel_sees == "right" else -1.0])
         spread = raw.covariance * signs[:, None] * signs
         line = line_of(meant, raw, clock) - clock.line[0]
         images[name] = ImagePoints.of(raw.point, line, pixel_of(meant, raw, pixels), spread)

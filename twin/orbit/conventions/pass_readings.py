@@ -88,7 +88,7 @@ class PassConventions:
         Image coordinate of the middle of the line that the table of times calls 0.
     pixel_origin : float
         Image coordinate of the middle of the first pixel.
-    sees : str
+    first_pixel_sees : str
         Side of the track to which the first pixel looks, right or left.
     backward : bool
         True if lines are counted from the last.
@@ -100,7 +100,7 @@ class PassConventions:
     moment: str
     line_origin: float
     pixel_origin: float
-    sees: str
+    first_pixel_sees: str
     backward: bool = False
 
 
@@ -290,7 +290,7 @@ _TURNED = {"forward": "back", "back": "forward", "right": "left", "left": "right
 
 
 @dataclass(frozen=True)
-class Question:
+class TestedConvention:
     """Convention with its possible values.
 
     Attributes
@@ -314,16 +314,16 @@ class Question:
     text: Callable[[Any], str] = str
 
 
-def _question(title: str, key: str, values: tuple[Any, ...], text: Callable[[Any], str] = str) -> Question:
-    """Return the question for a convention of the pass, or of the platform where its key begins with ``platform.``."""
+def _convention(title: str, key: str, values: tuple[Any, ...], text: Callable[[Any], str] = str) -> TestedConvention:
+    """Return the test of a convention of the pass, or of the platform where its key begins with ``platform.``."""
     name = key.removeprefix("platform.")
     if name == key:
-        return Question(title, attrgetter(key), lambda c, v: replace(c, **{key: v}), lambda c: values, text)
+        return TestedConvention(title, attrgetter(key), lambda c, v: replace(c, **{key: v}), lambda c: values, text)
 
     def put(conventions: PassConventions, value: Any) -> PassConventions:
         return replace(conventions, platform=replace(conventions.platform, **{name: value}))
 
-    return Question(title, attrgetter(key), put, lambda c: values, text)
+    return TestedConvention(title, attrgetter(key), put, lambda c: values, text)
 
 
 def _turned(c: PassConventions) -> tuple[tuple[str, str, str], ...]:
@@ -338,35 +338,35 @@ def _seconds(value: float) -> str:
     return f"{value:+g} s" if value else "none"
 
 
-QUESTIONS: Mapping[str, Question] = FrozenMap(
+TESTED_CONVENTIONS: Mapping[str, TestedConvention] = FrozenMap(
     {
-        "quaternion_scalar": _question("scalar of the quaternion", "platform.scalar", ("last", "first")),
-        "quaternion_turns": _question("quaternion turns", "platform.turns", ("body_to_frame", "frame_to_body")),
-        "body_axes": Question(
+        "quaternion_scalar": _convention("scalar of the quaternion", "platform.scalar", ("last", "first")),
+        "quaternion_turns": _convention("quaternion turns", "platform.turns", ("body_to_frame", "frame_to_body")),
+        "body_axes": TestedConvention(
             "body x, y, z point",
             lambda c: c.platform.body_axes,
             lambda c, v: replace(c, platform=replace(c.platform, body_axes=v)),
             _turned,
             ", ".join,
         ),
-        "angle_sequence": _question(
+        "angle_sequence": _convention(
             "sequence of the angles", "platform.sequence", ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")
         ),
-        "attitude_frame": _question("frame of the attitude", "platform.attitude_frame", _FRAMES),
-        "orbit_frame": _question("frame of the orbit", "platform.orbit_frame", _FRAMES),
-        "orbit_time_scale": _question("time scale of the orbit", "platform.orbit_scale", _SCALES),
-        "attitude_time_scale": _question("time scale of the attitude", "platform.attitude_scale", _SCALES),
-        "line_time_scale": _question("time scale of the lines", "line_scale", _SCALES),
-        "line_time_offset": _question("offset of the line times", "line_offset", (0.0, -1.0, 1.0), _seconds),
-        "line_moment": _question("moment of a line's time", "moment", ("start", "middle", "end")),
-        "line_origin": _question(
+        "attitude_frame": _convention("frame of the attitude", "platform.attitude_frame", _FRAMES),
+        "orbit_frame": _convention("frame of the orbit", "platform.orbit_frame", _FRAMES),
+        "orbit_time_scale": _convention("time scale of the orbit", "platform.orbit_scale", _SCALES),
+        "attitude_time_scale": _convention("time scale of the attitude", "platform.attitude_scale", _SCALES),
+        "line_time_scale": _convention("time scale of the lines", "line_scale", _SCALES),
+        "line_time_offset": _convention("offset of the line times", "line_offset", (0.0, -1.0, 1.0), _seconds),
+        "line_moment": _convention("moment of a line's time", "moment", ("start", "middle", "end")),
+        "line_origin": _convention(
             "coordinate of the middle of line 0", "line_origin", (0.0, 0.5, 1.0), lambda v: f"{v:g}"
         ),
-        "pixel_origin": _question(
+        "pixel_origin": _convention(
             "coordinate of the middle of the first pixel", "pixel_origin", (0.0, 0.5, 1.0, 1.5), lambda v: f"{v:g}"
         ),
-        "first_pixel_sees": _question("first pixel sees", "sees", ("right", "left")),
-        "line_axis": _question(
+        "first_pixel_sees": _convention("first pixel sees", "first_pixel_sees", ("right", "left")),
+        "line_axis": _convention(
             "lines are counted", "backward", (False, True), lambda v: "from the last" if v else "from the first"
         ),
     }
@@ -374,7 +374,7 @@ QUESTIONS: Mapping[str, Question] = FrozenMap(
 """Conventions that a check tests, by name."""
 
 
-def asked(stated: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ...]]:
+def alternatives(stated: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ...]]:
     """Return the values of each convention other than the stated one; conventions that do not apply are left out.
 
     Parameters
@@ -386,11 +386,11 @@ def asked(stated: PassConventions, quaternions: bool) -> dict[str, tuple[Any, ..
     """
     without = {"angle_sequence"} if quaternions else {"quaternion_scalar", "quaternion_turns"}
     values = {}
-    for name, question in QUESTIONS.items():
-        here = question.get(stated)
+    for name, convention in TESTED_CONVENTIONS.items():
+        here = convention.get(stated)
         if name in without or (name == "attitude_frame" and here == "orbital"):
             continue
-        values[name] = tuple(v for v in question.values(stated) if v != here)
+        values[name] = tuple(v for v in convention.values(stated) if v != here)
     return values
 
 
@@ -422,7 +422,7 @@ def singles_and_pairs(others: Mapping[str, tuple[Any, ...]], start: Changes = ()
 def changed(stated: PassConventions, changes: Changes) -> PassConventions:
     """Return the reading with these changes."""
     for name, value in changes:
-        stated = QUESTIONS[name].put(stated, value)
+        stated = TESTED_CONVENTIONS[name].put(stated, value)
     return stated
 
 
@@ -437,7 +437,7 @@ class ImpossibleError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class _Turned:
+class _PerturbedPlatform:
     """Platform with a small rotation and shift for each of some times."""
 
     path: TabulatedTrajectory
@@ -560,7 +560,7 @@ class PassBench:
         places = {}
         for name, raw in self.readings.images.items():
             part = raw if most is None else raw.taken(spread(len(raw.line), most))
-            places[name] = self._ground(name, meant, part, _Turned(self.path(meant.platform)))[0]
+            places[name] = self._ground(name, meant, part, _PerturbedPlatform(self.path(meant.platform)))[0]
         return places
 
     def residuals(self, meant: PassConventions, most: int | None = None) -> np.ndarray:
@@ -624,7 +624,7 @@ class PassBench:
         delay, step, rise = np.zeros((10, n)), np.zeros((10, n)), np.zeros((10, n))
         direction = np.where(pixel_of(meant, raw, pixels) + 1.0 <= pixels - 0.5, 1.0, -1.0)
         delay[7], step[8], rise[9] = _DELAY, direction, _RISE
-        moved = _Turned(path, rotation.reshape(-1, 3, 3), shift.reshape(-1, 3))
+        moved = _PerturbedPlatform(path, rotation.reshape(-1, 3, 3), shift.reshape(-1, 3))
         repeated = raw.taken(np.tile(np.arange(n), 10))
         ground, line_time = self._ground(name, meant, repeated, moved, delay.ravel(), step.ravel(), rise.ravel())
         return list(ground.reshape(10, n, 3)), direction, line_time[:n]
@@ -634,7 +634,7 @@ class PassBench:
         name: str,
         meant: PassConventions,
         raw: ImagePoints,
-        platform: _Turned,
+        platform: _PerturbedPlatform,
         delay: np.ndarray | float = 0.0,
         step: np.ndarray | float = 0.0,
         rise: np.ndarray | float = 0.0,
@@ -709,7 +709,7 @@ def line_of(meant: PassConventions, raw: ImagePoints, clock: LineClock) -> np.nd
 def pixel_of(meant: PassConventions, raw: ImagePoints, pixels: int) -> np.ndarray:
     """Return pixels of image points (n,), counted from the one that looks farthest to the right of the track."""
     number = raw.pixel - meant.pixel_origin
-    return number if meant.sees == "right" else pixels - 1.0 - number
+    return number if meant.first_pixel_sees == "right" else pixels - 1.0 - number
 
 
 def _plan(known: np.ndarray, computed: np.ndarray) -> np.ndarray:

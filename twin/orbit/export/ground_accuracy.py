@@ -27,7 +27,7 @@ from optics.numerics.number_tree import FrozenMap
 from twin.orbit.export.rational_polynomial import axis_sigma
 from twin.orbit.flight.earth import east_north_up
 from twin.orbit.flight.line_camera import LineCamera, corrected_line
-from twin.orbit.flight.sensor import MovedPlatform, Sensor
+from twin.orbit.flight.sensor import OffsetPlatform, Sensor
 
 _GRID = (13, 13)
 """Lines and pixels of an image at which errors are taken; they are smooth."""
@@ -102,7 +102,7 @@ class AccuracyMap:
     line, pixel : Array
         (N,) of the grid, in the image that it is of.
     longitude, latitude : Array
-        (N,) radians; NaN where a look misses the Earth or, of several lines, fewer than two see.
+        (N,) radians; NaN where a line of sight misses the Earth or, of several lines, fewer than two see.
     height : float
         Of the ground above the ellipsoid, metres.
     constant : Array
@@ -183,7 +183,7 @@ def _derivatives(sensor: Sensor, line: Array, pixel: Array, height: float, level
     def seen(at: Array, which: Array, up: float = height, moved: Array | None = None) -> Array:
         where = sensor
         if moved is not None:
-            where = replace(sensor, trajectory=MovedPlatform(sensor.trajectory, moved[:3], moved[3:]))
+            where = replace(sensor, trajectory=OffsetPlatform(sensor.trajectory, moved[:3], moved[3:]))
         return np.einsum("nij,nj->ni", level, where.ground(at, which, up))
 
     by_line = (seen(line + _EDGE, pixel) - seen(line - _EDGE, pixel)) / (2.0 * _EDGE)
@@ -437,7 +437,7 @@ def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, heigh
     Raises
     ------
     ValueError
-        a look misses the Earth.
+        a line of sight misses the Earth.
     """
     line = np.linspace(-0.5, sensor.lines - 0.5, _CHANGE_GRID[0])
     pixel = np.linspace(-0.5, sensor.camera.pixels - 0.5, _CHANGE_GRID[1])
@@ -449,7 +449,7 @@ def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, heigh
 
     middle = seen(values)
     if not np.all(np.isfinite(middle)):
-        raise ValueError("a look misses the Earth")
+        raise ValueError("a line of sight misses the Earth")
     longitude, latitude, _ = sensor.earth.geodetic(middle)
     level = east_north_up(longitude, latitude)[:, :2]
     columns = [
@@ -476,7 +476,7 @@ def ground_sigma(sensor: Sensor, calibrated: CalibratedLine, change: EstimatedCh
     Raises
     ------
     ValueError
-        a look misses the Earth.
+        a line of sight misses the Earth.
     """
     rows = ground_rows(sensor, calibrated, change.values, height)
     spreads = [rows @ covariance @ np.swapaxes(rows, 1, 2) for covariance in (change.constant, change.random)]

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array
 from twin.orbit.flight.earth import EQUATORIAL_RADIUS, FLATTENING, tai_of
-from twin.orbit.flight.platform_table import joined_quaternions
+from twin.orbit.flight.platform_table import continuous_quaternions
 from twin.orbit.flight.sensor import Sensor
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
@@ -163,7 +163,7 @@ def line_scanner(
     Raises
     ------
     ValueError
-        a look misses the Earth, or the trajectory is too rough for `_MOST` nodes.
+        a line of sight misses the Earth, or the trajectory is too rough for `_MOST` nodes.
     """
     camera = _effective_camera(sensor, pitch, heights[1], epoch)
     first, pixels = (0, camera.pixels) if window is None else window
@@ -279,7 +279,7 @@ def _directions(sensor: Sensor, seconds: Array, pixel: Array, height: float) -> 
     at, which = (v.ravel() for v in np.meshgrid(np.arange(float(count)), pixel, indexing="ij"))
     ground = nodes.ground(at, which, height).reshape(count, len(pixel), 3)
     if not np.all(np.isfinite(ground)):
-        raise ValueError("a look misses the Earth")
+        raise ValueError("a line of sight misses the Earth")
     middle = np.array([0.5 * (sensor.camera.pixels - 1)])
     to_itrs = sensor.trajectory.body_to_itrs(seconds)
     station = sensor.trajectory.position(seconds) + to_itrs @ sensor.camera.origin(middle)[0]
@@ -308,7 +308,7 @@ def _lagrange(times: Array, values: Array, at: Array) -> Array:
 
 def _joined(rotation: Rotation) -> Array:
     """Quaternions (N, 4) x, y, z, w of the way from the ITRS to the camera; neighbours on one side."""
-    return joined_quaternions(rotation.inv().as_quat(canonical=False))
+    return continuous_quaternions(rotation.inv().as_quat(canonical=False))
 
 
 def _smooth(camera: EffectiveCamera) -> bool:
@@ -335,7 +335,7 @@ def _error(sensor: Sensor, camera: EffectiveCamera, height: float, window: tuple
     at, which = (v.ravel() for v in np.meshgrid(line, pixel, indexing="ij"))
     ground = sensor.ground(at, which, height)
     if not np.all(np.isfinite(ground)):
-        raise ValueError("a look misses the Earth")
+        raise ValueError("a line of sight misses the Earth")
     seconds = sensor.time(at)
     here = _image(camera, seconds, ground)
     later = _image(camera, seconds + sensor.line_time, ground)

@@ -89,7 +89,7 @@ def _seen(
     line, sample, height = _places(0.5 * (low + high), 0.5 * (high - low), counts, at_ends)
     ground = sensor.ground(line, first_pixel + sample, height)
     if not np.all(np.isfinite(ground)):
-        raise ValueError("a look misses the Earth")
+        raise ValueError("a line of sight misses the Earth")
     longitude, latitude, _ = sensor.earth.geodetic(ground)
     return np.stack([line, sample, np.degrees(latitude), np.degrees(longitude), height], axis=-1)
 

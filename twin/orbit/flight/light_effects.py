@@ -24,7 +24,7 @@ EARTH_RATE = 7.292115146706979e-5
 _FIXED_POINT_STEPS = 3
 
 
-def carried_with_earth(position: np.ndarray) -> np.ndarray:
+def earth_rotation_velocity(position: np.ndarray) -> np.ndarray:
     """Return the inertial velocity of points that rotate with the Earth, in axes of the ITRS, in m/s.
 
     The Earth's axis is taken as Z: polar motion (1e-6 rad) changes the velocity by 1 mm/s.
@@ -109,7 +109,7 @@ def aberrated(direction: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     return apparent / np.linalg.norm(apparent, axis=-1, keepdims=True)
 
 
-def turned_with_earth(vectors: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+def rotated_with_earth(vectors: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """Rotate vectors in Earth-fixed axes eastward with the Earth for a time.
 
     Parameters

@@ -324,7 +324,7 @@ def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> L
     degree = 5 if line.k2 else 3
 
     def look(pixel: np.ndarray, ccd: CcdSpec | None = None) -> np.ndarray:
-        x, y = (_ccd_places(line, ccd, pixel, pixels, pitch) - np.array(line.principal_point)).T
+        x, y = (_ccd_positions(line, ccd, pixel, pixels, pitch) - np.array(line.principal_point)).T
         square = x**2 + y**2
         corrected = 1.0 + line.k1 * square + line.k2 * square**2
         return np.stack([-x * corrected, -y * corrected, np.full_like(y, line.principal_distance)], axis=-1) @ to_body.T
@@ -339,7 +339,7 @@ def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> L
     return LineCamera(name, pixels, straight, np.array([line.position]), tuple(pieces))
 
 
-def pixel_places(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
+def pixel_positions(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
     """Return focal-plane positions of a line's pixels, x (flight) and y (along the line) from its centre, in metres.
 
     Parameters
@@ -359,15 +359,17 @@ def pixel_places(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch: fl
         Positions x and y, metres.
     """
     at = np.asarray(pixel, dtype=np.float64)
-    position = _ccd_places(line, None, at, pixels, pitch)
+    position = _ccd_positions(line, None, at, pixels, pitch)
     for ccd in line.ccds:
         here = (at >= ccd.first - 0.5) & (at <= ccd.last + 0.5)
-        position[here] = _ccd_places(line, ccd, at[here], pixels, pitch)
+        position[here] = _ccd_positions(line, ccd, at[here], pixels, pitch)
     return position
 
 
-def _ccd_places(line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
-    """Return positions of pixels of one CCD, or of a straight line if `ccd` is None; see `pixel_places`."""
+def _ccd_positions(
+    line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pixels: int, pitch: float
+) -> np.ndarray:
+    """Return positions of pixels of one CCD, or of a straight line if `ccd` is None; see `pixel_positions`."""
     straight = (pixel - 0.5 * (pixels - 1)) * pitch
     if ccd is None:
         return np.stack([np.zeros_like(straight), straight], axis=-1)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from analysis.arrays import Array
 from optics.numerics.array_math import UnphysicalError, in_span
-from twin.orbit.flight.light_effects import carried_with_earth
+from twin.orbit.flight.light_effects import earth_rotation_velocity
 from twin.orbit.flight.trajectory import Attitude, Trajectory, readings
 
 Interpolation = Literal["spline", "lagrange"]
@@ -119,7 +119,7 @@ class PlatformTable:
         norm = np.linalg.norm(rotation, axis=1)
         if np.any(np.abs(norm - 1.0) > _UNIT_TOLERANCE):
             raise ValueError("platform: a quaternion is not of unit length")
-        return cls(epoch, times, positions, speed, looks, joined_quaternions(rotation / norm[:, None]))
+        return cls(epoch, times, positions, speed, looks, continuous_quaternions(rotation / norm[:, None]))
 
     @classmethod
     def sampled(cls, trajectory: Trajectory, orbit_interval: float, attitude_interval: float) -> PlatformTable:
@@ -130,7 +130,7 @@ class PlatformTable:
         return cls.of(str(trajectory.orbit.epoch), fixes, positions, speed, looks, rotation)
 
 
-def joined_quaternions(quaternion: Array) -> Array:
+def continuous_quaternions(quaternion: Array) -> Array:
     """Return quaternions of the same rotations whose neighbours lie on one side of the sphere, for interpolation.
 
     Parameters
@@ -207,7 +207,7 @@ class TabulatedTrajectory:
         widest = float(np.max(np.diff(self.table.orbit_time)[~self._gaps(self.table.orbit_time)], initial=0.0))
         return "spline" if widest**4 * _FOURTH_DERIVATIVE / 384.0 <= _SPLINE_ERROR else "lagrange"
 
-    def known(self, seconds: ArrayLike) -> np.ndarray:
+    def covers(self, seconds: ArrayLike) -> np.ndarray:
         """Return whether readings of orbit and attitude cover times (...), which lie within them and not in a gap."""
         t = np.asarray(seconds, dtype=np.float64)
         covered = in_span(t, self.first, self.last)
@@ -228,7 +228,7 @@ class TabulatedTrajectory:
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
         """Return the velocity relative to the stars in axes of the ITRS, in m/s; (...) -> (..., 3)."""
-        return np.asarray(self.velocity(seconds) + carried_with_earth(self.position(seconds)))
+        return np.asarray(self.velocity(seconds) + earth_rotation_velocity(self.position(seconds)))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
         """Return the axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
@@ -265,7 +265,7 @@ class TabulatedTrajectory:
     def _checked(self, seconds: Any) -> np.ndarray:
         """Return the times as an array, or raise UnphysicalError if one of them is not covered by readings."""
         t = np.asarray(seconds, dtype=np.float64)
-        covered = self.known(t)
+        covered = self.covers(t)
         if not np.all(covered):
             worst = float(np.ravel(t)[int(np.argmin(np.ravel(covered)))])
             where = f"which cover {self.first:.9g} s to {self.last:.9g} s"

@@ -18,7 +18,7 @@ from optics.geometry.pose import rotation_matrix
 from optics.numerics.array_math import in_span
 from twin.orbit.flight import light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, LightEffects, aberrated, turned_with_earth
+from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, LightEffects, aberrated, rotated_with_earth
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
 
 _MOST_STEPS = 30
@@ -47,7 +47,7 @@ class Platform(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class MovedPlatform:
+class OffsetPlatform:
     """Platform with a constant offset of position and attitude.
 
     Attributes
@@ -179,7 +179,7 @@ class Sensor:
             # Heights do not change as the Earth rotates: the point is expressed in the Earth-fixed axes of the moment
             # at which its light left.
             delay = np.linalg.norm(point - station, axis=-1) / SPEED_OF_LIGHT
-            point, station = turned_with_earth(point, delay), turned_with_earth(station, delay)
+            point, station = rotated_with_earth(point, delay), rotated_with_earth(station, delay)
         if self.effects.refraction:
             point = light_effects.refracted(point, station, self.earth, self.effects.wavelength)
         return point
@@ -249,12 +249,12 @@ class Sensor:
             delay = np.zeros(len(point))
             if self.effects.light_time:
                 delay = np.linalg.norm(source - station, axis=-1) / SPEED_OF_LIGHT
-            left_station = turned_with_earth(station, delay)
+            left_station = rotated_with_earth(station, delay)
             if self.effects.refraction:
                 source = light_effects.unrefracted(source, left_station, self.earth, self.effects.wavelength)
             if self.effects.light_time:
                 delay = np.linalg.norm(source - left_station, axis=-1) / SPEED_OF_LIGHT
-                source = turned_with_earth(source, -delay)
+                source = rotated_with_earth(source, -delay)
         direction = source - station
         direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
         if self.effects.aberration:

@@ -35,7 +35,7 @@ from twin.orbit.measured.pass_measurements import ImagePoints
 if TYPE_CHECKING:
     from scenes.specs.orbit.scene import ImagePointsSpec
 
-BEYOND = 0.1
+UNMODELLED_SIGMA = 0.1
 """Standard deviation, in pixels, added to the matching's own for errors that no fit shows.
 
 Such errors are another season's light (RMS of matches 0.11 px where 0.06 is predicted) and the attitude between its
@@ -153,7 +153,7 @@ def predicted(image: LineFrame, points: np.ndarray) -> np.ndarray:
     return np.stack([line - image.window.first_line, pixel - image.window.first_pixel], axis=-1)
 
 
-def fits(image: LineFrame, place: np.ndarray, border: float) -> np.ndarray:
+def inside_frame(image: LineFrame, place: np.ndarray, border: float) -> np.ndarray:
     """Return which positions (..., 2) lie in a frame at least `border` pixels from its border; False for NaN."""
     last = np.array(image.frame.shape) - 1.0 - border
     return np.asarray(np.all((place >= border) & (place <= last), axis=-1))
@@ -244,9 +244,9 @@ def _templates_of_image(
     base = predicted(source, points)
     at = np.broadcast_to(place.T[:, :, None, None], (2, *samples[0].shape))
     for k, sample in enumerate(samples):
-        moved = centre.copy()
-        moved[k] += _STEP
-        slope = (predicted(source, frame.itrs(*moved)) - base) / _STEP
+        shifted = centre.copy()
+        shifted[k] += _STEP
+        slope = (predicted(source, frame.itrs(*shifted)) - base) / _STEP
         at = at + slope.T[:, :, None, None] * (sample - centre[k][:, None, None])
     return resampled(source.frame, at[0], at[1])
 
@@ -306,7 +306,7 @@ class MatchedLine:
     first: tuple[int, int]
     scatter: float
     text: str
-    way: DisplacementField | None = None
+    displacement_field: DisplacementField | None = None
 
     @property
     def accepted(self) -> np.ndarray:
@@ -324,17 +324,17 @@ class MatchedLine:
         return self.place + np.array(self.first)
 
     @property
-    def moved(self) -> np.ndarray:
+    def median_displacement(self) -> np.ndarray:
         """Median displacement from predicted to measured of the accepted, lines and pixels, (2,)."""
         return np.asarray(np.median((self.place - self.predicted)[self.accepted], axis=0))
 
     @property
-    def usual_sigma(self) -> np.ndarray:
+    def median_sigma(self) -> np.ndarray:
         """Median sigma of the accepted, lines and pixels, (2,)."""
         return np.asarray(np.median(np.sqrt(np.diagonal(self.covariance[self.accepted], axis1=1, axis2=2)), axis=0))
 
     def measured(self, rows: np.ndarray, point: np.ndarray) -> ImagePoints:
-        """Return the image points that a mask or index selects, with `BEYOND` in their covariances.
+        """Return the image points that a mask or index selects, with `UNMODELLED_SIGMA` in their covariances.
 
         Parameters
         ----------
@@ -343,20 +343,20 @@ class MatchedLine:
         point : ndarray of int
             Index of the ground point of each.
         """
-        image, spread = self.image[rows], self.covariance[rows] + BEYOND**2 * np.eye(2)
+        image, spread = self.image[rows], self.covariance[rows] + UNMODELLED_SIGMA**2 * np.eye(2)
         return ImagePoints.of(point, image[:, 0], image[:, 1], spread)
 
     @property
-    def lost(self) -> Mapping[str, int]:
+    def rejections(self) -> Mapping[str, int]:
         """Number of points not accepted by reason, the most frequent first."""
         count = Counter(int(code) for code in self.status[~self.accepted])
         return {status_text(code): number for code, number in count.most_common()}
 
     def displacement(self, place: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Return the smooth displacement (n, 2) from predicted to measured at positions (n, 2) and heights (n,)."""
-        if self.way is None:
+        if self.displacement_field is None:
             return np.zeros_like(place)
-        return self.way(place, None if self.way.heights is None else height)
+        return self.displacement_field(place, None if self.displacement_field.heights is None else height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,10 +388,10 @@ class MatchedPoints:
     @property
     def source(self) -> str | None:
         """Name of the line whose frame ties were chosen in; None for points of the map."""
-        return next((name for name, line in self.lines.items() if line.way is None), None)
+        return next((name for name, line in self.lines.items() if line.displacement_field is None), None)
 
     @property
-    def sought_in(self) -> Mapping[str, MatchedLine]:
+    def searched_lines(self) -> Mapping[str, MatchedLine]:
         """Lines that were searched for the points: without the source of ties."""
         return {name: line for name, line in self.lines.items() if name != self.source}
 
@@ -492,8 +492,10 @@ def tie_points(
     heights = ReferenceHeights.of(patch.control.dem)
     image = patch.images[source]
     place = distinct_points(image.frame, spec.tie, spacing=max(0.5 * spec.template, 1.0), border=border)
-    ground = _followed(patch, image, heights, place, control.lines[source] if control else None)
-    seen = [fits(other, predicted(other, ground), border) for other in patch.images.values() if other is not image]
+    ground = _ground_of_looks(patch, image, heights, place, control.lines[source] if control else None)
+    seen = [
+        inside_frame(other, predicted(other, ground), border) for other in patch.images.values() if other is not image
+    ]
     good = np.all([np.isfinite(ground).all(axis=1), *seen], axis=0)
     place, ground = place[good], ground[good]
     if not len(place):
@@ -547,7 +549,9 @@ def _distinct_map(
     row, column = np.meshgrid(*sides, indexing="ij")
     east, north = photo.east_north(row.ravel(), column.ravel())
     ground = patch.frame.itrs(east, north, heights(east, north))
-    seen = np.all([fits(im, predicted(im, ground), border) for im in patch.images.values()], axis=0).reshape(row.shape)
+    seen = np.all([inside_frame(im, predicted(im, ground), border) for im in patch.images.values()], axis=0).reshape(
+        row.shape
+    )
     if not seen.any():
         raise PointsError(f"no place of the orthophoto is seen by every line {border} pixels from the frames' borders")
     scale = float(np.mean([np.mean(im.sample) for im in patch.images.values()])) / photo.spacing
@@ -564,11 +568,11 @@ def _distinct_map(
         raise PointsError("the orthophoto has no distinct places where every line sees it")
     found_east, found_north = photo.east_north(place[:, 0] + top * _MASK, place[:, 1] + left * _MASK)
     ground = patch.frame.itrs(found_east, found_north, heights(found_east, found_north))
-    good = np.all([fits(im, predicted(im, ground), border) for im in patch.images.values()], axis=0)
+    good = np.all([inside_frame(im, predicted(im, ground), border) for im in patch.images.values()], axis=0)
     return found_east[good][:count], found_north[good][:count]
 
 
-def _followed(
+def _ground_of_looks(
     patch: ImagedGround, image: LineFrame, heights: ReferenceHeights, place: np.ndarray, known: MatchedLine | None
 ) -> np.ndarray:
     """Return the points at which the measured sensor's looks meet the reference heights, ITRS, (n, 3), in metres.

@@ -301,13 +301,13 @@ def _collection(sensor: Sensor, optics: LineOptics) -> Collection:
     return Collection.of(optics.ccd.band.tdi, sensor.line_time)
 
 
-def collected(sensor: Sensor, optics: LineOptics) -> Sensor:
+def with_mean_jitter(sensor: Sensor, optics: LineOptics) -> Sensor:
     """Return the sensor of a line's image, with jitter averaged over the collection of light."""
     jitter = _jitter(sensor)
     return sensor if jitter is None else _with(sensor, jitter.over(_collection(sensor, optics)))
 
 
-def steady(sensor: Sensor) -> Sensor:
+def without_jitter(sensor: Sensor) -> Sensor:
     """Return the sensor without its jitter."""
     return sensor if _jitter(sensor) is None else _with(sensor, None)
 

@@ -30,7 +30,7 @@ from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.orthophoto import Control, Extent, apparent, around, make_control, reflectance
 from twin.orbit.images import pushbroom
 from twin.orbit.images.image_points import ImagedGround, LineFrame, MatchedPoints
-from twin.orbit.images.line_optics import ImageMotion, LineOptics, collected
+from twin.orbit.images.line_optics import ImageMotion, LineOptics, with_mean_jitter
 from twin.orbit.images.pushbroom import BORDER, LookMap, PushbroomScene, Window
 from twin.sensors.area_detector import FixedPattern
 
@@ -248,7 +248,10 @@ def imaged_lines(
     """
     return {
         name: ImagedLine(
-            collected(sensor, optics[name]), measured[name], optics[name], optics[name].ccd.pattern(stream(seed, k))
+            with_mean_jitter(sensor, optics[name]),
+            measured[name],
+            optics[name],
+            optics[name].ccd.pattern(stream(seed, k)),
         )
         for k, (name, sensor) in enumerate(sensors.items())
     }
@@ -341,7 +344,7 @@ WRONG = f"more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigma
 
 
 @dataclass(frozen=True, eq=False)
-class LineJudgement:
+class LineComparison:
     """Points measured in one line compared with the truth.
 
     Attributes
@@ -404,11 +407,11 @@ def true_ground(patch: Patch, points: MatchedPoints) -> np.ndarray:
     return patch.true_point(source, place[:, 0], place[:, 1])
 
 
-def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineJudgement]:
+def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineComparison]:
     """Compare measured points with the truth, by line; the frame that ties were chosen in is left out."""
     truth = true_ground(patch, points)
     judgements = {}
-    for name, line in points.sought_in.items():
+    for name, line in points.searched_lines.items():
         true = np.stack(patch.images[name].sensor.image(truth), axis=-1)
         error = line.image - true
         size = np.linalg.norm(error, axis=1)
@@ -418,7 +421,7 @@ def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineJudgement]:
         right = line.accepted & ~wrong
         good = error[right]
         square = float(np.einsum("ni,nij,nj->", good, np.linalg.inv(line.covariance[right]), good))
-        judgements[name] = LineJudgement(
+        judgements[name] = LineComparison(
             found=int(np.isfinite(size).sum()),
             matched=int(line.matched.sum()),
             accepted=int(line.accepted.sum()),

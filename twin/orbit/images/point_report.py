@@ -19,7 +19,7 @@ from twin.framework.report import Section
 from twin.framework.svg import SKY, VERMILION, YELLOW, look, new_figure, to_png
 from twin.orbit.images.image_points import CONSENSUS, ImagedGround, LineFrame, MatchedPoints, PatchPoints, status_text
 from twin.orbit.images.patch import WRONG, Patch, judged
-from twin.orbit.images.simulate_run import JUDGED, MATCHED
+from twin.orbit.images.simulate_run import COMPARED, MATCHED
 
 
 def pixel_axes(axes: Axes) -> None:
@@ -147,32 +147,32 @@ def flat(points: PatchPoints, below: Callable[[MatchedPoints], Mapping[str, T]])
 
 def found_table(points: PatchPoints) -> Table:
     """Return the table of the points that were matched, by kind and line."""
-    matches = flat(points, lambda group: group.sought_in)
+    matches = flat(points, lambda group: group.searched_lines)
     rows = {name: MATCHED(line) for name, line in matches.items() if line.accepted.any()}
     caption = (
         "Displacement from predicted to measured and sigma: medians of the accepted, px along the track and the line."
     )
-    moved = ("displacement_lines_px", "displacement_pixels_px")
-    keys = ("found", "matched", "accepted", *moved, *(f"{key}_sigma" for key in moved))
+    displacement = ("displacement_lines_px", "displacement_pixels_px")
+    keys = ("found", "matched", "accepted", *displacement, *(f"{key}_sigma" for key in displacement))
     return MATCHED.table("points-found", "Matching", caption, rows, keys, "points, line", digits=4)
 
 
 def _true(patch: Patch, points: PatchPoints) -> Table:
     """Return the table of measured points compared with the truth."""
-    rows = {name: JUDGED(line) for name, line in flat(points, lambda quantity: judged(patch, quantity)).items()}
+    rows = {name: COMPARED(line) for name, line in flat(points, lambda quantity: judged(patch, quantity)).items()}
     caption = (
         f"Wrong: {WRONG}; counted among all measured points, those that passed the matching, and those that passed the "
         "consensus. RMS and mean error, px, and chi-square of the right points."
     )
-    keys = [quantity.key for quantity in JUDGED][:-1]
-    return JUDGED.table("points-truth", "Comparison with the truth", caption, rows, keys, "points, line", digits=4)
+    keys = [quantity.key for quantity in COMPARED][:-1]
+    return COMPARED.table("points-truth", "Comparison with the truth", caption, rows, keys, "points, line", digits=4)
 
 
 def _lost_table(points: PatchPoints) -> Table:
     """Return the table of the reasons why points were not accepted."""
     rows: list[tuple[Cell, ...]] = []
     for sort, group in points.sorts.items():
-        count = {name: line.lost for name, line in group.sought_in.items()}
+        count = {name: line.rejections for name, line in group.searched_lines.items()}
         total: Counter[str] = Counter()
         for reasons in count.values():
             total.update(reasons)
@@ -184,7 +184,7 @@ def _lost_table(points: PatchPoints) -> Table:
 def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
     """Return a PNG of every line's frame with its points and their displacements."""
     with look(f"points-{points.kind}"):
-        names = list(points.sought_in)
+        names = list(points.searched_lines)
         figure = new_figure(4.3 if len(names) > 2 else 5.6)
         panels = np.atleast_1d(figure.subplots(1, len(names)))
         for axes, name in zip(panels, names, strict=True):
@@ -208,7 +208,7 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
     axes.imshow(image.frame, cmap="gray", vmin=low, vmax=high, extent=ends, interpolation="antialiased", alpha=0.75)
     at, to = line.predicted + np.array(line.first), line.image
     # Adding zero removes a minus before zero.
-    middle = np.round(line.moved, 1) + 0.0
+    middle = np.round(line.median_displacement, 1) + 0.0
     rest = to - at - middle
     good, against = line.accepted, line.status == CONSENSUS
     longest = float(np.quantile(np.linalg.norm(rest[good], axis=1), 0.95))
@@ -217,9 +217,9 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
     effects = [Stroke(linewidth=1.2, foreground="black"), Normal()]
     axes.quiver(to[good, 1], to[good, 0], rest[good, 1], rest[good, 0], color=YELLOW, path_effects=effects, **arrow)
     axes.plot(to[against, 1], to[against, 0], "x", color=VERMILION, ms=6, mew=1.6)
-    lost = ~good & ~against
+    unmatched = ~good & ~against
     # Points that were not matched are drawn at their expected position.
-    axes.plot(at[lost, 1] + middle[1], at[lost, 0] + middle[0], ".", color=SKY, ms=5, mec="black", mew=0.4)
+    axes.plot(at[unmatched, 1] + middle[1], at[unmatched, 0] + middle[0], ".", color=SKY, ms=5, mec="black", mew=0.4)
     axes.set(
         title=f"{name}: median {middle[0]:.1f} lines, {middle[1]:.1f} pixels\nresiduals enlarged {enlarged:g} ×",
         xlim=ends[:2],

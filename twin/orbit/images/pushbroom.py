@@ -24,7 +24,7 @@ from optics.numerics.backend import cores, one_blas_thread
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame, Terrain
 from twin.orbit.ground.orthophoto import Extent
-from twin.orbit.images.line_optics import ImageMotion, LineOptics, exposures, steady
+from twin.orbit.images.line_optics import ImageMotion, LineOptics, exposures, without_jitter
 
 TOLERANCE = 2e-4
 """Largest interpolation error of the look's position at given heights, in metres."""
@@ -407,7 +407,7 @@ def render_patch(
     line, pixel = window.middle
     height = float(looks.ground(np.array([line]), np.array([pixel]))[2][0, 0])
     # Blur by jitter differs from line to line and is contained in the moments of the collection.
-    motion = ImageMotion.of(steady(sensor), line, pixel, height)
+    motion = ImageMotion.of(without_jitter(sensor), line, pixel, height)
     moments = exposures(sensor, optics)
     if len(moments) > 1 or moments[0][1] is not sensor:
         seen = [

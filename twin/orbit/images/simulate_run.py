@@ -33,7 +33,7 @@ from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, LineTimes, changed_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
-from twin.orbit.flight.platform_table import PlatformTable, joined_quaternions
+from twin.orbit.flight.platform_table import PlatformTable, continuous_quaternions
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory, readings
 from twin.orbit.ground.orthophoto import Raster
@@ -49,8 +49,8 @@ from twin.orbit.images.image_points import (
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import (
     ImagedLine,
+    LineComparison,
     LineImage,
-    LineJudgement,
     Patch,
     PatchError,
     fly_patch,
@@ -318,15 +318,21 @@ MATCHED: Record[MatchedLine] = Record(
         lambda line: (line.status == CONSENSUS).sum(),
         "points that contradict their neighbours",
     ),
-    Quantity("not_accepted", lambda line: line.lost, "number of points by reason, the most frequent first"),
+    Quantity("not_accepted", lambda line: line.rejections, "number of points by reason, the most frequent first"),
     Quantity(
-        "displacement_lines_px", lambda line: line.moved[0], "measured minus predicted along track", "moved, track"
+        "displacement_lines_px",
+        lambda line: line.median_displacement[0],
+        "measured minus predicted along track",
+        "moved, track",
     ),
     Quantity(
-        "displacement_pixels_px", lambda line: line.moved[1], "measured minus predicted along line", "moved, line"
+        "displacement_pixels_px",
+        lambda line: line.median_displacement[1],
+        "measured minus predicted along line",
+        "moved, line",
     ),
-    Quantity("displacement_lines_px_sigma", lambda line: line.usual_sigma[0], "1 sigma along track", "σ track"),
-    Quantity("displacement_pixels_px_sigma", lambda line: line.usual_sigma[1], "1 sigma along line", "σ line"),
+    Quantity("displacement_lines_px_sigma", lambda line: line.median_sigma[0], "1 sigma along track", "σ track"),
+    Quantity("displacement_pixels_px_sigma", lambda line: line.median_sigma[1], "1 sigma along line", "σ line"),
     Quantity(
         "consensus_scatter_px", lambda line: line.scatter, "scatter of the displacements beyond their covariances"
     ),
@@ -335,7 +341,7 @@ POINTS: Record[MatchedPoints] = Record(
     "Points of one kind; for ties without the line in which they are chosen.",
     Quantity("sought", lambda points: len(points.ground), "number of points"),
     Quantity("in_all_lines", lambda points: points.in_all.sum(), "points accepted in every line"),
-    Quantity("lines", lambda points: points.sought_in, "each line that was searched", record=MATCHED),
+    Quantity("lines", lambda points: points.searched_lines, "each line that was searched", record=MATCHED),
 )
 SIMULATE: Record[Simulation] = Record(
     "simulate.json. Quantities that the user of the images may know.",
@@ -393,7 +399,7 @@ def trajectory_data(run: Simulation, path: Trajectory) -> dict[str, Any]:
         "velocity_m_per_s": path.velocity(fixes),
         "inertial_velocity_m_per_s": path.inertial_velocity(fixes),
         "attitude_s": looks,
-        "quaternion": joined_quaternions(quaternion),
+        "quaternion": continuous_quaternions(quaternion),
     }
     return {key: plain_data(value) for key, value in data.items()}
 
@@ -404,7 +410,7 @@ def georeference_data(run: Simulation) -> dict[str, Any]:
     return {"orthophoto": GEOREFERENCE(control.orthophoto), "dem": GEOREFERENCE(control.dem)}
 
 
-def _errors(judgement: LineJudgement) -> list[list[float | None]]:
+def _errors(judgement: LineComparison) -> list[list[float | None]]:
     """Return the errors of every point, None where it was not measured."""
     return [[float(v) if np.isfinite(v) else None for v in row] for row in judgement.error]
 
@@ -420,7 +426,7 @@ MATCH_COUNTS = {
 }
 """Meaning of each count of points in one line."""
 
-JUDGED: Record[LineJudgement] = Record(
+COMPARED: Record[LineComparison] = Record(
     "Points of one kind in one line compared with the truth; RMS and mean of those that are not wrong.",
     *(Quantity(key, attrgetter(key), meaning) for key, meaning in MATCH_COUNTS.items()),
     Quantity("rms_lines_px", lambda one: one.rms[0], "root mean square error along the track", "RMS track"),
@@ -434,7 +440,7 @@ JUDGED: Record[LineJudgement] = Record(
 TRUE_POINTS: Record[tuple[Patch, MatchedPoints]] = Record(
     "True ground positions of the points of one kind, in the order of points.csv.",
     Quantity("itrs_m", lambda of: true_ground(*of), "ITRS coordinates"),
-    Quantity("lines", lambda of: judged(*of), "each line that was searched", record=JUDGED),
+    Quantity("lines", lambda of: judged(*of), "each line that was searched", record=COMPARED),
 )
 
 

@@ -28,10 +28,10 @@ from analysis.statistics import robust_sigma
 from optics.numerics.array_math import PhysicalError, in_span
 from scenes.specs.orbit.jitter_search import AXES, JitterSearchSpec
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import LightEffects, carried_with_earth
+from twin.orbit.flight.light_effects import LightEffects, earth_rotation_velocity
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
 from twin.orbit.flight.platform_table import TabulatedTrajectory
-from twin.orbit.flight.sensor import MovedPlatform, Sensor
+from twin.orbit.flight.sensor import OffsetPlatform, Sensor
 from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured.pass_measurements import PassMeasurements
 
@@ -75,17 +75,17 @@ class SteadyPlatform:
             The readings do not cover the times.
         """
         path.position(np.array([first, last]))
-        reach = last - first
-        begin, end = max(first - reach, path.first), min(last + reach, path.last)
+        duration = last - first
+        begin, end = max(first - duration, path.first), min(last + duration, path.last)
         span = begin, end
         fixes, looks = (_inside(time, begin, end, path) for time in (path.table.orbit_time, path.table.attitude_time))
         degree = _ORBIT + int((end - begin) / _PER)
-        place = _fitted(fixes, path.position(fixes), span, degree)
+        place = _chebyshev_fit(fixes, path.position(fixes), span, degree)
         draft = cls(span, place, np.zeros((1, 3)), np.eye(3), path.law)
         against = Rotation.from_matrix(np.einsum("nji,njk->nik", draft._orbital(looks), path.body_to_itrs(looks)))
         middle = against.mean().as_matrix()
-        away = (Rotation.from_matrix(middle).inv() * against).as_rotvec()
-        return cls(span, place, _fitted(looks, away, span, _ATTITUDE), middle, path.law)
+        rotation = (Rotation.from_matrix(middle).inv() * against).as_rotvec()
+        return cls(span, place, _chebyshev_fit(looks, rotation, span, _ATTITUDE), middle, path.law)
 
     def position(self, seconds: Any) -> np.ndarray:
         """Position in the ITRS, metres; (...) -> (..., 3)."""
@@ -98,13 +98,13 @@ class SteadyPlatform:
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
         """Velocity against the stars in axes of the ITRS, m/s; (...) -> (..., 3)."""
-        return np.asarray(self.velocity(seconds) + carried_with_earth(self.position(seconds)))
+        return np.asarray(self.velocity(seconds) + earth_rotation_velocity(self.position(seconds)))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
         """Axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
         t = np.asarray(seconds, np.float64)
-        turn = Rotation.from_rotvec(self._series(self.turn, t).reshape(-1, 3)).as_matrix().reshape(*t.shape, 3, 3)
-        return np.asarray(self._orbital(t) @ self.middle @ turn)
+        rotation = Rotation.from_rotvec(self._series(self.turn, t).reshape(-1, 3)).as_matrix().reshape(*t.shape, 3, 3)
+        return np.asarray(self._orbital(t) @ self.middle @ rotation)
 
     def _orbital(self, seconds: Any) -> np.ndarray:
         return self.law.orbital_to_itrs(self.position(seconds), self.velocity(seconds), self.inertial_velocity(seconds))
@@ -117,13 +117,13 @@ class SteadyPlatform:
 
 def _inside(time: np.ndarray, first: float, last: float, path: TabulatedTrajectory) -> np.ndarray:
     """Readings between two times; where there are few, moments that are joined from them."""
-    found = time[in_span(time, first, last)]
-    if len(found) < 2 * _ORBIT:
-        found = np.linspace(first, last, 4 * _ORBIT)
-    return np.asarray(found[path.known(found)])
+    moments = time[in_span(time, first, last)]
+    if len(moments) < 2 * _ORBIT:
+        moments = np.linspace(first, last, 4 * _ORBIT)
+    return np.asarray(moments[path.covers(moments)])
 
 
-def _fitted(time: np.ndarray, values: np.ndarray, span: tuple[float, float], degree: int) -> np.ndarray:
+def _chebyshev_fit(time: np.ndarray, values: np.ndarray, span: tuple[float, float], degree: int) -> np.ndarray:
     x = (2.0 * time - span[0] - span[1]) / (span[1] - span[0])
     return np.asarray(chebyshev.chebfit(x, values, min(degree, len(time) - 1)))
 
@@ -191,9 +191,9 @@ class _Line:
 
 
 def sights_of(
-    one: PassMeasurements,
+    measurements: PassMeasurements,
     cameras: Mapping[str, LineCamera],
-    chosen: tuple[str, ...] | None,
+    used: tuple[str, ...] | None,
     search: JitterSearchSpec,
     effects: LightEffects,
 ) -> Sights:
@@ -219,52 +219,52 @@ def sights_of(
     ValueError
         Readings that do not cover the points' moments.
     """
-    names = [name for name in cameras if name in one.images and name in (chosen or cameras)]
-    if missing := [name for name in chosen or () if name not in one.images]:
+    names = [name for name in cameras if name in measurements.images and name in (used or cameras)]
+    if missing := [name for name in used or () if name not in measurements.images]:
         raise SightsError(f"no image points of {', '.join(missing)}")
-    count = np.zeros(len(one.ground), int)
+    count = np.zeros(len(measurements.ground), int)
     for name in names:
-        count[one.images[name].point] += 1
+        count[measurements.images[name].point] += 1
     shared = np.flatnonzero(count >= 2)
     if len(names) < 2 or len(shared) < _LEAST_POINTS:
         raise SightsError(f"{len(shared)} points are seen by two lines or more, {_LEAST_POINTS} at least are needed")
-    lines = _lines(one, cameras, names, shared, search, effects)
+    lines = _lines(measurements, cameras, names, shared, search, effects)
     order = sorted(names, key=lambda name: _moment(lines[name], lines))
-    prior = _start(one, lines, shared, search)
-    place = _improved(lines, shared, prior)
-    observations, left = _whitened(lines, order, shared, place, prior, search)
+    prior = _prior_of(measurements, lines, shared, search)
+    place = _improved_positions(lines, shared, prior)
+    observations, residual = _whitened_observations(lines, order, shared, place, prior, search)
     pixel = float(np.median([_pixel(cameras[name]) for name in order]))
-    gaps, pairs = _pairs(lines, order, len(one.ground), left)
+    gaps, pairs = _pairs(lines, order, len(measurements.ground), residual)
     return Sights(observations, tuple(order), gaps, pixel, len(shared), pairs)
 
 
 def _lines(
-    one: PassMeasurements,
+    measurements: PassMeasurements,
     cameras: Mapping[str, LineCamera],
     names: list[str],
     shared: np.ndarray,
     search: JitterSearchSpec,
     effects: LightEffects,
 ) -> dict[str, _Line]:
-    rows = {name: one.images[name].taken(np.isin(one.images[name].point, shared)) for name in names}
+    rows = {name: measurements.images[name].taken(np.isin(measurements.images[name].point, shared)) for name in names}
     times, first = {}, {}
     for name, row in rows.items():
-        first[name], times[name] = _cut(one.line_times[name], row.line)
+        first[name], times[name] = _trimmed_times(measurements.line_times[name], row.line)
     ends = [at.at(np.array([-0.5, at.line[-1] + 0.5])) for at in times.values()]
     begin, end = float(np.min(ends)), float(np.max(ends))
-    path = TabulatedTrajectory(one.platform)
-    steady = SteadyPlatform.of(path, max(begin, path.first), min(end, path.last))
-    turned = [MovedPlatform(steady, np.zeros(3), _TURN * np.eye(3)[AXES.index(axis)]) for axis in search.axes]
-    found = {}
+    path = TabulatedTrajectory(measurements.platform)
+    without_jitter = SteadyPlatform.of(path, max(begin, path.first), min(end, path.last))
+    rotated = [OffsetPlatform(without_jitter, np.zeros(3), _TURN * np.eye(3)[AXES.index(axis)]) for axis in search.axes]
+    lines = {}
     for name, row in rows.items():
-        sensor = Sensor.of_lines(cameras[name], steady, Earth(), times[name], effects)
+        sensor = Sensor.of_lines(cameras[name], without_jitter, Earth(), times[name], effects)
         place = np.stack([row.line - first[name], row.pixel], axis=-1)
-        about = tuple(replace(sensor, trajectory=platform) for platform in turned)
-        found[name] = _Line(sensor, row.point, place, row.covariance, times[name].at(place[:, 0]), about)
-    return found
+        about = tuple(replace(sensor, trajectory=platform) for platform in rotated)
+        lines[name] = _Line(sensor, row.point, place, row.covariance, times[name].at(place[:, 0]), about)
+    return lines
 
 
-def _cut(times: LineTimes, line: np.ndarray) -> tuple[float, LineTimes]:
+def _trimmed_times(times: LineTimes, line: np.ndarray) -> tuple[float, LineTimes]:
     """The times of the lines about some, counted from the first of them, and that one's number."""
     first = max(float(np.floor(line.min())) - _SPARE, float(times.line[0]))
     last = min(float(np.ceil(line.max())) + _SPARE, float(times.line[-1]))
@@ -275,11 +275,11 @@ def _cut(times: LineTimes, line: np.ndarray) -> tuple[float, LineTimes]:
 
 def _moment(line: _Line, lines: Mapping[str, _Line]) -> float:
     """Mean of a line's sights less those of all lines of the same points, seconds."""
-    away = []
+    difference = []
     for other in lines.values():
         _, mine, theirs = np.intersect1d(line.point, other.point, return_indices=True)
-        away.append(float(np.mean(line.seconds[mine] - other.seconds[theirs])) if len(mine) else 0.0)
-    return float(np.mean(away))
+        difference.append(float(np.mean(line.seconds[mine] - other.seconds[theirs])) if len(mine) else 0.0)
+    return float(np.mean(difference))
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,49 +313,49 @@ class _Prior:
         return root, (root @ (self.place[rows] - place)[..., None])[..., 0]
 
 
-def _start(one: PassMeasurements, lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec) -> _Prior:
-    place = np.full((len(one.ground), 3), np.nan)
+def _prior_of(measurements: PassMeasurements, lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec) -> _Prior:
+    place = np.full((len(measurements.ground), 3), np.nan)
     for line in lines.values():
-        seen = line.sensor.ground(line.place[:, 0], line.place[:, 1], search.height)
+        ground = line.sensor.ground(line.place[:, 0], line.place[:, 1], search.height)
         empty = np.isnan(place[line.point, 0])
-        place[line.point[empty]] = seen[empty]
-    tie = one.ground.role == "tie"
-    place[~tie] = one.ground.itrs[~tie]
+        place[line.point[empty]] = ground[empty]
+    tie = measurements.ground.role == "tie"
+    place[~tie] = measurements.ground.itrs[~tie]
     place, tie = place[shared], tie[shared]
     if not np.all(np.isfinite(place)):
         raise SightsError("lines look past the Earth")
     root = np.zeros((len(place), 3, 3))
     longitude, latitude, _ = Earth().geodetic(place[tie])
     root[tie, 0] = east_north_up(longitude, latitude)[:, 2] / search.height_sigma
-    spread = one.ground.covariance[shared[~tie]] + _EXACT**2 * np.eye(3)
+    spread = measurements.ground.covariance[shared[~tie]] + _EXACT**2 * np.eye(3)
     root[~tie] = np.linalg.inv(np.linalg.cholesky(spread))
     return _Prior(tie, place, root)
 
 
-def _improved(lines: Mapping[str, _Line], shared: np.ndarray, prior: _Prior) -> np.ndarray:
+def _improved_positions(lines: Mapping[str, _Line], shared: np.ndarray, prior: _Prior) -> np.ndarray:
     """Places at which the derivatives are taken: near enough for them to hold."""
     normal, right = prior.normal, np.zeros((len(shared), 3))
     for line in lines.values():
         which = np.searchsorted(shared, line.point)
-        off, by = _seen(line, prior.place[which])
+        residual, slope = _residual_and_slope(line, prior.place[which])
         weight = np.linalg.inv(line.covariance)
-        good = np.all(np.isfinite(off), axis=1) & np.all(np.isfinite(by), axis=(1, 2))
-        np.add.at(normal, which[good], np.einsum("nki,nkl,nlj->nij", by, weight, by)[good])
-        np.add.at(right, which[good], np.einsum("nki,nkl,nl->ni", by, weight, np.nan_to_num(off))[good])
+        good = np.all(np.isfinite(residual), axis=1) & np.all(np.isfinite(slope), axis=(1, 2))
+        np.add.at(normal, which[good], np.einsum("nki,nkl,nlj->nij", slope, weight, slope)[good])
+        np.add.at(right, which[good], np.einsum("nki,nkl,nl->ni", slope, weight, np.nan_to_num(residual))[good])
     alone = np.linalg.cond(normal) > 1e14
     normal[alone] = np.eye(3)
     step = np.linalg.solve(normal, right[..., None])[..., 0]
     return np.asarray(prior.place + np.where(alone[:, None], 0.0, step))
 
 
-def _seen(line: _Line, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _residual_and_slope(line: _Line, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Measured less expected line and pixel (n, 2), and their derivatives by the place (n, 2, 3), per metre."""
     expected = np.stack(line.sensor.image(place), axis=-1)
     by = [(np.stack(line.sensor.image(place + _STEP * axis), axis=-1) - expected) / _STEP for axis in np.eye(3)]
     return line.place - expected, np.stack(by, axis=-1)
 
 
-def _whitened(
+def _whitened_observations(
     lines: Mapping[str, _Line],
     order: list[str],
     shared: np.ndarray,
@@ -367,7 +367,7 @@ def _whitened(
     axes, count = len(search.axes), len(order)
     size, width = len(shared), (search.interior + 1) + search.trend
     value, by = np.zeros((size, count, 2)), np.zeros((size, count, 2, 3))
-    turn, time = np.zeros((size, count, 2, axes)), np.zeros((size, count))
+    rotation, time = np.zeros((size, count, 2, axes)), np.zeros((size, count))
     spread = np.zeros((size, count, 2, count, 2))
     basis = _basis(lines, shared, search)
     seen = np.zeros((size, count), bool)
@@ -375,47 +375,47 @@ def _whitened(
     for k, name in enumerate(order):
         line = lines[name]
         which = np.searchsorted(shared, line.point)
-        here = place[which]
-        off, slope = _seen(line, here)
-        expected = line.place - off
-        turns = [(np.stack(s.image(here), axis=-1) - expected) / _TURN for s in line.axes]
-        good = np.all(np.isfinite(off), axis=1) & (np.max(np.abs(np.nan_to_num(off, nan=np.inf)), axis=1) < _FAR)
-        for one in (slope, *turns):
-            good &= np.all(np.isfinite(one.reshape(len(one), -1)), axis=1)
+        positions = place[which]
+        difference, slope = _residual_and_slope(line, positions)
+        expected = line.place - difference
+        rotations = [(np.stack(s.image(positions), axis=-1) - expected) / _TURN for s in line.axes]
+        good = np.all(np.isfinite(difference), axis=1) & (np.max(np.abs(np.nan_to_num(difference, nan=np.inf)), axis=1) < _FAR)
+        for derivative in (slope, *rotations):
+            good &= np.all(np.isfinite(derivative.reshape(len(derivative), -1)), axis=1)
         rows = which[good]
         seen[rows, k] = True
-        moments = _moments(line, off[:, 0], basis[which])
-        value[rows, k], by[rows, k], time[rows, k] = off[good], slope[good], moments[good]
-        turn[rows, k] = np.stack(turns, axis=-1)[good]
+        moments = _moments(line, difference[:, 0], basis[which])
+        value[rows, k], by[rows, k], time[rows, k] = difference[good], slope[good], moments[good]
+        rotation[rows, k] = np.stack(rotations, axis=-1)[good]
         spread[rows, k, :, k] = line.covariance[good]
-        residual[name] = off
+        residual[name] = difference
     values: list[np.ndarray] = []
     times: list[np.ndarray] = []
     weights, columns, groups, mixes = [], [], [], []
-    for used, rows in _alike(seen, prior.tie):
+    for used, rows in _visibility_groups(seen, prior.tie):
         m, n = len(used), len(rows)
         root = np.linalg.inv(np.linalg.cholesky(spread[rows][:, used][:, :, :, used].reshape(n, 2 * m, 2 * m)))
         seen_by = root @ by[rows][:, used].reshape(n, 2 * m, 3)
-        before, off = prior.of(rows, place[rows])
+        before, difference = prior.of(rows, place[rows])
         # combinations of observations that no place on the ground explains
         free = np.linalg.svd(np.concatenate([seen_by, before], axis=1))[0][:, :, 3:].swapaxes(1, 2)
-        measured = np.concatenate([(root @ value[rows][:, used].reshape(n, 2 * m, 1))[..., 0], off], axis=1)
+        measured = np.concatenate([(root @ value[rows][:, used].reshape(n, 2 * m, 1))[..., 0], difference], axis=1)
         values.append((free @ measured[..., None]).ravel())
         root = free[:, :, : 2 * m] @ root
-        left = root.shape[1]
-        weight = np.zeros((n, left, count, axes))
-        column = np.zeros((n, left, count, 2, width))
-        mix = np.zeros((n, left, count + 1, 3))
+        free_count = root.shape[1]
+        weight = np.zeros((n, free_count, count, axes))
+        column = np.zeros((n, free_count, count, 2, width))
+        mix = np.zeros((n, free_count, count + 1, 3))
         mix[:, :, count, : before.shape[1]] = free[:, :, 2 * m :]
         for j, k in enumerate(used):
             part = root[:, :, 2 * j : 2 * j + 2]
-            weight[:, :, k] = part @ turn[rows, k]
+            weight[:, :, k] = part @ rotation[rows, k]
             column[:, :, k] = part[..., None] * basis[rows][:, None, None, :]
             mix[:, :, k, :2] = free[:, :, 2 * j : 2 * j + 2]
         weights.append(weight.reshape(-1, count, axes))
-        columns.append(column.reshape(n * left, -1))
-        mixes.append(mix.reshape(n * left, count + 1, 3))
-        groups.append(np.repeat(np.arange(n), left) + sum(len(part) for part in times))
+        columns.append(column.reshape(n * free_count, -1))
+        mixes.append(mix.reshape(n * free_count, count + 1, 3))
+        groups.append(np.repeat(np.arange(n), free_count) + sum(len(part) for part in times))
         times.append(time[rows])
     if not values:
         raise SightsError("no point is seen by two lines where camera and platform expect it, to 200 pixels")
@@ -440,26 +440,26 @@ def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
         (n, width) smooth functions of the points.
     """
     sigma = np.sqrt(line.covariance[:, 0, 0])
-    kept = np.isfinite(off)
+    accepted = np.isfinite(off)
     for _ in range(_ROUNDS):
-        if kept.sum() < 2 * basis.shape[1]:
+        if accepted.sum() < 2 * basis.shape[1]:
             return line.seconds
-        left = off - basis @ np.linalg.lstsq(basis[kept], off[kept], rcond=None)[0]
-        kept = np.abs(left) <= _NOISE * np.maximum(sigma, robust_sigma(left[kept]))
-    noise = np.clip(np.nan_to_num(left), -_NOISE * sigma, _NOISE * sigma)
+        remainder = off - basis @ np.linalg.lstsq(basis[accepted], off[accepted], rcond=None)[0]
+        accepted = np.abs(remainder) <= _NOISE * np.maximum(sigma, robust_sigma(remainder[accepted]))
+    noise = np.clip(np.nan_to_num(remainder), -_NOISE * sigma, _NOISE * sigma)
     return np.asarray(line.sensor.time(line.place[:, 0] - noise))
 
 
-def _alike(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _visibility_groups(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Lines (m,) and points (n,) of each set of points that the same two lines or more see, of one sort."""
-    found = []
+    groups = []
     for sort in (True, False):
         for pattern in np.unique(seen, axis=0):
             alike = np.all(seen == pattern, axis=1)
             rows = np.flatnonzero(alike & (tie if sort else ~tie))
             if pattern.sum() >= 2 and len(rows):
-                found.append((np.flatnonzero(pattern), rows))
-    return found
+                groups.append((np.flatnonzero(pattern), rows))
+    return groups
 
 
 def _basis(lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec) -> np.ndarray:
@@ -483,7 +483,7 @@ def _pixel(camera: LineCamera) -> float:
 
 
 def _pairs(
-    lines: Mapping[str, _Line], order: list[str], count: int, left: Mapping[str, np.ndarray]
+    lines: Mapping[str, _Line], order: list[str], count: int, residual: Mapping[str, np.ndarray]
 ) -> tuple[dict[tuple[str, str], tuple[float, float, float]], dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]]:
     """Gaps, and disparities without what is smooth along and across the strip."""
     gaps, pairs = {}, {}
@@ -496,7 +496,7 @@ def _pairs(
         gaps[a, b] = float(low), float(middle), float(high)
         if order.index(b) != order.index(a) + 1:
             continue
-        moved = (left[b][theirs] - left[a][mine])[:, ::-1]
+        moved = (residual[b][theirs] - residual[a][mine])[:, ::-1]
         at = lines[a].seconds[mine]
         x = lines[a].place[mine, 1]
         scaled = [(2.0 * v - v.min() - v.max()) / max(float(np.ptp(v)), 1e-9) for v in (x, at)]

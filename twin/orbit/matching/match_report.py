@@ -29,7 +29,7 @@ def _verdict(run: Match) -> tuple[str, tuple[str, ...]]:
     role = run.measurements.ground.role
     counts = [f"{int(np.sum(role == name))} {name}" for name in ("control", "check", "tie") if np.any(role == name)]
     displacements = [
-        (float(np.linalg.norm(line.moved)), name)
+        (float(np.linalg.norm(line.median_displacement)), name)
         for group in run.points.sorts.values()
         for name, line in group.lines.items()
         if group.kind == "map" and line.accepted.any()
@@ -82,7 +82,7 @@ def _warnings(run: Match) -> tuple[str, ...]:
     texts, reach = [], run.setup.test.points.reach
     for group in run.points.sorts.values():
         for name, line in group.lines.items():
-            if group.kind == "map" and line.accepted.any() and np.max(np.abs(line.moved)) > _FAR * reach:
+            if group.kind == "map" and line.accepted.any() and np.max(np.abs(line.median_displacement)) > _FAR * reach:
                 texts.append(
                     f"points of {name} lie near the limit of the search; a larger `points.reach` may find more"
                 )

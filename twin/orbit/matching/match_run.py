@@ -141,7 +141,7 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
         raise BenchError(f"the images cannot be matched: {error}", ("images",), "images of the map's ground") from error
     advance("points", 3, 3)
     measured = PassMeasurements(spec.name, table, FrozenMap(times), *_measured(points, spec))
-    return Match(setup, ground, points, measured, max((photo.way.accuracy, dem.way.accuracy)))
+    return Match(setup, ground, points, measured, max((photo.to_geographic.accuracy, dem.to_geographic.accuracy)))
 
 
 def _times(spec: OrbitMatchSpec, clock: LineClock, epoch: str) -> LineTimes:

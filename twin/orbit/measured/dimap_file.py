@@ -32,8 +32,8 @@ from analysis.arrays import Array
 from optics.numerics.array_math import in_span
 from optics.numerics.number_tree import FrozenMap
 from scenes.yaml.errors import InputError, Issue, names_text, shown
-from twin.orbit.flight.light_effects import carried_with_earth
-from twin.orbit.flight.platform_table import joined_quaternions
+from twin.orbit.flight.light_effects import earth_rotation_velocity
+from twin.orbit.flight.platform_table import continuous_quaternions
 from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.orbit_files import (
     SPEED_TOLERANCE,
@@ -43,7 +43,7 @@ from twin.orbit.measured.orbit_files import (
     require_unit,
     velocity_misfit,
 )
-from twin.orbit.measured.xml_file import Element, read_xml, readings, require_rising
+from twin.orbit.measured.xml_file import Element, read_xml, readings, require_increasing
 
 PROFILES = ("PHR_SENSOR", "PNEO_SENSOR", "S6_SENSOR", "S7_SENSOR")
 """Metadata profiles of products with a rigorous model."""
@@ -211,7 +211,7 @@ class DimapPass:
         if not more:
             return attitude
         # This is the interpolation of the samples everywhere else.
-        turns = CubicSpline(time, joined_quaternions(attitude.quaternion))(np.array(more))
+        turns = CubicSpline(time, continuous_quaternions(attitude.quaternion))(np.array(more))
         order = np.argsort(times := np.concatenate([time, more]))
         quaternion = np.concatenate([attitude.quaternion, turns / np.linalg.norm(turns, axis=1, keepdims=True)])
         return replace(attitude, clock=self._clock(times[order]), quaternion=quaternion[order])
@@ -363,7 +363,7 @@ def _clock(items: list[Element], file: str) -> Readings:
     """Return the times of elements, which must increase."""
     moments = [_moment(item.one("TIME")) for item in items]
     clock = Readings(np.array([m.day[0] for m in moments]), np.array([m.second[0] for m in moments]))
-    require_rising(file, clock, [item.line for item in items])
+    require_increasing(file, clock, [item.line for item in items])
     return clock
 
 
@@ -378,7 +378,7 @@ def _orbit(ephemeris: Element, file: str) -> tuple[OrbitReadings, bool]:
     require_orbit(file, position, lines)
     share, inertial = velocity_misfit((clock.day - clock.day[0]) * _DAY + clock.second, position, velocity)
     if inertial:
-        velocity = velocity - carried_with_earth(position)
+        velocity = velocity - earth_rotation_velocity(position)
     elif np.median(share) > SPEED_TOLERANCE:
         found = f"they differ by {100.0 * np.median(share):.3g} % in the median"
         points[0].one("VELOCITY_XYZ").wrong("not the velocity of these positions", found, "Earth-fixed, m/s")

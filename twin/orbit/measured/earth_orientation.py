@@ -137,7 +137,7 @@ class TableRotation:
         celestial = erfa.c2ixys(x + offsets[..., 0], y + offsets[..., 1], s)
         return np.asarray(erfa.c2tcio(celestial, erfa.era00(self.julian, ut1), self._polar(t, pole)))
 
-    def mean_equinox(self, seconds: Any) -> np.ndarray:
+    def teme_to_itrs(self, seconds: Any) -> np.ndarray:
         """Return the rotation TEME -> ITRS, (...) -> (..., 3, 3).
 
         By Greenwich mean sidereal time of 1982 and polar motion (Vallado et al., AIAA 2006-6753, appendix C).
@@ -151,7 +151,7 @@ class TableRotation:
         return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], erfa.sp00(tai_1, tai_2 + (t + erfa.TTMTAI) / DAY)))
 
 
-def rate_of(matrix: Any, seconds: np.ndarray) -> np.ndarray:
+def angular_velocity(matrix: Any, seconds: np.ndarray) -> np.ndarray:
     """Return the angular velocity (N, 3), in rad/s, of the target axes of a rotation, in these axes.
 
     Parameters

@@ -428,20 +428,20 @@ class MapPart:
     raster: GeoRaster
     first: tuple[int, int]
     frame: GroundFrame
-    way: pyproj.Transformer
+    to_geographic: pyproj.Transformer
     spacing: float
 
     def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return east and north, in metres, at real-valued (row, column), broadcast."""
         row, column = np.broadcast_arrays(np.asarray(row, float), np.asarray(column, float))
         x, y = self.raster.coordinates_of(row + self.first[0], column + self.first[1])
-        return self.frame.plane(*np.radians(self.way.transform(x, y)))
+        return self.frame.plane(*np.radians(self.to_geographic.transform(x, y)))
 
     def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return row and column of plane coordinates east and north, in metres: the inverse of `east_north`."""
         east, north = np.broadcast_arrays(np.asarray(east, float), np.asarray(north, float))
         longitude, latitude = np.degrees(self.frame.geographic(east, north))
-        x, y = self.way.transform(longitude, latitude, direction="INVERSE")
+        x, y = self.to_geographic.transform(longitude, latitude, direction="INVERSE")
         if self.raster.crs.is_geographic:
             # Bring longitudes to the range of the map.
             middle = self.raster.coordinates_of(0.5 * self.raster.shape[0], 0.5 * self.raster.shape[1])[0]
@@ -465,7 +465,7 @@ class UserMap:
     """
 
     raster: GeoRaster
-    way: pyproj.Transformer
+    to_geographic: pyproj.Transformer
     geoid: Geoid | None
 
     @classmethod
@@ -548,7 +548,7 @@ class UserMap:
         side = np.linspace(0.0, 1.0, 21)
         east = ends[0] + (ends[1] - ends[0]) * np.concatenate([side, side, 0.0 * side, 0.0 * side + 1.0])
         north = ends[2] + (ends[3] - ends[2]) * np.concatenate([0.0 * side, 0.0 * side + 1.0, side, side])
-        whole = MapPart(np.empty((0, 0)), None, self.raster, (0, 0), frame, self.way, 1.0)
+        whole = MapPart(np.empty((0, 0)), None, self.raster, (0, 0), frame, self.to_geographic, 1.0)
         row, column = whole.row_column(east, north)
         good = np.isfinite(row) & np.isfinite(column)
         if not good.any():
@@ -560,7 +560,7 @@ class UserMap:
                 lon, lat = np.degrees((frame.longitude, frame.latitude))
                 found = f"images near {lat:.4f} deg N, {lon:.4f} deg E"
                 allowed = "a map of the ground in the images; the centre of this one is at "
-                x, y = self.way.transform(*self.raster.coordinates_of(*(0.5 * n for n in self.raster.shape)))
+                x, y = self.to_geographic.transform(*self.raster.coordinates_of(*(0.5 * n for n in self.raster.shape)))
                 raise InputError(
                     Issue("the map does not cover the images", self.raster.file, None, (), found,
                           f"{allowed}{float(x):.4f} deg E, {float(y):.4f} deg N")
@@ -569,7 +569,7 @@ class UserMap:
         values, valid = self.raster.read(*bounds)
         first = (bounds[0].start, bounds[1].start)
         middle = np.array([0.5 * n for n in values.shape])
-        part = MapPart(values, None if valid.all() else valid, self.raster, first, frame, self.way, 1.0)
+        part = MapPart(values, None if valid.all() else valid, self.raster, first, frame, self.to_geographic, 1.0)
         e, n = part.east_north(middle[0] + np.array([0.0, 1.0, 0.0]), middle[1] + np.array([0.0, 0.0, 1.0]))
         area = abs((e[1] - e[0]) * (n[2] - n[0]) - (e[2] - e[0]) * (n[1] - n[0]))
         if heights:
@@ -577,7 +577,7 @@ class UserMap:
         else:
             shown = values.astype(np.float32)
             shown[~valid] = np.nan
-        return MapPart(shown, part.valid, self.raster, first, frame, self.way, float(np.sqrt(area)))
+        return MapPart(shown, part.valid, self.raster, first, frame, self.to_geographic, float(np.sqrt(area)))
 
     def _heights(self, part: MapPart) -> np.ndarray:
         """Return heights above the ellipsoid, in metres."""

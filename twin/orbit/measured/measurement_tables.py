@@ -34,7 +34,7 @@ from twin.framework.procedure import Advance, silent
 from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.measured.maps import MOST_HEIGHT
-from twin.orbit.measured.orbit_files import AGAINST_EARTH, INERTIAL, SPEED_TOLERANCE, velocity_misfit
+from twin.orbit.measured.orbit_files import EARTH_FIXED_VELOCITY, INERTIAL_VELOCITY, SPEED_TOLERANCE, velocity_misfit
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 
 _FAR, _FAST, _LATE, _MANY = 1e9, 1e5, 1e10, 1e9
@@ -353,7 +353,7 @@ def _image_points_of(
                 low, high = (v + half + first for v in (-0.5, most + 0.5))
                 where = f"{low:.10g} to {high:.10g}, the {what}s of {name}"
                 raise table.error(int(row), what, "outside the image", f"{table[what][row]:.10g}", where)
-        for row in order[~trajectory.known(times[name].at(line))][:1]:
+        for row in order[~trajectory.covers(times[name].at(line))][:1]:
             problem = "exposed in a gap of the readings of orbit or attitude"
             raise table.error(int(row), "line", problem, allowed="points where readings are at most 5 intervals apart")
         spread = image_covariance(table, order)
@@ -623,5 +623,5 @@ def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, place: A
     if np.median(far) > SPEED_TOLERANCE:
         row = int(order[int(np.argsort(far)[len(far) // 2])])
         found = f"they differ by {100.0 * np.median(far):.3g} % in the median"
-        problem = INERTIAL if inertial else "not the velocity of these positions"
-        raise table.error(row, "vx", problem, found, AGAINST_EARTH)
+        problem = INERTIAL_VELOCITY if inertial else "not the velocity of these positions"
+        raise table.error(row, "vx", problem, found, EARTH_FIXED_VELOCITY)

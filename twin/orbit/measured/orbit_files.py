@@ -20,9 +20,9 @@ import numpy as np
 
 from analysis.arrays import Array
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
-from twin.orbit.flight.light_effects import carried_with_earth
+from twin.orbit.flight.light_effects import earth_rotation_velocity
 from twin.orbit.measured.clock import Readings, known_scale
-from twin.orbit.measured.xml_file import numbers, parsed_xml, readings, require_rising, text_lines
+from twin.orbit.measured.xml_file import numbers, parsed_xml, readings, require_increasing, text_lines
 
 Frame = Literal["ITRS", "GCRS", "EME2000", "TEME"]
 Scalar = Literal["last", "first"]
@@ -202,21 +202,21 @@ def velocity_misfit(time: Array, place: Array, speed: Array) -> tuple[Array, boo
     # Across a long step the chord is shorter than the arc and lies to its side, which is not an error of the velocity.
     earth_fixed, inertial = (
         np.linalg.norm(rate - 0.5 * (v[1:] + v[:-1]), axis=1) / np.linalg.norm(rate, axis=1).clip(1.0)
-        for v in (speed, speed - carried_with_earth(place))
+        for v in (speed, speed - earth_rotation_velocity(place))
     )
     return earth_fixed, bool(np.median(earth_fixed) > SPEED_TOLERANCE >= np.median(inertial))
 
 
-def require_own_velocity(orbit: OrbitReadings) -> None:
+def require_earth_fixed_velocity(orbit: OrbitReadings) -> None:
     """Raise InputError if the velocities of Earth-fixed positions are inertial ones."""
     time = (orbit.clock.day - orbit.clock.day[0]) * 86400.0 + orbit.clock.second
     if orbit.velocity is not None and velocity_misfit(time, orbit.position, orbit.velocity)[1]:
-        raise InputError(Issue(INERTIAL, orbit.file, None, (), None, AGAINST_EARTH))
+        raise InputError(Issue(INERTIAL_VELOCITY, orbit.file, None, (), None, EARTH_FIXED_VELOCITY))
 
 
-INERTIAL = "the velocities are inertial, larger than those of the Earth-fixed positions by omega x P"
+INERTIAL_VELOCITY = "the velocities are inertial, larger than those of the Earth-fixed positions by omega x P"
 """Problem text of inertial velocities with Earth-fixed positions."""
-AGAINST_EARTH = "velocities relative to the same axes as the positions, or none"
+EARTH_FIXED_VELOCITY = "velocities relative to the same axes as the positions, or none"
 """Text of the allowed velocities."""
 
 
@@ -272,7 +272,7 @@ def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     parts = _parts(file, segments)
     for part, segment in zip(parts, segments, strict=True):
         part_of = slice(part.first, part.last + 1)
-        require_rising(file, Readings(clock.day[part_of], clock.second[part_of]), segment.lines)
+        require_increasing(file, Readings(clock.day[part_of], clock.second[part_of]), segment.lines)
     scale = _scale(file, segments)
     return OrbitReadings(file, clock, states[:, :3], states[:, 3:], known_frame(frame, file, line), scale, parts)
 
@@ -308,7 +308,7 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
     quaternion = numbers(file, cells, lines, heads)
     require_unit(file, quaternion, lines)
     clock = readings(file, [row[0] for row in rows], lines)
-    require_rising(file, clock, lines)
+    require_increasing(file, clock, lines)
     frame = known_frame(reference, file, at, "REF_FRAME_A")
     return AttitudeReadings(file, clock, quaternion, None, frame, _scale(file, segments), scalar, turns)
 
@@ -524,7 +524,7 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     if len(rows) < 2:
         raise InputError(Issue(f"fewer than two positions of {which}", file, None, (), str(len(rows)), "two or more"))
     clock = readings(file, texts, rows)
-    require_rising(file, clock, rows)
+    require_increasing(file, clock, rows)
     position = 1e3 * numbers(file, places, rows, ("x", "y", "z"))
     require_orbit(file, position, rows)
     velocity = None

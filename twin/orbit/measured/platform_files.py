@@ -32,11 +32,11 @@ from twin.orbit.measured.earth_orientation import EarthOrientation, TableRotatio
 from twin.orbit.measured.orbit_files import (
     AttitudeReadings,
     OrbitReadings,
+    require_earth_fixed_velocity,
     require_orbit,
-    require_own_velocity,
     require_unit,
 )
-from twin.orbit.measured.xml_file import first_lines, require_rising
+from twin.orbit.measured.xml_file import first_lines, require_increasing
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.measurements import AttitudeFileSpec, LineTimesFileSpec, OrbitFileSpec, PlatformFilesSpec
@@ -152,7 +152,7 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
         Attitude(spec_of.nadir != "geocentric", spec_of.steering == "yaw"),
     )
     if conventions.orbit_frame == "ITRS":
-        require_own_velocity(orbit)
+        require_earth_fixed_velocity(orbit)
     return PlatformReadings(orbit, attitude, _earth(spec, folder, orbit, conventions)), conventions
 
 
@@ -196,7 +196,7 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
     if meant.attitude_frame == "orbital":
         unit = np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
         flown = TabulatedTrajectory(PlatformTable.of(epoch, time, position, velocity, time[[0, -1]], unit), meant.law)
-        known = flown.known(turn_time)
+        known = flown.covers(turn_time)
         if np.sum(known) < 2:
             found = f"{turn_time[0]:.9g} s to {turn_time[-1]:.9g} s, and orbit from {flown.first:.9g} s"
             allowed = "two or more attitude readings within the time span of the orbit, which defines their frame"
@@ -256,14 +256,14 @@ def _in_itrs(
     position = np.einsum("nij,nj->ni", matrix, orbit.position)
     if orbit.velocity is None:
         return position, None
-    carried = np.cross(earth_orientation.rate_of(to_earth, time), position)
+    carried = np.cross(earth_orientation.angular_velocity(to_earth, time), position)
     return position, np.einsum("nij,nj->ni", matrix, orbit.velocity) - carried
 
 
 def to_itrs(frame: str, rotation: TableRotation) -> Any:
     """Return a function from seconds (N,) to rotations (N, 3, 3) from an inertial frame to the ITRS."""
     if frame == "TEME":
-        return rotation.mean_equinox
+        return rotation.teme_to_itrs
     if frame == "EME2000":
         return lambda seconds: rotation.matrix(seconds) @ _EME2000_FROM_GCRS.T
     return rotation.matrix
@@ -392,7 +392,7 @@ def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readin
         zoned = "UTC" if str(spec.epoch).endswith("Z") else None
         if (spec.time_scale or zoned) == "UTC":
             clock = _counted(spec, clock)
-    require_rising(table.file, clock, [int(v) for v in table.lines])
+    require_increasing(table.file, clock, [int(v) for v in table.lines])
     return clock, zoned
 
 

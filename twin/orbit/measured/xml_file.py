@@ -92,7 +92,7 @@ def readings(file: str, texts: Sequence[str], lines: Sequence[int]) -> Readings:
         ) from None
 
 
-def require_rising(file: str, clock: Readings, lines: Sequence[int]) -> None:
+def require_increasing(file: str, clock: Readings, lines: Sequence[int]) -> None:
     """Raise InputError unless each of the readings (N,) on these lines is later than the one before it."""
     back = (np.diff(clock.day) * 86400.0 + np.diff(clock.second)) <= 0.0
     for row in np.flatnonzero(back)[:1]:

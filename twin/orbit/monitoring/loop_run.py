@@ -1,14 +1,13 @@
-"""A loop closed and open along one orbit: what is left of pointing and focus, and heights of points both lines see.
+"""A loop closed and open along one orbit: remaining errors of pointing and focus, and heights of ground points.
 
-Heights are those of forward intersection of exact lines of sight with the stated errors of image points, orbit and
-attitude: the lines are traced through the state that the mechanisms have left, and the intersection knows the lines as
-calibrated, with the corrections that the processing makes. Truth enters where errors are counted.
+Heights come from forward intersection of exact lines of sight with the stated errors of image points, orbit and
+attitude. The lines are traced through the state that the mechanisms have corrected; the intersection uses the lines as
+calibrated, with the corrections of the processing. The truth enters only where errors are computed.
 
-Pairs of line images rendered at some moments of a loop: matched, and intersected to heights.
-
-The lens of a line is round and evenly lit, with the camera's f-number and the moment's traced defocus as its wavefront;
-detector and band are those of the camera. Points of the second camera's image are sought in the first one's and
-intersected by the lines that the user knows, on the measured trajectory.
+At some moments, pairs of line images can be rendered, matched and intersected. The lens of a line is then round and
+evenly illuminated, with the camera's f-number and the moment's traced defocus as its wavefront; detector and band are
+those of the camera. Points of the second camera's image are matched in the first one's and intersected with the lines
+that the user knows, on the measured trajectory.
 """
 
 from __future__ import annotations
@@ -49,11 +48,11 @@ from twin.orbit.monitoring.pair_flight import (
     OrbitAndAttitude,
     PairFlight,
     fly,
-    view_check_points,
     rms,
     second_view,
     sightings,
     traced_pair,
+    view_check_points,
 )
 
 if TYPE_CHECKING:
@@ -63,20 +62,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ImagedPair:
-    """Points that were matched in one pair of images, and intersected.
+    """Points matched in one pair of rendered images, and intersected.
 
     Attributes
     ----------
     moment : int
-        Number of the reading after which they are taken.
-    errors : np.ndarray
-        (n, 3) of the points that were matched: found minus true, east, north, up, metres.
-    misplaced : np.ndarray
-        (n, 2) found minus true place in the first camera's image, lines and pixels.
-    sigma : np.ndarray
-        (2,) that matching states of it, median, lines and pixels.
+        Index of the reading after which the images are taken.
+    errors : (n, 3) ndarray
+        Intersected minus true coordinates of the matched points: east, north, up, in metres.
+    misplaced : (n, 2) ndarray
+        Matched minus true position in the first camera's image, in lines and pixels.
+    sigma : (2,) ndarray
+        Median standard deviation predicted by the matching, in lines and pixels.
     sought : int
-        Points that were sought.
+        Number of points that were sought.
     """
 
     moment: int
@@ -87,13 +86,13 @@ class ImagedPair:
 
     @property
     def height(self) -> tuple[float, float]:
-        """Mean error in height, and its standard deviation by the scatter of the points, metres."""
+        """Mean error in height and its standard deviation from the scatter of the points, in metres."""
         up = self.errors[:, 2]
         return float(up.mean()), float(up.std(ddof=1) / np.sqrt(len(up)))
 
     @property
     def matching(self) -> np.ndarray:
-        """(2,) RMS of ``misplaced``, lines and pixels."""
+        """RMS (2,) of ``misplaced``, in lines and pixels."""
         return np.sqrt(np.mean(self.misplaced**2, axis=0))
 
 
@@ -107,31 +106,31 @@ def imaged_pair(
     flown: OrbitAndAttitude,
     seed: np.random.SeedSequence,
 ) -> ImagedPair:
-    """Render, match and intersect.
+    """Render a pair of line images, match points in them, and intersect the points.
 
     Parameters
     ----------
     setup : MonitorSetup
-        The loop.
+        Resolved test file and instrument.
     flight : PairFlight
-        Lines as they truly are, and as calibrated in the analysis's form.
+        True lines, and calibrated lines in the analysis's form.
     moment : int
-        Number of the reading.
+        Index of the reading.
     nominal : Mapping[str, LineCamera]
-        Camera -> its line as it was calibrated.
-    changes : Mapping[str, np.ndarray]
-        Camera -> (4,) what the processing takes for its change.
+        Camera -> its line as calibrated.
+    changes : Mapping[str, ndarray]
+        Camera -> (4,) change that the processing corrects.
     foci : Mapping[str, float]
-        Camera -> its defocus, metres.
-    flown : Flown
-        Orbit and attitude.
+        Camera -> its defocus, in metres.
+    flown : OrbitAndAttitude
+        True and measured orbit and attitude.
     seed : np.random.SeedSequence
-        Of ground and frames.
+        Seed of ground and frames.
 
     Raises
     ------
     BenchError
-        a patch that a line cannot image, or too few points in it.
+        A line cannot image the patch, or too few points are matched.
     """
     spec, pair, images = setup.test, setup.pair, setup.test.loop.images
     assert images is not None
@@ -163,7 +162,9 @@ def imaged_pair(
         raise BenchError(problem, ("mechanisms", "images"), POINTS_REMEDY)
     ground = patch.true_point(pair[1], *ties.lines[pair[1]].place[good].T)
     should = np.stack(true[pair[0]].image(ground), axis=1)
-    first_points, second_points = ((calibrated[name].corrected(changes[name]), ties.lines[name].image[good]) for name in pair)
+    first_points, second_points = (
+        (calibrated[name].corrected(changes[name]), ties.lines[name].image[good]) for name in pair
+    )
     first, second = (
         sightings(users[name], users[name].trajectory, *places.T)
         for name, (_, places) in zip(pair, (first_points, second_points), strict=True)
@@ -173,9 +174,9 @@ def imaged_pair(
 
 
 _FEWEST = 8
-"""Points, of which a mean height and its scatter are told."""
+"""Least number of points from which a mean height and its scatter are computed."""
 _TRANSMISSION = 0.8
-"""Transmission of a lens, mean over the spectrum: that of payloads that say none."""
+"""Transmission of a lens, mean over the spectrum: the default of payloads."""
 
 
 def _optics(setup: MonitorSetup, name: str, defocus: float) -> LineOptics:
@@ -199,42 +200,44 @@ def _optics(setup: MonitorSetup, name: str, defocus: float) -> LineOptics:
 
 
 _IMAGES = 100_000
-"""Random stream of line images; moments of the check points have those up to the number of readings."""
+"""Random stream of line images; the moments of the check points use streams up to the number of readings."""
 GAIN_MARGIN, PHASE_MARGIN_DEG = 1.5, 30.0
 """Margins below which a loop is barely stable: it amplifies what is near its crossover twice and more. Of an integrator
 with a delay the two are the same limit (Astrom, Hagglund, PID Controllers, 1995, sec. 4.4).
 """
 WORSE = 0.01
-"""Relative rise of an error by the loop, the same draw with and without it, from which the loop makes it worse: half of
-the last of two digits that reports show.
+"""Relative increase of an error by the loop, with the same draws, above which the loop is reported to make it worse:
+half of the last of two digits that reports show.
 """
 _NOTHING = 1e-9
-"""Rad, m and MTF that are no error: a fraction of a milliarcsecond, a nanometre."""
+"""Errors in rad, m or MTF below which there is none: a fraction of a milliarcsecond, a nanometre."""
 FOCUS_SCALE = 10e-6
-"""Metres of defocus that count as much as a metre of height where modes are sought: a tenth of what blurs an image."""
+"""Defocus, in metres, that weighs as much as a metre of height in the search for unobservable modes: a tenth of what
+blurs an image.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopOutcome:
-    """One course with what it truly leaves.
+    """Course with the true errors that it leaves.
 
     Attributes
     ----------
     course : LoopCourse
-        Of it.
+        Simulated course.
     flight : PairFlight
-        Its lines and check points.
-    truth : np.ndarray
-        (T, P) true quantities when images are taken, less what the processing corrects.
+        Lines and check points.
+    truth : (T, P) ndarray
+        True quantities when images are taken, less the corrections of the processing.
     heights : CaseErrors
         Errors at the check points.
-    slopes : np.ndarray
-        (T, P) of the mean height error by the quantities, m/rad and m/m.
-    angle : np.ndarray
-        (P,) row of the angle between the pair's lines of sight, opening positive.
-    mtf : Mapping[str, np.ndarray]
-        Camera -> (T, 2) at Nyquist along the line and along the track, mean over the fields.
-    images : tuple[ImagedPair, ...]
+    slopes : (T, P) ndarray
+        Derivatives of the mean height error by the quantities, in m/rad and m/m.
+    angle : (P,) ndarray
+        Coefficients of the angle between the pair's lines of sight, opening positive.
+    mtf : Mapping[str, (T, 2) ndarray]
+        Camera -> MTF at Nyquist along the line and along the track, mean over the fields.
+    images : tuple of ImagedPair
         Pairs of line images, at the moments that the file names.
     """
 
@@ -248,12 +251,12 @@ class LoopOutcome:
     images: tuple[ImagedPair, ...] = ()
 
     def posterior(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(T,) what the posterior says of a quantity, and its sigma.
+        """Return posterior mean (T,) and standard deviation (T,) of a linear combination of the quantities.
 
         Parameters
         ----------
-        rows : np.ndarray
-            (P,) or (T, P) of it on the quantities.
+        rows : (P,) or (T, P) ndarray
+            Coefficients of the combination.
         """
         each = np.broadcast_to(rows, self.truth.shape)
         value = np.einsum("tp,tp->t", each, self.course.expected)
@@ -261,11 +264,11 @@ class LoopOutcome:
         return value, np.sqrt(np.maximum(variance, 0.0))
 
     def true(self, rows: np.ndarray) -> np.ndarray:
-        """(T,) of a quantity, by the traced states; arguments as of `posterior`."""
+        """Return the true values (T,) of a combination from the traced states; argument as in `posterior`."""
         return np.einsum("tp,tp->t", np.broadcast_to(rows, self.truth.shape), self.truth)
 
     def ratio(self, rows: np.ndarray) -> float:
-        """Largest error of what the posterior says of a quantity over its sigma; arguments as of `posterior`."""
+        """Return the largest error of a combination's posterior over its sigma; argument as in `posterior`."""
         value, sigma = self.posterior(rows)
         positive = sigma > 0.0
         return float(np.max(np.abs(value - self.true(rows))[positive] / sigma[positive], initial=0.0))
@@ -273,20 +276,20 @@ class LoopOutcome:
 
 @dataclass(frozen=True, eq=False)
 class LoopAnalysis:
-    """One correction as a loop.
+    """Stability of one correction as a loop.
 
     Attributes
     ----------
     corrector : Corrector
-        Of it.
+        Correction.
     loop_gain : float
-        Gain, times what the spots tell of what the mechanism does beyond what is known.
+        Gain, times the share of the mechanism's response that acts in the loop.
     margins : Margins
-        Of this gain with the delay.
-    cycle : LimitCycle | None
-        Of a mechanism of whole steps; None for another one.
-    ends : tuple[int, ...]
-        Numbers of the moments at which the end of the range held it.
+        Margins of this gain with the delay.
+    cycle : LimitCycle or None
+        Limit cycle of a mechanism with discrete steps; None for another one.
+    ends : tuple of int
+        Indices of the moments at which the end of the range limited the command.
     """
 
     corrector: Corrector
@@ -298,28 +301,28 @@ class LoopAnalysis:
 
 @dataclass(frozen=True, eq=False)
 class LoopRun:
-    """A finished loop.
+    """Results of a test with a closed loop.
 
     Attributes
     ----------
     setup : MonitorSetup
-        What its file says.
+        Resolved test file and instrument.
     seed : int
-        Of all random numbers.
+        Seed of all random numbers.
     model : LoopModel
-        Of the loop.
-    closed : LoopPass
-        With the corrections; open: without.
-    loops : Mapping[str, LoopFacts]
-        Of the corrections, by name.
+        Model of the loop.
+    closed, open : LoopOutcome
+        Outcome with and without the corrections.
+    loops : Mapping[str, LoopAnalysis]
+        Stability of each correction, by name.
     radius : float
-        Largest size of the eigenvalues of all loops together.
+        Spectral radius of all loops together.
     margin : float
-        By how much all gains together may be larger.
-    modes : tuple[UnseenMode, ...]
-        What no spot shows; quantities are height (m) and the defocus (m) of the pair.
-    unseen : np.ndarray
-        (3, T) standard deviations of the same that no estimate from the spots can have less of.
+        Factor by which all gains together may be increased before the loop is unstable.
+    modes : tuple of UnobservableMode
+        Unobservable modes; their quantities are height (m) and the defocus (m) of the pair.
+    unobservable_sigma : (3, T) ndarray
+        Lower limits of the standard deviations of these quantities for any estimate from the spots.
     """
 
     setup: MonitorSetup
@@ -335,21 +338,26 @@ class LoopRun:
 
     @property
     def stable(self) -> bool:
-        """Return whether all loops together are stable."""
+        """True if all loops together are stable."""
         return self.radius < DECAYING
 
     @property
     def margins_hold(self) -> bool:
-        """Return whether the loops are stable, and as far from the limit as GAIN_MARGIN and PHASE_MARGIN_DEG."""
+        """True if the loops are stable with margins of at least GAIN_MARGIN and PHASE_MARGIN_DEG."""
         return self.stable and self.margin >= GAIN_MARGIN and not self.phase_deg < PHASE_MARGIN_DEG
 
     @property
     def worse(self) -> dict[str, tuple[float, float]]:
-        """Return the errors that the loop makes larger, RMS over the moments with the loop open and closed: angle and
-        quantities in rad and m, height in m, and of the MTF at Nyquist what it lacks to 1.
+        """Errors that the loop increases: RMS over the moments with the loop open and closed.
+
+        Angle and quantities are in rad and m, height in m; of the MTF at Nyquist, its difference from 1.
         """
         open_errors, closed_errors = self._errors(self.open), self._errors(self.closed)
-        return {n: (open_errors[n], v) for n, v in closed_errors.items() if v > max((1.0 + WORSE) * open_errors[n], _NOTHING)}
+        return {
+            n: (open_errors[n], v)
+            for n, v in closed_errors.items()
+            if v > max((1.0 + WORSE) * open_errors[n], _NOTHING)
+        }
 
     def _errors(self, outcome: LoopOutcome) -> dict[str, float]:
         places = [(name, key) for name in self.model.cameras for key in (*PARAMETERS, "defocus")]
@@ -359,45 +367,51 @@ class LoopRun:
 
     @property
     def pair(self) -> tuple[str, str]:
-        """The two cameras."""
+        """Names of the two cameras."""
         return self.setup.pair
 
     @property
     def ratios(self) -> dict[str, float]:
-        """Quantity -> largest error of what the posterior says of it over its sigma, both courses together."""
+        """Largest error of the posterior over its sigma, of each quantity, over both courses."""
         rows = {f"defocus of {name}": self.model.unit(name, "defocus") for name in self.pair}
         rows_of = {"angle": (self.open.angle,) * 2, "height": (self.closed.slopes, self.open.slopes)}
         rows_of |= {name: (row, row) for name, row in rows.items()}
-        return {name: max(self.closed.ratio(closed_rows), self.open.ratio(open_rows)) for name, (closed_rows, open_rows) in rows_of.items()}
+        return {
+            name: max(self.closed.ratio(closed_rows), self.open.ratio(open_rows))
+            for name, (closed_rows, open_rows) in rows_of.items()
+        }
 
     @property
     def ratio_limit(self) -> float:
-        """Limit of `ratios`, exceeded with a chance of `FALSE_ALARM` at most whatever the correlations."""
+        """Limit of `ratios`, exceeded with a probability of at most `FALSE_ALARM` for any correlations."""
         return float(norm.isf(0.5 * FALSE_ALARM / (2 * len(self.closed.course.times) * len(self.ratios))))
 
     @property
     def phase_deg(self) -> float:
-        """Smallest phase margin of the loops; NaN where none has one."""
-        margins = [analysis.margins.phase_deg for analysis in self.loops.values() if math.isfinite(analysis.margins.phase_deg)]
+        """Smallest phase margin of the loops, in degrees; NaN where none has one."""
+        margins = [
+            analysis.margins.phase_deg for analysis in self.loops.values() if math.isfinite(analysis.margins.phase_deg)
+        ]
         return min(margins, default=math.nan)
 
 
 _SCALE = np.array([1.0, FOCUS_SCALE, FOCUS_SCALE])
+"""Scales of height and of the two foci in the search for unobservable modes, in metres."""
 
 
 def run_loop(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> LoopRun:
-    """Draw, render, read, correct, look down: `run_monitor` of a test with mechanisms.
+    """Simulate the loop closed and open: `run_monitor` of a test with mechanisms.
 
     Raises
     ------
     InputError
-        a mechanism or a node that the instrument does not have, or that does not move so.
+        The instrument does not have a mechanism or a node, or it does not allow the motion.
     BenchError
-        The loop cannot be run as its file says.
+        The loop cannot be run as its file describes it.
     AimError, BeamMissedError
         Light is lost.
     IntersectionError
-        Rays that are parallel.
+        Rays are parallel.
     """
     spec, pair = setup.test, setup.pair
     ground_seed, monitor_seed = np.random.SeedSequence(seed).spawn(2)
@@ -449,7 +463,11 @@ def _analyse_loop(model: LoopModel, k: int, course: LoopCourse) -> LoopAnalysis:
     if step is not None and spec.gain:
         cycle = control_loop.limit_cycle(spec.gain, spec.delay, spec.band / abs(step * corrector.sensitivity))
     return LoopAnalysis(
-        corrector, gain, control_loop.margins(gain, spec.delay), cycle, tuple(np.flatnonzero(course.held[:, k]).tolist())
+        corrector,
+        gain,
+        control_loop.margins(gain, spec.delay),
+        cycle,
+        tuple(np.flatnonzero(course.held[:, k]).tolist()),
     )
 
 
@@ -464,7 +482,7 @@ def _outcome_of(
     seed: np.random.SeedSequence,
     advance: Advance,
 ) -> LoopOutcome:
-    """A course with its truth and heights."""
+    """Compute the true errors and the heights of a course."""
     model, pair, experiment, test = course.model, setup.pair, course.model.experiment, setup.test
     axes, distance = experiment.sight.axes, experiment.nominal_truth.principal_distance
     lines = tuple(traced_pair(experiment, state, pair) for state in course.states)
@@ -477,19 +495,21 @@ def _outcome_of(
     quality = image_quality(
         experiment.instrument, experiment.backend, list(course.states), FOCUS_FIELDS, obstruction=False
     )
-    # what processing undoes is no error of a camera any more
+    # changes that the processing corrects are no errors of a camera
     errors = [truth.vector(name) - changes[name] for name in model.cameras]
     quantities = np.concatenate([*errors, defocus(quality).T], axis=1)
     slopes = np.zeros(quantities.shape)
     for name in pair:
         first = model.row(name, PARAMETERS[0])
-        # what the analysis is told too little of, the height is wrong by the other way
+        # an uncorrected change has the opposite effect of a wrong correction
         slopes[:, first : first + len(PARAMETERS)] = -flight.slopes[name]
     looks = [experiment.instrument.spec.cameras[name].look for name in pair]
     angle = np.zeros(quantities.shape[1])
     angle[[model.row(name, "d_alpha") for name in pair]] = [1.0, -1.0] if looks[0] > looks[1] else [-1.0, 1.0]
     mtf = {
-        name: np.stack([camera_quality.mtf_along_line.mean(axis=1), camera_quality.mtf_along_track.mean(axis=1)], axis=1)
+        name: np.stack(
+            [camera_quality.mtf_along_line.mean(axis=1), camera_quality.mtf_along_track.mean(axis=1)], axis=1
+        )
         for name, camera_quality in quality.cameras.items()
     }
     images = []
@@ -505,5 +525,5 @@ def _outcome_of(
 
 
 def height_rms(outcome: LoopOutcome) -> float:
-    """RMS over the moments of the mean height error that the cameras alone make, metres."""
+    """Return the RMS over the moments of the mean height error by the cameras alone, in metres."""
     return rms(outcome.heights.camera)
