@@ -118,7 +118,7 @@ _LOOP = {
     "height.closed": ("height_closed_rms_m", 2, "m"),
     "height.open": ("height_open_rms_m", 2, "m"),
     "height.sigma": ("height_sigma_rms_m", 2, "m"),
-    "height.unseen": ("height_unseen_rms_m", 2, "m"),
+    "height.unseen": ("height_unobservable_rms_m", 2, "m"),
     "angle.closed": ("angle_closed_rms_arcsec", 3, "arcsec"),
     "angle.open": ("angle_open_rms_arcsec", 2, "arcsec"),
     "gain_margin": ("gain_margin", 1, ""),
@@ -140,6 +140,6 @@ def loop_measured() -> dict[str, tuple[float, int, str]]:
         for camera in ("forward", "backward"):
             focus = found[course]["focus"][camera]["defocus_rms_um"]
             out[f"loop.focus.{camera}.{course}"] = (float(focus), 0, "um")
-    for camera, unseen in zip(("forward", "backward"), found["unseen_defocus_um"], strict=True):
+    for camera, unseen in zip(("forward", "backward"), found["unobservable_defocus_um"], strict=True):
         out[f"loop.focus.{camera}.unseen"] = (float(unseen), 0, "um")
     return out

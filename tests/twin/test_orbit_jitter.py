@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.orbit.jitter import Found, search
+from analysis.orbit.jitter import JitterSearch, search
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.jitter_search import OrbitJitterSpec
 from scenes.specs.orbit.setup import JitterSetup, load_three_line_camera
@@ -43,7 +43,7 @@ def attitude(*lines: dict) -> dict:
 OSCILLATION = {"frequency": "0.65 Hz", "amplitude": "2.4 1 0 arcsec", "phase": "40 10 0 deg"}
 
 
-def searched(one: JitterSetup, seed: int) -> Found:
+def searched(one: JitterSetup, seed: int) -> JitterSearch:
     spec = one.test
     measured, _ = fly_strip(one, seed)
     seen = sights_of(measured, line_cameras(one.camera), spec.lines, spec.search, LightEffects.of(spec.effects))
@@ -67,9 +67,9 @@ def test_every_warning_of_a_search_is_told_when_and_only_when_it_holds(oscillati
     lines, used = one.result.lines, np.arange(len(one.result.used)) / len(one.result.used)
     for nothing in ({}, {"used": used < 0.71}, {"factors": 0.0 * one.result.factors + 1.29**2}):
         assert told(**nothing) == (), nothing
-    assert any("31% of the observations of jitter were left out as wrong" in text for text in told(used=used < 0.69))
+    assert any("31% of the observations of jitter were rejected as wrong" in text for text in told(used=used < 0.69))
     assert any(
-        "what remains in jitter is the noise" in text for text in told(factors=0.0 * one.result.factors + 1.31**2)
+        "the remaining noise in jitter is" in text for text in told(factors=0.0 * one.result.factors + 1.31**2)
     )
     (text,) = told(lines=replace(lines, aliases=((8.5, 9.1),)))
     assert "jitter: 0.65 Hz may as well be 8.5, 9.1 Hz" in text.replace(f"{lines.frequency[0]:.4g}", "0.65")
@@ -158,10 +158,10 @@ def test_steady_readings_are_those_of_a_pass_without_noise() -> None:
     """Polynomials through exact readings: the orbit to a millimetre, the attitude to a thousandth of an arcsecond."""
     one = setup(attitude={"steering": "yaw"}, errors={})
     path = TabulatedTrajectory(fly_strip(one, 1)[0].platform)
-    without_jitter = SteadyPlatform.of(path, -4.0, 4.0)
+    steady = SteadyPlatform.of(path, -4.0, 4.0)
     t = np.linspace(-4.0, 4.0, 33)
-    np.testing.assert_allclose(without_jitter.position(t), path.position(t), rtol=0, atol=1e-3)
-    turn = np.einsum("nji,njk->nik", path.body_to_itrs(t), without_jitter.body_to_itrs(t))
+    np.testing.assert_allclose(steady.position(t), path.position(t), rtol=0, atol=1e-3)
+    turn = np.einsum("nji,njk->nik", path.body_to_itrs(t), steady.body_to_itrs(t))
     np.testing.assert_allclose(turn, np.broadcast_to(np.eye(3), turn.shape), rtol=0, atol=1e-3 * ARCSEC)
 
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.model_fit import unseen_modes
+from analysis.monitor.model_fit import unobservable_modes
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, intersect_pair
 from optics.geometry.tree import Motion
 from scenes.models.disturbances import state_of
@@ -310,9 +310,9 @@ def model(loop_setup: MonitorSetup, backend) -> LoopModel:
 def course_of(loop_setup: MonitorSetup, model: LoopModel, still: bool = False, **changed: dict) -> LoopCourse:
     """A rendered course, with other keys of some corrections."""
     own = tuple(replace(one, spec=one.spec.model_copy(update=changed.get(one.name, {}))) for one in model.correctors)
-    loop = LoopModel(model.experiment, model.stated, own)
+    loop = LoopModel(model.experiment, model.prior, own)
     states = closed_loop.drifting_states(loop_setup.test, model.experiment, 3)
-    return closed_loop.gone_through(loop, loop_setup.test, states, closed_loop.reader(loop, loop_setup.test, 7), still)
+    return closed_loop.simulate_course(loop, loop_setup.test, states, closed_loop.reader(loop, loop_setup.test, 7), still)
 
 
 @pytest.fixture(scope="module")
@@ -437,7 +437,7 @@ def test_a_mode_that_no_spot_shows_moves_heights_by_the_exact_trace(loop_setup, 
     angle, first, second = np.zeros(10), np.zeros(10), np.zeros(10)
     angle[[model.row("forward", "d_alpha"), model.row("backward", "d_alpha")]] = 1.0, -1.0
     first[model.row("forward", "defocus")] = second[model.row("backward", "defocus")] = 1.0
-    modes = unseen_modes(model.stated, np.stack([angle, first, second]), np.array([ARCSEC, 1e-5, 1e-5]))
+    modes = unobservable_modes(model.prior, np.stack([angle, first, second]), np.array([ARCSEC, 1e-5, 1e-5]))
     assert len(modes) == 3
     components = experiment.stated.components
     for mode in modes:

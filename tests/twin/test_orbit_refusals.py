@@ -423,18 +423,18 @@ object.__setattr__(STRIP, "camera", load_three_line_camera("ms4"))
 
 
 def spots_lost() -> None:
-    with MonitorSeries._told(SERIES, [0]):
+    with MonitorSeries._reporting_spot_errors(SERIES, [0]):
         raise SpotError({1: "too faint"})
 
 
 PARTS: dict[str, tuple[Any, dict[str, Any], Callable[[], object], tuple[str, ...], str, str]] = {
     "monitor": (
         monitoring_run,
-        {"fly_monitored": fails(IntersectionError("looks are parallel"))},
+        {"simulate_monitoring": fails(IntersectionError("looks are parallel"))},
         lambda: monitoring_run.run_monitor(Ns(test=MONITOR), UNMADE, 1),
         ("cameras",),
         "looks are parallel",
-        "cameras that look different ways",
+        "cameras with different look angles",
     ),
     "spots of a loop": (
         closed_loop,

@@ -179,7 +179,7 @@ def test_verdicts_among_the_numbers_warn_when_they_are_false() -> None:
     assert "larger than their sigmas predict (p = 0.0009): biases" in FIT["agrees"].warning(run)
     spec.errors.switched_on = False
     assert FIT["agrees"].of(run) is None
-    right = Ns(agrees=True, spread=3.0, sigma=2.0, limits=(0.8, 1.2), chi_square=9.5, limit=8.25, furthest=5.0)
+    right = Ns(agrees=True, spread=3.0, sigma=2.0, limits=(0.8, 1.2), chi_square=9.5, limit=8.25, largest_ratio=5.0)
     wrong = Ns(**vars(right) | {"agrees": False})
     for verdict, whole, part, words in (
         (STEPWISE["converged"], "stepwise", None, "has not converged after 7 rounds"),

@@ -1,1 +1,1 @@
-"""Jitter found in what the lines of a camera saw one after the other."""
+"""Search for jitter of the attitude in points that the lines of a camera see one after the other."""

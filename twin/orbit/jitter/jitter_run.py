@@ -1,7 +1,4 @@
-"""A search for jitter: ``python -m twin.orbit jitter``, on a simulated pass or on measured ones.
-
-The quantities of a search for jitter, as jitter.json has them.
-"""
+"""Search for jitter, simulated or on measurements (``python -m twin.orbit jitter``), and the keys of jitter.json."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.orbit.jitter import Course, JitterSearch, JitterError, search, fit_spline
+from analysis.orbit.jitter import Course, JitterError, JitterSearch, fit_spline, search
 from optics.numerics.backend import one_blas_thread
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.orbit.jitter_search import AXES, OrbitJitterSpec
@@ -37,140 +34,141 @@ if TYPE_CHECKING:
 
 TEST_FILE = "jitter.yaml"
 _WRONG = 20.0
-"""Pixels: within which a wrong match lies."""
+"""Largest error of a wrong match in a simulation, in pixels."""
 _SPARE = 1.3
-"""Times as many places are drawn as are asked for: some lie beyond an edge of a line."""
+"""Number of candidates drawn per point; some lie beyond an edge of a line."""
 _REMEDY = "points that several lines see, spread over the strip; a larger `height_sigma` or another `height`"
 
 
 @dataclass(frozen=True, eq=False)
 class PassJitter:
-    """What was found in a pass.
+    """Jitter detected in one pass.
 
     Attributes
     ----------
     setup : AnyJitter
-        What the test's file says.
+        Resolved test file and camera.
     sights : Sights
-        What lines saw of the same points.
-    found : Found
-        Oscillations, spectra.
-    course : Course | None
-        The attitude as a spline; None where none was asked for.
+        Sightings of the same points by several lines.
+    result : JitterSearch
+        Detected oscillations and spectra.
+    course : Course or None
+        Attitude as a spline; None where the file asks for none.
     measurements : PassMeasurements
-        What it was found in.
-    truth : Jitter | None
-        The jitter of a simulation, with what it is of lines; None on measurements.
+        Measurements of the pass.
+    truth : Jitter or None
+        True jitter of a simulation, as a sum of lines; None for measurements.
     """
 
     setup: AnyJitter
     sights: Sights
-    found: JitterSearch
+    result: JitterSearch
     course: Course | None
     measurements: PassMeasurements
     truth: Jitter | None = None
 
     @property
     def columns(self) -> list[int]:
-        """Columns of rotation vectors, for the axes that were searched."""
+        """Columns of rotation vectors for the axes that are searched."""
         return [AXES.index(axis) for axis in self.setup.test.search.axes]
 
     @property
     def oscillations(self) -> list[Oscillation]:
-        """All that were found, the strongest first."""
-        return [Oscillation(self, k) for k in range(len(self.found.lines.frequency))]
+        """Detected oscillations, the strongest first."""
+        return [Oscillation(self, k) for k in range(len(self.result.lines.frequency))]
 
     @property
     def noise_factors(self) -> dict[str, float]:
-        """Line -> standard deviation of its noise over that of its points' covariances."""
-        return dict(zip(self.sights.lines, np.sqrt(self.found.factors[:-1]).tolist(), strict=True))
+        """Remaining standard deviation of each line over that of its points' covariances."""
+        return dict(zip(self.sights.lines, np.sqrt(self.result.factors[:-1]).tolist(), strict=True))
 
     @property
-    def chance_of_the_next(self) -> float:
-        """Probability that noise alone has the highest power that is left."""
-        after = self.found.after
+    def next_p_value(self) -> float:
+        """p-value of the highest remaining power."""
+        after = self.result.after
         return float(after.chance(after.power[after.best]))
 
     def by_axis(self, values: np.ndarray) -> dict[str, float]:
-        """Axis -> value of a row (A,)."""
+        """Return a row of values (A,) as a mapping by axis."""
         return dict(zip(self.setup.test.search.axes, np.asarray(values).tolist(), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
 class Oscillation:
-    """An oscillation that was found.
+    """Detected oscillation.
 
     Attributes
     ----------
-    one : PassJitter
-        The pass.
+    pass_jitter : PassJitter
+        Pass in which it was detected.
     number : int
-        Which one, the strongest first.
+        Index among the detected oscillations, the strongest first.
     """
 
-    one: PassJitter
+    pass_jitter: PassJitter
     number: int
 
     @property
     def amplitude(self) -> tuple[np.ndarray, np.ndarray]:
-        """(A,) radians about the axes, and their sigmas."""
-        lines = self.one.found.lines
+        """Amplitudes (A,) about the axes, in radians, and their standard deviations."""
+        lines = self.pass_jitter.result.lines
         return lines.amplitude[self.number], lines.amplitude_sigma[self.number]
 
     @property
     def phase(self) -> np.ndarray:
-        """(A,) phases at the epoch, radians."""
-        return np.asarray(self.one.found.lines.phase[self.number])
+        """Phases (A,) at the epoch, in radians."""
+        return np.asarray(self.pass_jitter.result.lines.phase[self.number])
 
     @property
     def pixels(self) -> np.ndarray:
-        """(A,) amplitudes in angles of a pixel."""
-        return np.asarray(self.amplitude[0] / self.one.sights.pixel)
+        """Amplitudes (A,) in angles of a pixel."""
+        return np.asarray(self.amplitude[0] / self.pass_jitter.sights.pixel)
 
     @property
     def truth(self) -> tuple[float, np.ndarray] | None:
-        """Frequency, hertz, and amplitudes (A,), radians, of the stated oscillation that it is; None where there is
-        none within a resolution element.
+        """Frequency (Hz) and amplitudes (A,) (rad) of the nearest true oscillation.
+
+        None if none lies within a resolution element, or for measurements.
         """
-        test, stated = self.one.setup.test, self.one.truth
-        if stated is None or not isinstance(test, OrbitJitterSpec) or test.attitude.jitter is None:
+        test, jitter = self.pass_jitter.setup.test, self.pass_jitter.truth
+        if jitter is None or not isinstance(test, OrbitJitterSpec) or test.attitude.jitter is None:
             return None
-        away = np.abs(stated.frequency[: len(test.attitude.jitter.lines)] - self.frequency[0])
-        if not len(away) or away.min() > 1.0 / self.one.sights.observations.span:
+        distance = np.abs(jitter.frequency[: len(test.attitude.jitter.lines)] - self.frequency[0])
+        if not len(distance) or distance.min() > 1.0 / self.pass_jitter.sights.observations.span:
             return None
-        k = int(np.argmin(away))
-        return float(stated.frequency[k]), np.hypot(stated.sine[k], stated.cosine[k])[self.one.columns]
+        k = int(np.argmin(distance))
+        return float(jitter.frequency[k]), np.hypot(jitter.sine[k], jitter.cosine[k])[self.pass_jitter.columns]
 
     @property
     def frequency(self) -> tuple[float, float]:
-        """Hertz, and its sigma."""
-        lines = self.one.found.lines
+        """Frequency in hertz, and its standard deviation."""
+        lines = self.pass_jitter.result.lines
         return float(lines.frequency[self.number]), float(lines.frequency_sigma[self.number])
 
     @property
     def in_search(self) -> bool:
-        """Return whether the frequency is one of those that were searched."""
-        search = self.one.setup.test.search
+        """True if the frequency lies within the search."""
+        search = self.pass_jitter.setup.test.search
         return bool(search.lowest <= self.frequency[0] <= search.highest)
 
     @property
     def aliases(self) -> tuple[float, ...]:
-        """Return the other frequencies, hertz, that explain the observations as well."""
-        return self.one.found.lines.aliases[self.number]
+        """Other frequencies, in hertz, that explain the observations equally well."""
+        return self.pass_jitter.result.lines.aliases[self.number]
 
 
 @dataclass(frozen=True, eq=False)
 class JitterRun:
-    """A search.
+    """Results of a search for jitter.
 
     Attributes
     ----------
     setup : AnyJitter
-        What its file says.
+        Resolved test file and camera.
     seed : int
-        Of all random numbers.
+        Seed of all random numbers.
     passes : Mapping[str, PassJitter]
-        By name.
+        Results by name of the pass.
     """
 
     setup: AnyJitter
@@ -179,56 +177,58 @@ class JitterRun:
 
     @property
     def simulated(self) -> bool:
-        """Whether there is a truth."""
+        """True for a simulation, which has a truth."""
         return isinstance(self.setup, JitterSetup)
 
 
 @one_blas_thread()
 def run_jitter(setup: AnyJitter, backend: Backend | None, seed: int, advance: Advance = silent) -> JitterRun:
-    """Fly or read, and search; nothing is traced, so that the backend is not used.
+    """Simulate or read the passes, and search them for jitter. Nothing is ray-traced: the backend is not used.
 
     Raises
     ------
     InputError
-        Files that cannot be used.
+        Files cannot be used.
     BenchError
-        No such orbit, or points that tell nothing of jitter.
+        No such orbit exists, or the points do not observe the attitude.
     """
     spec = setup.test
     passes: list[tuple[PassMeasurements, Jitter | None]] = []
     if isinstance(setup, MeasuredJitterSetup):
         effects = LightEffects.of(setup.test.effects) if setup.test.effects.corrected else NO_EFFECTS
-        passes = [(one, None) for one in read_measurements(setup.data, setup.camera, advance, needed={})]
+        passes = [
+            (measurements, None) for measurements in read_measurements(setup.data, setup.camera, advance, needed={})
+        ]
     else:
         effects = LightEffects.of(setup.test.effects)
         passes = [fly_strip(setup, seed)]
-    cameras, found = line_cameras(setup.camera), {}
-    for k, (one, truth) in enumerate(passes):
+    cameras, results = line_cameras(setup.camera), {}
+    for k, (measurements, truth) in enumerate(passes):
         advance("search", k, len(passes))
         try:
-            sights = sights_of(one, cameras, spec.lines, spec.search, effects)
-            given = sights.observations
+            sights = sights_of(measurements, cameras, spec.lines, spec.search, effects)
+            observations = sights.observations
             sought = spec.search
-            fastest = 0.5 / max(one.line_times[name].line_time for name in sights.lines)
-            lines = search(given, sought.lowest, sought.highest, sought.false_alarm, fastest)
+            fastest = 0.5 / max(measurements.line_times[name].line_time for name in sights.lines)
+            lines = search(observations, sought.lowest, sought.highest, sought.false_alarm, fastest)
             spline = spec.search.spline
-            kept = given.taken(lines.used)
-            course = None if spline is None else fit_spline(kept, spline.interval, spline.sigma)
+            used = observations.taken(lines.used)
+            course = None if spline is None else fit_spline(used, spline.interval, spline.sigma)
         except (JitterError, SightsError, ValueError) as error:
             key = "points" if isinstance(setup, JitterSetup) else "data"
-            raise BenchError(f"{one.name}: {error}", (key,), _REMEDY) from error
-        found[one.name] = PassJitter(setup, sights, lines, course, one, truth)
+            raise BenchError(f"{measurements.name}: {error}", (key,), _REMEDY) from error
+        results[measurements.name] = PassJitter(setup, sights, lines, course, measurements, truth)
     advance("search", len(passes), len(passes))
-    return JitterRun(setup, seed, FrozenMap(found))
+    return JitterRun(setup, seed, FrozenMap(results))
 
 
 def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter | None]:
-    """Places that all lines of a simulated pass saw, with noise, and the true jitter.
+    """Simulate a pass whose points all lines see, with noise; return its measurements and the true jitter.
 
     Raises
     ------
     BenchError
-        No such orbit, or lines that do not see enough of the strip.
+        No such orbit exists, or the lines do not see enough of the strip.
     """
     spec: OrbitJitterSpec = setup.test
     root = np.random.SeedSequence(seed)
@@ -237,8 +237,10 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
         trajectory = Trajectory.flown(propagate(spec.orbit, earth), spec.attitude, root)
     except ValueError as error:
         raise BenchError(str(error), ("orbit",), "an orbit that the satellite can fly") from error
-    place, image, false, data = (np.random.default_rng(stream(root, k)) for k in range(4))
-    measured = trajectory.with_errors(spec.errors, int(data.integers(2**31)))
+    random_points, random_noise, random_wrong, random_errors = (
+        np.random.default_rng(stream(root, k)) for k in range(4)
+    )
+    measured = trajectory.with_errors(spec.errors, int(random_errors.integers(2**31)))
     platform = PlatformTable.sampled(measured, spec.errors.gps.interval, spec.errors.star_tracker.interval)
     count = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
     times = LineTimes.even(trajectory.first + 0.5 * spec.line_time, spec.line_time, count)
@@ -247,13 +249,15 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
     sensors = {name: Sensor.of_lines(cameras[name], trajectory, earth, times, effects) for name in names}
     many = int(np.ceil(_SPARE * wanted.count))
     first = sensors[names[0]]
-    away = wanted.duration * (place.uniform(size=many) - 0.5)
+    offset = wanted.duration * (random_points.uniform(size=many) - 0.5)
     if wanted.rows is not None:
-        spread = wanted.row_spread * np.clip(place.standard_normal(many), -3.0, 3.0)
-        away = np.clip(wanted.rows * np.rint(away / wanted.rows) + spread, *(0.5 * wanted.duration * np.array([-1, 1])))
-    seconds = spec.time + away
-    pixel = place.uniform(0.0, first.camera.pixels - 1.0, many)
-    height = wanted.height + wanted.relief * place.uniform(-1.0, 1.0, many)
+        spread = wanted.row_spread * np.clip(random_points.standard_normal(many), -3.0, 3.0)
+        offset = np.clip(
+            wanted.rows * np.rint(offset / wanted.rows) + spread, *(0.5 * wanted.duration * np.array([-1, 1]))
+        )
+    seconds = spec.time + offset
+    pixel = random_points.uniform(0.0, first.camera.pixels - 1.0, many)
+    height = wanted.height + wanted.relief * random_points.uniform(-1.0, 1.0, many)
     points = first.ground((seconds - first.first_line_time) / first.line_time, pixel, height)
     seen = {name: np.stack(sensor.image(points), axis=-1) for name, sensor in sensors.items()}
     noise = {name: wanted.line_noise.get(name, wanted.noise) for name in names}
@@ -263,28 +267,32 @@ def fly_strip(setup: JitterSetup, seed: int) -> tuple[PassMeasurements, Jitter |
         last = np.array([count, sensors[name].camera.pixels]) - 1.0 - edge
         with np.errstate(invalid="ignore"):
             inside &= np.all((at > edge) & (at < last), axis=1)
-    kept = np.flatnonzero(inside)[: wanted.count]
-    if len(kept) < wanted.count:
-        problem = f"{len(kept)} of {wanted.count} places are seen by all of {', '.join(names)}"
+    selected = np.flatnonzero(inside)[: wanted.count]
+    if len(selected) < wanted.count:
+        problem = f"{len(selected)} of {wanted.count} points are seen by all of {', '.join(names)}"
         raise BenchError(problem, ("points", "duration"), "a shorter strip within the orbit, or other `lines`")
     images = {}
     for name, at in seen.items():
-        off = noise[name] * image.standard_normal((len(kept), 2))
-        bad = false.uniform(size=len(kept)) < wanted.wrong
-        off[bad] += false.uniform(-_WRONG, _WRONG, (len(kept), 2))[bad]
-        found = at[kept] + off
-        images[name] = ImagePoints.of(np.arange(len(kept)), found[:, 0], found[:, 1], wanted.noise**2 * np.eye(2))
-    ids = np.array([f"t{k}" for k in range(len(kept))], object)
-    ground = GroundPoints.of(ids, np.full((len(kept), 3), np.nan), np.zeros((3, 3)), "tie")
-    one = PassMeasurements(spec.name, platform, FrozenMap(dict.fromkeys(names, times)), ground, FrozenMap(images))
-    return one, trajectory.jitter if isinstance(trajectory.jitter, Jitter) else None
+        noise_px = noise[name] * random_noise.standard_normal((len(selected), 2))
+        bad = random_wrong.uniform(size=len(selected)) < wanted.wrong
+        noise_px[bad] += random_wrong.uniform(-_WRONG, _WRONG, (len(selected), 2))[bad]
+        position = at[selected] + noise_px
+        images[name] = ImagePoints.of(
+            np.arange(len(selected)), position[:, 0], position[:, 1], wanted.noise**2 * np.eye(2)
+        )
+    ids = np.array([f"t{k}" for k in range(len(selected))], object)
+    ground = GroundPoints.of(ids, np.full((len(selected), 3), np.nan), np.zeros((3, 3)), "tie")
+    measurements = PassMeasurements(
+        spec.name, platform, FrozenMap(dict.fromkeys(names, times)), ground, FrozenMap(images)
+    )
+    return measurements, trajectory.jitter if isinstance(trajectory.jitter, Jitter) else None
 
 
 def exported(run: JitterRun) -> dict[str, str]:
-    """Path -> text of a folder of measurements with a test file that reads them back."""
+    """Return a folder of measurements with a test file that reads them back, path -> text."""
     spec = run.setup.test
     plain = spec.plain()
-    files = campaign_files([one.measurements for one in run.passes.values()], run.setup.camera.plain())
+    files = campaign_files([pass_jitter.measurements for pass_jitter in run.passes.values()], run.setup.camera.plain())
     test = {
         "name": spec.name,
         "description": spec.description,
@@ -299,24 +307,24 @@ def exported(run: JitterRun) -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class BlindMultiple:
-    """A multiple k / dt of a pair's gap.
+    """Multiple k / dt of the reciprocal gap of a pair of lines.
 
     Attributes
     ----------
     first : str
-        Line that sees a place first.
+        Line that sees a point first.
     second : str
-        The other.
+        Line that sees it second.
     gap : float
-        Between their sights, seconds.
+        Time between their sightings, in seconds.
     order : int
-        k.
+        Multiple k.
     frequency : float
-        hertz.
+        Frequency k / dt, in hertz.
     response : float
-        Of all lines together there, of the worst axis as against its best.
+        Response of all lines together at this frequency, of the worst axis, relative to its maximum.
     blind : bool
-        Whether all lines together are blind there.
+        True if all lines together are blind at this frequency.
     """
 
     first: str
@@ -328,101 +336,109 @@ class BlindMultiple:
     blind: bool
 
 
-def blind_multiples(one: PassJitter) -> list[BlindMultiple]:
-    """Where each pair of lines by itself is blind, among the frequencies that were looked at."""
-    before, out = one.found.before, []
+def blind_multiples(pass_jitter: PassJitter) -> list[BlindMultiple]:
+    """Return the frequencies of the search at which a pair of lines by itself is blind."""
+    before, multiples = pass_jitter.result.before, []
     share = np.min(before.response / np.max(before.response, axis=0), axis=1)
-    for (first, second), (_, gap, _) in one.sights.gaps.items():
+    for (first, second), (_, gap, _) in pass_jitter.sights.gaps.items():
         for order in range(1, int(before.frequency[-1] * abs(gap)) + 1):
             frequency = order / abs(gap)
             if frequency < before.frequency[0]:
                 continue
             k = int(np.argmin(np.abs(before.frequency - frequency)))
-            out.append(BlindMultiple(first, second, gap, order, frequency, float(share[k]), bool(before.blind[k])))
-    return out
+            multiples.append(
+                BlindMultiple(first, second, gap, order, frequency, float(share[k]), bool(before.blind[k]))
+            )
+    return multiples
 
 
-def transfers(one: PassJitter) -> dict[str, dict[str, float]]:
-    """Line -> root mean square over the phases of the transfer at Nyquist, along the line (by roll) and along the track
-    (by pitch), of all oscillations found together; of the lines whose file says how they collect light.
+def transfers(pass_jitter: PassJitter) -> dict[str, dict[str, float]]:
+    """Return the transfer at Nyquist of all detected oscillations together, by line and direction.
+
+    It is the root mean square over the phases, along the line (by roll) and along the track (by pitch), for lines whose
+    file describes how they collect light.
     """
-    directions, out = {"roll": "along_line", "pitch": "along_track"}, {}
-    swings = [(line.frequency[0], one.by_axis(line.pixels)) for line in one.oscillations]
-    for name in one.sights.lines:
-        image = one.setup.camera.image_of(name)
+    directions, by_line = {"roll": "along_line", "pitch": "along_track"}, {}
+    swings = [(line.frequency[0], pass_jitter.by_axis(line.pixels)) for line in pass_jitter.oscillations]
+    for name in pass_jitter.sights.lines:
+        image = pass_jitter.setup.camera.image_of(name)
         if image is None:
             continue
-        light = Collection.of(image.tdi, one.measurements.line_times[name].line_time)
-        out[name] = {
+        light = Collection.of(image.tdi, pass_jitter.measurements.line_times[name].line_time)
+        by_line[name] = {
             directions[axis]: float(light.mtf(0.5, Motion.of([(f, swing[axis]) for f, swing in swings])))
-            for axis in one.setup.test.search.axes
+            for axis in pass_jitter.setup.test.search.axes
             if axis in directions
         }
-    return out
+    return by_line
 
 
 def _true_amplitudes(of: Oscillation) -> dict[str, float] | None:
-    return None if of.truth is None else of.one.by_axis(of.truth[1])
+    return None if of.truth is None else of.pass_jitter.by_axis(of.truth[1])
 
 
 LINE: Record[Oscillation] = Record(
-    "An oscillation that was found.",
-    Quantity("frequency_hz", lambda of: of.frequency[0], "of it"),
+    "A detected oscillation.",
+    Quantity("frequency_hz", lambda of: of.frequency[0], "frequency"),
     Quantity("frequency_hz_sigma", lambda of: of.frequency[1], "standard deviation"),
-    Quantity("amplitude_arcsec", lambda of: of.one.by_axis(of.amplitude[0]), "axis -> half of what it swings in all"),
-    Quantity("amplitude_arcsec_sigma", lambda of: of.one.by_axis(of.amplitude[1]), "axis -> standard deviation"),
-    Quantity("amplitude_px", lambda of: of.one.by_axis(of.pixels), "axis -> in angles of a pixel"),
-    Quantity("phase_deg", lambda of: of.one.by_axis(of.phase), "axis -> p of sin(2 pi f t + p), t from the epoch"),
-    Quantity("chance", lambda of: of.one.found.lines.chance[of.number], "largest, of noise alone, anywhere"),
-    Quantity("in_search", lambda of: of.in_search, "whether the frequency is one of those that were searched"),
+    Quantity("amplitude_arcsec", lambda of: of.pass_jitter.by_axis(of.amplitude[0]), "axis -> half of peak to peak"),
+    Quantity(
+        "amplitude_arcsec_sigma", lambda of: of.pass_jitter.by_axis(of.amplitude[1]), "axis -> standard deviation"
+    ),
+    Quantity("amplitude_px", lambda of: of.pass_jitter.by_axis(of.pixels), "axis -> amplitude in pixels"),
+    Quantity(
+        "phase_deg", lambda of: of.pass_jitter.by_axis(of.phase), "axis -> p of sin(2 pi f t + p), t from the epoch"
+    ),
+    Quantity("p_value", lambda of: of.pass_jitter.result.lines.chance[of.number], "by noise alone, at any frequency"),
+    Quantity("in_search", lambda of: of.in_search, "true if the frequency lies within the search"),
     Quantity("aliases_hz", lambda of: list(of.aliases), "other frequencies that explain the observations as well"),
-    Quantity("true_frequency_hz", lambda of: of.truth and of.truth[0], "of the stated one", where_known=True),
-    Quantity("true_amplitude_arcsec", _true_amplitudes, "axis -> likewise", where_known=True),
+    Quantity("true_frequency_hz", lambda of: of.truth and of.truth[0], "true frequency", where_known=True),
+    Quantity("true_amplitude_arcsec", _true_amplitudes, "axis -> true amplitude", where_known=True),
 )
 MULTIPLE: Record[BlindMultiple] = Record(
-    "Where two lines by themselves see nothing: a whole number of periods lies between their sights.",
-    Quantity("first", lambda one: one.first, "line that sees a place first", "first"),
-    Quantity("second", lambda one: one.second, "the other", "second"),
-    Quantity("gap_ms", lambda one: one.gap, "between their sights", "gap", 2),
-    Quantity("periods", lambda one: one.order, "in the gap", "periods"),
-    Quantity("frequency_hz", lambda one: one.frequency, "periods over gap", "frequency [Hz]", 3),
-    Quantity("response", lambda one: one.response, "of all lines together, as against their best", "response", 3),
-    Quantity("blind", lambda one: one.blind, "whether all lines together see nothing there either", "by all lines"),
+    "A frequency at which a pair of lines alone is blind: a whole number of periods lies between their sightings.",
+    Quantity("first", lambda m: m.first, "line that sees a point first", "first"),
+    Quantity("second", lambda m: m.second, "line that sees it second", "second"),
+    Quantity("gap_ms", lambda m: m.gap, "time between their sightings", "gap", 2),
+    Quantity("periods", lambda m: m.order, "number of periods in the gap", "periods"),
+    Quantity("frequency_hz", lambda m: m.frequency, "periods over gap", "frequency [Hz]", 3),
+    Quantity("response", lambda m: m.response, "of all lines together, relative to their maximum", "response", 3),
+    Quantity("blind", lambda m: m.blind, "true if all lines together are blind there", "by all lines"),
 )
 
 
-def _gaps(one: PassJitter) -> dict[str, float]:
-    return {f"{first} to {second}": gap for (first, second), (_, gap, _) in one.sights.gaps.items()}
+def _gaps(pass_jitter: PassJitter) -> dict[str, float]:
+    return {f"{first} to {second}": gap for (first, second), (_, gap, _) in pass_jitter.sights.gaps.items()}
 
 
-def _detectable(one: PassJitter) -> dict[str, float]:
-    """Axis -> median over the frequencies that are looked at, radians."""
-    return one.by_axis(np.median(one.found.detectable[~one.found.before.blind], axis=0))
+def _detectable(pass_jitter: PassJitter) -> dict[str, float]:
+    """Return the median detectable amplitude over the searched frequencies by axis, in radians."""
+    return pass_jitter.by_axis(np.median(pass_jitter.result.detectable[~pass_jitter.result.before.blind], axis=0))
 
 
 PASS: Record[PassJitter] = Record(
-    "A pass.",
-    Quantity("epoch_utc", lambda one: one.measurements.platform.epoch, "from which times count"),
-    Quantity("lines", lambda one: list(one.sights.lines), "in the order in which they see a place"),
-    Quantity("points", lambda one: one.sights.points, "seen by two lines or more"),
-    Quantity("share_used", lambda one: np.mean(one.found.used), "of the observations; the others are wrong matches"),
-    Quantity("gap_ms", _gaps, "pair -> median time between the sights of a place"),
-    Quantity("duration_s", lambda one: one.sights.observations.span, "from the first sight to the last"),
+    "Jitter of one pass.",
+    Quantity("epoch_utc", lambda one: one.measurements.platform.epoch, "zero of the times"),
+    Quantity("lines", lambda one: list(one.sights.lines), "lines in the order in which they see a point"),
+    Quantity("points", lambda one: one.sights.points, "number of points seen by two lines or more"),
+    Quantity("share_used", lambda one: np.mean(one.result.used), "share of observations used, not wrong matches"),
+    Quantity("gap_ms", _gaps, "pair -> median time between the sightings of a point"),
+    Quantity("duration_s", lambda one: one.sights.observations.span, "time from first to last sighting"),
     Quantity("pixel_arcsec", lambda one: one.sights.pixel, "angle of a pixel along the line"),
-    Quantity("noise_factor", lambda one: one.noise_factors, "line -> what remains over what its covariances say"),
-    Quantity("aliases_sought_to_hz", lambda one: one.found.beyond, "highest frequency of aliases"),
+    Quantity("noise_factor", lambda one: one.noise_factors, "line -> remaining noise over its covariances"),
+    Quantity("aliases_sought_to_hz", lambda one: one.result.beyond, "highest frequency of aliases"),
     Quantity("oscillations", lambda one: one.oscillations, "the strongest first", record=LINE),
-    Quantity("chance_of_the_next", lambda one: one.chance_of_the_next, "of noise alone, of the highest power left"),
-    Quantity("detectable_arcsec", _detectable, "axis -> amplitude that would just be found, median over frequencies"),
-    Quantity("blind_hz", lambda one: one.found.before.intervals(), "first and last of frequencies not looked at"),
-    Quantity("blind_multiples", blind_multiples, "of every pair by itself", record=MULTIPLE),
+    Quantity("next_p_value", lambda one: one.next_p_value, "p-value of the highest remaining power"),
+    Quantity("detectable_arcsec", _detectable, "axis -> least detectable amplitude, median over frequencies"),
+    Quantity("blind_hz", lambda one: one.result.before.intervals(), "first and last of blind frequencies"),
+    Quantity("blind_multiples", blind_multiples, "blind frequencies of every pair alone", record=MULTIPLE),
     Quantity("mtf_at_nyquist", lambda one: transfers(one) or None, "line -> transfer, rms of phases", where_known=True),
 )
 JITTER: Record[JitterRun] = Record(
-    "jitter.json. Jitter in what several lines saw one after the other.",
-    Quantity("axes", lambda run: list(run.setup.test.search.axes), "of the body about which it was sought"),
-    Quantity("lowest_hz", lambda run: run.setup.test.search.lowest, "frequency looked at"),
-    Quantity("highest_hz", lambda run: run.setup.test.search.highest, "likewise"),
-    Quantity("false_alarm", lambda run: run.setup.test.search.false_alarm, "probability of any where there is none"),
-    Quantity("passes", lambda run: run.passes, "each by itself", record=PASS),
+    "Content of jitter.json: jitter detected in points that several lines see one after the other.",
+    Quantity("axes", lambda run: list(run.setup.test.search.axes), "axes of the body that are searched"),
+    Quantity("lowest_hz", lambda run: run.setup.test.search.lowest, "lowest frequency of the search"),
+    Quantity("highest_hz", lambda run: run.setup.test.search.highest, "highest frequency of the search"),
+    Quantity("false_alarm", lambda run: run.setup.test.search.false_alarm, "probability of any false detection"),
+    Quantity("passes", lambda run: run.passes, "each pass by itself", record=PASS),
 )

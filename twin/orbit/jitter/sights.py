@@ -1,15 +1,14 @@
-"""From image points of a pass to observations of its attitude.
+"""Observations of the attitude of a pass from its image points, and a model of the pass without fast motions.
 
-Each point is on the ground once, and lines see it one after the other. Its place there is not known, or not well: it is
-taken out, with what is known of it beforehand as a covariance. What remains, the lines' disagreement, tells of the
-attitude at the moments of their sights, whatever angle the lines look at: across the track always, along it as far as
-the height is known better than the lines' angles tell it.
+Lines see the same ground point one after the other. Its position, which is not known or not well, is eliminated, with
+its prior as a covariance. The remaining disagreement of the lines observes the attitude at the moments of their
+sightings, at any angle between the lines: across the track always, along it as far as the height is known better than
+the angles of the lines determine it.
 
-A pass without anything fast: the readings of orbit and attitude brought to polynomials.
-
-Readings that are joined by a spline carry their noise into the attitude between them, with the period of the readings.
-Image points that are compared with such an attitude show that period, whatever the satellite did. Against polynomials
-there is nothing that has a period.
+`SteadyPlatform` is a pass without anything fast: polynomials through the readings of orbit and attitude. Readings
+interpolated by a spline carry their noise into the attitude between them, with the period of the readings, and image
+points that are compared with such an attitude would show that period whatever the satellite did. Polynomials have no
+period.
 """
 
 from __future__ import annotations
@@ -36,27 +35,29 @@ from twin.orbit.flight.trajectory import Attitude
 from twin.orbit.measured.pass_measurements import PassMeasurements
 
 _ORBIT, _PER = 6, 60.0
-"""Degree of a polynomial through an orbit, one more for each so many seconds: good to 0.1 mm."""
+"""Degree of the polynomial of the orbit, and seconds per further degree: accurate to 0.1 mm."""
 _ATTITUDE = 4
-"""Degree of what a body does against the orbital frame: slow, and what this leaves of it each line's trend takes."""
+"""Degree of the polynomial of the body's attitude against the orbital frame: it is slow, and each line's trend takes up
+the remainder.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class SteadyPlatform:
-    """Position and attitude as polynomials of time, seconds; times have shape (...).
+    """Position and attitude as polynomials of time in seconds; times have shape (...).
 
     Attributes
     ----------
-    span : tuple[float, float]
-        Of the readings that they go through.
-    place : np.ndarray
-        Chebyshev coefficients of the position, ITRS, (K, 3), metres.
-    turn : np.ndarray
-        Of rotation vectors from `middle`, (K, 3), radians.
-    middle : np.ndarray
-        Rotation of the body against the orbital frame, (3, 3).
+    span : tuple of float
+        First and last time of the readings used.
+    place : (K, 3) ndarray
+        Chebyshev coefficients of the position, ITRS, in metres.
+    turn : (K, 3) ndarray
+        Chebyshev coefficients of rotation vectors from `middle`, in radians.
+    middle : (3, 3) ndarray
+        Mean rotation of the body against the orbital frame.
     law : Attitude
-        Orbital axes.
+        Definition of the orbital axes.
     """
 
     span: tuple[float, float]
@@ -67,7 +68,7 @@ class SteadyPlatform:
 
     @classmethod
     def of(cls, path: TabulatedTrajectory, first: float, last: float) -> SteadyPlatform:
-        """Through the readings between two times and, to each side, as long again where there are any.
+        """Fit the readings between two times and, on each side, over the same duration again where there are any.
 
         Raises
         ------
@@ -88,20 +89,20 @@ class SteadyPlatform:
         return cls(span, place, _chebyshev_fit(looks, rotation, span, _ATTITUDE), middle, path.law)
 
     def position(self, seconds: Any) -> np.ndarray:
-        """Position in the ITRS, metres; (...) -> (..., 3)."""
+        """Return the position in the ITRS, in metres; (...) -> (..., 3)."""
         return self._series(self.place, seconds)
 
     def velocity(self, seconds: Any) -> np.ndarray:
-        """Velocity against the turning Earth in axes of the ITRS, m/s; (...) -> (..., 3)."""
+        """Return the velocity relative to the rotating Earth in axes of the ITRS, in m/s; (...) -> (..., 3)."""
         first, last = self.span
         return self._series(chebyshev.chebder(self.place) * (2.0 / (last - first)), seconds)
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
-        """Velocity against the stars in axes of the ITRS, m/s; (...) -> (..., 3)."""
+        """Return the inertial velocity in axes of the ITRS, in m/s; (...) -> (..., 3)."""
         return np.asarray(self.velocity(seconds) + earth_rotation_velocity(self.position(seconds)))
 
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
-        """Axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
+        """Return the axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
         t = np.asarray(seconds, np.float64)
         rotation = Rotation.from_rotvec(self._series(self.turn, t).reshape(-1, 3)).as_matrix().reshape(*t.shape, 3, 3)
         return np.asarray(self._orbital(t) @ self.middle @ rotation)
@@ -116,7 +117,7 @@ class SteadyPlatform:
 
 
 def _inside(time: np.ndarray, first: float, last: float, path: TabulatedTrajectory) -> np.ndarray:
-    """Readings between two times; where there are few, moments that are joined from them."""
+    """Return the times of readings between two times; where there are few, evenly spaced moments between them."""
     moments = time[in_span(time, first, last)]
     if len(moments) < 2 * _ORBIT:
         moments = np.linspace(first, last, 4 * _ORBIT)
@@ -129,45 +130,46 @@ def _chebyshev_fit(time: np.ndarray, values: np.ndarray, span: tuple[float, floa
 
 
 _SPARE = 200
-"""Lines about the points' that are looked through for them."""
+"""Number of lines before and after the points' lines in which they are searched."""
 _TURN = 1e-5
-"""Radians: of the difference quotients."""
+"""Step of the difference quotients by rotation, in radians."""
 _STEP = 10.0
-"""Metres: likewise."""
+"""Step of the difference quotients by position, in metres."""
 _EXACT = 1e-3
-"""Metres: of points that are said to be exact."""
+"""Standard deviation, in metres, added to that of ground points, some of which are given as exact."""
 _LEAST_POINTS = 15
+"""Least number of points that two lines or more must see."""
 _NOISE, _ROUNDS = 4.0, 4
-"""Sigmas of a measured line within which it may be noise, and rounds that leave out the others."""
+"""Limit, in sigmas, within which a measured line's residual counts as noise, and rounds of rejecting the others."""
 _FAR = 200.0
-"""Pixels between lines and what is known of camera and platform."""
+"""Largest difference between measured and expected image positions, in pixels."""
 
 
 class SightsError(PhysicalError, ValueError):
-    """Points that tell nothing of the attitude."""
+    """Error of points that do not observe the attitude."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """What lines saw of the same points.
+    """Sightings of the same points by several lines.
 
     Attributes
     ----------
     observations : Observations
-        Of the attitude about the axes that are sought, whitened.
-    lines : tuple[str, ...]
-        That are used, in the order in which they see a place.
+        Whitened observations of the attitude about the axes that are searched.
+    lines : tuple of str
+        Lines that are used, in the order in which they see a point.
     gaps : Mapping[tuple[str, str], tuple[float, float, float]]
-        (first line, second line) -> seconds between their sights of the same points: the median, and before and after
-        it the ends of nine tenths of them.
+        (first line, second line) -> seconds between their sightings of the same points: 5 % quantile, median, 95 %
+        quantile.
     pixel : float
-        Angle of a pixel along the line, radians.
+        Angle of a pixel along the line, in radians.
     points : int
-        How many are seen by two lines or more.
-    pairs : Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
-        (first line, second line) -> moments (n,) of the first sight, and what the second line sees the points by
-        farther across (pixels to the right) and along (lines later) than the first, as far as neither ground nor
-        interior orientation explain it, (n, 2): to look at.
+        Number of points that two lines or more see.
+    pairs : Mapping[tuple[str, str], tuple[ndarray, ndarray]]
+        (first line, second line) -> times (n,) of the first sighting, and disparities (n, 2) of the second line against
+        the first, across (pixels to the right) and along (lines later), less what ground and interior orientation
+        explain; for figures.
     """
 
     observations: Observations
@@ -180,7 +182,7 @@ class Sights:
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """One line's part: of which points, when, and how they move."""
+    """Sightings by one line: points, image positions, covariances, times, and sensors rotated about each axis."""
 
     sensor: Sensor
     point: np.ndarray
@@ -197,27 +199,27 @@ def sights_of(
     search: JitterSearchSpec,
     effects: LightEffects,
 ) -> Sights:
-    """Of a pass.
+    """Return the sightings of a pass.
 
     Parameters
     ----------
-    one : PassMeasurements
-        What was measured.
+    measurements : PassMeasurements
+        Measurements of the pass.
     cameras : Mapping[str, LineCamera]
-        As the laboratory knows them.
-    chosen : tuple[str, ...] | None
+        Cameras as the laboratory measured them.
+    used : tuple of str, optional
         Lines that are used; None for all that have points.
     search : JitterSearchSpec
-        Axes, trends and what is known of heights.
+        Axes, trends and prior of the heights.
     effects : LightEffects
-        On the light, that are in the image points.
+        Effects on the light that are contained in the image points.
 
     Raises
     ------
     SightsError
-        Lines without points, or fewer than two lines that see the same ones.
+        Lines have no points, or fewer than two lines see the same ones.
     ValueError
-        Readings that do not cover the points' moments.
+        The readings do not cover the times of the points.
     """
     names = [name for name in cameras if name in measurements.images and name in (used or cameras)]
     if missing := [name for name in used or () if name not in measurements.images]:
@@ -227,7 +229,7 @@ def sights_of(
         count[measurements.images[name].point] += 1
     shared = np.flatnonzero(count >= 2)
     if len(names) < 2 or len(shared) < _LEAST_POINTS:
-        raise SightsError(f"{len(shared)} points are seen by two lines or more, {_LEAST_POINTS} at least are needed")
+        raise SightsError(f"{len(shared)} points are seen by two lines or more; at least {_LEAST_POINTS} are needed")
     lines = _lines(measurements, cameras, names, shared, search, effects)
     order = sorted(names, key=lambda name: _moment(lines[name], lines))
     prior = _prior_of(measurements, lines, shared, search)
@@ -265,7 +267,7 @@ def _lines(
 
 
 def _trimmed_times(times: LineTimes, line: np.ndarray) -> tuple[float, LineTimes]:
-    """The times of the lines about some, counted from the first of them, and that one's number."""
+    """Return the number of the first line near the points, and the times of the lines near them, counted from it."""
     first = max(float(np.floor(line.min())) - _SPARE, float(times.line[0]))
     last = min(float(np.ceil(line.max())) + _SPARE, float(times.line[-1]))
     inner = times.line[(times.line > first) & (times.line < last)]
@@ -274,7 +276,7 @@ def _trimmed_times(times: LineTimes, line: np.ndarray) -> tuple[float, LineTimes
 
 
 def _moment(line: _Line, lines: Mapping[str, _Line]) -> float:
-    """Mean of a line's sights less those of all lines of the same points, seconds."""
+    """Return the mean time of a line's sightings relative to those of all lines of the same points, in seconds."""
     difference = []
     for other in lines.values():
         _, mine, theirs = np.intersect1d(line.point, other.point, return_indices=True)
@@ -284,16 +286,16 @@ def _moment(line: _Line, lines: Mapping[str, _Line]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """What is known of places before they are seen.
+    """Prior of the ground points.
 
     Attributes
     ----------
-    tie : np.ndarray
-        (n,) whether only the height is known.
-    place : np.ndarray
-        (n, 3), ITRS, metres.
-    root : np.ndarray
-        (n, 3, 3) by which differences in place become white; of ties the first row alone, for the height.
+    tie : (n,) ndarray of bool
+        True where only the height has a prior.
+    place : (n, 3) ndarray
+        Prior positions, ITRS, in metres.
+    root : (n, 3, 3) ndarray
+        Whitening matrices of differences in position; of tie points only the first row, for the height.
     """
 
     tie: np.ndarray
@@ -302,18 +304,22 @@ class _Prior:
 
     @property
     def normal(self) -> np.ndarray:
-        """(n, 3, 3) inverse covariances, of ties singular."""
+        """Inverse covariances (n, 3, 3), singular for tie points."""
         return np.asarray(self.root.swapaxes(1, 2) @ self.root)
 
     def of(self, rows: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """For some, all ties or none: rows (n, k, 3) by which a step from places (n, 3) is observed, and how far (n, k)
-        the prior's place lies.
+        """Return the prior's observations of some points, all of them ties or none.
+
+        They are the derivatives (n, k, 3) by a step from positions (n, 3), and the residuals (n, k) of the prior's
+        positions.
         """
         root = self.root[rows][:, :1] if self.tie[rows[0]] else self.root[rows]
         return root, (root @ (self.place[rows] - place)[..., None])[..., 0]
 
 
-def _prior_of(measurements: PassMeasurements, lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec) -> _Prior:
+def _prior_of(
+    measurements: PassMeasurements, lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec
+) -> _Prior:
     place = np.full((len(measurements.ground), 3), np.nan)
     for line in lines.values():
         ground = line.sensor.ground(line.place[:, 0], line.place[:, 1], search.height)
@@ -323,7 +329,7 @@ def _prior_of(measurements: PassMeasurements, lines: Mapping[str, _Line], shared
     place[~tie] = measurements.ground.itrs[~tie]
     place, tie = place[shared], tie[shared]
     if not np.all(np.isfinite(place)):
-        raise SightsError("lines look past the Earth")
+        raise SightsError("lines of sight miss the Earth")
     root = np.zeros((len(place), 3, 3))
     longitude, latitude, _ = Earth().geodetic(place[tie])
     root[tie, 0] = east_north_up(longitude, latitude)[:, 2] / search.height_sigma
@@ -333,7 +339,7 @@ def _prior_of(measurements: PassMeasurements, lines: Mapping[str, _Line], shared
 
 
 def _improved_positions(lines: Mapping[str, _Line], shared: np.ndarray, prior: _Prior) -> np.ndarray:
-    """Places at which the derivatives are taken: near enough for them to hold."""
+    """Return the positions at which derivatives are taken, close enough for linearisation."""
     normal, right = prior.normal, np.zeros((len(shared), 3))
     for line in lines.values():
         which = np.searchsorted(shared, line.point)
@@ -349,7 +355,7 @@ def _improved_positions(lines: Mapping[str, _Line], shared: np.ndarray, prior: _
 
 
 def _residual_and_slope(line: _Line, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Measured less expected line and pixel (n, 2), and their derivatives by the place (n, 2, 3), per metre."""
+    """Return measured less expected line and pixel (n, 2), and their derivatives by position (n, 2, 3), per metre."""
     expected = np.stack(line.sensor.image(place), axis=-1)
     by = [(np.stack(line.sensor.image(place + _STEP * axis), axis=-1) - expected) / _STEP for axis in np.eye(3)]
     return line.place - expected, np.stack(by, axis=-1)
@@ -363,7 +369,7 @@ def _whitened_observations(
     prior: _Prior,
     search: JitterSearchSpec,
 ) -> tuple[Observations, dict[str, np.ndarray]]:
-    """Observations, and line -> measured less expected at the places (n, 2), pixels."""
+    """Return the whitened observations, and measured less expected positions (n, 2) by line, in pixels."""
     axes, count = len(search.axes), len(order)
     size, width = len(shared), (search.interior + 1) + search.trend
     value, by = np.zeros((size, count, 2)), np.zeros((size, count, 2, 3))
@@ -379,7 +385,9 @@ def _whitened_observations(
         difference, slope = _residual_and_slope(line, positions)
         expected = line.place - difference
         rotations = [(np.stack(s.image(positions), axis=-1) - expected) / _TURN for s in line.axes]
-        good = np.all(np.isfinite(difference), axis=1) & (np.max(np.abs(np.nan_to_num(difference, nan=np.inf)), axis=1) < _FAR)
+        good = np.all(np.isfinite(difference), axis=1) & (
+            np.max(np.abs(np.nan_to_num(difference, nan=np.inf)), axis=1) < _FAR
+        )
         for derivative in (slope, *rotations):
             good &= np.all(np.isfinite(derivative.reshape(len(derivative), -1)), axis=1)
         rows = which[good]
@@ -397,7 +405,7 @@ def _whitened_observations(
         root = np.linalg.inv(np.linalg.cholesky(spread[rows][:, used][:, :, :, used].reshape(n, 2 * m, 2 * m)))
         seen_by = root @ by[rows][:, used].reshape(n, 2 * m, 3)
         before, difference = prior.of(rows, place[rows])
-        # combinations of observations that no place on the ground explains
+        # combinations of observations that do not depend on the ground position
         free = np.linalg.svd(np.concatenate([seen_by, before], axis=1))[0][:, :, 3:].swapaxes(1, 2)
         measured = np.concatenate([(root @ value[rows][:, used].reshape(n, 2 * m, 1))[..., 0], difference], axis=1)
         values.append((free @ measured[..., None]).ravel())
@@ -418,26 +426,26 @@ def _whitened_observations(
         groups.append(np.repeat(np.arange(n), free_count) + sum(len(part) for part in times))
         times.append(time[rows])
     if not values:
-        raise SightsError("no point is seen by two lines where camera and platform expect it, to 200 pixels")
+        raise SightsError("no point is seen by two lines within 200 pixels of its expected positions")
     parts = (values, groups, times, weights, columns, mixes)
     value, group, time, weight, nuisance, mix = (np.concatenate(part) for part in parts)
     return Observations.of(value, group, time, weight, nuisance, mix=mix), residual
 
 
 def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return the times (n,) at which points cross a line, seconds, without the noise of the measured lines.
+    """Return the times (n,) at which points cross a line, in seconds, without the noise of the measured lines.
 
-    A measured line is wrong by the same noise as what is observed, so that a time that follows from it goes with the
-    observation; where points lie on rows, all of the scatter of their times is this noise.
+    A measured line number contains the same noise as the observation, so that a time that follows from it is correlated
+    with the observation; where points lie on rows, all of the scatter of their times is this noise.
 
     Parameters
     ----------
     line : _Line
-        With the measured places.
-    off : np.ndarray
-        Measured less expected lines (n,), of which noise is what is smooth no more, as far as its sigma allows.
-    basis : np.ndarray
-        (n, width) smooth functions of the points.
+        Sightings with the measured positions.
+    off : (n,) ndarray
+        Measured less expected lines, whose part that is not smooth counts as noise, within the limits of its sigma.
+    basis : (n, width) ndarray
+        Smooth functions of the points.
     """
     sigma = np.sqrt(line.covariance[:, 0, 0])
     accepted = np.isfinite(off)
@@ -451,7 +459,7 @@ def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def _visibility_groups(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Lines (m,) and points (n,) of each set of points that the same two lines or more see, of one sort."""
+    """Return lines (m,) and points (n,) of each set of points of one sort that the same two lines or more see."""
     groups = []
     for sort in (True, False):
         for pattern in np.unique(seen, axis=0):
@@ -463,8 +471,10 @@ def _visibility_groups(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarr
 
 
 def _basis(lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec) -> np.ndarray:
-    """(n, width) powers of each point's place across the strip and of its time, the same for all lines: what they have
-    in common then moves the ground alone, and drops out, with the noise of the places.
+    """Return (n, width) Legendre polynomials of each point's position across the strip and of its time.
+
+    They are the same for all lines: the part that lines have in common moves only the ground point and is eliminated,
+    with its noise.
     """
     total, seen = np.zeros((len(shared), 2)), np.zeros(len(shared))
     for line in lines.values():
@@ -485,7 +495,7 @@ def _pixel(camera: LineCamera) -> float:
 def _pairs(
     lines: Mapping[str, _Line], order: list[str], count: int, residual: Mapping[str, np.ndarray]
 ) -> tuple[dict[tuple[str, str], tuple[float, float, float]], dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]]:
-    """Gaps, and disparities without what is smooth along and across the strip."""
+    """Return the gaps of all pairs of lines, and the disparities of neighbours without their smooth parts."""
     gaps, pairs = {}, {}
     for a, b in combinations(order, 2):
         _, mine, theirs = np.intersect1d(lines[a].point, lines[b].point, return_indices=True)

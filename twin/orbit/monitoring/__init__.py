@@ -1,1 +1,1 @@
-"""A monitored stereo pair in orbit: flight, readings, heights, the loop with mechanisms, numbers, report."""
+"""Heights from a stereo pair with an on-board monitor, and the closed loop of monitor and mechanisms."""

@@ -1,12 +1,13 @@
-"""A loop of mechanisms on its instrument, and its course: at every moment spots are rendered and recovered where the
-mechanisms stand, the filter takes them, commands go out, mechanisms move, and images are taken.
+"""Closed loop of a monitor and correcting mechanisms on their instrument, simulated over a course.
 
-The filter is told what moves and by which laws, the readings, and where mechanisms are known to stand; it never sees
-the state. All of it rests on exact traces: stated motions with what they do to spots, cameras and foci, what every
-mechanism does to the same, and the truth of the state that the mechanisms have left.
+At every moment, spots are rendered and recovered with the mechanisms at their positions, the filter processes them,
+commands are sent, mechanisms move, and images are taken. The filter knows the prior of the motions with its laws in
+time, the readings, and the commanded positions of the mechanisms; it never uses the true state. All effects come from
+exact traces: those of the prior's motions and of every mechanism on spots, cameras and foci, and the truth of the state
+that the mechanisms have corrected.
 
-The quantities of a loop are P = 5 K numbers of the instrument's K cameras: d_alpha, d_beta, d_gamma, d_f of each, as
-all estimators have them, and after these the defocus of each, best focus less line CCD, the mean over `FOCUS_FIELDS`.
+The quantities of a loop are P = 5 K numbers for the instrument's K cameras: d_alpha, d_beta, d_gamma, d_f of each, in
+the order of all estimators, followed by the defocus of each: best focus less line CCD, mean over `FOCUS_FIELDS`.
 """
 
 from __future__ import annotations
@@ -46,21 +47,21 @@ from twin.monitor.motions import ElementaryMotion
 from twin.monitor.observation import LOST, Observing, observe
 from twin.monitor.truth import truth_jacobian
 from twin.orbit.monitoring.monitor_series import states_of
-from twin.orbit.monitoring.pair_flight import TOO_FAR, moves_at
+from twin.orbit.monitoring.pair_flight import TOO_FAR, motions_at
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
 
 FOCUS_FIELDS = (0.7, 0.0, -0.7)
-"""Shares of half the line at which the focus is looked at."""
+"""Fields at which the focus is computed, as shares of half the line."""
 _READ = 1e-3
-"""Pixels to which one reading knows a spot, about."""
+"""Approximate standard deviation of a spot coordinate in one reading, in pixels."""
 _SMALL = 1e-6
-"""Effect of a mechanism on its quantity, for 1 rad or 1 m, below which it has none; rad or m."""
+"""Effect of a mechanism on its quantity, for 1 rad or 1 m, below which it counts as none, in rad or m."""
 _DISTANCE: Mapping[str, float] = FrozenMap({"shift": 1e-5, "rotate": 5e-6})
-"""Steps of mechanisms over which a focus is differentiated, m and rad: foci are known to 1e-8 m."""
+"""Steps of mechanisms over which a focus is differentiated, in m and rad; foci are accurate to 1e-8 m."""
 _DRAWN = 20
-"""Random stream of the motions; detectors have the first ones."""
+"""Random stream of the motions; the detectors use the first ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,15 +71,17 @@ class Corrector:
     Attributes
     ----------
     name : str
-        Of it.
+        Name of the correction.
     spec : CorrectionSpec
-        What the file says.
-    motion : ElementaryMotion | None
-        Of its mechanism; None for a correction on the ground.
+        Section of the file.
+    motion : ElementaryMotion or None
+        Motion of its mechanism; None for a correction on the ground.
     row : int
-        Number of its quantity, of P.
-    effect : np.ndarray
-        (P,) what 1 rad or 1 m of it does to the quantities; spots: (D,) to the spots, px.
+        Index of its quantity among the P quantities.
+    effect : (P,) ndarray
+        Effect of 1 rad or 1 m of the correction on the quantities.
+    spots : (D,) ndarray
+        Effect of 1 rad or 1 m of the correction on the spots, in px.
     """
 
     name: str
@@ -89,94 +92,98 @@ class Corrector:
     spots: np.ndarray
 
     @property
-    def own(self) -> float:
-        """Return the effect of 1 rad or 1 m on its quantity."""
+    def sensitivity(self) -> float:
+        """Effect of 1 rad or 1 m of the correction on its quantity."""
         return float(self.effect[self.row])
 
     @property
     def unit(self) -> tuple[str, float]:
-        """Unit in which its position is told, and its size in SI."""
+        """Unit in which positions are reported, and its size in SI units."""
         key = "um" if self.spec.kind_of("step").si == "m" else "arcsec"
         return key, 1e-6 if key == "um" else ARCSEC
 
 
 @dataclass(frozen=True, eq=False)
 class LoopModel:
-    """A loop on its instrument.
+    """Linear model of a loop on its instrument.
 
     Attributes
     ----------
     experiment : MonitorExperiment
-        The instrument.
-    stated : Disturbances
-        What moves, with all P quantities in place of the parameters.
-    correctors : tuple[Corrector, ...]
-        By name, in the order of the names, so that their order in the file does not matter.
+        Instrument with its monitor.
+    prior : Disturbances
+        Prior of the motions, with all P quantities in place of the parameters.
+    correctors : tuple of Corrector
+        Corrections sorted by name, so that their order in the file does not matter.
     """
 
     experiment: MonitorExperiment
-    stated: Disturbances
+    prior: Disturbances
     correctors: tuple[Corrector, ...]
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of all K."""
+        """Names of all K cameras."""
         return tuple(self.experiment.instrument.cameras)
 
     def row(self, camera: str, quantity: str) -> int:
-        """Number of a quantity."""
+        """Return the index of a camera's quantity."""
         return _row(self.cameras, camera, quantity)
 
     def unit(self, camera: str, quantity: str) -> np.ndarray:
-        """(P,) of a quantity alone."""
-        return np.eye(len(self.stated.parameters))[self.row(camera, quantity)]
+        """Return the (P,) unit vector of a camera's quantity."""
+        return np.eye(len(self.prior.parameters))[self.row(camera, quantity)]
 
     def moved(self, state: State, positions: np.ndarray) -> State:
-        """A state with the mechanisms at positions, which do what they really do.
+        """Return a state with the mechanisms at positions, with their true response.
 
         Parameters
         ----------
         state : State
-            Without them.
-        positions : np.ndarray
-            (n,) of the correctors, rad or m.
+            State without the mechanisms.
+        positions : (n,) ndarray
+            Commanded positions of the correctors, in rad or m.
         """
         bodies = {body.path: body for body in self.experiment.instrument.assembly.tree.bodies}
-        for one, position in zip(self.correctors, positions.tolist(), strict=True):
-            if one.motion is not None and position != 0.0:
-                state = compose(state, one.motion.state(one.spec.response * position), bodies)
+        for corrector, position in zip(self.correctors, positions.tolist(), strict=True):
+            if corrector.motion is not None and position != 0.0:
+                state = compose(state, corrector.motion.state(corrector.spec.response * position), bodies)
         return state
 
     def on_ground(self, camera: str, positions: np.ndarray) -> np.ndarray:
-        """(4,) change of a camera that the processing takes for true: what its corrections undo."""
+        """Return the (4,) change of a camera that the processing on the ground corrects."""
         change = np.zeros(4)
-        for one, position in zip(self.correctors, positions.tolist(), strict=True):
-            if one.motion is None and one.spec.camera == camera:
-                change[PARAMETERS.index(one.spec.quantity)] -= position
+        for corrector, position in zip(self.correctors, positions.tolist(), strict=True):
+            if corrector.motion is None and corrector.spec.camera == camera:
+                change[PARAMETERS.index(corrector.spec.quantity)] -= position
         return change
 
     @cached_property
     def effects(self) -> np.ndarray:
-        """(P, n) on the quantities."""
-        return np.stack([one.effect for one in self.correctors], axis=1)
+        """Effects (P, n) of the corrections on the quantities."""
+        return np.stack([corrector.effect for corrector in self.correctors], axis=1)
 
     @cached_property
     def spots(self) -> np.ndarray:
-        """(D, n) on the spots, px."""
-        return np.stack([one.spots for one in self.correctors], axis=1)
+        """Effects (D, n) of the corrections on the spots, in px."""
+        return np.stack([corrector.spots for corrector in self.correctors], axis=1)
 
     @cached_property
     def coupling(self) -> np.ndarray:
-        """(n, n) what each mechanism, a column, does to the quantity of a row over what the row's own does."""
-        rows = [one.row for one in self.correctors]
-        return np.asarray(self.effects[rows] / np.array([one.own for one in self.correctors])[:, None])
+        """Effect (n, n) of each mechanism (column) on each correction's quantity (row), over that correction's own."""
+        rows = [corrector.row for corrector in self.correctors]
+        return np.asarray(
+            self.effects[rows] / np.array([corrector.sensitivity for corrector in self.correctors])[:, None]
+        )
 
     @cached_property
-    def seen(self) -> np.ndarray:
-        """(n,) which share of what a mechanism does beyond what is known of it one reading of the spots tells."""
-        gain = self.stated.best_gain(_READ**2 * np.eye(len(self.spots)))
-        told = gain @ self.spots
-        return np.array([told[one.row, k] / one.own for k, one in enumerate(self.correctors)])
+    def observed_share(self) -> np.ndarray:
+        """Share (n,) of a mechanism's unmodelled response that one reading of the spots reveals."""
+        gain = self.prior.best_gain(_READ**2 * np.eye(len(self.spots)))
+        estimate = gain @ self.spots
+        return np.array(
+            [estimate[corrector.row, k] / corrector.sensitivity for k, corrector in enumerate(self.correctors)]
+        )
 
 
 def _row(cameras: Sequence[str], camera: str, quantity: str) -> int:
@@ -185,18 +192,18 @@ def _row(cameras: Sequence[str], camera: str, quantity: str) -> int:
 
 
 def loop_model(setup: MonitorSetup, experiment: MonitorExperiment) -> LoopModel:
-    """Trace what moves and what the mechanisms do.
+    """Trace the effects of the prior's motions and of the mechanisms.
 
     Raises
     ------
     InputError
-        a mechanism that the instrument does not have, or that does nothing to its quantity; a node that does not exist
-        or does not move so.
+        The instrument does not have a mechanism, a mechanism has no effect on its quantity, or a node does not exist or
+        does not allow the motion.
     AimError, BeamMissedError
         Light is lost.
     """
-    stated, motions = experiment.disturbances, experiment.stated
-    assert stated is not None  # the set-up states them
+    prior, motions = experiment.disturbances, experiment.stated
+    assert prior is not None  # the set-up states them
     assert motions is not None
     test, cameras, corrections = setup.test, tuple(experiment.instrument.cameras), setup.test.loop.corrections
     named = {name: _mechanism(setup, experiment, name, corrections[name]) for name in sorted(corrections)}
@@ -207,13 +214,13 @@ def loop_model(setup: MonitorSetup, experiment: MonitorExperiment) -> LoopModel:
     foci = defocus(image_quality(experiment.instrument, experiment.backend, states, FOCUS_FIELDS, obstruction=False))
     moved = (foci[:, 1:] - foci[:, :1]) / sizes
     per_sigma = moved[:, : len(singles)] * motions.sigma
-    spots = spot_jacobian(experiment.path, bodies).reshape(stated.spots.shape[0], -1) if bodies else None
+    spots = spot_jacobian(experiment.path, bodies).reshape(prior.spots.shape[0], -1) if bodies else None
     traced = truth_jacobian(experiment.instrument, experiment.backend, bodies) if bodies else {}
     correctors, k = [], 0
     for name, motion in named.items():
         spec = corrections[name]
         row = _row(cameras, spec.camera, spec.quantity)
-        effect, shift = np.zeros(5 * len(cameras)), np.zeros(stated.spots.shape[0])
+        effect, shift = np.zeros(5 * len(cameras)), np.zeros(prior.spots.shape[0])
         if motion is None:
             effect[row] = 1.0
         else:
@@ -222,23 +229,29 @@ def loop_model(setup: MonitorSetup, experiment: MonitorExperiment) -> LoopModel:
             shift = spots[:, k]
             k += 1
             if abs(effect[row]) < _SMALL:
-                problem = f"{spec.mechanism} does nothing to {spec.quantity} of {spec.camera}"
-                allowed = "a motion that corrects it"
+                problem = f"{spec.mechanism} has no effect on {spec.quantity} of {spec.camera}"
+                allowed = "a motion that changes it"
                 raise test.error(problem, ("mechanisms", "corrections", name, "mechanism"), allowed=allowed)
         correctors.append(Corrector(name, spec, motion, row, effect, shift))
-    whole = replace(stated, parameters=np.concatenate([stated.parameters, per_sigma]))
+    whole = replace(prior, parameters=np.concatenate([prior.parameters, per_sigma]))
     return LoopModel(experiment, whole, tuple(correctors))
 
 
 def defocus(quality: ImageQuality) -> np.ndarray:
-    """(K, S) best focus less line CCD of every camera and state, metres; NaN where it is not known."""
-    return np.stack([one.defocus.mean(axis=1) for one in quality.cameras.values()])
+    """Return (K, S) best focus less line CCD of every camera and state, in metres; NaN where it is not known."""
+    return np.stack([camera.defocus.mean(axis=1) for camera in quality.cameras.values()])
 
 
 def _mechanism(
     setup: MonitorSetup, experiment: MonitorExperiment, name: str, spec: CorrectionSpec
 ) -> ElementaryMotion | None:
-    """InputError unless the body exists, moves so and has the pivot."""
+    """Return the motion of a correction's mechanism.
+
+    Raises
+    ------
+    InputError
+        The body does not exist, does not allow the motion, or does not have the pivot.
+    """
     if spec.mechanism is None:
         return None
     test, key = setup.test, ("mechanisms", "corrections", name, "mechanism")
@@ -258,30 +271,30 @@ def _mechanism(
 
 @dataclass(frozen=True, eq=False)
 class LoopCourse:
-    """One way through the moments: with the loop closed or open.
+    """Course over T moments with the loop closed or open.
 
     Attributes
     ----------
     model : LoopModel
-        Of the loop.
-    times : np.ndarray
-        (T,) seconds from the orbit's epoch.
-    positions : np.ndarray
-        (T, n) where the mechanisms are told to stand when images are taken, rad or m.
-    held : np.ndarray
-        (T, n) whether a command was held by the end of a range.
-    expected : np.ndarray
-        (T, P) what the posterior says of the quantities when images are taken.
-    covariance : np.ndarray
-        (T, P, P) of its error.
-    chi_square : np.ndarray
-        (T,) of the readings against what was expected of them before they came.
-    jumps : tuple[Jump, ...]
-        That the filter told.
-    states : tuple[State, ...]
-        Of the moments, when images are taken.
-    evidence : SpotEvidence | None
-        What the fits of the spots say of their sigmas; None where nobody judged them.
+        Model of the loop.
+    times : (T,) ndarray
+        Seconds from the orbit's epoch.
+    positions : (T, n) ndarray
+        Commanded positions of the mechanisms when images are taken, in rad or m.
+    held : (T, n) ndarray of bool
+        True where a command was limited by the end of a range.
+    expected : (T, P) ndarray
+        Posterior mean of the quantities when images are taken.
+    covariance : (T, P, P) ndarray
+        Posterior covariance of the quantities.
+    chi_square : (T,) ndarray
+        Chi-square of each reading against its prediction.
+    jumps : tuple of Jump
+        Jumps that the filter detected.
+    states : tuple of State
+        True states when images are taken.
+    evidence : SpotEvidence or None
+        Test of the spots' sigmas by their fits; None where they were not tested.
     """
 
     model: LoopModel
@@ -297,71 +310,70 @@ class LoopCourse:
 
     @property
     def sigma(self) -> np.ndarray:
-        """(T, P) standard deviations of ``expected``."""
+        """Standard deviations (T, P) of ``expected``."""
         return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
 
     @property
     def degrees(self) -> int:
         """Degrees of freedom of all chi-squares together."""
-        return int(len(self.times) * self.model.stated.spots.shape[0])
+        return int(len(self.times) * self.model.prior.spots.shape[0])
 
     @property
     def limit(self) -> float:
-        """Limit of the sum of all chi-squares, exceeded with a chance of `FALSE_ALARM` where all is as stated."""
+        """Limit of the sum of all chi-squares, exceeded with a probability of `FALSE_ALARM` if the prior is right."""
         return float(limit_of(FALSE_ALARM, self.degrees))
 
     @property
     def agrees(self) -> bool:
-        """Return whether the readings, together and one by one, agree with what is stated."""
+        """True if the readings, together and one by one, agree with the prior."""
         return float(self.chi_square.sum()) <= self.limit and self.contradiction is None
 
     @property
     def contradiction(self) -> int | None:
-        """The first reading that what is stated does not explain, at `FALSE_ALARM` over all readings; None for none."""
-        chance = chance_beyond(self.chi_square, self.model.stated.spots.shape[0])
-        beyond = np.flatnonzero(chance < FALSE_ALARM / len(self.times))
+        """Index of the first reading that contradicts the prior, at `FALSE_ALARM` over all readings; None for none."""
+        p_value = chance_beyond(self.chi_square, self.model.prior.spots.shape[0])
+        beyond = np.flatnonzero(p_value < FALSE_ALARM / len(self.times))
         return int(beyond[0]) if len(beyond) else None
 
 
 def drifting_states(spec: OrbitMonitorSpec, experiment: MonitorExperiment, seed: int) -> Sequence[State]:
-    """States of the moments without any mechanism: by the file's course, or by amounts that are drawn by their laws;
-    with the motions of the file.
+    """Return the states of the moments without any mechanism, with the motions of the file.
+
+    They follow the file's course, or motions drawn by their laws in time.
 
     Raises
     ------
     InputError
-        a node that does not exist or does not move so.
+        A node does not exist or does not allow the motion.
     """
     spec.check_nodes(experiment.instrument.nodes)
     if spec.course is not None:
         return states_of(experiment, spec)
-    stated, times = experiment.stated, np.array(spec.times)
-    assert stated is not None
-    amounts = drawn_motions(
-        stated, times - times[0], lambda number: np.random.default_rng(stream(seed, _DRAWN, number))
-    )
+    prior, times = experiment.stated, np.array(spec.times)
+    assert prior is not None
+    amounts = drawn_motions(prior, times - times[0], lambda number: np.random.default_rng(stream(seed, _DRAWN, number)))
     bodies = {body.path: body for body in experiment.instrument.assembly.tree.bodies}
-    drawn = amounts_as_states(amounts, stated.components, experiment.thermal)
-    return [compose(s, moves_at(spec, time), bodies) for time, s in zip(spec.times, drawn, strict=True)]
+    drawn = amounts_as_states(amounts, prior.components, experiment.thermal)
+    return [compose(s, motions_at(spec, time), bodies) for time, s in zip(spec.times, drawn, strict=True)]
 
 
 Read: TypeAlias = Callable[[State, int], Recovery]
-"""From a state and the number of its moment to what is read of it: shifts since images of the nominal instrument."""
+"""Function of a state and the index of its moment that returns the recovered shifts since the nominal images."""
 
 
 def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:
-    """Function of a state and the number of its moment -> what is read of it: rendered and recovered.
+    """Return the function that renders a state at a moment and recovers its spots.
 
-    It raises BenchError where light is lost or a spot cannot be measured.
+    The function raises BenchError where light is lost or a spot cannot be measured.
 
     Parameters
     ----------
     model : LoopModel
-        Of the loop.
+        Model of the loop.
     spec : OrbitMonitorSpec
-        The test.
+        Content of the test file.
     seed : int
-        Of the detectors.
+        Seed of the detectors.
     """
     experiment, errors = model.experiment, spec.errors
     frames = spec.frames or experiment.instrument.spec.autocollimator.frames
@@ -379,11 +391,11 @@ def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:
             return first, experiment.expected_frames(photons)
         return first, mean_frames(experiment.frames_after(photons, frames, seed, numbers))
 
-    how = Observing(record, centroid, stated=False, frames=frames)
+    observing = Observing(record, centroid, stated=False, frames=frames)
 
     def read(state: State, number: int) -> Recovery:
         try:
-            return next(iter(observe(experiment, [state], how, [number]))).recovery
+            return next(iter(observe(experiment, [state], observing, [number]))).recovery
         except (*LOST, SpotError) as error:
             text = f"the spots cannot be read at {moment(spec.times[number])}: {error}"
             raise BenchError(text, spec.times_key, f"{TOO_FAR}; a smaller range of the mechanisms") from error
@@ -391,7 +403,7 @@ def reader(model: LoopModel, spec: OrbitMonitorSpec, seed: int) -> Read:
     return read
 
 
-def gone_through(
+def simulate_course(
     model: LoopModel,
     spec: OrbitMonitorSpec,
     states: Sequence[State],
@@ -399,45 +411,45 @@ def gone_through(
     open_loop: bool,
     advance: Callable[[int], None] = lambda done: None,
 ) -> LoopCourse:
-    """Go through the moments.
+    """Simulate the loop over all moments.
 
     Parameters
     ----------
     model : LoopModel
-        Of the loop.
+        Model of the loop.
     spec : OrbitMonitorSpec
-        The test.
-    states : Sequence[State]
-        Of its T moments without mechanisms.
+        Content of the test file.
+    states : sequence of State
+        States of the T moments without mechanisms.
     read : Read
-        As of `reader`.
+        Function that reads the spots, from `reader`.
     open_loop : bool
-        Leave all mechanisms where they are.
+        True to leave all mechanisms at rest.
     advance : Callable[[int], None]
-        Told of the number of moments that are done.
+        Callback with the number of moments done.
     """
     commands = Commands.none(model, open_loop)
     rows: list[tuple[np.ndarray, ...]] = []
-    chi_square, jumps, out = [], [], []
+    chi_square, jumps, moved_states = [], [], []
     evidence: tuple[SpotEvidence, ...] = ()
     for k, state in enumerate(states):
-        standing = commands.standing
-        spots = read(model.moved(state, standing), k)
+        positions_now = commands.positions_now
+        spots = read(model.moved(state, positions_now), k)
         evidence += () if spots.evidence is None else (spots.evidence,)
         before, after = (np.diag(sigma[0].ravel() ** 2) for sigma in (spots.sigma_before, spots.sigma_after))
-        reading = Observed(spec.times[k] - spec.times[0], spots.shift[0] - model.spots @ standing, after)
+        reading = Observed(spec.times[k] - spec.times[0], spots.shift[0] - model.spots @ positions_now, after)
         if not k:
-            how = SeriesFilter(model.stated, before)
-            belief = how.start(reading.time)
-        belief, innovation = how.update(belief, reading)
+            series_filter = SeriesFilter(model.prior, before)
+            filter_state = series_filter.start(reading.time)
+        filter_state, innovation = series_filter.update(filter_state, reading)
         chi_square.append(innovation.chi_square)
         if innovation.jump is not None:
             jumps.append(innovation.jump)
-        mean, covariance = how.parameters(how.blended(belief), reading.time)
-        commands = commands.given(mean)
-        position = commands.standing
+        mean, covariance = series_filter.parameters(series_filter.mixture(filter_state), reading.time)
+        commands = commands.after_reading(mean)
+        position = commands.positions_now
         rows.append((position, commands.held, mean + model.effects @ position, covariance))
-        out.append(model.moved(state, position))
+        moved_states.append(model.moved(state, position))
         advance(k + 1)
     positions, held, expected, spread = (np.array(column) for column in zip(*rows, strict=True))
     times = np.array(spec.times)
@@ -450,64 +462,64 @@ def gone_through(
         spread,
         np.array(chi_square),
         tuple(jumps),
-        tuple(out),
+        tuple(moved_states),
         SpotEvidence.joined(evidence) if evidence else None,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """Commands to n mechanisms.
+    """Commands to n mechanisms up to a moment.
 
     Attributes
     ----------
     model : LoopModel
-        Of the loop.
+        Model of the loop.
     idle : bool
-        Whether none is given.
-    given_before : tuple[np.ndarray, ...]
-        (n,) rad or m, the newest first; empty before any reading.
-    held : np.ndarray
-        (n,) whether the newest was held by the end of a range.
+        True if no commands are sent.
+    history : tuple of (n,) ndarray
+        Commands in rad or m, the newest first; empty before any reading.
+    held : (n,) ndarray of bool
+        True where the newest command was limited by the end of a range.
     """
 
     model: LoopModel
     idle: bool
-    given_before: tuple[np.ndarray, ...]
+    history: tuple[np.ndarray, ...]
     held: np.ndarray
 
     @classmethod
     def none(cls, model: LoopModel, idle: bool) -> Commands:
-        """Before any reading."""
+        """Return the commands before any reading."""
         return cls(model, idle, (), np.zeros(len(model.correctors), bool))
 
     @property
-    def standing(self) -> np.ndarray:
-        """(n,) where the mechanisms are told to stand now."""
-        out = np.zeros(len(self.model.correctors))
-        for k, one in enumerate(self.model.correctors):
-            if one.spec.delay < len(self.given_before):
-                command, step = float(self.given_before[one.spec.delay][k]), one.spec.smallest
-                out[k] = command if step is None else step * round(command / step)
-        return out
+    def positions_now(self) -> np.ndarray:
+        """Positions (n,) of the mechanisms now, by the commands, their delay and their steps."""
+        positions = np.zeros(len(self.model.correctors))
+        for k, corrector in enumerate(self.model.correctors):
+            if corrector.spec.delay < len(self.history):
+                command, step = float(self.history[corrector.spec.delay][k]), corrector.spec.smallest
+                positions[k] = command if step is None else step * round(command / step)
+        return positions
 
-    def given(self, mean: np.ndarray) -> Commands:
-        """Commands after a reading.
+    def after_reading(self, mean: np.ndarray) -> Commands:
+        """Return the commands after a reading.
 
         Parameters
         ----------
-        mean : np.ndarray
-            (P,) what the posterior says would be there without mechanisms.
+        mean : (P,) ndarray
+            Posterior mean of the quantities without mechanisms.
         """
-        left = mean + self.model.effects @ self.standing
+        remaining = mean + self.model.effects @ self.positions_now
         count = len(self.model.correctors)
-        now = self.given_before[0].copy() if self.given_before else np.zeros(count)
+        now = self.history[0].copy() if self.history else np.zeros(count)
         held = np.zeros(count, bool)
-        for k, one in enumerate(self.model.correctors):
-            own = float(left[one.row])
-            if self.idle or one.spec.gain == 0.0 or abs(own) <= one.spec.band:
+        for k, corrector in enumerate(self.model.correctors):
+            error = float(remaining[corrector.row])
+            if self.idle or corrector.spec.gain == 0.0 or abs(error) <= corrector.spec.band:
                 continue
-            now[k] -= one.spec.gain * own / one.own
-            if one.spec.largest is not None and abs(now[k]) > one.spec.largest:
-                now[k], held[k] = np.sign(now[k]) * one.spec.largest, True
-        return Commands(self.model, self.idle, (now, *self.given_before), held)
+            now[k] -= corrector.spec.gain * error / corrector.sensitivity
+            if corrector.spec.largest is not None and abs(now[k]) > corrector.spec.largest:
+                now[k], held[k] = np.sign(now[k]) * corrector.spec.largest, True
+        return Commands(self.model, self.idle, (now, *self.history), held)

@@ -1,4 +1,4 @@
-"""Readings of the monitor of a stereo pair over a course, counted from its reference images."""
+"""Readings of the monitor of a stereo pair over a course, relative to its reference images."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from twin.framework.procedure import BenchError
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, Record, light_of, read
 from twin.monitor.truth import Truth
-from twin.orbit.monitoring.pair_flight import TOO_FAR, moves_at
+from twin.orbit.monitoring.pair_flight import TOO_FAR, motions_at
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.monitor import OrbitMonitorSpec
 
 CHUNK = 25
-"""States rendered at once, to bound memory."""
+"""Number of states rendered at once, which bounds the memory."""
 
 
 def states_of(
@@ -43,27 +43,27 @@ def states_of(
     numbers: Sequence[int] | None = None,
     only: tuple[str, str] | None = None,
 ) -> list[State]:
-    """States at times of the course.
+    """Return the states of the instrument at times of the course.
 
     Parameters
     ----------
     experiment : MonitorExperiment
-        The instrument.
+        Instrument with its monitor.
     spec : OrbitMonitorSpec
-        The test.
-    numbers : Sequence[int] | None
-        Of the times, all by default.
-    only : tuple[str, str] | None
-        "temperature" or "motion", and the node of the course that alone has one; the others of the course have
-        temperatures of 0 K, so that nothing is inherited. What `perturb` says stays.
+        Content of the test file.
+    numbers : sequence of int, optional
+        Indices of the times; all by default.
+    only : tuple of str, optional
+        "temperature" or "motion", and the node of the course to which it is limited. The other nodes of the course then
+        have temperatures of 0 K, so that nothing is inherited; the key `perturb` still applies.
 
     Raises
     ------
     InputError
-        a temperature at or below 0 K at some time, or one at which a glass's index is not known.
+        A temperature is at or below 0 K at some time, or outside the range in which a glass's index is known.
     """
     job, bodies = spec.job, {body.path: body for body in experiment.instrument.assembly.tree.bodies}
-    course, out = spec.course, []
+    course, states = spec.course, []
     assert course is not None
     for k in range(len(course.times)) if numbers is None else numbers:
         time, fields = course.times[k], job.fields(k)
@@ -73,28 +73,28 @@ def states_of(
             experiment.thermal.check(fields)
             state = experiment.thermal.state(fields, motions_of(job))
         except TemperatureError as error:
-            own = error.origin in course.temperature
-            key = ("course", *course.key(error.origin, k)) if own else ("perturb", error.origin, "temperature")
+            of_course = error.origin in course.temperature
+            key = ("course", *course.key(error.origin, k)) if of_course else ("perturb", error.origin, "temperature")
             raise spec.error(f"{error} at {moment(time)}", key, allowed=error.allowed) from error
-        moves = {} if only is not None and only[0] == "temperature" else moves_at(spec, time, only and only[1])
-        out.append(compose(state, moves, bodies))
-    return out
+        moves = {} if only is not None and only[0] == "temperature" else motions_at(spec, time, only and only[1])
+        states.append(compose(state, moves, bodies))
+    return states
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Changes of two cameras since the reference at T times.
+    """Estimated changes of two cameras since the reference at T times.
 
     Attributes
     ----------
-    cameras : tuple[str, str]
-        Names of the two.
-    values : np.ndarray
-        (T, 8) d_alpha, d_beta, d_gamma (rad), d_f (m) of the first, then of the second.
-    noise : np.ndarray
-        (T, 8, 8) covariance of their errors by the noise of the images.
-    total : np.ndarray | None
-        Likewise of the whole error; None where nothing is stated to move.
+    cameras : tuple of str
+        Names of the two cameras.
+    values : (T, 8) ndarray
+        d_alpha, d_beta, d_gamma (rad) and d_f (m) of the first camera, then of the second.
+    noise : (T, 8, 8) ndarray
+        Covariance of their errors from the noise of the images.
+    total : (T, 8, 8) ndarray or None
+        Covariance of the whole error; None without a prior of disturbances.
     """
 
     cameras: tuple[str, str]
@@ -107,29 +107,29 @@ class Readings:
         return slice(at, at + 4)
 
     def __getitem__(self, camera: str) -> CameraParameters:
-        """One camera's."""
+        """Return the changes of one camera."""
         part = self._part(camera)
         total = None if self.total is None else self.total[:, part, part]
         return CameraParameters.from_vector(self.values[:, part], self.noise[:, part, part], total)
 
     @property
     def across(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """(T, 4, 4) covariances of the first camera's with the second's errors: by noise, and of the whole error."""
+        """Covariances (T, 4, 4) between the errors of the two cameras: from noise, and of the whole error."""
         return self.noise[:, :4, 4:], None if self.total is None else self.total[:, :4, 4:]
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedReadings:
-    """All measurements at one interval together.
+    """Changes of the cameras smoothed from all measurements at one interval.
 
     Attributes
     ----------
     readings : Readings
-        At all times of the course.
+        Smoothed changes at all times of the course.
     consistency : Consistency
-        Chi-square of the measurements.
-    jumps : tuple[Jump, ...] | None
-        That were found; None where nothing is stated to jump.
+        Chi-square test of the measurements.
+    jumps : tuple of Jump or None
+        Detected jumps; None where the prior has no jumps.
     """
 
     readings: Readings
@@ -139,20 +139,20 @@ class SmoothedReadings:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Shifts of all spots since the reference images, of S states.
+    """Shifts of all C spots since the reference images, for S states.
 
     Attributes
     ----------
-    positions : np.ndarray
-        (2, S, C, 2) before and after, px.
-    covariance : np.ndarray
-        (S, 2 C, 2 C) px^2 of each state's shifts.
-    noise : SeriesNoise | None
-        Of the shifts of all states together; None where they are not of one series.
+    positions : (2, S, C, 2) ndarray
+        Positions before and after, in px.
+    covariance : (S, 2 C, 2 C) ndarray
+        Covariance of each state's shifts, in px^2.
+    noise : SeriesNoise or None
+        Joint noise of the shifts of all states; None where the states are not a series.
     evidence : SpotEvidence
-        What the fits of the spots say of their sigmas.
-    truth : tuple[Truth, ...]
-        Of the states.
+        Test of the spots' sigmas by their fits.
+    truth : tuple of Truth
+        Truth of the states.
     """
 
     positions: np.ndarray
@@ -162,34 +162,34 @@ class Measured:
     truth: tuple[Truth, ...]
 
     @classmethod
-    def of(cls, found: Sequence[Recovery], noise: SeriesNoise | None, truth: Sequence[Truth]) -> Measured:
-        """From what was recovered piece by piece."""
-        positions = [np.stack([one.before, one.after]) for one in found]
-        evidence = SpotEvidence.joined([one.evidence for one in found if one.evidence is not None])
-        spread = np.concatenate([one.shift_covariance for one in found])
+    def of(cls, recoveries: Sequence[Recovery], noise: SeriesNoise | None, truth: Sequence[Truth]) -> Measured:
+        """Join the recoveries of successive groups of states."""
+        positions = [np.stack([recovery.before, recovery.after]) for recovery in recoveries]
+        evidence = SpotEvidence.joined([recovery.evidence for recovery in recoveries if recovery.evidence is not None])
+        spread = np.concatenate([recovery.shift_covariance for recovery in recoveries])
         return cls(np.concatenate(positions, axis=1), spread, noise, evidence, tuple(truth))
 
     def doubts(self, times: Sequence[float], spots: Sequence[str]) -> tuple[str, ...]:
-        """A warning where sigma does not hold: at the worst of the states.
+        """Return a warning if the spots' sigmas do not hold, for the worst of the states.
 
         Parameters
         ----------
-        times : Sequence[float]
-            Of the states, seconds.
-        spots : Sequence[str]
-            Their names.
+        times : sequence of float
+            Times of the states, in seconds.
+        spots : sequence of str
+            Names of the spots.
         """
         doubt = self.evidence.course_doubt([moment(time) for time in times], spots)
         return () if doubt is None else (doubt,)
 
     @property
     def shifts(self) -> np.ndarray:
-        """(S, 2 C) px."""
+        """Shifts (S, 2 C), in px."""
         return (self.positions[1] - self.positions[0]).reshape(len(self.covariance), -1)
 
 
 @dataclass(frozen=True, eq=False)
-class _Some:
+class _NoiseSubset:
     """Noise of some measurements of a series."""
 
     noise: SeriesNoise
@@ -200,19 +200,21 @@ class _Some:
 
 
 class MonitorSeries:
-    """A monitor with its reference images. Where disturbances are stated each state is read by `posterior`, with what
-    they are expected to change since the reference; else by `model`.
+    """A monitor with its reference images.
+
+    With a prior of disturbances each state is estimated by `posterior`, with the changes expected since the reference;
+    otherwise by `model`.
 
     Parameters
     ----------
-    experiment
-        The instrument with its calibration on the ground.
-    spec
-        The test.
-    reference
+    experiment : MonitorExperiment
+        Instrument with its calibration on the ground.
+    spec : OrbitMonitorSpec
+        Content of the test file.
+    reference : State
         State at the reference time.
-    pair
-        The two cameras.
+    pair : tuple of str
+        Names of the two cameras.
     """
 
     def __init__(
@@ -227,16 +229,16 @@ class MonitorSeries:
 
     @property
     def estimator(self) -> str:
-        """Name of the estimator that reads each state."""
+        """Name of the estimator that is used for each state."""
         return "model" if self.experiment.disturbances is None else "posterior"
 
     def measured(self, states: Sequence[State], seed: int) -> tuple[Measured, Measured]:
-        """From exposed frames, and from expected images without noise.
+        """Measure the states from exposed frames, and from expected images without noise.
 
         Raises
         ------
         BenchError
-            a spot cannot be measured.
+            A spot cannot be measured.
         AimError, BeamMissedError
             Light is lost.
         """
@@ -250,23 +252,32 @@ class MonitorSeries:
         return Measured.of(*exposed), Measured.of(*expected)
 
     def clean(self, states: Sequence[State]) -> Measured:
-        """From expected images without noise. Raises as `measured`."""
+        """Measure the states from expected images without noise; raises as `measured`."""
         return Measured.of(*self._observed(states, (self._expected,))[0])
 
-    def of_prisms(self) -> np.ndarray:
-        """(T, 2 C) shifts without noise by temperatures that the file gives to the monitor's prisms themselves."""
+    def prism_shifts(self) -> np.ndarray:
+        """Return the (T, 2 C) shifts, without noise, by temperatures that the file gives to the monitor's prisms."""
         job = self.spec.job
         states = []
         for k in range(len(self.spec.times)):
-            own = {p: f for p, f in job.fields(k).items() if "/monitor/" in p or p.startswith(CENTRAL_PRISM)}
-            states.append(self.experiment.thermal.state(own, {}))
+            of_prisms = {p: f for p, f in job.fields(k).items() if "/monitor/" in p or p.startswith(CENTRAL_PRISM)}
+            states.append(self.experiment.thermal.state(of_prisms, {}))
         shifts = self.clean(states).shifts
         return np.asarray(shifts - shifts[self.spec.referred])
 
     def repeated(self, state: State, count: int, seed: int, number: int) -> Measured:
-        """Measure the reference and one state ``count`` times, each time with another pattern of the detectors.
+        """Measure the reference and one state ``count`` times, each time with another fixed pattern of the detectors.
 
-        ``number`` is that of the state's time.
+        Parameters
+        ----------
+        state : State
+            State to measure.
+        count : int
+            Number of measurements.
+        seed : int
+            Seed of the detectors.
+        number : int
+            Index of the state's time.
         """
 
         def record(k: int) -> Record:
@@ -275,90 +286,95 @@ class MonitorSeries:
                 self._exposed(photons, seed + k, 0),
             )
 
-        every = self._observed([state], [record(k) for k in range(count)], [number])
-        return Measured.of([one for found, _, _ in every for one in found], None, every[0][2])
+        repeats = self._observed([state], [record(k) for k in range(count)], [number])
+        return Measured.of([recovery for recoveries, _, _ in repeats for recovery in recoveries], None, repeats[0][2])
 
     def gains(self, measured: Measured, numbers: Sequence[int]) -> np.ndarray:
-        """(S, 8, 2 C) of the estimator, parameters of the pair per pixel.
+        """Return the (S, 8, 2 C) gains of the estimator: parameters of the pair per pixel of shift.
 
         Parameters
         ----------
         measured : Measured
-            S states.
-        numbers : Sequence[int]
-            Of their times.
+            Shifts of S states.
+        numbers : sequence of int
+            Indices of their times.
         """
-        stated, spec = self.experiment.disturbances, self.spec
+        prior, spec = self.experiment.disturbances, self.spec
         cameras, (before, after) = self.experiment.cameras, measured.positions
-        if stated is None:
-            every = LeastSquares().gain(Shifts(before, after, measured.covariance, cameras))
-            return np.asarray(every[:, self._own])
-        out = []
+        if prior is None:
+            all_gains = LeastSquares().gain(Shifts(before, after, measured.covariance, cameras))
+            return np.asarray(all_gains[:, self._own])
+        gains = []
         for k, number in enumerate(numbers):
-            one, span = slice(k, k + 1), stated.between(spec.reference_time, spec.times[number])
-            shifts = Shifts(before[one], after[one], measured.covariance[one], cameras, span)
-            out.append(Posterior().gain(shifts)[0, self._own])
-        return np.array(out)
+            single, span = slice(k, k + 1), prior.between(spec.reference_time, spec.times[number])
+            shifts = Shifts(before[single], after[single], measured.covariance[single], cameras, span)
+            gains.append(Posterior().gain(shifts)[0, self._own])
+        return np.array(gains)
 
     def readings(self, measured: Measured, numbers: Sequence[int]) -> Readings:
-        """Return what the shifts of each state say alone.
+        """Return the changes estimated from the shifts of each state alone.
 
         Parameters
         ----------
         measured : Measured
-            S states.
-        numbers : Sequence[int]
-            Of their times.
+            Shifts of S states.
+        numbers : sequence of int
+            Indices of their times.
         """
         gains = self.gains(measured, numbers)
         noise = gains @ measured.covariance @ np.swapaxes(gains, 1, 2)
         values = np.einsum("spd,sd->sp", gains, measured.shifts)
-        stated, total = self.experiment.disturbances, None
-        if stated is not None:
-            left = []
+        prior, total = self.experiment.disturbances, None
+        if prior is not None:
+            misfits = []
             for gain, number in zip(gains, numbers, strict=True):
-                span = stated.between(self.spec.reference_time, self.spec.times[number])
+                span = prior.between(self.spec.reference_time, self.spec.times[number])
                 root = (gain @ span.spots - span.parameters[self._own]) @ span.root
-                left.append(root @ root.T)
-            total = noise + np.array(left)
+                misfits.append(root @ root.T)
+            total = noise + np.array(misfits)
         return Readings(self.pair, values, noise, total)
 
     def smoothed(self, measured: Measured, interval: float) -> SmoothedReadings:
-        """From the measurements at one interval, at all times.
+        """Return the changes at all times, smoothed from the measurements at one interval.
 
         Parameters
         ----------
         measured : Measured
-            All times of the course.
+            Shifts at all times of the course.
         interval : float
-            seconds.
+            Interval between measurements, in seconds.
         """
-        stated, noise = self.experiment.disturbances, measured.noise
-        if stated is None or noise is None:
+        prior, noise = self.experiment.disturbances, measured.noise
+        if prior is None or noise is None:
             raise ValueError("smoother: needs stated disturbances and a series")
         at = np.array(self.spec.measured(interval))
         times = np.array(self.spec.times)
         with one_blas_thread():
-            found = smooth_series(
-                stated, times[at], measured.shifts[at], _Some(noise, at), times, reference=self.spec.reference_time
+            series = smooth_series(
+                prior,
+                times[at],
+                measured.shifts[at],
+                _NoiseSubset(noise, at),
+                times,
+                reference=self.spec.reference_time,
             )
-        own, late = self._own, found.smoothed
-        block = np.ix_(np.arange(len(times)), own, own)
+        rows, smoothed = self._own, series.smoothed
+        block = np.ix_(np.arange(len(times)), rows, rows)
         return SmoothedReadings(
-            Readings(self.pair, late.values[:, own], late.noise[block], late.total[block]),
-            found.consistency,
-            found.jumps,
+            Readings(self.pair, smoothed.values[:, rows], smoothed.noise[block], smoothed.total[block]),
+            series.consistency,
+            series.jumps,
         )
 
-    def by_camera(self, gains: np.ndarray, shifts: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Camera -> (S, 4) what an estimator makes of shifts.
+    def estimates_by_camera(self, gains: np.ndarray, shifts: np.ndarray) -> Mapping[str, np.ndarray]:
+        """Return the (S, 4) estimates of each camera from shifts.
 
         Parameters
         ----------
-        gains : np.ndarray
-            (S, 8, 2 C) or (8, 2 C).
-        shifts : np.ndarray
-            (S, 2 C).
+        gains : (S, 8, 2 C) or (8, 2 C) ndarray
+            Gains of the estimator.
+        shifts : (S, 2 C) ndarray
+            Shifts of the spots, in px.
         """
         values = np.einsum("...pd,...d->...p", gains, shifts)
         return {name: values[:, 4 * k : 4 * k + 4] for k, name in enumerate(self.pair)}
@@ -367,61 +383,67 @@ class MonitorSeries:
         return mean_frames(self.experiment.frames_after(photons, self.frames, seed, numbers))
 
     def _expected(self, photons: np.ndarray, numbers: np.ndarray) -> tuple[MeasuredSpots, np.ndarray]:
-        """A `Record` of expected images."""
+        """Return the reference spots and the expected images, as a `Record`."""
         return self._clean_reference, self.experiment.expected_frames(photons)
 
     def _reference_spots(self, images: np.ndarray) -> MeasuredSpots:
         """Measure the spots of mean frames (1, C, rows, columns) at the reference."""
         experiment, centroid = self.experiment, self.spec.analysis.centroid
-        with self._told([self.spec.referred]), one_blas_thread():
+        with self._reporting_spot_errors([self.spec.referred]), one_blas_thread():
             return judged_spots(images[0], self.frames, experiment.calibration, centroid, cores())
 
     def _observed(
         self, states: Sequence[State], records: Sequence[Record], numbers: Sequence[int] = (), series: bool = False
     ) -> list[tuple[list[Recovery], SeriesNoise | None, list[Truth]]]:
-        """Observe the same states by several ways to record images, piece by piece, as `Measured.of` takes it.
+        """Observe the same states with several ways of recording images, in groups, as `Measured.of` takes them.
 
         Parameters
         ----------
-        states : Sequence[State]
-            To be observed.
-        records : Sequence[Record]
-            Ways to record.
-        numbers : Sequence[int]
-            Of the states' times; those of the course if not given.
+        states : sequence of State
+            States to observe.
+        records : sequence of Record
+            Functions that record images.
+        numbers : sequence of int
+            Indices of the states' times; by default those of the course.
         series : bool
-            Whether the states are those of the course, whose noise is wanted together.
+            True if the states are those of the course and their joint noise is needed.
         """
         experiment, spots = self.experiment, self.experiment.calibration.spots
         series = series and experiment.disturbances is not None
         times = numbers or range(len(states))
         noise: list[SeriesNoise | None] = [None] * len(records)
-        found: list[list[Recovery]] = [[] for _ in records]
+        recoveries: list[list[Recovery]] = [[] for _ in records]
         truths = []
         for first in range(0, len(states), CHUNK):
             piece = slice(first, first + CHUNK)
-            some = states[piece]
-            photons = experiment.path.expected_photons(some, chunk=CHUNK)
-            light = light_of(experiment, some, np.arange(first, first + len(some)), photons=photons)
+            piece_states = states[piece]
+            photons = experiment.path.expected_photons(piece_states, chunk=CHUNK)
+            light = light_of(experiment, piece_states, np.arange(first, first + len(piece_states)), photons=photons)
             truths.append(light.truth)
             for k, record in enumerate(records):
-                how = Observing(
+                observing = Observing(
                     record, self.spec.analysis.centroid, stated=False, keep_parts=series, frames=self.frames
                 )
-                with self._told(times[piece]):
-                    one = read(experiment, light, how)
-                assert one is not None
-                if one.recovery.parts is not None:
-                    before, after = one.recovery.parts
+                with self._reporting_spot_errors(times[piece]):
+                    result = read(experiment, light, observing)
+                assert result is not None
+                if result.recovery.parts is not None:
+                    before, after = result.recovery.parts
                     together = noise[k] = noise[k] or SeriesNoise(before, window_of(2 * spots))
                     together.add(after)
                 # influence maps of all positions would be large
-                found[k].append(replace(one.recovery, parts=None))
-        return [(every, own, truths) for every, own in zip(found, noise, strict=True)]
+                recoveries[k].append(replace(result.recovery, parts=None))
+        return [(recovered, series_noise, truths) for recovered, series_noise in zip(recoveries, noise, strict=True)]
 
     @contextmanager
-    def _told(self, numbers: Sequence[int]) -> Iterator[None]:
-        """Spots that cannot be measured as an error of the file, with the number of each state's time."""
+    def _reporting_spot_errors(self, numbers: Sequence[int]) -> Iterator[None]:
+        """Convert errors of spots that cannot be measured to errors of the file, with the time of the state.
+
+        Parameters
+        ----------
+        numbers : sequence of int
+            Index of each state's time.
+        """
         try:
             yield
         except SpotError as error:

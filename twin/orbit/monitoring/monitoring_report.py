@@ -1,7 +1,7 @@
-"""Report of a monitored orbit, with the loop open or closed.
+"""Report of a monitored orbit, without or with a closed loop, and its figures.
 
-Figures of a monitored orbit: the angle, heights with and without monitoring, the interval, what is left; of a closed
-loop what is left over the orbit, where mechanisms stand, the open loop.
+Figures: the angle, heights with and without monitoring, the interval and the remaining errors; for a closed loop, the
+remaining errors over the orbit, the positions of the mechanisms and the open loop.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from analysis.arrays import ARCSEC
 from analysis.monitor import disturbances
 from analysis.monitor.control_loop import open_loop, rejection
-from analysis.monitor.model_fit import UnseenMode
+from analysis.monitor.model_fit import UnobservableMode
 from analysis.monitor.monitor_formulas import PER_SI
 from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
@@ -42,26 +42,26 @@ PARTS = {
     "beyond_parameters": ("beyond the four parameters", svg.SKY),
     "interpolation": ("interpolation over the interval", svg.GREEN),
 }
-"""Part of the height error -> how reports call it, and its colour."""
+"""Part of the height error -> its name in reports, and its colour."""
 _DRAWN_PART = 5e-3
-"""Metres; parts that are smaller at all times are not drawn."""
+"""Size below which a part of the height error is not drawn, in metres, if it is smaller at all times."""
 _COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.PURPLE, svg.ORANGE, svg.SKY)
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-"""Where a legend stands that would hide curves."""
+"""Position of a legend that would otherwise hide curves."""
 _BODIES, _MOTIONS = 3, 3
 """Bodies and motions of a mode that are named in words."""
 _LEAST = 1e-6
-"""Numbers of a mode below this are rounding."""
+"""Size below which numbers of a mode are rounding errors."""
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], run: Any) -> SvgFigure:
     return SvgFigure(name, title, caption, svg.drawn(f"monitor-{name}", draw, run))
 
 
-def _panels(height: float, rows: int, zero: bool = True, label: str = "time [min]", **how: Any) -> Any:
-    """A figure of panels below each other, with one axis of time, and with a line where there is no error."""
+def _panels(height: float, rows: int, zero: bool = True, label: str = "time [min]", **options: Any) -> Any:
+    """Return a figure of panels below each other with a common axis of time, and a line at zero error."""
     figure = svg.new_figure(height)
-    panels = list(np.ravel(figure.subplots(rows, 1, sharex=True, **how)))
+    panels = list(np.ravel(figure.subplots(rows, 1, sharex=True, **options)))
     panels[-1].set_xlabel(label)
     for axes in panels:
         svg.gridded(axes)
@@ -70,12 +70,12 @@ def _panels(height: float, rows: int, zero: bool = True, label: str = "time [min
     return figure, panels
 
 
-def _band(axes: Axes, minutes: np.ndarray, middle: Any, sigma: np.ndarray, colour: str, **how: Any) -> None:
-    axes.fill_between(minutes, middle - sigma, middle + sigma, color=colour, lw=0, **how)
+def _band(axes: Axes, minutes: np.ndarray, middle: Any, sigma: np.ndarray, colour: str, **options: Any) -> None:
+    axes.fill_between(minutes, middle - sigma, middle + sigma, color=colour, lw=0, **options)
 
 
 def _angle_figure(run: MonitorRun) -> Figure:
-    """Change of the intersection angle, true and monitored, and their difference."""
+    """Draw the change of the intersection angle, true and monitored, and their difference."""
     minutes = run.times / 60.0
     figure, (above, below) = _panels(4.4, 2, height_ratios=(2.2, 1.0))
     true, monitored = run.angle_change / ARCSEC, run.angle.change_rad / ARCSEC
@@ -91,7 +91,7 @@ def _angle_figure(run: MonitorRun) -> Figure:
 
 
 def _height_figure(run: MonitorRun) -> Figure:
-    """Mean height error of the cameras alone, and the points' RMS, over the orbit."""
+    """Draw the mean height error by the cameras alone and the points' RMS over the orbit."""
     minutes, cases = run.times / 60.0, run.cases
     figure, (above, below) = _panels(5.2, 2)
     for name, colour, style, label in (
@@ -111,10 +111,10 @@ def _height_figure(run: MonitorRun) -> Figure:
 
 
 def _smoothed_figure(run: MonitorRun) -> Figure:
-    """Mean height error of the cameras smoothed and interpolated, with the sigma that the smoother states."""
+    """Draw the mean height error by the cameras, smoothed and interpolated, with the smoother's sigma."""
     spec, minutes, chosen = run.spec, run.times / 60.0, run.smoothed
     figure, (axes,) = _panels(3.8, 1)
-    for many, alpha, label in ((2.0, 0.2, "2σ as the smoother states it"), (1.0, 0.4, "σ as the smoother states it")):
+    for many, alpha, label in ((2.0, 0.2, "2σ of the smoother"), (1.0, 0.4, "σ of the smoother")):
         _band(axes, minutes, 0.0, many * chosen.sigma, svg.SKY, alpha=alpha, label=label)
     axes.plot(minutes, run.cases["interval"].camera, "s--", color=svg.GREEN, ms=3.5, lw=1.0, label="linear between")
     axes.plot(minutes, chosen.case.camera, "o-", color=svg.PURPLE, ms=3.5, lw=1.2, label="smoothed")
@@ -128,7 +128,7 @@ def _smoothed_figure(run: MonitorRun) -> Figure:
 
 
 def _interval_figure(run: MonitorRun) -> Figure:
-    """RMS in height against the interval."""
+    """Draw the RMS error in height against the interval."""
     figure, (axes,) = _panels(3.6, 1, False, "interval between measurements [min]")
     minutes, intervals = np.array(list(run.intervals)) / 60.0, run.intervals.values()
     curves = [
@@ -137,9 +137,9 @@ def _interval_figure(run: MonitorRun) -> Figure:
     ]
     if run.smoothing:
         chosen = [run.smoothing[interval] for interval in run.intervals]
-        smoothed = [one.case.camera_height_rms for one in chosen]
+        smoothed = [smoothing.case.camera_height_rms for smoothing in chosen]
         curves.append((smoothed, "D-", svg.PURPLE, 4, "by the cameras alone, smoothed"))
-        curves.append(([rms(one.sigma) for one in chosen], ":", svg.PURPLE, 4, "σ that the smoother states"))
+        curves.append(([rms(smoothing.sigma) for smoothing in chosen], ":", svg.PURPLE, 4, "σ of the smoother"))
     for values, style, colour, size, label in curves:
         axes.loglog(minutes, values, style, color=colour, ms=size, lw=1.2, label=label)
     axes.axhline(run.cases["none"].height_rms, color=svg.VERMILION, lw=1.1, label="without monitoring")
@@ -156,7 +156,7 @@ def _interval_figure(run: MonitorRun) -> Figure:
 
 
 def _parts_figure(run: MonitorRun) -> Figure:
-    """Height error of the corrected cameras, in parts."""
+    """Draw the height error of the corrected cameras by its parts."""
     minutes = run.times / 60.0
     figure, (axes,) = _panels(3.8, 1)
     axes.plot(minutes, run.cases["interval"].camera, color=svg.INK, lw=1.6, label="together, with the file's interval")
@@ -170,20 +170,23 @@ def _parts_figure(run: MonitorRun) -> Figure:
 
 
 def _course_figure(run: LoopRun) -> Figure:
-    """Angle, height and foci over the orbit, with the loop open and closed."""
+    """Draw angle, height and foci over the orbit, with the loop open and closed."""
     minutes = run.closed.course.times / 60.0
-    label = "time [min]; bands: what the posterior says, ±σ"
+    label = "time [min]; bands: posterior ±σ"
     figure, panels = _panels(2.2 * (2 + len(run.pair)), 2 + len(run.pair), label=label)
-    for state, one, style, colour in (("open", run.open, "s--", svg.VERMILION), ("closed", run.closed, "o-", svg.BLUE)):
+    for state, outcome, style, colour in (
+        ("open", run.open, "s--", svg.VERMILION),
+        ("closed", run.closed, "o-", svg.BLUE),
+    ):
         shown = {
-            "angle [arcsec]": (one.true(one.angle), one.angle, ARCSEC),
-            "height by the\ncameras [m]": (one.heights.camera, one.slopes, 1.0),
+            "angle [arcsec]": (outcome.true(outcome.angle), outcome.angle, ARCSEC),
+            "height by the\ncameras [m]": (outcome.heights.camera, outcome.slopes, 1.0),
         }
         for name in run.pair:
             row = run.model.unit(name, "defocus")
-            shown[f"defocus of\n{name} [µm]"] = one.true(row), row, 1e-6
+            shown[f"defocus of\n{name} [µm]"] = outcome.true(row), row, 1e-6
         for axes, (quantity, (true, rows, size)) in zip(panels, shown.items(), strict=True):
-            middle, sigma = one.posterior(rows)
+            middle, sigma = outcome.posterior(rows)
             _band(axes, minutes, middle / size, sigma / size, colour, alpha=0.2)
             axes.plot(minutes, true / size, style, color=colour, ms=3.0, lw=1.1, label=f"loop {state}, true")
             axes.set_ylabel(quantity)
@@ -192,17 +195,15 @@ def _course_figure(run: LoopRun) -> Figure:
 
 
 def _positions_figure(run: LoopRun) -> Figure:
-    """Where the mechanisms stand."""
-    units = list(dict.fromkeys(one.unit[0] for one in run.model.correctors))
-    figure, panels = _panels(
-        1.0 + 2.2 * len(units), len(units), False, "time [min]; dotted: held by the end of a range"
-    )
+    """Draw the positions of the mechanisms."""
+    units = list(dict.fromkeys(corrector.unit[0] for corrector in run.model.correctors))
+    figure, panels = _panels(1.0 + 2.2 * len(units), len(units), False, "time [min]; dotted: at the end of a range")
     minutes = run.closed.course.times / 60.0
     for axes, unit in zip(panels, units, strict=True):
-        for k, one in enumerate(one for one in run.model.correctors if one.unit[0] == unit):
+        for k, corrector in enumerate(corrector for corrector in run.model.correctors if corrector.unit[0] == unit):
             colour = _COLOURS[k % len(_COLOURS)]
-            axes.step(minutes, positions(run, one.name), where="post", color=colour, lw=1.2, label=one.name)
-            for number in run.loops[one.name].ends:
+            axes.step(minutes, positions(run, corrector.name), where="post", color=colour, lw=1.2, label=corrector.name)
+            for number in run.loops[corrector.name].ends:
                 axes.axvline(minutes[number], color=colour, lw=0.8, ls=":")
         axes.set_ylabel(f"position [{shown_unit(unit)}]")
         axes.legend(loc="best", ncols=2)
@@ -210,19 +211,19 @@ def _positions_figure(run: LoopRun) -> Figure:
 
 
 def _loop_figure(run: LoopRun) -> Figure:
-    """The open loop in the complex plane, and what the closed one leaves of a swing."""
+    """Draw the open loop in the complex plane, and the drift that remains with the closed loop."""
     figure = svg.new_figure(4.2)
     left, right = figure.subplots(1, 2)
     svg.gridded(left)
     svg.gridded(right)
     step, frequency = run.setup.test.step, np.geomspace(1e-3, 0.5, 400)
-    turn = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
-    left.plot(turn.real, turn.imag, color=svg.LIGHT, lw=1.0)
+    circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 200))
+    left.plot(circle.real, circle.imag, color=svg.LIGHT, lw=1.0)
     left.plot([-1.0], [0.0], "x", color=svg.INK, ms=7)
     drawn: dict[tuple[float, int], list[str]] = {}
-    for name, one in run.loops.items():
-        if one.loop_gain:
-            drawn.setdefault((one.loop_gain, one.corrector.spec.delay), []).append(name)
+    for name, analysis in run.loops.items():
+        if analysis.loop_gain:
+            drawn.setdefault((analysis.loop_gain, analysis.corrector.spec.delay), []).append(name)
     for k, ((gain, delay), names) in enumerate(drawn.items()):
         colour, at = _COLOURS[k % len(_COLOURS)], open_loop(gain, delay, frequency)
         left.plot(at.real, at.imag, color=colour, lw=1.2, label=f"gain {gain:.3g}, delay {delay}")
@@ -230,7 +231,7 @@ def _loop_figure(run: LoopRun) -> Figure:
         right.loglog(frequency / step * 3600.0, share, color=colour, lw=1.2, label=", ".join(names))
     left.set(xlim=(-2.5, 1.5), ylim=(-2.5, 1.5), xlabel="real part of L", ylabel="imaginary part of L", aspect="equal")
     right.axhline(1.0, color=svg.GREY, lw=0.7)
-    right.set(xlabel="frequency of the drift [1/h]", ylabel="share that is left", ylim=(1e-3, 5.0))
+    right.set(xlabel="frequency of the drift [1/h]", ylabel="remaining share", ylim=(1e-3, 5.0))
     if drawn:
         left.legend(loc="lower right")
         right.legend(loc="lower right")
@@ -238,19 +239,19 @@ def _loop_figure(run: LoopRun) -> Figure:
 
 
 def monitor_report(run: MonitorRun | LoopRun) -> Report:
-    """Report of a monitored orbit."""
+    """Return the report of a monitored orbit."""
     if isinstance(run, LoopRun):
         return Report(
             "A monitor in the loop",
             *_loop_verdict(run),
             _facts(run),
             _loop_summary(run),
-            (_orbit(run), *_images(run), _loops(run), _unseen(run)),
+            (_orbit(run), *_images(run), _loops(run), _unobservable(run)),
             warnings=(*numbers.LOOP.warnings(run), *_worse_warnings(run), *_loop_warnings(run)),
         )
     smoothed = (_smoothed(run),) if run.smoothing else ()
     return Report(
-        "What on-board monitoring buys on the ground",
+        "Effect of on-board monitoring on the ground",
         *_verdict(run),
         _facts(run),
         _table(run),
@@ -262,25 +263,29 @@ def monitor_report(run: MonitorRun | LoopRun) -> Report:
 def _facts(run: MonitorRun | LoopRun) -> tuple[tuple[str, str], ...]:
     setup, test, errors, on = run.setup, run.setup.test, run.setup.test.errors, run.setup.test.errors.switched_on
     span = f"{moment(test.times[0])} to {moment(test.times[-1])} in steps of {moment(test.step)}"
-    stated = setup.disturbances.name if setup.disturbances else "none stated: sigmas are of the noise alone"
-    own = (
+    prior = setup.disturbances.name if setup.disturbances else "none: sigmas contain the noise alone"
+    particular = (
         ("Readings", f"{len(test.times)}, rendered and recovered"),
         ("Motions", "of the course" if test.course is not None else "drawn by the disturbances' laws in time"),
-        ("Lines of sight", "exact, traced; points are drawn about them; matched where line images are rendered"),
+        ("Lines of sight", "exact, by ray trace; points are drawn, or matched where line images are rendered"),
     )
     if isinstance(run, MonitorRun):
         applied = ("Applied", ", ".join(test.apply))
-        own = (("Reference", moment(test.reference_time)), applied, ("Calibration at the reference", "taken as exact"))
+        particular = (
+            ("Reference", moment(test.reference_time)),
+            applied,
+            ("Calibration at the reference", "assumed exact"),
+        )
     return (
         ("Instrument", f"{setup.instrument.name}, {setup.instrument.description}"),
         ("Pair", f"{setup.pair[0]} against {setup.pair[1]}"),
         ("Course", f"{span}, from {test.orbit.epoch}"),
-        *own,
-        ("Disturbances", stated),
+        *particular,
+        ("Disturbances", prior),
         ("Check points", f"{test.ground.points} at each time, both views from the state at that time"),
         ("Image points", f"σ {errors.image:g} px, drawn" if on else "exact"),
         ("Monitor's frames", "with noise" if on and errors.monitor else "without noise"),
-        ("Effects on the light", "taken as corrected"),
+        ("Effects on the light", "assumed corrected"),
         ("Description", test.description),
     )
 
@@ -288,42 +293,42 @@ def _facts(run: MonitorRun | LoopRun) -> tuple[tuple[str, str], ...]:
 def _verdict(run: MonitorRun) -> tuple[str, tuple[str, ...]]:
     cases, spec = run.cases, run.spec
     none, chosen, floor = cases["none"], cases["interval"], cases["true"]
-    bought = none.height_rms - chosen.height_rms
+    gain = none.height_rms - chosen.height_rms
     others = floor.height_rms**2 > 0.5 * chosen.height_rms**2
     limit = "images, orbit and attitude" if others else "the remaining errors of the monitor"
     verdict, more = answer(
-        f"Monitoring every {moment(spec.every)} changes the heights' error from {none.height_rms:.2f} m to "
-        f"{chosen.height_rms:.2f} m RMS{'' if bought > 0.0 else ', which is no gain'}",
+        f"Monitoring every {moment(spec.every)} changes the height error from {none.height_rms:.2f} m to "
+        f"{chosen.height_rms:.2f} m RMS{'' if gain > 0.0 else ', which is no gain'}",
         f"with the true cameras {floor.height_rms:.2f} m would remain, so that {limit} cause most of the error",
         f"the intersection angle changes by {np.ptp(run.angle_change) / ARCSEC:.2g} arcsec: see the errors over the "
         "course",
         _gain(run),
     )
     alone = (
-        f"The cameras alone: {none.camera_height_rms:.2f} m without, {chosen.camera_height_rms:.2f} m with this "
-        f"interval, {cases['monitored'].camera_height_rms:.2f} m monitored at every time. "
-        f"One arcsecond of the angle is {abs(run.conversion.of_angle):.1f} m of height."
+        f"Height error by the cameras alone: {none.camera_height_rms:.2f} m without monitoring, "
+        f"{chosen.camera_height_rms:.2f} m with this interval, {cases['monitored'].camera_height_rms:.2f} m monitored "
+        f"at every time. One arcsecond of the angle is {abs(run.conversion.of_angle):.1f} m of height."
     )
     return verdict, (*more, alone)
 
 
 def _times(factor: float, less: str) -> str:
-    """Factor by which an error is smaller, or larger, in words."""
+    """Return in words the factor by which an error is smaller or larger."""
     if factor >= 1.0:
         return f"{factor:.2f} times {less}"
     return f"{1.0 / factor:.2f} times {'more' if less == 'less' else 'larger'}"
 
 
 def _gain(run: MonitorRun) -> str:
-    """Return what smoothing buys at the file's interval; empty where nothing is stated to move."""
+    """Return a sentence on the gain of smoothing at the file's interval; empty without a prior."""
     if not run.smoothing:
         return ""
     chosen = run.smoothed
     fits = "agrees with" if chosen.agrees else "contradicts"
     return (
-        f"smoothed together, the same measurements leave {chosen.case.camera_height_rms:.2f} m by the cameras, "
-        f"{_times(chosen.factor, 'less')} than by linear interpolation, which {fits} their sigma of "
-        f"{rms(chosen.sigma):.2f} m"
+        f"smoothing the same measurements reduces the height error by the cameras to "
+        f"{chosen.case.camera_height_rms:.2f} m, {_times(chosen.factor, 'less')} than linear interpolation, which "
+        f"{fits} the predicted sigma of {rms(chosen.sigma):.2f} m"
     )
 
 
@@ -340,7 +345,8 @@ def _table(run: MonitorRun) -> Table:
     return numbers.SUMMARY.table(
         "cases",
         "Errors at check points over the course",
-        "RMS of all points and times; worst: RMS of the worst time; by the cameras: without image, orbit and attitude.",
+        "RMS of all points and times; worst: RMS of the worst time; by the cameras: without the errors of image "
+        "points, orbit and attitude.",
         {name: numbers.SUMMARY(run.cases[key]) for key, name in names.items() if key in run.cases},
         numbers.SUMMARY.headed,
         "cameras",
@@ -350,8 +356,8 @@ def _table(run: MonitorRun) -> Table:
 def _angle(run: MonitorRun) -> Section:
     error = (run.angle.change_rad - run.angle_change) / ARCSEC
     text = (
-        f"Traced, the angle changes by {np.ptp(run.angle_change) / ARCSEC:.3g} arcsec over the course. The monitor "
-        f"follows it to {rms(error):.2g} arcsec RMS, {np.abs(error).max():.2g} arcsec at worst.",
+        f"The true angle changes by {np.ptp(run.angle_change) / ARCSEC:.3g} arcsec over the course. The monitor "
+        f"measures it with an error of {rms(error):.2g} arcsec RMS, {np.abs(error).max():.2g} arcsec at worst.",
     )
     caption = f"Estimator {run.estimator}, all frames."
     figure = _figure("angle", "Intersection angle over the orbit", caption, _angle_figure, run)
@@ -366,13 +372,13 @@ def _changes(run: MonitorRun, name: str) -> Table:
     rows = np.column_stack([run.times / 60.0, both.reshape(len(both), -1)]) + 0.0
     title = f"Changes of {name}, true and monitored"
     decimals = (1, *([3] * 6), 1, 1)
-    return Table(f"changes-{name.lower()}", title, "Since the reference.", heads, rows.tolist(), decimals)
+    return Table(f"changes-{name.lower()}", title, "Changes since the reference.", heads, rows.tolist(), decimals)
 
 
 def _height(run: MonitorRun) -> Section:
     text = (
-        f"One arcsecond in pitch of both cameras, which the monitor does not see, makes "
-        f"{abs(run.conversion.of_common):.2f} m of height.",
+        f"A common pitch of both cameras by one arcsecond, which the monitor does not measure, changes heights by "
+        f"{abs(run.conversion.of_common):.2f} m.",
     )
     caption = "Above: mean over the points. Below: all errors, with the points' noise."
     figure = _figure("height", "Height errors over the orbit", caption, _height_figure, run)
@@ -380,23 +386,23 @@ def _height(run: MonitorRun) -> Section:
 
 
 def _smoothed(run: MonitorRun) -> Section:
-    spec, stated = run.spec, run.setup.disturbances
-    assert stated is not None
+    spec, prior = run.spec, run.setup.disturbances
+    assert prior is not None
     chosen = run.smoothed
-    found = chosen.consistency
+    consistency = chosen.consistency
     table = numbers.SMOOTHED.table(
         "smoothing",
         "Heights smoothed against heights interpolated, from the same measurements",
-        "By the cameras alone, RMS over all times; the sigma that the smoother states; the largest error over its "
-        f"sigma, limit {chosen.limit:.2f}; chi-square of the shifts and its degrees of freedom.",
+        "Height errors by the cameras alone, RMS over all times; sigma predicted by the smoother; largest error over "
+        f"its sigma, limit {chosen.limit:.2f}; chi-square of the shifts and its degrees of freedom.",
         [numbers.SMOOTHED((run, *item)) for item in run.smoothing.items()],
         numbers.SMOOTHED.headed,
     )
     text = (
-        f"Measured every {moment(spec.every)}, all measurements together, by the prior {stated.name}, make the "
-        f"cameras' height error {_times(chosen.factor, 'smaller')} than values that are linear between them.",
-        f"Measured shifts {'agree' if found.agrees else 'do not agree'} with the prior: chi-square "
-        f"{found.chi_square:.4g} of {found.degrees} degrees of freedom, limit {found.limit:.4g}.",
+        f"Smoothing all measurements, one every {moment(spec.every)}, under the prior {prior.name} makes the "
+        f"cameras' height error {_times(chosen.factor, 'smaller')} than linear interpolation between them.",
+        f"Measured shifts {'agree' if consistency.agrees else 'do not agree'} with the prior: chi-square "
+        f"{consistency.chi_square:.4g} for {consistency.degrees} degrees of freedom, limit {consistency.limit:.4g}.",
     )
     caption = "Mean over the points, with the total sigma of the smoothed height."
     figure = _figure("smoothed", "Heights between the measurements", caption, _smoothed_figure, run)
@@ -407,19 +413,19 @@ def _interval(run: MonitorRun) -> Section:
     table = numbers.INTERVAL.table(
         "intervals",
         "Height error against the monitoring interval",
-        "Measured from the reference on, linear between, held before the first and after the last.",
+        "Measurements from the reference on, interpolated linearly, constant before the first and after the last.",
         [numbers.INTERVAL((run, interval)) for interval in run.intervals],
         numbers.INTERVAL.headed,
     )
     figure = _figure("interval", "RMS in height against the interval", "Over all times.", _interval_figure, run)
-    return Section("How often to measure", (), (figure, table))
+    return Section("Monitoring interval", (), (figure, table))
 
 
 def _rest(run: MonitorRun) -> Section:
     parts = numbers.PART.table(
         "parts",
         "Parts of the corrected cameras' height error",
-        "Over all times; signed, they add up to the whole but for products of two small errors.",
+        "RMS and largest over all times. The signed parts add up to the whole except for products of two small errors.",
         {PARTS[name][0]: numbers.PART(part) for name, part in run.parts.items()},
         numbers.PART.headed,
         "part",
@@ -427,24 +433,24 @@ def _rest(run: MonitorRun) -> Section:
     causes = numbers.CAUSE.table(
         "causes",
         f"Each cause alone, at {moment(float(run.times[run.worst]))}",
-        "Height that it makes without monitoring, and height that the monitor makes by misreading it.",
+        "Height error by the cause without monitoring, and height error by the monitor's misreading of it.",
         [numbers.CAUSE((run, cause)) for cause in run.causes],
         ("what", "node", "height_without_monitoring_m", "height_left_by_monitor_m"),
     )
     largest = max(run.parts, key=lambda name: rms(run.parts[name]))
     text = (
-        f"Most of the rest comes from {PARTS[largest][0]}, {rms(run.parts[largest]):.2g} m RMS. The true four "
-        f"parameters leave {1e3 * rms(run.parts['beyond_parameters']):.2g} mm RMS in height and "
-        f"{run.residual / ARCSEC:.2g} arcsec at the worst place of a line.",
+        f"Most of the remaining error comes from {PARTS[largest][0]}, {rms(run.parts[largest]):.2g} m RMS. With the "
+        f"true four parameters, {1e3 * rms(run.parts['beyond_parameters']):.2g} mm RMS in height and "
+        f"{run.residual / ARCSEC:.2g} arcsec at the worst point of a line would remain.",
         *_worse(run),
     )
-    caption = "Mean over the points; parts below 5 mm are left out."
-    figure = _figure("remainder", "What the correction leaves", caption, _parts_figure, run)
-    return Section("Where the rest comes from", text, (figure, parts, causes))
+    caption = "Mean over the points; parts below 5 mm are omitted."
+    figure = _figure("remainder", "Remaining error after the correction", caption, _parts_figure, run)
+    return Section("Sources of the remaining error", text, (figure, parts, causes))
 
 
 def _worse(run: MonitorRun) -> tuple[str, ...]:
-    """Name the changes that the monitor says worse than nothing would."""
+    """Return a sentence naming the parameters that the monitor reads with errors larger than their true changes."""
     worse = []
     for name in run.pair:
         for k, key in enumerate(PARAMETERS):
@@ -456,8 +462,8 @@ def _worse(run: MonitorRun) -> tuple[str, ...]:
     if not worse:
         return ()
     return (
-        f"The monitor misreads by more than the true change: {'; '.join(worse)}. Such values are better left out, by "
-        "the key apply.",
+        f"Some errors of the monitor exceed the true changes: {'; '.join(worse)}. Exclude such parameters with the key "
+        "`apply`.",
     )
 
 
@@ -465,82 +471,82 @@ def _conversion(run: MonitorRun) -> Section:
     conversion = run.conversion
     table = numbers.BY_CAMERA.table(
         "conversion",
-        "Metres of height",
-        "Of a whole camera turned by 1 arcsec about its Y and traced, by base to height, and of each parameter that "
-        "the analysis is told wrongly: a bias of the monitor acts like this.",
+        "Height changes",
+        "Height change when a whole camera is rotated by 1 arcsec about its Y, by ray trace and by base to height, and "
+        "for an error of each parameter in the analysis, as a bias of the monitor causes it.",
         {name: numbers.BY_CAMERA((run, name)) for name in run.pair},
         label="camera",
     )
     text = (
-        f"Base to height is {conversion.base_to_height:.3f}. An arcsecond of the angle, half from each camera, is "
-        f"{abs(conversion.of_angle):.2f} m.",
+        f"Base to height is {conversion.base_to_height:.3f}. One arcsecond of the angle, half from each camera, "
+        f"changes heights by {abs(conversion.of_angle):.2f} m.",
     )
     return Section("From arcseconds to metres", text, (table,))
 
 
 def _noise(run: MonitorRun) -> Section:
-    seen, (low, high) = run.scatter, run.scatter.limits
-    verdict = "agrees" if seen.agrees else "does not agree"
+    scatter, (low, high) = run.scatter, run.scatter.limits
+    verdict = "lies within" if scatter.agrees else "lies outside"
     text = (
-        f"Measured {len(seen.heights)} times at {moment(float(run.times[run.worst]))}, reference images "
-        f"and detectors' patterns drawn anew, heights scatter by {1e3 * seen.spread:.2f} mm; the monitor's covariance "
-        f"propagates to {1e3 * seen.sigma:.2f} mm. The ratio {seen.spread / seen.sigma:.3f} {verdict} with its limits "
+        f"In {len(scatter.heights)} measurements at {moment(float(run.times[run.worst]))}, with reference images and "
+        f"detectors' patterns drawn anew, heights scatter by {1e3 * scatter.spread:.2f} mm; the monitor's covariance "
+        f"predicts {1e3 * scatter.sigma:.2f} mm. The ratio {scatter.spread / scatter.sigma:.3f} {verdict} its limits "
         f"{low:.2f} to {high:.2f} (false alarm {FALSE_ALARM:g}).",
     )
     return Section("Noise of the monitor", text)
 
 
 def _warnings(run: MonitorRun) -> tuple[str, ...]:
-    out = [*coarse_warnings(run.setup), *run.doubts]
+    warnings = [*coarse_warnings(run.setup), *run.doubts]
     together = run.together.get(run.spec.every)
-    out += [jump_text(one) for one in (together.jumps if together is not None else None) or ()]
-    out += numbers.MONITOR.warnings(run)
+    warnings += [jump_text(jump) for jump in (together.jumps if together is not None else None) or ()]
+    warnings += numbers.MONITOR.warnings(run)
     if run.cases["monitored"].camera_height_rms > run.cases["none"].camera_height_rms:
-        out.append("monitoring makes heights worse: the monitor's own errors are larger than the cameras' changes")
-    return tuple(out)
+        warnings.append("monitoring makes heights worse: errors of the monitor are larger than the cameras' changes")
+    return tuple(warnings)
 
 
 def _loop_verdict(run: LoopRun) -> tuple[str, tuple[str, ...]]:
-    left, free = height_rms(run.closed), height_rms(run.open)
-    sigma, hidden = rms(run.closed.posterior(run.closed.slopes)[1]), rms(run.unseen[0])
-    stands = "" if run.margins_hold else f"the loop is {'barely stable' if run.stable else 'unstable'}; "
+    closed, opened = height_rms(run.closed), height_rms(run.open)
+    sigma, unobservable = rms(run.closed.posterior(run.closed.slopes)[1]), rms(run.unobservable_sigma[0])
+    prefix = "" if run.margins_hold else f"the loop is {'barely stable' if run.stable else 'unstable'}; "
     if run.worse:
-        stands += f"the loop makes {names_text(list(run.worse))} worse; "
+        prefix += f"the loop makes {names_text(list(run.worse))} worse; "
     angle = rms(run.closed.true(run.closed.angle)) / ARCSEC, rms(run.open.true(run.open.angle)) / ARCSEC
     return answer(
-        f"{stands}with the loop closed the cameras make height errors of {significant(left, 2)} m RMS over the orbit, "
-        f"with the loop open {significant(free, 2)} m; the posterior's sigma is {significant(sigma, 2)} m",
-        f"what no spot shows costs {significant(hidden, 2)} m, which no gain takes away, and {_margin(run)}",
-        f"the angle between the lines of sight is {significant(angle[0], 2)} arcsec RMS off, with the loop open "
-        f"{significant(angle[1], 2)} arcsec",
+        f"{prefix}with the loop closed the height error by the cameras is {significant(closed, 2)} m RMS over the "
+        f"orbit, with the loop open {significant(opened, 2)} m; the posterior's sigma is {significant(sigma, 2)} m",
+        f"unobservable motions cause {significant(unobservable, 2)} m, which no gain can remove, and {_margin(run)}",
+        f"the error of the angle between the lines of sight is {significant(angle[0], 2)} arcsec RMS, with the loop "
+        f"open {significant(angle[1], 2)} arcsec",
         _focus_words(run),
     )
 
 
 def _margin(run: LoopRun) -> str:
     if not math.isfinite(run.margin):
-        return "no correction acts"
+        return "no correction is active"
     phase = f", the smallest phase margin {run.phase_deg:.0f} deg" if math.isfinite(run.phase_deg) else ""
-    return f"all gains together may be {significant(run.margin, 3)} times as large before the loop is unstable{phase}"
+    return f"the gain margin of all loops together is {significant(run.margin, 3)}{phase}"
 
 
 def _focus_words(run: LoopRun) -> str:
-    """Return the share of the focus that the spots leave as it was before any reading."""
-    left, stated = [], run.model.stated
-    for name, unseen in zip(run.pair, run.unseen[1:], strict=True):
-        effect = stated.parameters[run.model.row(name, "defocus")]
-        prior = math.sqrt(float(effect @ stated.correlation @ effect))
+    """Return a sentence on the share of the focus's standard deviation that the spots do not reduce."""
+    shares, model_prior = [], run.model.prior
+    for name, unobservable in zip(run.pair, run.unobservable_sigma[1:], strict=True):
+        effect = model_prior.parameters[run.model.row(name, "defocus")]
+        prior = math.sqrt(float(effect @ model_prior.correlation @ effect))
         if prior > 0.0:
-            left.append(f"{float(unseen.max()) / prior:.1%} of {name}'s")
-    return f"of the standard deviation of the focus the spots leave {' and '.join(left)} as it was" if left else ""
+            shares.append(f"{float(unobservable.max()) / prior:.1%} ({name})")
+    return f"the spots cannot reduce {' and '.join(shares)} of the prior sigma of focus" if shares else ""
 
 
 def _loop_summary(run: LoopRun) -> Table:
     return numbers.PASS.table(
         "loop",
-        "What the loop leaves",
+        "Errors with the loop open and closed",
         "RMS over the moments. Height: mean over the points, by the cameras alone; all errors: of each point, with "
-        "those of image points, orbit and attitude; σ: as the posterior says it; MTF at Nyquist, the least of all.",
+        "those of image points, orbit and attitude; σ: predicted by the posterior; MTF at Nyquist, smallest value.",
         {"loop open": numbers.PASS((run, run.open)), "loop closed": numbers.PASS((run, run.closed))},
         numbers.PASS.headed,
         "course",
@@ -548,36 +554,36 @@ def _loop_summary(run: LoopRun) -> Table:
 
 
 def _orbit(run: LoopRun) -> Section:
-    caption = "True values by the exact trace; bands are what the posterior says after each reading, ±σ."
-    course = _figure("course", "What is left over the orbit", caption, _course_figure, run)
-    places = _figure("positions", "Where the mechanisms stand", "When images are taken.", _positions_figure, run)
+    caption = "True values by the exact trace; bands: posterior ±σ after each reading."
+    course = _figure("course", "Errors over the orbit", caption, _course_figure, run)
+    mechanisms = _figure("positions", "Positions of the mechanisms", "When images are taken.", _positions_figure, run)
     columns: dict[str, list[float]] = {"time_s": run.closed.course.times.tolist()}
-    for label, one in (("open", run.open), ("closed", run.closed)):
-        columns |= {f"{label}_{key}": values for key, values in numbers.MOMENTS(one).items()}
+    for label, outcome in (("open", run.open), ("closed", run.closed)):
+        columns |= {f"{label}_{key}": values for key, values in numbers.MOMENTS(outcome).items()}
     for corrector in run.model.correctors:
         columns[f"{corrector.name} [{corrector.unit[0]}]"] = numbers.positions(run, corrector.name).tolist()
     rows = csv_table([list(columns), *zip(*columns.values(), strict=True)]).decode()
     text = (
-        f"True cameras leave {significant(run.closed.flight.true_case.height_rms, 2)} m RMS in height by image points, "
-        "orbit and attitude.",
+        f"With the true cameras, {significant(run.closed.flight.true_case.height_rms, 2)} m RMS in height would "
+        "remain, by image points, orbit and attitude.",
     )
-    return Section("Over the orbit", text, (course, places, CsvFile("moments", "All numbers", "", rows)))
+    return Section("Over the orbit", text, (course, mechanisms, CsvFile("moments", "All numbers", "", rows)))
 
 
 def _images(run: LoopRun) -> tuple[Section, ...]:
     if not run.closed.images:
         return ()
     rows = {
-        f"{label}, {moment(float(one.course.times[pair.moment]))}": numbers.IMAGES((one, pair))
-        for label, one in (("open", run.open), ("closed", run.closed))
-        for pair in one.images
+        f"{label}, {moment(float(outcome.course.times[pair.moment]))}": numbers.IMAGES((outcome, pair))
+        for label, outcome in (("open", run.open), ("closed", run.closed))
+        for pair in outcome.images
     }
     table = numbers.IMAGES.table(
         "images",
         "Heights from rendered line images",
-        "Points of the second camera's image, matched in the first one's: mean height error with σ by their scatter; "
-        "the same of drawn points over the whole swath, and by the cameras alone; matching, found minus true place, "
-        "and the σ that it states.",
+        "Points of the second camera's image, matched in the first one's: mean height error with σ from their scatter; "
+        "the same for drawn points over the whole swath, and by the cameras alone; RMS error of the matched positions, "
+        "and its predicted σ.",
         rows,
         numbers.IMAGES.headed[1:],
         "loop, after",
@@ -586,33 +592,32 @@ def _images(run: LoopRun) -> tuple[Section, ...]:
 
 
 def _loops(run: LoopRun) -> Section:
-    rows = {name: numbers.CORRECTION((run, name, one)) for name, one in run.loops.items()}
+    rows = {name: numbers.CORRECTION((run, name, analysis)) for name, analysis in run.loops.items()}
     for row in rows.values():
         row["mechanism"] = row["mechanism"] or "on the ground"
     table = numbers.CORRECTION.table(
         "corrections",
         "Each correction as a loop",
-        "Limit: gain below which a loop of this delay is stable. Cycle: steps by which a mechanism of whole steps goes "
-        "to and fro at worst although nothing changes. Told: share of what a mechanism does beyond what is known that "
-        "the spots tell.",
+        "Limit: gain below which a loop of this delay is stable. Cycle: largest limit cycle, in steps, of a mechanism "
+        "with discrete steps. Observed: share of a mechanism's unmodelled response that one reading of the spots "
+        "reveals.",
         rows,
         (
             *("camera", "quantity", "mechanism", "gain", "delay", "gain_limit", "gain_margin", "phase_margin_deg"),
-            *("cycle_steps", "seen"),
+            *("cycle_steps", "observed_share"),
         ),
         "name",
     )
-    text = (
-        f"Together, with what mechanisms do to each other's quantities, the largest eigenvalue is {run.radius:.3f}.",
-    )
+    text = (f"The spectral radius of all loops together, with the coupling between mechanisms, is {run.radius:.3f}.",)
     caption = (
-        "Left: L in the complex plane with the point −1. Right: share of a swing that is left when images are taken."
+        "Left: open loop L in the complex plane, with the point −1. Right: share of a sinusoidal drift that remains "
+        "when images are taken."
     )
-    figure = _figure("open-loop", "Open loop, and what the closed loop leaves of a drift", caption, _loop_figure, run)
+    figure = _figure("open-loop", "Open loop, and rejection of a drift", caption, _loop_figure, run)
     return Section("Stability", text, (table, figure))
 
 
-def _unseen(run: LoopRun) -> Section:
+def _unobservable(run: LoopRun) -> Section:
     rows = []
     for mode in run.modes:
         row = {
@@ -621,61 +626,69 @@ def _unseen(run: LoopRun) -> Section:
         }
         rows.append(row | {"bodies": _bodies(mode), "motions": _motions(run, mode)})
     table = numbers.MODE.table(
-        "unseen",
-        "Motions that no spot shows",
-        f"For one standard deviation of each mode: combinations of stated motions that leave every spot where it is. "
-        f"First and second: {run.pair[0]} and {run.pair[1]}.",
+        "unobservable-modes",
+        "Unobservable modes",
+        f"Combinations of motions of the prior that move no spot, for one standard deviation of each. "
+        f"First and second camera: {run.pair[0]} and {run.pair[1]}.",
         rows,
         ("height_m", "angle_arcsec", "defocus_first_um", "defocus_second_um", "bodies", "motions"),
     )
-    hidden = rms(run.unseen[0])
-    foci = " and ".join(significant(1e6 * float(one.max()), 2) for one in run.unseen[1:])
+    height = rms(run.unobservable_sigma[0])
+    foci = " and ".join(significant(1e6 * float(focus.max()), 2) for focus in run.unobservable_sigma[1:])
     text = (
-        f"{run.model.stated.spots.shape[0]} spot coordinates stand against {len(run.model.stated.labels)} stated "
-        f"motions. What they do to heights and no spot shows is {significant(hidden, 2)} m, to the focus {foci} µm, "
-        "one standard deviation.",
+        f"The monitor has {run.model.prior.spots.shape[0]} spot coordinates for {len(run.model.prior.labels)} motions "
+        f"of the prior. Unobservable motions cause {significant(height, 2)} m in height and {foci} µm of defocus, one "
+        "standard deviation.",
     )
-    return Section("What the loop cannot see", text, (table,))
+    return Section("Unobservable modes", text, (table,))
 
 
-def _bodies(mode: UnseenMode) -> str:
+def _bodies(mode: UnobservableMode) -> str:
     return ", ".join(f"{body} {share:.0%}" for body, share in list(mode.bodies.items())[:_BODIES])
 
 
-def _motions(run: LoopRun, mode: UnseenMode) -> str:
-    every = numbers.motions_of(run, mode)[:_MOTIONS]
-    return ", ".join(f"{one['motion']} {significant(one['amount'], 2, sign=True)} {one['unit']}" for one in every)
+def _motions(run: LoopRun, mode: UnobservableMode) -> str:
+    motions = numbers.motions_of(run, mode)[:_MOTIONS]
+    return ", ".join(
+        f"{motion['motion']} {significant(motion['amount'], 2, sign=True)} {motion['unit']}" for motion in motions
+    )
 
 
 def _worse_warnings(run: LoopRun) -> Iterator[str]:
-    """Yield a warning of every error that is larger with the loop closed."""
-    for label, (free, left) in run.worse.items():
-        times = f"{significant(left / free, 3)} times that of the loop open" if free else "0 with the loop open"
+    """Yield a warning for every error that is larger with the loop closed."""
+    for label, (open_error, closed_error) in run.worse.items():
+        times = (
+            f"{significant(closed_error / open_error, 3)} times that of the loop open"
+            if open_error
+            else "0 with the loop open"
+        )
         yield f"the loop makes {label} worse: its error, RMS over the moments, is {times}"
 
 
 def _loop_warnings(run: LoopRun) -> tuple[str, ...]:
-    out = [*coarse_warnings(run.setup)]
-    for name, one in run.loops.items():
-        if one.ends:
-            first = moment(float(run.closed.course.times[one.ends[0]]))
-            out.append(f"the range of {name} ends: held at {len(one.ends)} of the readings, first at {first}")
-        if one.cycle is not None and one.cycle.steps > 1:
-            out.append(
-                f"{name} can go to and fro by {one.cycle.steps} steps although nothing changes: a smaller gain, a "
-                "shorter delay or a dead band stops it"
+    warnings = [*coarse_warnings(run.setup)]
+    for name, analysis in run.loops.items():
+        if analysis.ends:
+            first = moment(float(run.closed.course.times[analysis.ends[0]]))
+            warnings.append(
+                f"{name} reaches the end of its range at {len(analysis.ends)} of the readings, first at {first}"
+            )
+        if analysis.cycle is not None and analysis.cycle.steps > 1:
+            warnings.append(
+                f"{name} can oscillate by {analysis.cycle.steps} steps without any drift (limit cycle): a smaller "
+                "gain, a shorter delay or a dead band prevents it"
             )
     for label, course in (("closed", run.closed.course), ("open", run.open.course)):
-        out += [f"with the loop {label} {jump_text(one)}" for one in course.jumps]
-        out += numbers.PASS.warnings((run, run.closed if label == "closed" else run.open))
+        warnings += [f"with the loop {label} {jump_text(analysis)}" for analysis in course.jumps]
+        warnings += numbers.PASS.warnings((run, run.closed if label == "closed" else run.open))
         if course.evidence is not None:
             spots = [channel.key for channel in run.model.experiment.path.channels]
             doubt = course.evidence.course_doubt([moment(float(time)) for time in course.times], spots)
-            out += [] if doubt is None else [f"with the loop {label}, {doubt}"]
+            warnings += [] if doubt is None else [f"with the loop {label}, {doubt}"]
     worst = max(run.ratios, key=lambda name: run.ratios[name])
     if run.ratios[worst] > run.ratio_limit:
-        out.append(
-            f"the posterior's {worst} is wrong by up to {run.ratios[worst]:.3g} of its sigma, limit "
+        warnings.append(
+            f"errors of the posterior's {worst} reach {run.ratios[worst]:.3g} times its sigma, limit "
             f"{run.ratio_limit:.2f} (false alarm {disturbances.FALSE_ALARM:g})"
         )
-    return tuple(out)
+    return tuple(warnings)

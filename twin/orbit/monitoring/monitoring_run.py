@@ -1,8 +1,9 @@
-"""Heights with and without on-board monitoring: points of every time intersected by cameras as calibrated, corrected by
-the monitor, corrected by values interpolated over an interval, and as they truly are.
+"""Heights with and without on-board monitoring, from points intersected at every time of a course.
 
-The analysis gets calibrated lines, measured orbit and attitude, image points and the monitor's values. Truth enters
-where errors are counted, and in two cases that are bounds: the true four parameters, and the true lines.
+The cameras are used as calibrated, corrected by the monitor, corrected by values interpolated over an interval, and as
+they truly are. The analysis has the calibrated lines, measured orbit and attitude, image points and the monitor's
+values. The truth enters where errors are computed, and in two cases that are bounds: the true four parameters, and the
+true lines.
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ from twin.orbit.monitoring.pair_flight import (
     TOO_FAR,
     CaseErrors,
     PairFlight,
-    in_analysis,
-    look_down,
+    in_calibrated_form,
     point_errors,
     traced_pair,
+    view_check_points,
 )
 
 if TYPE_CHECKING:
@@ -47,23 +48,23 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
 
 FALSE_ALARM = 1e-4
-"""Chance that right sigmas are called wrong, both sides together."""
+"""Probability, both sides together, that right sigmas are reported as wrong."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """One entry of the file alone, all others without effect.
+    """Effect of one temperature or motion of the file alone.
 
     Attributes
     ----------
     what : str
-        Temperature or motion.
+        "temperature" or "motion".
     path : str
-        Of the node.
-    truth : Mapping[str, np.ndarray]
-        Camera -> (4,) true changes since the reference.
-    error : Mapping[str, np.ndarray]
-        Camera -> (4,) what the monitor says, without noise, minus the truth.
+        Path of the node.
+    truth : Mapping[str, (4,) ndarray]
+        Camera -> true changes since the reference.
+    error : Mapping[str, (4,) ndarray]
+        Camera -> reading of the monitor without noise, minus the truth.
     """
 
     what: str
@@ -74,15 +75,15 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Conversion:
-    """Metres of height for one arcsecond, at the reference time.
+    """Height change for one arcsecond, in metres, at the reference time.
 
     Attributes
     ----------
     traced : Mapping[str, float]
-        Camera -> height change when this camera alone is turned by 1 arcsec about its Y, by the trace, m.
+        Camera -> height change, by ray trace, when this camera alone is rotated by 1 arcsec about its Y, in m.
     theory : Mapping[str, float]
-        Camera -> the same by base to height: slant range x 1 arcsec / cos(incidence) over the difference of the
-        tangents of both incidences, m.
+        Camera -> the same from base to height, in m: slant range x 1 arcsec / cos(incidence) over the difference of the
+        tangents of both incidences.
     base_to_height : float
         That difference.
     """
@@ -93,26 +94,26 @@ class Conversion:
 
     @property
     def of_angle(self) -> float:
-        """Metres per arcsec of the angle when both cameras turn by half of it against one another."""
+        """Height change for 1 arcsec of the angle, half from each camera, in metres."""
         first, second = self.traced.values()
         return 0.5 * (first - second)
 
     @property
     def of_common(self) -> float:
-        """Metres per arcsec by which both cameras turn alike, which leaves the angle as it is."""
+        """Height change for a common rotation of both cameras by 1 arcsec, in metres; the angle does not change."""
         return float(sum(self.traced.values()))
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Height errors of one time's points when the monitor measures again and again.
+    """Height errors at one time over repeated measurements of the monitor.
 
     Attributes
     ----------
-    heights : np.ndarray
-        (R,) mean height error from the monitor's values alone, metres.
+    heights : (R,) ndarray
+        Mean height error from the monitor's values alone, in metres.
     sigma : float
-        By propagation of the claimed covariance, metres, mean over the repeats.
+        Standard deviation propagated from the predicted covariance, mean over the repeats, in metres.
     """
 
     heights: np.ndarray
@@ -120,39 +121,39 @@ class Scatter:
 
     @property
     def spread(self) -> float:
-        """Standard deviation seen, metres."""
+        """Standard deviation over the repeats, in metres."""
         return float(np.std(self.heights, ddof=1))
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Limits of spread / sigma, exceeded with a chance of `FALSE_ALARM`."""
-        free = len(self.heights) - 1
-        low, high = chi2.ppf([0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM], free)
-        return float(np.sqrt(low / free)), float(np.sqrt(high / free))
+        """Limits of spread / sigma, exceeded with a probability of `FALSE_ALARM`."""
+        degrees = len(self.heights) - 1
+        low, high = chi2.ppf([0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM], degrees)
+        return float(np.sqrt(low / degrees)), float(np.sqrt(high / degrees))
 
     @property
     def agrees(self) -> bool:
-        """The spread lies within the limits."""
+        """True if spread / sigma lies within the limits."""
         low, high = self.limits
         return low < self.spread / self.sigma < high
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothing:
-    """Heights by values smoothed from the measurements at one interval.
+    """Heights with values smoothed from the measurements at one interval.
 
     Attributes
     ----------
     case : CaseErrors
-        errors.
+        Errors with the smoothed values.
     interpolated : CaseErrors
         Errors with values interpolated between the same measurements.
-    error : np.ndarray
-        (T,) mean height error by what the smoothed values are wrong, to first order, metres.
-    sigma : np.ndarray
-        (T,) of the same as the smoother states it, metres; 0 at the reference.
+    error : (T,) ndarray
+        Mean height error by the errors of the smoothed values, to first order, in metres.
+    sigma : (T,) ndarray
+        Standard deviation of that error by the smoother, in metres; 0 at the reference.
     consistency : Consistency
-        Chi-square of the measured shifts under the stated disturbances.
+        Chi-square test of the measured shifts under the prior.
     """
 
     case: CaseErrors
@@ -163,68 +164,69 @@ class Smoothing:
 
     @property
     def factor(self) -> float:
-        """Factor by which the height error of the cameras is smaller than with interpolation."""
+        """Height error of the cameras with interpolation over that with smoothing."""
         return self.interpolated.camera_height_rms / self.case.camera_height_rms
 
     @property
     def ratios(self) -> np.ndarray:
-        """Errors over their sigma, of the times at which there is one."""
-        known = self.sigma > 0.0
-        return np.asarray(self.error[known] / self.sigma[known])
+        """Errors over their sigma, at the times with a sigma above zero."""
+        positive = self.sigma > 0.0
+        return np.asarray(self.error[positive] / self.sigma[positive])
 
     @property
-    def furthest(self) -> float:
-        """Largest of all ratios."""
+    def largest_ratio(self) -> float:
+        """Largest absolute ratio."""
         return float(np.max(np.abs(self.ratios), initial=0.0))
 
     @property
     def limit(self) -> float:
-        """Limit of the largest ratio, exceeded with a chance of `FALSE_ALARM` at most whatever the correlations."""
+        """Limit of the largest ratio, exceeded with a probability of at most `FALSE_ALARM` for any correlations."""
         return float(norm.isf(0.5 * FALSE_ALARM / max(len(self.ratios), 1)))
 
     @property
     def agrees(self) -> bool:
-        """No error lies beyond the limit."""
-        return self.furthest <= self.limit
+        """True if no ratio is beyond the limit."""
+        return self.largest_ratio <= self.limit
 
 
 @dataclass(frozen=True, eq=False)
 class MonitorRun(PairFlight):
-    """A finished test: truth and measurements at T times, counted from the reference, at which the lines were
-    calibrated, and what follows from them for heights.
+    """Results of a monitored orbit: truth and measurements at T times, and the resulting heights.
+
+    Changes are relative to the reference, at which the lines were calibrated.
 
     Attributes
     ----------
     setup : MonitorSetup
-        What its file says.
+        Resolved test file and instrument.
     seed : int
-        Of all random numbers.
-    looks : tuple[float, float]
-        Nominal look angles of the two cameras, radians.
-    truth : Mapping[str, np.ndarray]
-        Camera -> (T, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) since the reference.
-    true_angle : np.ndarray
-        (T,) true angle between the lines of sight, radians.
+        Seed of all random numbers.
+    looks : tuple of float
+        Nominal look angles of the two cameras, in radians.
+    truth : Mapping[str, (T, 4) ndarray]
+        Camera -> true d_alpha, d_beta, d_gamma (rad) and d_f (m) since the reference.
+    true_angle : (T,) ndarray
+        True angle between the lines of sight, in radians.
     estimator : str
-        By which the monitor's shifts are read.
+        Name of the estimator that is used for the monitor's shifts.
     monitored : Readings
-        What the monitor says of the cameras' changes since the reference.
+        Readings of the monitor since the reference.
     together : Mapping[float, SmoothedReadings]
-        Seconds -> what all its measurements at this interval say together; empty where nothing is stated to move.
-    clean : Mapping[str, np.ndarray]
-        Camera -> (T, 4) as monitored, from expected images without noise.
-    prisms : Mapping[str, np.ndarray]
-        Camera -> (T, 4) what temperatures that the file gives to prisms alone make it say, without noise.
+        Interval in seconds -> changes smoothed from all measurements at this interval; empty without a prior.
+    clean : Mapping[str, (T, 4) ndarray]
+        Camera -> readings from expected images without noise.
+    prisms : Mapping[str, (T, 4) ndarray]
+        Camera -> readings without noise by the temperatures that the file gives to prisms alone.
     repeated : Readings
-        What the monitor says at time `worst`, measured again and again.
+        Repeated readings of the monitor at time index `worst`.
     worst : int
-        Number of the time with the largest change of the angle.
-    causes : tuple[Cause, ...]
-        What each temperature and motion of the file does alone at time `worst`, without noise.
+        Index of the time with the largest change of the angle.
+    causes : tuple of Cause
+        Effect of each temperature and motion of the file alone at time index `worst`, without noise.
     turned : Mapping[str, LineCamera]
-        Camera -> its line at the reference when the whole camera is turned by 1 arcsec about its Y.
-    doubts : tuple[str, ...]
-        Where the monitor's sigmas do not hold, for its spots are not as calibrated.
+        Camera -> its line at the reference with the whole camera rotated by 1 arcsec about its Y.
+    doubts : tuple of str
+        Warnings that the monitor's sigmas do not hold because its spots differ from the calibrated ones.
     """
 
     setup: MonitorSetup
@@ -245,62 +247,62 @@ class MonitorRun(PairFlight):
 
     @property
     def spec(self) -> OrbitMonitorSpec:
-        """The test."""
+        """Content of the test file."""
         return self.setup.test
 
     @property
     def mask(self) -> np.ndarray:
-        """(4,) 1 for parameters that are applied."""
+        """Mask (4,): 1 for parameters that are applied, 0 for the others."""
         return np.array([float(name in self.spec.apply) for name in PARAMETERS])
 
     def height(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """(T,) of the mean height, metres, by parameters (T, 4) of each camera that the analysis is told too much."""
-        every = [np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair]
-        return np.asarray(np.sum(every, axis=0))
+        """Return the (T,) mean height errors, in metres, by errors (T, 4) of each camera's parameters."""
+        heights = [np.sum(self.slopes[n] * values[n], axis=1) for n in self.pair]
+        return np.asarray(np.sum(heights, axis=0))
 
     def variance(self, covariance: np.ndarray, at: int | None = None) -> np.ndarray:
-        """Variance (S,) of the mean height by the pair's values, m^2.
+        """Return the variance (S,) of the mean height by the pair's values, in m^2.
 
         Parameters
         ----------
-        covariance : np.ndarray
-            (S, 8, 8) of the pair's values.
-        at : int | None
-            Number of the time to which all of them belong; None for one of each time.
+        covariance : (S, 8, 8) ndarray
+            Covariance of the pair's values.
+        at : int, optional
+            Index of the time to which all of them belong; None for one at each time.
         """
         both = np.concatenate([self.slopes[n] * self.mask for n in self.pair], axis=1)
         slope = both if at is None else both[at]
         return np.asarray(np.einsum("...i,...ij,...j->...", slope, covariance, slope))
 
     def applied(self, readings: Readings) -> dict[str, np.ndarray]:
-        """Camera -> (S, 4) values that correct it: of the parameters that are applied."""
+        """Return the (S, 4) values that correct each camera; 0 for parameters that are not applied."""
         return {name: readings[name].vector * self.mask for name in self.pair}
 
     def _interpolated(self, interval: float) -> CaseErrors:
         at = self.spec.measured(interval)
-        every = self.applied(self.monitored)
-        return self.case({name: between(self.times, self.times[at], v[at]) for name, v in every.items()})
+        applied = self.applied(self.monitored)
+        return self.case({name: between(self.times, self.times[at], v[at]) for name, v in applied.items()})
 
     @cached_property
     def cases(self) -> Mapping[str, CaseErrors]:
-        """Errors by what corrects the cameras.
+        """Errors by the correction of the cameras.
 
         none: as calibrated; monitored: at every time; interval: by values interpolated over the file's interval;
         smoothed: by values smoothed from the same measurements, if there is a prior; parameters: by the true four
-        parameters; true: the true lines. The last two are bounds that no measurement gives.
+        parameters; true: the true lines. The last two are bounds that no measurement reaches.
         """
-        found = {
+        cases = {
             "none": self.case({name: np.zeros((len(self.times), 4)) for name in self.pair}),
             "monitored": self.case(self.applied(self.monitored)),
             "interval": self._interpolated(self.spec.every),
         }
         if self.smoothing:
-            found["smoothed"] = self.smoothed.case
-        return FrozenMap(found | {"parameters": self.case(self.truth), "true": self.true_case})
+            cases["smoothed"] = self.smoothed.case
+        return FrozenMap(cases | {"parameters": self.case(self.truth), "true": self.true_case})
 
     @cached_property
     def intervals(self) -> Mapping[float, CaseErrors]:
-        """Seconds -> errors with values interpolated over the interval."""
+        """Errors with values interpolated over each interval, in seconds."""
         return FrozenMap({interval: self._interpolated(interval) for interval in self.spec.compared})
 
     @cached_property
@@ -311,44 +313,44 @@ class MonitorRun(PairFlight):
 
     @property
     def angle_change(self) -> np.ndarray:
-        """(T,) true, radians."""
+        """True change (T,) of the intersection angle, in radians."""
         return np.asarray(self.true_angle - self.true_angle[self.spec.referred])
 
     @property
     def sigma(self) -> np.ndarray:
-        """(T,) of the mean height by the noise of the monitor, propagated, metres."""
+        """Standard deviation (T,) of the mean height, propagated from the noise of the monitor, in metres."""
         return np.sqrt(self.variance(self.monitored.noise))
 
     @property
     def sigma_total(self) -> np.ndarray | None:
-        """(T,) likewise of the whole error; None where nothing is stated to move."""
+        """Standard deviation (T,) of the mean height from the whole error, in metres; None without a prior."""
         total = self.monitored.total
         return None if total is None else np.sqrt(self.variance(total))
 
     @cached_property
     def smoothing(self) -> Mapping[float, Smoothing]:
-        """Seconds -> heights smoothed from measurements at this interval; empty where nothing is stated to move."""
+        """Heights smoothed from measurements at each interval, in seconds; empty without a prior."""
         return FrozenMap({interval: self._smoothing(interval) for interval in sorted(self.together)})
 
     @property
     def smoothed(self) -> Smoothing:
-        """Heights smoothed from the measurements at the file's interval; there is none without a prior."""
+        """Heights smoothed from the measurements at the file's interval; needs a prior."""
         return self.smoothing[self.spec.every]
 
     def _smoothing(self, interval: float) -> Smoothing:
-        found, mask = self.together[interval], self.mask
-        readings = found.readings
+        smoothed, mask = self.together[interval], self.mask
+        readings = smoothed.readings
         assert readings.total is not None
         case = self.case(self.applied(readings))
-        wrong = self.height({n: mask * (readings[n].vector - self.truth[n]) for n in self.pair})
-        # what rounding leaves at the reference is no sigma
+        error = self.height({n: mask * (readings[n].vector - self.truth[n]) for n in self.pair})
+        # at the reference the variance is zero but for rounding
         variance = np.maximum(self.variance(readings.total), 0.0)
         interpolated = self.intervals[interval] if interval in self.intervals else self._interpolated(interval)
-        return Smoothing(case, interpolated, wrong, np.sqrt(variance), found.consistency)
+        return Smoothing(case, interpolated, error, np.sqrt(variance), smoothed.consistency)
 
     @cached_property
     def parts(self) -> Mapping[str, np.ndarray]:
-        """Name -> (T,) parts of the monitored cameras' mean height error, metres."""
+        """Parts (T,) of the monitored cameras' mean height error by name, in metres."""
 
         def applied(values: Callable[[str], np.ndarray]) -> np.ndarray:
             return self.height({name: self.mask * values(name) for name in self.pair})
@@ -367,7 +369,7 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def conversion(self) -> Conversion:
-        """Arcseconds to metres, at the reference, where the calibrated cameras are the true ones."""
+        """Height change for an arcsecond, at the reference, where the calibrated cameras are the true ones."""
         k = self.spec.referred
         view, traced = self.views[k], {}
         first, second = self.pair
@@ -376,15 +378,15 @@ class MonitorRun(PairFlight):
         up = view.ground / np.linalg.norm(view.ground, axis=1, keepdims=True)
         for i, name in enumerate(self.pair):
             pair = self.true_pair(k)
-            pair[i] = in_analysis(self.turned[name], self.calibrated[name])
+            pair[i] = in_calibrated_form(self.turned[name], self.calibrated[name])
             traced[name] = float(point_errors(pair, view, exact_data=True)[:, 2].mean() - calm)
             arm = view.exact[i].station - view.ground
             slant[name] = np.linalg.norm(arm, axis=1)
             forward = np.cross(up, view.exact[i].attitude[:, :, 1])  # along the track, level
             incidence[name] = np.arctan2(-np.sum(arm * forward, axis=1), np.sum(arm * up, axis=1))
         ratio = np.tan(incidence[first]) - np.tan(incidence[second])
-        # a ray that is taken to look farther forward passes above the point, and the other ray is met the higher, the
-        # more it comes from ahead
+        # a ray assumed to look farther forward passes above the point, and intersects the other ray higher, the more
+        # that one comes from ahead
         theory = {
             name: float(np.mean(sign * slant[name] * ARCSEC / np.cos(incidence[name]) / ratio))
             for name, sign in ((first, 1.0), (second, -1.0))
@@ -393,7 +395,7 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def scatter(self) -> Scatter:
-        """Heights of repeated measurements, by exact image points, so that the monitor's noise is all there is."""
+        """Heights of repeated measurements, from exact image points, so that only the monitor's noise contributes."""
         monitored, heights = self.applied(self.repeated), []
         for row in range(self.spec.repeats):
             pair = [self.calibrated[n].corrected(monitored[n][row]) for n in self.pair]
@@ -403,8 +405,9 @@ class MonitorRun(PairFlight):
 
     @cached_property
     def residual(self) -> float:
-        """Largest angle between a true line and the calibrated one corrected by the true four parameters, over the
-        line and all times, radians.
+        """Largest angle between a true line and the calibrated one corrected by the true four parameters, in radians.
+
+        The maximum is over the line and all times.
         """
         away = []
         for k, lines in enumerate(self.lines):
@@ -415,47 +418,47 @@ class MonitorRun(PairFlight):
         return max(away)
 
     def cause_heights(self, cause: Cause) -> tuple[float, float]:
-        """Height errors that a cause alone makes at its time, metres: without monitoring, and by what the monitor
-        misreads.
-        """
+        """Return the height errors by one cause, in metres: without monitoring, and by the monitor's misreading."""
         slopes = {n: self.slopes[n][self.worst] for n in self.pair}
         without = sum(float(-slopes[n] @ cause.truth[n]) for n in self.pair)
         return without, sum(float(slopes[n] @ (self.mask * cause.error[n])) for n in self.pair)
 
 
 def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance = silent) -> MonitorRun | LoopRun:
-    """Fly, measure, intersect: ``python -m twin.orbit monitor``; with mechanisms the loop is closed.
+    """Simulate a monitored pair and intersect its points: ``python -m twin.orbit monitor``.
+
+    With mechanisms the closed loop is simulated.
 
     Raises
     ------
     InputError
-        An unknown node, a mechanism that the instrument does not have, or an impossible temperature.
+        A node is unknown, the instrument does not have a mechanism, or a temperature is impossible.
     BenchError
-        The test cannot be carried out as its file says.
+        The test cannot be carried out as its file describes it.
     """
     spec = setup.test
     try:
         if spec.mechanisms is not None:
             return run_loop(setup, backend, seed, advance)
-        run = fly_monitored(setup, backend, seed, advance)
-        # intersections that fail are told here
+        run = simulate_monitoring(setup, backend, seed, advance)
+        # intersections that fail raise here
         run.cases, run.intervals, run.conversion, run.scatter  # noqa: B018
         return run
     except (AimError, BeamMissedError) as error:
         raise BenchError(f"the instrument cannot be rendered: {error}", spec.times_key, TOO_FAR) from error
     except IntersectionError as error:
-        raise BenchError(str(error), ("cameras",), "cameras that look different ways") from error
+        raise BenchError(str(error), ("cameras",), "cameras with different look angles") from error
 
 
-def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorRun:
-    """Trace, render, measure, look down.
+def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advance: Advance) -> MonitorRun:
+    """Trace, render and measure the monitored pair over its course.
 
     Raises
     ------
     InputError
-        An unknown node or an impossible temperature.
+        A node is unknown or a temperature is impossible.
     BenchError
-        The test cannot be carried out as its file says.
+        The test cannot be carried out as its file describes it.
     AimError, BeamMissedError
         Light is lost.
     """
@@ -479,14 +482,14 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
     angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
     worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
     # before the images, which take longer
-    views = look_down(spec, pair, lines, ground_seed, advance)
+    views = view_check_points(spec, pair, lines, ground_seed, advance)
     monitor = MonitorSeries(experiment, spec, reference, pair)
     noisy, clean = monitor.measured(states, number)
     truth, distance = _changes(clean.truth, spec.referred)
     used = noisy if spec.errors.switched_on and spec.errors.monitor else clean
     gains = monitor.gains(used, range(len(states)))
     advance("monitor", 3, parts)
-    prisms = monitor.of_prisms()
+    prisms = monitor.prism_shifts()
     advance("monitor", 4, parts)
     repeated = monitor.repeated(states[worst], spec.repeats, number + 1, worst)
     advance("monitor", 5, parts)
@@ -509,8 +512,8 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
         monitor.estimator,
         monitor.readings(used, range(len(states))),
         FrozenMap(smoothed),
-        FrozenMap(monitor.by_camera(gains, clean.shifts)),
-        FrozenMap(monitor.by_camera(gains, prisms)),
+        FrozenMap(monitor.estimates_by_camera(gains, clean.shifts)),
+        FrozenMap(monitor.estimates_by_camera(gains, prisms)),
         monitor.readings(repeated, [worst] * spec.repeats),
         worst,
         causes,
@@ -520,35 +523,47 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
 
 
 def _changes(truths: Sequence[Truth], reference: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Camera -> (T, 4) true changes since the reference, and camera -> principal distance there.
+    """Return the true changes (T, 4) of each camera since the reference, and its principal distance there.
 
-    The trace refers changes to the nominal camera; their differences are those between two states but for products of
-    two arcseconds, 1e-11 rad.
+    The trace refers changes to the nominal camera; their differences are those between two states except for products
+    of two arcseconds, 1e-11 rad.
     """
-    out, distance = {}, {}
+    changes, distance = {}, {}
     for name in truths[0].cameras:
-        every = [one.cameras[name] for one in truths]
-        values = np.concatenate([change.vector for change in every])
-        out[name] = values - values[reference]
-        distance[name] = float(np.concatenate([c.principal_distance for c in every])[reference])
-    return out, distance
+        cameras = [truth.cameras[name] for truth in truths]
+        values = np.concatenate([change.vector for change in cameras])
+        changes[name] = values - values[reference]
+        distance[name] = float(np.concatenate([c.principal_distance for c in cameras])[reference])
+    return changes, distance
 
 
 def _causes(
     experiment: MonitorExperiment, spec: OrbitMonitorSpec, monitor: MonitorSeries, worst: int, gain: np.ndarray
 ) -> tuple[Cause, ...]:
-    """Return what each temperature of the course and each motion does from the reference to time number ``worst``, at
-    which the estimator has this gain (8, 2 C).
+    """Return the effect of each temperature and each motion of the course alone, from the reference to one time.
+
+    Parameters
+    ----------
+    experiment : MonitorExperiment
+        Instrument with its monitor.
+    spec : OrbitMonitorSpec
+        Content of the test file.
+    monitor : MonitorSeries
+        Monitor with its reference images.
+    worst : int
+        Index of the time.
+    gain : (8, 2 C) ndarray
+        Gain of the estimator at that time.
     """
     assert spec.course is not None
     named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]
     states = [s for what, path in named for s in states_of(experiment, spec, (spec.referred, worst), (what, path))]
-    found = monitor.clean(states)
-    truth, _ = _changes(found.truth, 0)
-    estimates = monitor.by_camera(gain, found.shifts)
-    out = []
+    measured = monitor.clean(states)
+    truth, _ = _changes(measured.truth, 0)
+    estimates = monitor.estimates_by_camera(gain, measured.shifts)
+    causes = []
     for k, (what, path) in enumerate(named):
         true, read = ({n: v[n][2 * k + 1] - v[n][2 * k] for n in monitor.pair} for v in (truth, estimates))
         error = {n: read[n] - true[n] for n in monitor.pair}
-        out.append(Cause(what, path, FrozenMap(true), FrozenMap(error)))
-    return tuple(out)
+        causes.append(Cause(what, path, FrozenMap(true), FrozenMap(error)))
+    return tuple(causes)

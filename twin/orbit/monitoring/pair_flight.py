@@ -1,7 +1,7 @@
-"""A stereo pair along its orbit: lines as they truly are, and points that they measure on the ground.
+"""Stereo pair along its orbit: true lines, and the ground points that they measure.
 
-Both views of a point, which are half a minute to a minute apart, are those of the state at the moment midway between
-them. Light time, aberration and refraction are left out: they are taken as corrected.
+Both views of a point, which are half a minute to a minute apart, use the state at the moment midway between them. Light
+time, aberration and refraction are left out: they are assumed to be corrected.
 """
 
 from __future__ import annotations
@@ -34,34 +34,38 @@ if TYPE_CHECKING:
 TOO_FAR = "temperatures and motions that keep the beams on the mirrors and the spots on their CCDs"
 """Remedy where light is lost or a spot cannot be measured."""
 HALF_SPAN = 60.0
-"""Seconds of the orbit to either side of a time of the course that its images take; two views 53 degrees apart from 500
-km are 70 s apart."""
+"""Time of the orbit before and after a time of the course that its images cover, in seconds; two views 53 degrees apart
+from 500 km are 70 s apart.
+"""
 _SPARE = 2
-"""Candidates for each ground point; those that a line does not see are left out."""
+"""Number of candidates per ground point; those that a line does not see are dropped."""
 _MIDDLE = 1e-3
-"""Seconds to which the two views are brought to equal times before and after; a satellite goes 8 m."""
+"""Tolerance, in seconds, to which the two views are placed at equal times before and after; a satellite moves 8 m in
+it.
+"""
 
 
 _STEP = np.array([ARCSEC, ARCSEC, ARCSEC, 10e-6])
-"""Steps of the derivatives, rad and m: over them the intersection is linear to 1e-5."""
+"""Steps of the derivatives by d_alpha, d_beta, d_gamma (rad) and d_f (m): over them the intersection is linear to 1e-5.
+"""
 
 
 def rms(values: np.ndarray) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def moves_at(spec: OrbitMonitorSpec, time: float, only: str | None = None) -> State:
-    """Motions of the file at a time.
+def motions_at(spec: OrbitMonitorSpec, time: float, only: str | None = None) -> State:
+    """Return the motions of the file at a time.
 
     Parameters
     ----------
     spec : OrbitMonitorSpec
-        The test.
+        Content of the test file.
     time : float
-        seconds.
-    only : str | None
-        Node that alone moves; all by default.
+        Time, in seconds.
+    only : str, optional
+        Node to which the motions are limited; all by default.
     """
     moves = {}
     for path, motion in spec.motion.items():
@@ -78,12 +82,12 @@ class View:
 
     Attributes
     ----------
-    ground : np.ndarray
-        (n, 3) true, ITRS, metres.
-    exact : tuple[Sightings, Sightings]
-        Of each camera of the pair, as it truly is, with the true orbit and attitude.
-    seen : tuple[Sightings, Sightings]
-        As measured.
+    ground : (n, 3) ndarray
+        True points, ITRS, in metres.
+    exact : tuple of Sightings
+        Exact sightings by each true camera of the pair, with the true orbit and attitude.
+    seen : tuple of Sightings
+        Measured sightings.
     """
 
     ground: np.ndarray
@@ -93,19 +97,19 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class CaseErrors:
-    """Errors at the check points over T times.
+    """Errors at the check points over T times, in metres.
 
     Attributes
     ----------
-    plan : np.ndarray
-        (T,) RMS, both axes, metres; height: (T,) likewise.
-    bias : np.ndarray
-        (T,) mean of the height errors, found minus true.
-    camera : np.ndarray
-        (T,) the same less that of the true cameras at the same image points, orbit and attitude: what the cameras alone
-        do.
-    camera_plan : np.ndarray
-        (T,) RMS over the points of what the cameras alone do in plan; camera_height: likewise in height.
+    plan, height : (T,) ndarray
+        RMS errors in plan (both axes) and in height.
+    bias : (T,) ndarray
+        Mean of the height errors, intersected minus true.
+    camera : (T,) ndarray
+        Mean height error by the cameras alone: less that of the true cameras with the same image points, orbit and
+        attitude.
+    camera_plan, camera_height : (T,) ndarray
+        RMS over the points of the errors by the cameras alone, in plan and in height.
     """
 
     plan: np.ndarray
@@ -127,30 +131,30 @@ class CaseErrors:
 
     @property
     def camera_height_rms(self) -> float:
-        """RMS of what the cameras alone do in height over all times, metres."""
+        """RMS of the height errors by the cameras alone over all times, in metres."""
         return rms(self.camera_height)
 
     @property
     def worst(self) -> float:
-        """Largest RMS in height of one time, metres."""
+        """Largest RMS error in height of a single time, in metres."""
         return float(self.height.max())
 
 
 @dataclass(frozen=True, eq=False)
 class PairFlight:
-    """A stereo pair at T times of its orbit.
+    """Stereo pair at T times of its orbit.
 
     Attributes
     ----------
-    pair : tuple[str, str]
+    pair : tuple of str
         Names of the two cameras.
-    times : np.ndarray
-        (T,) seconds from the orbit's epoch.
-    lines : tuple[Mapping[str, LineCamera], ...]
-        Of each time: camera -> its line as it truly is.
+    times : (T,) ndarray
+        Seconds from the orbit's epoch.
+    lines : tuple of Mapping[str, LineCamera]
+        True line of each camera, for each time.
     calibrated : Mapping[str, CalibratedLine]
-        Camera -> its line as calibrated, which the ground knows.
-    views : tuple[View, ...]
+        Camera -> its line as calibrated, which the processing uses.
+    views : tuple of View
         Check points of each time.
     """
 
@@ -161,25 +165,25 @@ class PairFlight:
     views: tuple[View, ...]
 
     def true_line(self, camera: str, k: int) -> CalibratedLine:
-        """A camera as it truly is at time number k, in the analysis's form: for comparison only."""
-        return in_analysis(self.lines[k][camera], self.calibrated[camera])
+        """Return the true line of a camera at time index k, in the analysis's form, for comparisons only."""
+        return in_calibrated_form(self.lines[k][camera], self.calibrated[camera])
 
     def true_pair(self, k: int) -> list[CalibratedLine]:
-        """Both cameras as they truly are at time number k."""
+        """Return the true lines of both cameras at time index k."""
         return [self.true_line(name, k) for name in self.pair]
 
     def point_errors(self, changes: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Errors (T, n, 3) of the points by calibrated cameras that are corrected by changes (T, 4) of each, metres."""
-        every = [[self.calibrated[n].corrected(changes[n][k]) for n in self.pair] for k in range(len(self.times))]
-        return np.array([point_errors(pair, view) for pair, view in zip(every, self.views, strict=True)])
+        """Return errors (T, n, 3) of the points, in metres, with calibrated cameras corrected by changes (T, 4)."""
+        corrected = [[self.calibrated[n].corrected(changes[n][k]) for n in self.pair] for k in range(len(self.times))]
+        return np.array([point_errors(pair, view) for pair, view in zip(corrected, self.views, strict=True)])
 
     @cached_property
     def true_errors(self) -> np.ndarray:
-        """Errors (T, n, 3) of the points by the true cameras, metres: of image points, orbit and attitude."""
+        """Errors (T, n, 3) of the points with the true cameras, in metres, by image points, orbit and attitude."""
         return np.array([point_errors(self.true_pair(k), view) for k, view in enumerate(self.views)])
 
     def case(self, changes: Mapping[str, np.ndarray]) -> CaseErrors:
-        """Errors with the cameras corrected by changes; as of `point_errors`."""
+        """Return the errors with cameras corrected by changes; argument as in `point_errors`."""
         return case_errors(self.point_errors(changes), self.true_errors)
 
     @property
@@ -189,13 +193,15 @@ class PairFlight:
 
     @cached_property
     def slopes(self) -> Mapping[str, np.ndarray]:
-        """Camera -> (T, 4) slopes of the mean height by d_alpha, d_beta, d_gamma and d_f that the analysis is told,
-        m/rad and m/m: central differences of the intersection of exact image points.
+        """Derivatives (T, 4) of the mean height by the correction of each camera.
+
+        The corrections are d_alpha, d_beta, d_gamma (m/rad) and d_f (m/m). The derivatives are central differences of
+        the intersection of exact image points.
         """
         return FrozenMap({name: self._slopes(i) for i, name in enumerate(self.pair)})
 
     def _slopes(self, i: int) -> np.ndarray:
-        """(T, 4) of camera number i of the pair."""
+        """Return the derivatives (T, 4) for camera i of the pair."""
         table = np.empty((len(self.views), 4))
         for k, view in enumerate(self.views):
             for j, step in enumerate(_STEP):
@@ -208,103 +214,105 @@ class PairFlight:
         return table
 
 
-def in_analysis(line: LineCamera, like: CalibratedLine) -> CalibratedLine:
-    """A traced line in the analysis's form, with the axes and principal distance of another."""
+def in_calibrated_form(line: LineCamera, like: CalibratedLine) -> CalibratedLine:
+    """Return a traced line in the analysis's form, with the axes and principal distance of another."""
     return calibrated_line(line, like.axes, like.principal_distance)
 
 
 def traced_pair(experiment: MonitorExperiment, state: State, pair: tuple[str, str]) -> Mapping[str, LineCamera]:
-    """Camera of the pair -> its line as it truly is in a state. Raises AimError, BeamMissedError: light is lost."""
+    """Trace the lines of the pair in a state; may raise AimError or BeamMissedError if light is lost."""
     traced = traced_line_cameras(experiment.instrument, experiment.backend, state)
     return FrozenMap({name: traced[name] for name in pair})
 
 
 def point_errors(cameras: Sequence[CalibratedLine], view: View, exact_data: bool = False) -> np.ndarray:
-    """Errors (n, 3) east, north, up of points that two cameras intersect, metres.
+    """Return the errors (n, 3) east, north, up of points that two cameras intersect, in metres.
 
     Parameters
     ----------
-    cameras : Sequence[CalibratedLine]
-        The two, as the analysis takes them.
+    cameras : sequence of CalibratedLine
+        The two lines, as the analysis uses them.
     view : View
-        The points.
+        Check points.
     exact_data : bool
-        With exact image points, orbit and attitude.
+        True for exact image points, orbit and attitude.
 
     Raises
     ------
     IntersectionError
-        Rays that are parallel.
+        Rays are parallel.
     """
     seen = view.exact if exact_data else view.seen
     return check_errors(intersect_pair(cameras[0], cameras[1], *seen).ground, view.ground).error
 
 
-def case_errors(found: np.ndarray, true: np.ndarray) -> CaseErrors:
-    """Errors of a case.
+def case_errors(errors: np.ndarray, true: np.ndarray) -> CaseErrors:
+    """Return the summary of a case's errors.
 
     Parameters
     ----------
-    found : np.ndarray
-        (T, n, 3) errors east, north, up of the points, metres.
-    true : np.ndarray
-        (T, n, 3) those by the true cameras with the same image points, orbit and attitude.
+    errors : (T, n, 3) ndarray
+        Errors east, north, up of the points, in metres.
+    true : (T, n, 3) ndarray
+        Errors with the true cameras and the same image points, orbit and attitude, in metres.
     """
-    alone = found - true
+    alone = errors - true
     return CaseErrors(
-        plan=np.sqrt(np.mean(np.sum(found[..., :2] ** 2, axis=-1), axis=1)),
-        height=np.sqrt(np.mean(found[..., 2] ** 2, axis=1)),
-        bias=found[..., 2].mean(axis=1),
+        plan=np.sqrt(np.mean(np.sum(errors[..., :2] ** 2, axis=-1), axis=1)),
+        height=np.sqrt(np.mean(errors[..., 2] ** 2, axis=1)),
+        bias=errors[..., 2].mean(axis=1),
         camera=alone[..., 2].mean(axis=1),
         camera_plan=np.sqrt(np.mean(np.sum(alone[..., :2] ** 2, axis=-1), axis=1)),
         camera_height=np.sqrt(np.mean(alone[..., 2] ** 2, axis=1)),
     )
 
 
-def look_down(
+def view_check_points(
     spec: OrbitMonitorSpec,
     pair: tuple[str, str],
     lines: Sequence[Mapping[str, LineCamera]],
     seed: np.random.SeedSequence,
     advance: Advance,
 ) -> tuple[View, ...]:
-    """Check points at every time, as both lines see them.
+    """Draw check points at every time, and compute their image points in both lines.
 
     Parameters
     ----------
     spec : OrbitMonitorSpec
-        Of orbit, attitude, ground and errors.
-    pair : tuple[str, str]
-        The two cameras.
-    lines : Sequence[Mapping[str, LineCamera]]
-        Of each of the T times: camera -> its line as it truly is.
+        Content of the test file: orbit, attitude, ground and errors.
+    pair : tuple of str
+        Names of the two cameras.
+    lines : sequence of Mapping[str, LineCamera]
+        True line of each camera, for each of the T times.
     seed : np.random.SeedSequence
-        Of places and errors.
+        Seed of the points and of the errors.
     advance : Advance
-        Told of the progress.
+        Callback that reports the progress.
 
     Raises
     ------
     BenchError
-        No such orbit, or not enough points that both lines see.
+        No such orbit exists, or too few points are seen by both lines.
     """
-    flown, out = fly(spec, seed), []
+    orbit_and_attitude, views = fly(spec, seed), []
     for k, line in enumerate(lines):
-        out.append(_view(spec, spec.times[k], [line[name] for name in pair], flown, stream(seed, k + 1)))
+        views.append(_view(spec, spec.times[k], [line[name] for name in pair], orbit_and_attitude, stream(seed, k + 1)))
         advance("ground", k + 1, len(lines))
-    return tuple(out)
+    return tuple(views)
 
 
 @dataclass(frozen=True, eq=False)
-class Flown:
-    """Orbit and attitude.
+class OrbitAndAttitude:
+    """True and measured orbit and attitude.
 
     Attributes
     ----------
     earth : Earth
-        Below them.
+        Rotation and ellipsoid of the Earth.
     true : Trajectory
-        As they are; measured: as the satellite says.
+        True orbit and attitude.
+    measured : Trajectory
+        Orbit and attitude as the satellite measures them.
     """
 
     earth: Earth
@@ -312,13 +320,13 @@ class Flown:
     measured: Trajectory
 
 
-def fly(spec: OrbitMonitorSpec, seed: np.random.SeedSequence) -> Flown:
-    """Orbit and attitude of a test, the same for the same seed.
+def fly(spec: OrbitMonitorSpec, seed: np.random.SeedSequence) -> OrbitAndAttitude:
+    """Simulate the orbit and attitude of a test; the same seed gives the same ones.
 
     Raises
     ------
     BenchError
-        No such orbit.
+        No such orbit exists.
     """
     earth = Earth.from_spec(spec.earth)
     try:
@@ -328,15 +336,19 @@ def fly(spec: OrbitMonitorSpec, seed: np.random.SeedSequence) -> Flown:
     measured = true
     if spec.errors.switched_on:
         measured = true.with_errors(spec.errors, int(np.random.default_rng(stream(seed, 0)).integers(2**31)))
-    return Flown(earth, true, measured)
+    return OrbitAndAttitude(earth, true, measured)
 
 
 def _view(
-    spec: OrbitMonitorSpec, time: float, cameras: Sequence[LineCamera], flown: Flown, seed: np.random.SeedSequence
+    spec: OrbitMonitorSpec,
+    time: float,
+    cameras: Sequence[LineCamera],
+    orbit_and_attitude: OrbitAndAttitude,
+    seed: np.random.SeedSequence,
 ) -> View:
-    """Points at a time."""
-    place, image = (np.random.default_rng(stream(seed, k)) for k in range(2))
-    true, earth = flown.true, flown.earth
+    """Draw the check points of one time, and compute their sightings."""
+    random_ground, random_image = (np.random.default_rng(stream(seed, k)) for k in range(2))
+    true, earth = orbit_and_attitude.true, orbit_and_attitude.earth
     ground = spec.ground
     begin, lines = time - HALF_SPAN, int(2.0 * HALF_SPAN / spec.line_time)
     try:
@@ -346,43 +358,45 @@ def _view(
         raise BenchError(f"{error} around {moment(time)}", ("orbit", "after"), remedy) from error
     at = second_view(sensors, time, 0.5 * (ground.first + ground.last), ground.height)
     wanted = ground.points
-    height = ground.height + ground.relief * place.uniform(-1.0, 1.0, _SPARE * wanted)
-    pixel = place.uniform(ground.first, ground.last, len(height))
+    height = ground.height + ground.relief * random_ground.uniform(-1.0, 1.0, _SPARE * wanted)
+    pixel = random_ground.uniform(ground.first, ground.last, len(height))
     speed = float(np.linalg.norm(true.velocity(time))) * float(
         np.linalg.norm(earth.ecef(0.0, 0.0)) / np.linalg.norm(true.position(time))
     )
-    reach = 0.5 * ground.length / speed
-    line = (at + place.uniform(-reach, reach, len(height)) - begin) / spec.line_time
+    half_time = 0.5 * ground.length / speed
+    line = (at + random_ground.uniform(-half_time, half_time, len(height)) - begin) / spec.line_time
     inside = (line > 0.0) & (line < lines - 1.0)
     points = sensors[1].ground(line[inside], pixel[inside], height[inside])
     seen = [s.image(points) for s in sensors]
     good = np.flatnonzero(np.all([np.isfinite(row) for row, _ in seen], axis=0))[:wanted]
     if len(good) < wanted:
-        problem = f"at {moment(time)} only {len(good)} of {len(height)} places are seen by both lines"
-        remedy = "places inside both strips: nearer to the line's middle, or attitude {steering: yaw}"
+        problem = f"at {moment(time)} only {len(good)} of {len(height)} candidate points are seen by both lines"
+        remedy = "points inside both strips: nearer to the line's middle, or attitude {steering: yaw}"
         raise BenchError(problem, ("ground",), remedy)
     noise = spec.errors.image * spec.errors.switched_on
     exact, noisy = [], []
     for sensor, (row, column) in zip(sensors, seen, strict=True):
         exact.append(sightings(sensor, true, row[good], column[good]))
-        offsets = noise * image.standard_normal((2, len(good)))
-        noisy.append(sightings(sensor, flown.measured, row[good] + offsets[0], column[good] + offsets[1]))
+        offsets = noise * random_image.standard_normal((2, len(good)))
+        noisy.append(sightings(sensor, orbit_and_attitude.measured, row[good] + offsets[0], column[good] + offsets[1]))
     return View(points[good], (exact[0], exact[1]), (noisy[0], noisy[1]))
 
 
 def second_view(sensors: Sequence[Sensor], time: float, pixel: float, height: float) -> float:
-    """When the second line sees a point that the first sees as long before ``time`` (or after it), seconds.
+    """Return the time, in seconds, at which the second line sees a point, for views placed evenly about ``time``.
+
+    The first line sees the point as long before ``time`` as the second sees it after, or the other way round.
 
     Parameters
     ----------
-    sensors : Sequence[Sensor]
-        Of the two lines.
+    sensors : sequence of Sensor
+        Sensors of the two lines.
     time : float
-        Between their views, seconds.
+        Time midway between their views, in seconds.
     pixel : float
-        Of the second line.
+        Pixel of the second line.
     height : float
-        Of the point, metres.
+        Height of the point, in metres.
 
     Raises
     ------
@@ -405,6 +419,6 @@ def second_view(sensors: Sequence[Sensor], time: float, pixel: float, height: fl
 
 
 def sightings(sensor: Sensor, trajectory: Platform, row: np.ndarray, column: np.ndarray) -> Sightings:
-    """Image points with orbit and attitude of a trajectory at the times of their lines."""
+    """Return image points with orbit and attitude of a trajectory at the times of their lines."""
     seconds = sensor.time(row)
     return Sightings(column, trajectory.position(seconds), trajectory.body_to_itrs(seconds))
