@@ -255,11 +255,11 @@ def _lines(
     ends = [at.at(np.array([-0.5, at.line[-1] + 0.5])) for at in times.values()]
     begin, end = float(np.min(ends)), float(np.max(ends))
     path = TabulatedTrajectory(measurements.platform)
-    without_jitter = SteadyPlatform.of(path, max(begin, path.first), min(end, path.last))
-    rotated = [OffsetPlatform(without_jitter, np.zeros(3), _TURN * np.eye(3)[AXES.index(axis)]) for axis in search.axes]
+    steady = SteadyPlatform.of(path, max(begin, path.first), min(end, path.last))
+    rotated = [OffsetPlatform(steady, np.zeros(3), _TURN * np.eye(3)[AXES.index(axis)]) for axis in search.axes]
     lines = {}
     for name, row in rows.items():
-        sensor = Sensor.of_lines(cameras[name], without_jitter, Earth(), times[name], effects)
+        sensor = Sensor.of_lines(cameras[name], steady, Earth(), times[name], effects)
         place = np.stack([row.line - first[name], row.pixel], axis=-1)
         about = tuple(replace(sensor, trajectory=platform) for platform in rotated)
         lines[name] = _Line(sensor, row.point, place, row.covariance, times[name].at(place[:, 0]), about)
