@@ -383,9 +383,9 @@ class PositionReadingsSpec(ReadingsSpec):
         return self.values is not None
 
 
-def _one_for_each(places: Any, values: Any, key: str) -> None:
-    if places is not None and values is not None and len(values) != len(places):
-        raise Problem("not one value for each position", str(len(values)), str(len(places)), within=(key,))
+def _one_for_each(positions: Any, values: Any, key: str) -> None:
+    if positions is not None and values is not None and len(values) != len(positions):
+        raise Problem("not one value for each position", str(len(values)), str(len(positions)), within=(key,))
 
 
 class MeasurementsSpec(Spec):
@@ -422,18 +422,18 @@ class MeasurementsSpec(Spec):
 
     @model_validator(mode="after")
     def _names_once(self) -> MeasurementsSpec:
-        seen: dict[str, str] = {}
+        kinds: dict[str, str] = {}
         for kind, name, _ in self.every():
-            if name in seen:
+            if name in kinds:
                 raise Problem("two measurements have one name", name, "a different name for each", within=(kind, name))
-            seen[name] = kind
+            kinds[name] = kind
         return self
 
     def every(self) -> Iterator[tuple[str, str, ReadingsSpec]]:
         """Iterate over kind, name and content of each measurement."""
         for kind in type(self).model_fields:
-            for name, one in getattr(self, kind).items():
-                yield kind, name, one
+            for name, measurement in getattr(self, kind).items():
+                yield kind, name, measurement
 
 
 class ActuatorSpec(CompensatorSpec):
@@ -543,13 +543,13 @@ class AsBuiltSpec(Spec):
         if not any(True for _ in self.measurements.every()):
             kinds = names_text(MeasurementsSpec.model_fields)
             raise Problem("nothing was measured", None, f"at least one measurement: {kinds}", within=("measurements",))
-        for kind, name, one in self.measurements.every():
+        for kind, name, measurement in self.measurements.every():
             where = ("measurements", kind, name)
-            if one.after is not None and one.after not in self.moves:
-                raise unknown_within("no such move", one.after, self.moves, (*where, "after"))
-            if self.simulate is None and not one.given:
+            if measurement.after is not None and measurement.after not in self.moves:
+                raise unknown_within("no such move", measurement.after, self.moves, (*where, "after"))
+            if self.simulate is None and not measurement.given:
                 raise Problem("no data", name, "values or files, or `simulate: {}` to draw them", within=where)
-            if self.simulate is not None and one.given:
+            if self.simulate is not None and measurement.given:
                 raise Problem("both data and `simulate`", name, "one of them", within=where)
         for name, move in self.moves.items():
             for actuator, amount in move.by.items():

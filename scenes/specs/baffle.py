@@ -65,8 +65,8 @@ def box(name: str, body: str, pose: Pose, size: tuple[float, float, float]) -> t
     """
     x, y, z = (0.5 * s for s in size)
 
-    def wall(axis: int, angle: float, place: tuple[float, float, float], half: tuple[float, float]) -> Plate:
-        inner = Pose(about_axis(axis, angle), np.array(place))
+    def wall(axis: int, angle: float, centre: tuple[float, float, float], half: tuple[float, float]) -> Plate:
+        inner = Pose(about_axis(axis, angle), np.array(centre))
         return Plate(name, body, pose @ inner, Rectangle(*half))
 
     quarter = 0.5 * np.pi
@@ -87,10 +87,10 @@ def tube(name: str, body: str, pose: Pose, radius: float, length: float) -> tupl
     half = radius * float(np.tan(np.pi / TUBE_SIDES))
     plates = []
     for k in range(TUBE_SIDES):
-        turn = about_axis(2, 2.0 * np.pi * k / TUBE_SIDES)
+        rotation = about_axis(2, 2.0 * np.pi * k / TUBE_SIDES)
         # rotate each plate so that its z points to the axis and its x along the tube
-        inner = Pose(turn @ about_axis(1, -0.5 * np.pi), turn @ np.array([radius, 0.0, 0.5 * length]))
-        plates.append(Plate(name, body, pose @ inner, Rectangle(0.5 * length, half)))
+        pose_in_tube = Pose(rotation @ about_axis(1, -0.5 * np.pi), rotation @ np.array([radius, 0.0, 0.5 * length]))
+        plates.append(Plate(name, body, pose @ pose_in_tube, Rectangle(0.5 * length, half)))
     return tuple(plates)
 
 
@@ -147,12 +147,12 @@ class BaffleSpec(Spec):
     @model_validator(mode="after")
     def _has_its_sizes(self) -> BaffleSpec:
         for name in ("width", "height", "length", "diameter", "hole"):
-            given, needed = getattr(self, name) is not None, name in _NEEDS[self.shape]
-            if given != needed:
+            present, needed = getattr(self, name) is not None, name in _NEEDS[self.shape]
+            if present != needed:
                 what = "needs" if needed else "has no"
                 allowed = f"for a {self.shape}: {', '.join(_NEEDS[self.shape])}"
                 raise Problem(
-                    f"a {self.shape} {what} {name}", "a value" if given else "no value", allowed, within=(name,)
+                    f"a {self.shape} {what} {name}", "a value" if present else "no value", allowed, within=(name,)
                 )
         if self.shape == "ring" and not self.hole < self.diameter:  # type: ignore[operator]
             problem = "the hole is not smaller than the ring"
@@ -233,13 +233,13 @@ class SurfaceEdgeSpec(Spec):
     def _one_shape_with_its_sizes(self) -> SurfaceEdgeSpec:
         require_one(self, ("clear", "blocks"), "an edge is clear or blocks", "clear: SHAPE, or blocks: SHAPE")
         needed, possible = SIZES[self.shape]
-        places = () if self.shape == "polygon" else ("centre",)
+        centred = () if self.shape == "polygon" else ("centre",)
         for name in ("centre", "radius", "inner", "half", "width", "turn", "corners"):
-            given = getattr(self, name) is not None
-            if given and name not in (*needed, *possible, *places):
-                names = ", ".join((*needed, *possible, *places))
+            present = getattr(self, name) is not None
+            if present and name not in (*needed, *possible, *centred):
+                names = ", ".join((*needed, *possible, *centred))
                 raise Problem(f"a {self.shape} has no {name}", name, names, within=(name,))
-            if name in needed and not given:
+            if name in needed and not present:
                 raise Problem(f"a {self.shape} needs its {name}", "nothing", name)
         if self.radius is not None and self.inner is not None and not self.inner < self.radius:
             raise Problem("the hole is not within the circle", allowed="inner less than radius", within=("inner",))
@@ -253,13 +253,13 @@ class SurfaceEdgeSpec(Spec):
     def to_edge(self) -> Edge:
         """Return the edge that the ray trace uses."""
         centre = self.centre or (0.0, 0.0)
-        made: EdgeShape
+        shape: EdgeShape
         if self.radius is not None:
-            made = Circle(self.radius, centre, self.inner or 0.0)
+            shape = Circle(self.radius, centre, self.inner or 0.0)
         elif self.half is not None:
-            made = (Rectangle if self.shape == "rectangle" else Ellipse)(*self.half, centre)
+            shape = (Rectangle if self.shape == "rectangle" else Ellipse)(*self.half, centre)
         elif self.width is not None:
-            made = Ray(self.width, centre)
+            shape = Ray(self.width, centre)
         else:
-            made = Polygon(self.corners or ())
-        return Edge(made, self.blocks is not None, self.turn or 0.0)
+            shape = Polygon(self.corners or ())
+        return Edge(shape, self.blocks is not None, self.turn or 0.0)

@@ -156,8 +156,8 @@ class BeamRangesSpec(Spec):
     @model_validator(mode="after")
     def _from_less_to_more(self) -> BeamRangesSpec:
         for name in type(self).model_fields:
-            given = getattr(self, name)
-            if given is not None and not given[0] <= given[1]:
+            limits = getattr(self, name)
+            if limits is not None and not limits[0] <= limits[1]:
                 raise Problem("the range ends before it begins", within=(name,), allowed="[smallest, largest]")
         return self
 
@@ -416,12 +416,12 @@ class MirrorSpec(Spec):
 
     @model_validator(mode="after")
     def _index_where_light_refracts(self) -> MirrorSpec:
-        given = [key for key in ("index", "glass") if getattr(self, key) is not None]
-        if (self.light == "refracts") != bool(given):
+        media = [key for key in ("index", "glass") if getattr(self, key) is not None]
+        if (self.light == "refracts") != bool(media):
             problem = "an index or a glass belongs to a face of a lens (light: refracts), and to no other surface"
-            found = f"{' and '.join(given)}, light: {self.light or 'reflected'}" if given else "no index"
+            found = f"{' and '.join(media)}, light: {self.light or 'reflected'}" if media else "no index"
             raise Problem(problem, found, "light: refracts with an index or a glass", within=("light",))
-        if len(given) > 1:
+        if len(media) > 1:
             problem = "the index of a glass follows from its dispersion"
             raise Problem(problem, "index and glass", "only one of them", within=("index",))
         return self
@@ -650,15 +650,17 @@ class CameraSpec(TitledSpec):
             name: band.model_copy(update={"spectrum": band.spectrum.read(self, ("bands", name, "spectrum"))})
             for name, band in self.bands.items()
         }
-        own = None if self.spectrum is None else self.spectrum.read(self, ("spectrum",))
-        if own is self.spectrum and all(bands[name].spectrum is band.spectrum for name, band in self.bands.items()):
+        spectrum = None if self.spectrum is None else self.spectrum.read(self, ("spectrum",))
+        if spectrum is self.spectrum and all(
+            bands[name].spectrum is band.spectrum for name, band in self.bands.items()
+        ):
             return self
-        read = self.model_copy(update={"bands": FrozenMap(bands), "spectrum": own})
+        camera = self.model_copy(update={"bands": FrozenMap(bands), "spectrum": spectrum})
         try:
-            read._check_glasses()
+            camera._check_glasses()
         except Problem as problem:
             raise self.error(problem) from None
-        return read
+        return camera
 
     def require_mirrors(self, where: str, on_axis: bool = False) -> None:
         """Raise `InputError` unless the camera consists of mirrors alone.

@@ -86,7 +86,7 @@ def moment(time: float) -> str:
 
 def no_such_time(time: float, times: Sequence[float], allowed: str) -> Problem:
     """Return the problem of a time, in seconds, that a course does not have."""
-    near = min(times, key=lambda one: abs(one - time))
+    near = min(times, key=lambda candidate: abs(candidate - time))
     return Problem("not one of the course's times", moment(time), allowed, moment(near))
 
 
@@ -211,11 +211,11 @@ class CourseSpec(Spec):
                     raise Problem("given in the table already", name, "pivot", within=("motion", path, name))
         return self
 
-    def _one_for_each_time(self, key: KeyPath, given: Mapping[str, tuple[Any, ...] | None]) -> None:
-        if all(values is None for values in given.values()):
-            *names, last = given
+    def _one_for_each_time(self, key: KeyPath, series: Mapping[str, tuple[Any, ...] | None]) -> None:
+        if all(values is None for values in series.values()):
+            *names, last = series
             raise Problem("nothing changes", None, f"{', '.join(names)} or {last}", None, key)
-        for name, values in given.items():
+        for name, values in series.items():
             if values is not None and len(values) != len(self.times):
                 found, allowed = f"{len(values)} entries", f"{len(self.times)}, as many as there are times"
                 raise Problem("not one entry for each time", found, allowed, None, (*key, name))
@@ -309,8 +309,8 @@ def read_course(path: Path, named: CourseSpec) -> CourseSpec:
         raise InputError(Issue("a table needs a row of heads and a row for each time", file, line, allowed=HEADS))
     (head_line, heads), body = rows[0], rows[1:]
     columns = [_column(head, file, head_line) for head in heads]
-    places = [(*column.place, column.axis) for column in columns]
-    twice = next((head for k, head in enumerate(heads) if places[k] in places[:k]), None)
+    keys = [(*column.place, column.axis) for column in columns]
+    twice = next((head for k, head in enumerate(heads) if keys[k] in keys[:k]), None)
     if twice is not None:
         raise InputError(Issue("a second column with this head", file, head_line, (twice.strip(),)))
     if TIME not in [column.what for column in columns]:
@@ -328,8 +328,8 @@ def read_course(path: Path, named: CourseSpec) -> CourseSpec:
     for node, moves in named.motion.items():
         if node not in data["motion"]:
             allowed = names_text(data["motion"]) or "nothing"
-            wrong = unknown("the table does not move this node", node, data["motion"], allowed=allowed)
-            raise named.error(wrong, ("motion", node))
+            problem = unknown("the table does not move this node", node, data["motion"], allowed=allowed)
+            raise named.error(problem, ("motion", node))
         data["motion"][node]["pivot"] = moves.pivot
     if named.detail is not None:
         data["detail"] = named.plain()["detail"]

@@ -130,13 +130,13 @@ class TimeLawSpec(Spec):
 
     @model_validator(mode="after")
     def _one_way(self) -> "TimeLawSpec":
-        given = {name for name in _TIMES if getattr(self, name) is not None}
-        if (self.kind is not None) == bool(given):
+        keys = {name for name in _TIMES if getattr(self, name) is not None}
+        if (self.kind is not None) == bool(keys):
             raise Problem("not a time law", self.text, _LAWS)
-        if given - {"drift", "period"} and given not in _PRODUCTS:
+        if keys - {"drift", "period"} and keys not in _PRODUCTS:
             allowed = "trend alone or with period, relaxation or jump alone, event alone or with drift and period"
             raise Problem("not a time law: these cannot be multiplied", self.text, allowed)
-        if self.since is not None and not {"trend", "relaxation"} & given:
+        if self.since is not None and not {"trend", "relaxation"} & keys:
             raise Problem(
                 "only trend and relaxation have a start",
                 self.text,
@@ -297,14 +297,14 @@ def _components(value: Any) -> Any:
     if len(value) > MOST_JOINT:
         raise Problem("too many components", f"{len(value)} of them", f"at most {MOST_JOINT}, the most important ones")
     out: dict[str, float] = {}
-    said: dict[tuple[str, str, str], str] = {}
+    names: dict[tuple[str, str, str], str] = {}
     for name, sigma in value.items():
         try:
             out[name] = _sigma_of(str(name), sigma)
             parts = component_named(name)[:3]
-            if parts in said:
-                raise Problem("a component is named twice", shown(name), f"once; it is also named {said[parts]}")
-            said[parts] = name
+            if parts in names:
+                raise Problem("a component is named twice", shown(name), f"once; it is also named {names[parts]}")
+            names[parts] = name
         except Problem as wrong:
             raise wrong.below(name) from None
     return out
@@ -387,10 +387,10 @@ class JointSpec(Spec):
         heads = tuple(cell.strip() for cell in rows[0][1]) if rows else ()
         line = rows[0][0] if rows else None
         if sorted(heads) != sorted(names):
-            strange = [head for head in heads if head not in names]
+            extra = [head for head in heads if head not in names]
             missing = [name for name in names if name not in heads]
-            found = f"{names_text(strange[:3])} among the heads" if strange else f"no column {names_text(missing[:3])}"
-            found = found if strange or missing else "a repeated column"
+            found = f"{names_text(extra[:3])} among the heads" if extra else f"no column {names_text(missing[:3])}"
+            found = found if extra or missing else "a repeated column"
             problem = f"not the components of {self.source.file or 'the file of disturbances'}"
             raise InputError(Issue(problem, str(path), line, (), found, f"their {len(names)} names, each once"))
         order = [heads.index(name) for name in names]
@@ -522,8 +522,8 @@ class CauseChangeSpec(_CauseWords):
         if self.figure is not None and cause.figure is not None:
             update["figure"] = FrozenMap({**cause.figure, **self.figure})
         if self.temperature is not None and cause.temperature is not None:
-            own = {name: getattr(self.temperature, name) for name in self.temperature.model_fields_set}
-            update["temperature"] = cause.temperature.model_copy(update=own)
+            changed = {name: getattr(self.temperature, name) for name in self.temperature.model_fields_set}
+            update["temperature"] = cause.temperature.model_copy(update=changed)
         return cause.model_copy(update=update)
 
 
@@ -591,8 +591,8 @@ class DisturbancesSpec(TitledSpec):
             if missing or not any(key in change.given for key in MOVES):
                 new = f"a new one with bodies, a reason and one of {names_text(MOVES)}"
                 allowed = f"a change of {names_text(self.causes)}; or {new}"
-                wrong = unknown(f"no such cause in {self.name}", name, self.causes, allowed=allowed)
-                raise changes.error(wrong, ("causes", name))
+                problem = unknown(f"no such cause in {self.name}", name, self.causes, allowed=allowed)
+                raise changes.error(problem, ("causes", name))
             # the parts are already validated; validating again would require quantities as text
             causes[name] = CauseSpec.model_construct(**change.given)
         if not causes and self.joint is None:

@@ -57,9 +57,9 @@ def kinds_of(data: Any) -> tuple[FileKind, ...]:
             return (next(kind for kind in file_kinds() if kind.name == name),)
     if "test" in keys:
         return kinds_of(data["test"])
-    found = [(strange, kind) for kind in file_kinds() if (strange := kind.count_unknown(keys)) is not None]
-    least = min((strange for strange, _ in found), default=SLIPS + 1)
-    return tuple(kind for strange, kind in found if strange == least <= SLIPS)
+    counts = [(extra, kind) for kind in file_kinds() if (extra := kind.count_unknown(keys)) is not None]
+    least = min((extra for extra, _ in counts), default=SLIPS + 1)
+    return tuple(kind for extra, kind in counts if extra == least <= SLIPS)
 
 
 def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Given:
@@ -88,8 +88,8 @@ def read_for(command: str, file: Path, resolve: Callable[[Path], Given]) -> Give
             raise error from None
         if not kinds or len(kinds) > _MOST or any(kind.command == command for kind in kinds):
             raise
-        what, there = " or ".join(kind.what for kind in kinds), ", or ".join(_place(kind, file) for kind in kinds)
-        raise InputError(Issue(f"this is {what}, which {command} does not read; {there}", str(file))) from None
+        what, remedy = " or ".join(kind.what for kind in kinds), ", or ".join(_place(kind, file) for kind in kinds)
+        raise InputError(Issue(f"this is {what}, which {command} does not read; {remedy}", str(file))) from None
 
 
 def _place(kind: FileKind, file: Path) -> str:

@@ -79,10 +79,10 @@ class LensGlassSpec(Spec):
 
     @model_validator(mode="after")
     def _is_known(self) -> LensGlassSpec:
-        given = [key for key in ("formula", "coefficients", "range") if getattr(self, key) is not None]
-        if given and len(given) < 3:
-            raise Problem("an incomplete definition of a glass", ", ".join(given), "formula, coefficients, range")
-        if not given:
+        keys = [key for key in ("formula", "coefficients", "range") if getattr(self, key) is not None]
+        if keys and len(keys) < 3:
+            raise Problem("an incomplete definition of a glass", ", ".join(keys), "formula, coefficients, range")
+        if not keys:
             try:
                 glass(self.name)
             except KeyError:
@@ -133,14 +133,14 @@ class LensGlassSpec(Spec):
         ValueError
             Neither the catalogue nor the file has its expansion or the change of its index.
         """
-        own = None if self.formula is not None else glass(self.name)
-        stuff = None if own is None else MATERIALS.get(own.name)
-        if self.expansion is None and stuff is None:
+        named = None if self.formula is not None else glass(self.name)
+        solid = None if named is None else MATERIALS.get(named.name)
+        if self.expansion is None and solid is None:
             raise UnphysicalError(
                 f"the thermal expansion of {self.name} is unknown; its glass needs `expansion: 8.2 ppm/K`, the first "
                 "number of ED in its AGF catalogue"
             )
-        thermal = own.thermal if own is not None else None
+        thermal = named.thermal if named is not None else None
         if self.thermal is not None:
             d0, d1, d2, e0, e1, lambda_tk = self.thermal
             thermal = ThermalDispersion(d0, d1, d2, e0, e1, lambda_tk)
@@ -150,12 +150,12 @@ class LensGlassSpec(Spec):
                 "[D0, D1, D2, E0, E1, Lambda_TK]`, the first six numbers of TD in its AGF catalogue"
             )
         if self.expansion is not None:
-            expansion, stated = self.expansion, CATALOGUE_RANGE
+            expansion, valid = self.expansion, CATALOGUE_RANGE
         else:
-            assert stuff is not None
-            expansion, stated = stuff.expansion, stuff.known
-        low, high = max(stated.coldest, SCHOTT_RANGE.coldest), min(stated.hottest, SCHOTT_RANGE.hottest)
-        source = stated.source if (low, high) == (stated.coldest, stated.hottest) else SCHOTT_RANGE.source
+            assert solid is not None
+            expansion, valid = solid.expansion, solid.known
+        low, high = (max(valid.coldest, SCHOTT_RANGE.coldest), min(valid.hottest, SCHOTT_RANGE.hottest))
+        source = valid.source if (low, high) == (valid.coldest, valid.hottest) else SCHOTT_RANGE.source
         known = TemperatureRange(low, high, source)
         return WarmGlass(self.name, expansion, known, self.index(wavelength, medium), wavelength, thermal)
 

@@ -443,11 +443,11 @@ class MountedCameraSpec(Spec):
             return self.model_copy(update={"pupil_offset": (-x, -y)})
         if self.channels is None:
             return self
-        turned = {
-            name: one.model_copy(update={"pupil_offset": (-one.pupil_offset[0], -one.pupil_offset[1])})
-            for name, one in self.channels.items()
+        opposite = {
+            name: spec.model_copy(update={"pupil_offset": (-spec.pupil_offset[0], -spec.pupil_offset[1])})
+            for name, spec in self.channels.items()
         }
-        return self.model_copy(update={"channels": FrozenMap(turned)})
+        return self.model_copy(update={"channels": FrozenMap(opposite)})
 
 
 class MaterialsSpec(Spec):
@@ -556,16 +556,16 @@ class InstrumentSpec(TitledSpec):
             missing = "monitor" if self.monitor is None else CENTRAL_KEY
             text = "a monitor needs both the section `monitor` and a central prism"
             raise Problem(text, f"no {missing}", f"{missing}, or neither of the two", within=())
-        for name, site in self.cameras.items():
+        for name, mounted in self.cameras.items():
             if self.monitor is not None:
                 allowed = "one of pupil_offset and channels"
-                asked = "the monitor's channels must be given in exactly one way"
-                require_one(site, ("pupil_offset", "channels"), asked, allowed, ("cameras", name))
+                problem = "the monitor's channels must be given in exactly one way"
+                require_one(mounted, ("pupil_offset", "channels"), problem, allowed, ("cameras", name))
                 continue
-            given = [key for key in ("pupil_offset", "channels") if getattr(site, key) is not None]
-            if given:
+            keys = [key for key in ("pupil_offset", "channels") if getattr(mounted, key) is not None]
+            if keys:
                 text = "a camera of an instrument without a monitor has no channels"
-                raise Problem(text, given[0], "neither, or a monitor and a central_prism", within=("cameras", name))
+                raise Problem(text, keys[0], "neither, or a monitor and a central_prism", within=("cameras", name))
         return self
 
     @classmethod
@@ -579,8 +579,8 @@ class InstrumentSpec(TitledSpec):
         camera : str
             Prescription, by name or path.
         """
-        site = MountedCameraSpec.model_construct(camera=camera, look=0.0, position=(0.0, 0.0, 0.0))
-        return cls.model_construct(name=name, cameras=FrozenMap({name: site}))
+        mounted = MountedCameraSpec.model_construct(camera=camera, look=0.0, position=(0.0, 0.0, 0.0))
+        return cls.model_construct(name=name, cameras=FrozenMap({name: mounted}))
 
     @property
     def autocollimator(self) -> MonitorSpec:
@@ -618,10 +618,10 @@ class InstrumentSpec(TitledSpec):
         key : KeyPath
             Key for all channels, e.g. ``("monitor", "prism_180", "width")``.
         """
-        site = self.cameras.get(camera)
-        if site is None or site.channels is None or channel not in site.channels:
+        mounted = self.cameras.get(camera)
+        if mounted is None or mounted.channels is None or channel not in mounted.channels:
             return key
-        whole = {
+        common = {
             ("monitor", "field"): "field",
             ("cameras", camera, "pupil_offset"): "pupil_offset",
             ("monitor", "return_face"): "return_face",
@@ -630,8 +630,8 @@ class InstrumentSpec(TitledSpec):
             ("monitor", PRISM_180): PRISM_180,
             ("monitor", PRISM_0): PRISM_0,
         }
-        for start, name in whole.items():
-            if key[: len(start)] == start and getattr(site.channels[channel], name) is not None:
+        for start, name in common.items():
+            if key[: len(start)] == start and getattr(mounted.channels[channel], name) is not None:
                 return ("cameras", camera, "channels", channel, name, *key[len(start) :])
         return key
 
@@ -643,26 +643,26 @@ class InstrumentSpec(TitledSpec):
         camera : str
             Name of the camera.
         """
-        site = self.cameras[camera]
+        mounted = self.cameras[camera]
         if self.monitor is None or self.central_prism is None:
             return {}
         monitor, prism = self.monitor, self.central_prism
-        given = site.channels
-        if given is None:
-            assert site.pupil_offset is not None
+        specs = mounted.channels
+        if specs is None:
+            assert mounted.pupil_offset is not None
             pair = zip(SIDES, (monitor.field, -monitor.field), strict=True)
-            given = {name: ChannelSpec.model_construct(field=f, pupil_offset=site.pupil_offset) for name, f in pair}
+            specs = {name: ChannelSpec.model_construct(field=f, pupil_offset=mounted.pupil_offset) for name, f in pair}
         return {
             name: ChannelParts(
-                one.field,
-                one.pupil_offset,
-                one.return_face or monitor.return_face,
-                one.spread or prism.spread,
-                one.photons_per_frame or monitor.reticle.photons_per_frame,
-                one.prism_180 or monitor.prism_180,
-                one.prism_0 or monitor.prism_0,
+                spec.field,
+                spec.pupil_offset,
+                spec.return_face or monitor.return_face,
+                spec.spread or prism.spread,
+                spec.photons_per_frame or monitor.reticle.photons_per_frame,
+                spec.prism_180 or monitor.prism_180,
+                spec.prism_0 or monitor.prism_0,
             )
-            for name, one in given.items()
+            for name, spec in specs.items()
         }
 
 

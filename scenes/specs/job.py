@@ -213,10 +213,10 @@ def pivot_problem(
         Key path of the course.
     """
     for path, moves in course.motion.items():
-        own = perturb.get(path)
-        if own is not None and (any(own.rotate) or own.scale) and own.pivot != moves.pivot:
+        other = perturb.get(path)
+        if other is not None and (any(other.rotate) or other.scale) and other.pivot != moves.pivot:
             text = "the pivot differs from that under perturb, to which the course is added"
-            return Problem(text, shown(moves.pivot), own.pivot, within=(*within, "motion", path, "pivot"))
+            return Problem(text, shown(moves.pivot), other.pivot, within=(*within, "motion", path, "pivot"))
     return None
 
 

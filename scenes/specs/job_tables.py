@@ -171,17 +171,17 @@ def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
     """
     heat = isinstance(spec, TableTemperatureSpec)
     assert spec.table is not None
-    place, known = (*key, "table"), (*node_table.TABLES, *node_table.MESHES)
-    path = owner.file_at(place, spec.table, Path(owner.source.file).parent, f"a file ({names_text(known)})")
+    table_key, known = (*key, "table"), (*node_table.TABLES, *node_table.MESHES)
+    path = owner.file_at(table_key, spec.table, Path(owner.source.file).parent, f"a file ({names_text(known)})")
     ending = path.suffix.lower()
     if ending in node_table.INPUT_DECKS:
         text = f"a {ending} file has no {'temperatures' if heat else 'displacements'} that this program can read"
         raise owner.error(
-            text, place, found=spec.table, allowed=node_table.HEAT_DECKS_NEED if heat else node_table.DECKS_NEED
+            text, table_key, found=spec.table, allowed=node_table.HEAT_DECKS_NEED if heat else node_table.DECKS_NEED
         )
     if ending not in known:
         text = "unknown type of table or mesh"
-        raise owner.error(Problem(text, shown(spec.table), names_text(known), nearest(ending, known)), place)
+        raise owner.error(Problem(text, shown(spec.table), names_text(known), nearest(ending, known)), table_key)
     of_meshes = ("unit", "field", "values") if heat else ("unit", "field")
     if ending in node_table.TABLES:
         wrong = next((name for name in of_meshes if getattr(spec, name) is not None), None)
@@ -190,11 +190,11 @@ def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
             raise owner.error(text, (*key, wrong), allowed=f"no {wrong}")
     elif spec.unit is None:
         raise owner.error(
-            "the file of a mesh does not contain its unit", place, found=spec.table, allowed="a key unit: mm"
+            "the file of a mesh does not contain its unit", table_key, found=spec.table, allowed="a key unit: mm"
         )
     elif isinstance(spec, TableTemperatureSpec) and spec.values is None:
         text = "the file of a mesh does not say whether its temperatures are changes or absolute"
-        raise owner.error(text, place, found=spec.table, allowed="values: change, K or degC as a further key")
+        raise owner.error(text, table_key, found=spec.table, allowed="values: change, K or degC as a further key")
     if isinstance(spec, TableTemperatureSpec):
         node_table.read_temperatures(path, spec.unit, spec.field, spec.values, spec.sha256)
     else:
@@ -348,17 +348,17 @@ def checked_finishes(owner: Spec, key: KeyPath, spec: FinishesSpec) -> FinishesS
     """
     out = {}
     for (kind, what), table in spec.tables.items():
-        place = (*key, kind, what)
-        path = owner.file_at(place, table.table, Path(owner.source.file).parent, "a file")
+        table_key = (*key, kind, what)
+        path = owner.file_at(table_key, table.table, Path(owner.source.file).parent, "a file")
         ending = path.suffix.lower()
-        right = (ENDING,) if what == "bsdf" else node_table.TABLES
-        if ending not in right:
+        suffixes = (ENDING,) if what == "bsdf" else node_table.TABLES
+        if ending not in suffixes:
             text = f"not the file type of a {what} table"
-            raise owner.error(text, place, found=table.table, allowed=names_text(right))
+            raise owner.error(text, table_key, found=table.table, allowed=names_text(suffixes))
         digest = digest_of(path)
         if table.sha256 is not None and digest != table.sha256:
             text = "not the table that was used: its checksum differs"
-            raise owner.error(text, place, found=digest, allowed=f"sha256 {table.sha256}")
+            raise owner.error(text, table_key, found=digest, allowed=f"sha256 {table.sha256}")
         if what == "bsdf":
             read_bsdf(path)
         else:

@@ -90,10 +90,10 @@ def load_instrument(reference: str | Path, owner: Spec | None = None, key: KeyPa
     data = text.data if isinstance(text.data, dict) else {}
     if "mirrors" in data:
         camera, path = validate(CameraSpec, text), Path(text.file)
-        own = path.stem if path.parent == _folder(CAMERAS) else path.name
+        reference_in_file = path.stem if path.parent == _folder(CAMERAS) else path.name
         if isinstance(reference, Inline):
-            own = Inline(camera.name, text)
-        return InstrumentSpec.of_camera(camera.name, own).with_source(Source(text.file))
+            reference_in_file = Inline(camera.name, text)
+        return InstrumentSpec.of_camera(camera.name, reference_in_file).with_source(Source(text.file))
     if DESIGN in data:
         return _as_built(validate(AsBuiltInstrumentSpec, text))
     instrument = validate(InstrumentSpec, text)
@@ -108,13 +108,13 @@ def _as_built(spec: AsBuiltInstrumentSpec) -> InstrumentSpec:
     """Return the instrument as built, made from its design."""
     data = _instrument_file(spec.design, spec, (DESIGN,)).data
     if isinstance(data, dict) and DESIGN in data:
-        problem, its = "this design is itself an instrument as built", shown(data[DESIGN])
-        allowed = f"its design, {its}, with all deviations below as_built"
+        problem, name = "this design is itself an instrument as built", shown(data[DESIGN])
+        allowed = f"its design, {name}, with all deviations below as_built"
         raise spec.error(problem, (DESIGN,), found=spec.design, allowed=allowed)
-    stated = spec.disturbances
-    if stated is not None and stated != NONE:
-        stated = placed(DISTURBANCES, stated, spec, ("disturbances",))
-    return spec.made_of(load_instrument(spec.design, spec, (DESIGN,)), stated)
+    disturbances = spec.disturbances
+    if disturbances is not None and disturbances != NONE:
+        disturbances = placed(DISTURBANCES, disturbances, spec, ("disturbances",))
+    return spec.made_of(load_instrument(spec.design, spec, (DESIGN,)), disturbances)
 
 
 def is_instrument(data: Any) -> bool:
@@ -139,19 +139,19 @@ def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesS
     InputError
         The file is missing or invalid, or the job changes a cause that the file does not have.
     """
-    asked = job.disturbances
+    changes = job.disturbances
     owner: Spec = job
-    reference = None if asked is None else asked.file
+    reference = None if changes is None else changes.file
     key: KeyPath = ("disturbances", "file")
     if reference is None:
         owner, reference, key = instrument, instrument.disturbances, ("disturbances",)
     if reference is None or reference == NONE:
-        if asked is not None and (asked.causes or asked.without):
+        if changes is not None and (changes.causes or changes.without):
             text = "there is no disturbances file to change"
             raise job.error(text, ("disturbances",), allowed="the name of one as file")
         return None
-    stated = load_disturbances(reference, owner, key)
-    return stated if asked is None else stated.changed(asked)
+    disturbances = load_disturbances(reference, owner, key)
+    return disturbances if changes is None else disturbances.changed(changes)
 
 
 AREA_CCD: KeyPath = ("monitor", "area_ccd", "detector")
@@ -180,8 +180,8 @@ def load_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath =
     text = referred(CAMERAS, reference, owner, key)
     if isinstance(text.data, dict) and DESIGN in text.data:
         problem = "an instrument as built is not a prescription of a camera"
-        line, place = text.lines.get((*text.prefix, DESIGN)), (*text.prefix, DESIGN)
-        raise InputError(Issue(problem, text.file, line, place, None, "its design's camera"))
+        line, key_path = text.lines.get((*text.prefix, DESIGN)), (*text.prefix, DESIGN)
+        raise InputError(Issue(problem, text.file, line, key_path, None, "its design's camera"))
     return validate(CameraSpec, text).with_curves()
 
 
@@ -227,10 +227,10 @@ def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
         # the pose of the whole camera has no effect in front of a collimator
         if node in (f"{BASE}/{name}", name):
             continue
-        own = node.removeprefix(f"{BASE}/").removeprefix(f"{name}/")
-        if own in built:
-            raise test.error(f"{text.file} already has this body", ("as_built", own), allowed="one of the two")
-        built[own] = what
+        part = node.removeprefix(f"{BASE}/").removeprefix(f"{name}/")
+        if part in built:
+            raise test.error(f"{text.file} already has this body", ("as_built", part), allowed="one of the two")
+        built[part] = what
     return test.model_copy(update={"as_built": FrozenMap(built)}), load_cameras(instrument)[mounted.camera]
 
 
@@ -319,8 +319,8 @@ def find_named(
         problem = unknown(text, str(reference), _names(folders), allowed=_names_and_paths(folders))
         raise InputError(problem.at("")) if owner is None else owner.error(problem, key)
     if owner is not None and not is_file(path):
-        meant = nearest(path.stem, _names(folders))
-        raise owner.error(unusable(path), key, allowed=_names_and_paths(folders), suggestion=meant)
+        near = nearest(path.stem, _names(folders))
+        raise owner.error(unusable(path), key, allowed=_names_and_paths(folders), suggestion=near)
     return path
 
 
@@ -328,8 +328,8 @@ def placed(folder: str, reference: str, owner: Spec, key: KeyPath, others: tuple
     """Return a reference that is valid from any folder; arguments and errors as in `referred`."""
     if isinstance(reference, Inline):
         return reference.placed(owner.source, key)
-    found = find_named(folder, reference, owner, key, others)
-    return str(found.absolute()) if is_path(reference) else reference
+    path = find_named(folder, reference, owner, key, others)
+    return str(path.absolute()) if is_path(reference) else reference
 
 
 def is_path(name_or_path: str | Path) -> bool:

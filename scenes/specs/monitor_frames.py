@@ -188,7 +188,7 @@ class MeasurementSpec(Spec):
             if self.times is not None and len(files.after) != len(self.times):
                 found, allowed = f"{len(files.after)} of {len(self.times)} times", "one file or list of files a time"
                 raise Problem("not as many entries as times", found, allowed, within=where)
-            if self.times is None and any(len(one) > 1 for one in files.after):
+            if self.times is None and any(len(entry) > 1 for entry in files.after):
                 text = "lists of files need several times"
                 raise Problem(text, None, "times: [...], or a plain list", within=where)
         return self
@@ -203,7 +203,7 @@ class MeasurementSpec(Spec):
         """
         if self.times is not None:
             return files.after
-        return (tuple(name for one in files.after for name in one),)
+        return (tuple(name for entry in files.after for name in entry),)
 
 
 def per_channel(files: Any, channel: str) -> tuple[str, ...]:
@@ -268,8 +268,8 @@ def _model(spec: MeasurementSpec, instrument: str) -> ResolvedJob:
         return model
     monitor = model.instrument.autocollimator
     ccd = monitor.area_ccd.model_copy(update={"exposure": spec.exposure})
-    own = model.instrument.model_copy(update={"monitor": monitor.model_copy(update={"area_ccd": ccd})})
-    return model.model_copy(update={"instrument": own})
+    instrument_spec = model.instrument.model_copy(update={"monitor": monitor.model_copy(update={"area_ccd": ccd})})
+    return model.model_copy(update={"instrument": instrument_spec})
 
 
 def _channels(spec: MeasurementSpec, model: ResolvedJob | None) -> tuple[str, ...]:
@@ -290,7 +290,7 @@ def _located(spec: MeasurementSpec, channels: tuple[str, ...], base: Path) -> Me
         for name, files in frames.items():
             _known(spec, ("frames", name), name, channels)
             before = _paths(spec, ("frames", name, BEFORE), files.before, base)
-            after = tuple(_paths(spec, ("frames", name, AFTER, k), one, base) for k, one in enumerate(files.after))
+            after = tuple(_paths(spec, ("frames", name, AFTER, k), entry, base) for k, entry in enumerate(files.after))
             frames[name] = files.model_copy(update={"before": before, "after": after})
     missing = [name for name in channels if name not in frames]
     if missing:
@@ -298,16 +298,16 @@ def _located(spec: MeasurementSpec, channels: tuple[str, ...], base: Path) -> Me
         raise spec.error(text, ("frames",), allowed="frames of every channel of the instrument, before and after")
     update["frames"] = FrozenMap({name: frames[name] for name in channels})
     for key in ("dark", "flat", "bad_pixels"):
-        given: Mapping[str, tuple[str, ...]] | None = getattr(spec, key)
-        if given is None:
+        files_of: Mapping[str, tuple[str, ...]] | None = getattr(spec, key)
+        if files_of is None:
             continue
-        for name in given:
+        for name in files_of:
             _known(spec, (key, name), name, (*channels, ALL))
-        update[key] = FrozenMap({name: _paths(spec, (key, name), files, base) for name, files in given.items()})
-        left = [name for name in channels if name not in given and ALL not in given]
-        if left:
+        update[key] = FrozenMap({name: _paths(spec, (key, name), files, base) for name, files in files_of.items()})
+        uncovered = [name for name in channels if name not in files_of and ALL not in files_of]
+        if uncovered:
             raise spec.error(
-                f"missing for {names_text(left)}", (key,), allowed=f"{ALL}: FILES, or files of every channel"
+                f"missing for {names_text(uncovered)}", (key,), allowed=f"{ALL}: FILES, or files of every channel"
             )
     return spec.model_copy(update=update)
 
@@ -326,34 +326,34 @@ def _paths(spec: Spec, key: KeyPath, files: Iterable[str], base: Path) -> tuple[
 
 
 def _found(
-    spec: MeasurementSpec, place: Path, channels: tuple[str, ...]
+    spec: MeasurementSpec, path: Path, channels: tuple[str, ...]
 ) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
     """Return the frames in a folder or a table, and the times of a series; no times for a single state."""
-    if is_file(place) and place.suffix.lower() == ".csv":
-        return read_frame_table(place, channels)
-    if is_file(place):
+    if is_file(path) and path.suffix.lower() == ".csv":
+        return read_frame_table(path, channels)
+    if is_file(path):
         allowed = "a folder of frames, a .csv table of files, or CAMERA/CHANNEL: {before: FILE, after: FILE}"
         raise spec.error("neither a folder nor a table", ("frames",), found=spec.frames, allowed=allowed)
     try:
-        names = sorted(one.name for one in place.iterdir())
+        names = sorted(entry.name for entry in path.iterdir())
     except (OSError, ValueError):
         allowed = "a folder of frames, relative to this file"
-        raise spec.error(f"no such folder: {place}", ("frames",), allowed=allowed) from None
+        raise spec.error(f"no such folder: {path}", ("frames",), allowed=allowed) from None
     frames = {}
     for channel in channels:
         files = {}
         for when in (BEFORE, AFTER):
             stem = f"{channel.replace('/', '_')}_{when}"
             present = [stem + ending for ending in ENDINGS if stem + ending in names]
-            file = next((name for name in present if not _is_picture(place / name)), None)
+            file = next((name for name in present if not _is_picture(path / name)), None)
             if file is None:
-                meant = None if present else nearest(f"{stem}.tiff", names)
-                text, others = f"no frames of {channel} {when} in {place}", ", ".join(ENDINGS[1:])
+                near = None if present else nearest(f"{stem}.tiff", names)
+                text, others = f"no frames of {channel} {when} in {path}", ", ".join(ENDINGS[1:])
                 if present:
                     text += f": {present[0]} is an 8-bit preview, not a recorded frame"
                 allowed = f"{stem}.tiff (or {others}), or CAMERA/CHANNEL: {{before: FILE, after: FILE}}"
-                raise spec.error(text, ("frames",), allowed=allowed, suggestion=meant)
-            files[when] = (str((place / file).absolute()),)
+                raise spec.error(text, ("frames",), allowed=allowed, suggestion=near)
+            files[when] = (str((path / file).absolute()),)
         frames[channel] = ChannelFramesSpec.model_construct(before=files[BEFORE], after=(files[AFTER],))
     return frames, ()
 
@@ -430,7 +430,7 @@ class _FrameTable:
         self,
         row: dict[str, str],
         line: int,
-        seen: dict[str, dict[float | str, list[str]]],
+        states: dict[str, dict[float | str, list[str]]],
         corners: dict[tuple[str, bool], tuple[int, int]],
     ) -> None:
         file = str(self.path)
@@ -449,11 +449,11 @@ class _FrameTable:
                 raise InputError(Issue(problem.problem, file, line, (head,), shown(row[head]), allowed)) from None
         elif row[head] not in (BEFORE, AFTER):
             raise InputError(Issue("no such state", file, line, (head,), shown(row[head]), f"{BEFORE}, {AFTER}"))
-        place = self.path.parent / row["file"]
-        if not is_file(place):
-            allowed, meant = f"{_IMAGES}, relative to the table", file_beside(place)
-            raise InputError(Issue(unusable(place), file, line, ("file",), None, allowed, meant))
-        seen.setdefault(channel, {}).setdefault(when, []).append(str(place.absolute()))
+        image = self.path.parent / row["file"]
+        if not is_file(image):
+            allowed, near = f"{_IMAGES}, relative to the table", file_beside(image)
+            raise InputError(Issue(unusable(image), file, line, ("file",), None, allowed, near))
+        states.setdefault(channel, {}).setdefault(when, []).append(str(image.absolute()))
         if "row" in row:
             corner = []
             for name in ("row", "column"):
@@ -466,25 +466,25 @@ class _FrameTable:
                 raise InputError(Issue(text, file, line, ("row",), shown(corner), "the same for all after a state"))
 
     def _frames(
-        self, seen: dict[str, dict[float | str, list[str]]], corners: dict[tuple[str, bool], tuple[int, int]]
+        self, states_of: dict[str, dict[float | str, list[str]]], corners: dict[tuple[str, bool], tuple[int, int]]
     ) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
         file = str(self.path)
-        states = {when for one in seen.values() for when in one if when != BEFORE}
+        states = {when for files in states_of.values() for when in files if when != BEFORE}
         order = sorted(states, key=lambda when: when if isinstance(when, float) else 0.0)
         if not order or len(order) > MOST_TIMES:
             raise InputError(Issue(f"{len(order)} states after", file, None, allowed=f"1 to {MOST_TIMES}"))
         frames = {}
         for channel in self.channels:
-            one = seen.get(channel, {})
+            files = states_of.get(channel, {})
             for when in (BEFORE, *order):
-                if when not in one:
-                    told = when if isinstance(when, str) else f"at {moment(when)}"
-                    raise InputError(Issue(f"no file of {channel} {told}", file, None, allowed="a row for each state"))
+                if when not in files:
+                    state = when if isinstance(when, str) else f"at {moment(when)}"
+                    raise InputError(Issue(f"no file of {channel} {state}", file, None, allowed="a row for each state"))
             corner: dict[str, Any] = {"offset": corners.get((channel, True))}
             corner["offset_after"] = corners.get((channel, False))
             frames[channel] = ChannelFramesSpec.model_construct(
-                before=tuple(one[BEFORE]),
-                after=tuple(tuple(one[when]) for when in order),
+                before=tuple(files[BEFORE]),
+                after=tuple(tuple(files[when]) for when in order),
                 **{key: pixel for key, pixel in corner.items() if pixel is not None},
             )
         times = tuple(when for when in order if isinstance(when, float))

@@ -69,11 +69,11 @@ def node_named(name: str, nodes: Iterable[str]) -> str:
     Problem
         The name fits no body, or several.
     """
-    found = meant(name, nodes)
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise Problem("several nodes have this name", shown(name), names_text(found))
+    matches = meant(name, nodes)
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        raise Problem("several nodes have this name", shown(name), names_text(matches))
     raise unknown("no such node", name, sorted(nodes))
 
 
@@ -87,9 +87,9 @@ def short_name(path: str, nodes: Iterable[str]) -> str:
     nodes : Iterable[str]
         Paths of all bodies.
     """
-    parts, every = path.split("/"), tuple(nodes)
+    parts, paths = path.split("/"), tuple(nodes)
     tails = ("/".join(parts[-count:]) for count in range(1, len(parts) + 1))
-    return next((tail for tail in tails if meant(tail, every) == [path]), path)
+    return next((tail for tail in tails if meant(tail, paths) == [path]), path)
 
 
 def motion_of(text: str) -> tuple[str, str, str, str, str]:
@@ -191,7 +191,7 @@ def perturbation_in_words(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
         A text is not of this form, or two texts set the same component.
     """
     out: dict[str, dict[str, Any]] = {}
-    said: set[tuple[str, str, str]] = set()
+    components: set[tuple[str, str, str]] = set()
     for text in texts:
         node, kind, axis, quantity, pivot = motion_of(text)
         amount: str | float = quantity
@@ -199,9 +199,9 @@ def perturbation_in_words(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
             amount = _pure(kind, quantity, text)
         elif split_quantity(quantity) is None:
             raise Problem("the amount with its unit is missing", shown(quantity or text), FORMS)
-        if (node, kind, axis) in said:
+        if (node, kind, axis) in components:
             raise Problem("this component is set twice", shown(text), f"one {kind} {axis}".rstrip() + f" of {node}")
-        said.add((node, kind, axis))
+        components.add((node, kind, axis))
         what = out.setdefault(node, {})
         put(what, kind, axis, amount, NOTHING.get(kind))
         if pivot:

@@ -156,7 +156,7 @@ class OperationSpec(Spec):
 
     @model_validator(mode="after")
     def _each_once(self) -> OperationSpec:
-        names = [one.name for one in self.requirements]
+        names = [requirement.name for requirement in self.requirements]
         for k, name in enumerate(names):
             if name in names[:k]:
                 text = "a quantity has two requirements"
@@ -202,20 +202,20 @@ def resolve_operation(spec: OperationSpec) -> OperationSetup:
     Errors as in `read_operation`.
     """
     update: dict[str, str] = {}
-    for key, place, others in (("instrument", INSTRUMENTS, ("cameras",)), ("disturbances", DISTURBANCES, ())):
+    for key, folder, others in (("instrument", INSTRUMENTS, ("cameras",)), ("disturbances", DISTURBANCES, ())):
         reference = getattr(spec, key)
         if reference == NONE:
             problem, allowed = "a plan of operation needs disturbances", "the name of a file of disturbances"
             raise spec.error(problem, (key,), found=reference, allowed=allowed)
-        update[key] = placed(place, reference, spec, (key,), others)
+        update[key] = placed(folder, reference, spec, (key,), others)
     spec = spec.model_copy(update=update)
     setup = OperationSetup.model_construct(operation=spec, model=resolve_on(spec, spec.instrument, spec.disturbances))
     known = setup.disturbances.causes
     for event, causes in spec.events.items():
         for k, cause in enumerate(causes):
             if cause not in known:
-                wrong = unknown(f"no such cause in {setup.disturbances.name}", cause, known)
-                raise spec.error(wrong, ("events", event, k))
+                unknown_cause = unknown(f"no such cause in {setup.disturbances.name}", cause, known)
+                raise spec.error(unknown_cause, ("events", event, k))
     return setup
 
 
@@ -304,37 +304,37 @@ class ReadingTableSpec(Spec):
             key = "columns" if self.columns else "form"
             raise Problem(f"a table of kind {self.kind} has no {key}", None, "name: HEAD", within=(key,))
         _measures(self.time_unit, MOMENT, ("time_unit",))
-        for subject, one in self.columns.items():
-            _is_measured(self.kind, one, ("columns", subject))
-            if self.form == "keywords" and len(one.column) > 1:
+        for subject, columns in self.columns.items():
+            _is_measured(self.kind, columns, ("columns", subject))
+            if self.form == "keywords" and len(columns.column) > 1:
                 problem = "several keywords for one reading"
-                raise Problem(problem, names_text(one.column), "one keyword", within=("columns", subject, "column"))
+                raise Problem(problem, names_text(columns.column), "one keyword", within=("columns", subject, "column"))
         return self
 
 
-def _is_measured(kind: str, one: ReadingColumnSpec, where: tuple[str, ...]) -> None:
+def _is_measured(kind: str, columns: ReadingColumnSpec, where: tuple[str, ...]) -> None:
     """Raise `Problem` for columns whose number, unit or sigma do not fit a kind of reading."""
     value, sigma = VALUES[kind]
-    count = {QUATERNION: 4}.get(one.unit, 3) if kind == "attitude" else 1
-    if len(one.column) != count:
-        text = f"{len(one.column)} columns for one {kind}"
-        raise Problem(text, names_text(one.column), f"{count} of them", within=(*where, "column"))
-    if not (kind == "attitude" and one.unit == QUATERNION):
-        _measures(one.unit, value, (*where, "unit"))
+    count = {QUATERNION: 4}.get(columns.unit, 3) if kind == "attitude" else 1
+    if len(columns.column) != count:
+        text = f"{len(columns.column)} columns for one {kind}"
+        raise Problem(text, names_text(columns.column), f"{count} of them", within=(*where, "column"))
+    if not (kind == "attitude" and columns.unit == QUATERNION):
+        _measures(columns.unit, value, (*where, "unit"))
     try:
-        known = parse_quantity(one.sigma, sigma)
+        known = parse_quantity(columns.sigma, sigma)
     except Problem as problem:
         raise problem.below(*where, "sigma") from None
     if not known > 0.0:
-        raise Problem("not greater than zero", one.sigma, sigma.allowed, within=(*where, "sigma"))
+        raise Problem("not greater than zero", columns.sigma, sigma.allowed, within=(*where, "sigma"))
 
 
 def _measures(unit: str, kind: Kind, where: tuple[str, ...]) -> None:
     try:
         parse_quantity(f"1 {unit}", kind)
     except Problem as problem:
-        meant = problem.suggestion or nearest(unit, kind.units)
-        raise Problem(problem.problem, repr(unit), names_text(kind.units), meant, within=where) from None
+        near = problem.suggestion or nearest(unit, kind.units)
+        raise Problem(problem.problem, repr(unit), names_text(kind.units), near, within=where) from None
 
 
 class TelemetrySpec(Spec):

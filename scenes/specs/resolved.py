@@ -594,12 +594,12 @@ def _of_run(yaml: YamlFile, name: str | None) -> CameraSetup:
     below = yaml.data if isinstance(yaml.data, dict) else {}
     if "study" in below and isinstance(below.get("base"), dict):
         yaml, below = yaml.part("base"), below["base"]
-    one, many = below.get("camera"), below.get("cameras")
-    if isinstance(one, dict) and "mirrors" in one:
+    single, several = below.get("camera"), below.get("cameras")
+    if isinstance(single, dict) and "mirrors" in single:
         return _alone(validate(CameraSpec, yaml.part("camera")), yaml.file, name)
-    held = {key: c for key, c in many.items() if isinstance(c, dict)} if isinstance(many, dict) else {}
-    if held and all("mirrors" in camera for camera in held.values()):
-        camera = validate(CameraSpec, yaml.part("cameras", _chosen(tuple(held), yaml.file, name)))
+    cameras = {key: c for key, c in several.items() if isinstance(c, dict)} if isinstance(several, dict) else {}
+    if cameras and all("mirrors" in camera for camera in cameras.values()):
+        camera = validate(CameraSpec, yaml.part("cameras", _chosen(tuple(cameras), yaml.file, name)))
         return CameraSetup.model_construct(camera=camera, mounted=None, instrument=None, cameras=FrozenMap())
     raise InputError(Issue("this file contains no prescription of a camera", yaml.file, 1, allowed=ALLOWED))
 

@@ -84,9 +84,11 @@ class SpectrumSpec(Spec):
 
     @model_validator(mode="after")
     def _one_form(self) -> SpectrumSpec:
-        given = "table" if self.table is not None else "curve"
+        curve_key = "table" if self.table is not None else "curve"
         allowed = "between, wavelengths or table"
-        require_one(self, ("between", "wavelengths", given), "the spectrum must be given in exactly one way", allowed)
+        require_one(
+            self, ("between", "wavelengths", curve_key), "the spectrum must be given in exactly one way", allowed
+        )
         if self.weights is not None and len(self.weights) != len(self.wavelengths or ()):
             problem, found = ("not one weight for each wavelength", f"{len(self.weights)} weights")
             raise Problem(problem, found, f"{len(self.wavelengths or ())} of them", within=("weights",))
@@ -103,10 +105,10 @@ class SpectrumSpec(Spec):
         if self.between is not None and not self.between[0] <= self.between[1]:
             found = f"[{', '.join(format_quantity(w, LENGTH) for w in self.between)}]"
             raise Problem("the spectrum's wavelengths are in the wrong order", found, "[shortest, longest]")
-        for name, along in (("wavelengths", self.wavelengths), ("curve", tuple(w for w, _ in self.curve or ()))):
-            late = next((k for k, (a, b) in enumerate(pairwise(along or ()), 1) if not a < b), None)
-            if late is not None:
-                raise Problem("the wavelengths do not ascend", None, "ascending wavelengths", within=(name, late))
+        for name, values in (("wavelengths", self.wavelengths), ("curve", tuple(w for w, _ in self.curve or ()))):
+            descending = next((k for k, (a, b) in enumerate(pairwise(values or ()), 1) if not a < b), None)
+            if descending is not None:
+                raise Problem("the wavelengths do not ascend", None, "ascending wavelengths", within=(name, descending))
         if self.curve is not None and not (all(r >= 0.0 for _, r in self.curve) and any(r for _, r in self.curve)):
             raise Problem("the response is negative, or zero everywhere", None, "a response", within=("curve",))
         return self
@@ -201,19 +203,19 @@ class SpectrumSpec(Spec):
         folder = Path(owner.source.file).parent
         path = owner.file_at((*key, "table"), self.table, folder, "a CSV file")
         columns = (Column("wavelength", LENGTH, least=100e-9, most=100e-6), Column("response", least=0.0))
-        read = read_table(path, columns, least_rows=2)
-        if len(read) > MOST_SAMPLES:
+        table = read_table(path, columns, least_rows=2)
+        if len(table) > MOST_SAMPLES:
             raise owner.error(
-                "the table has too many rows", (*key, "table"), found=len(read), allowed=f"at most {MOST_SAMPLES}"
+                "the table has too many rows", (*key, "table"), found=len(table), allowed=f"at most {MOST_SAMPLES}"
             )
-        along, response = read["wavelength"], read["response"]
-        late = np.flatnonzero(np.diff(along) <= 0.0)
-        if len(late):
-            raise read.error(int(late[0]) + 1, "wavelength", "the wavelengths do not ascend")
+        wavelengths, response = table["wavelength"], table["response"]
+        descending = np.flatnonzero(np.diff(wavelengths) <= 0.0)
+        if len(descending):
+            raise table.error(int(descending[0]) + 1, "wavelength", "the wavelengths do not ascend")
         if not np.any(response > 0.0):
-            raise read.error(0, "response", "no response at any wavelength")
+            raise table.error(0, "response", "no response at any wavelength")
         # remove the rounding error of the conversion to metres
-        curve = tuple((float(f"{w:.12g}"), float(r)) for w, r in zip(along, response, strict=True))
+        curve = tuple((float(f"{w:.12g}"), float(r)) for w, r in zip(wavelengths, response, strict=True))
         return self.model_copy(update={"curve": curve})
 
 
@@ -243,9 +245,9 @@ def _corners(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
     if spectrum.curve is None:
         raise ValueError(f"the table {spectrum.table} has not been read")
     corners, response = np.array(spectrum.curve).T
-    lit = np.flatnonzero(response > 0.0)
-    some = slice(max(int(lit[0]) - 1, 0), int(lit[-1]) + 2)
-    return corners[some], response[some]
+    signal = np.flatnonzero(response > 0.0)
+    used = slice(max(int(signal[0]) - 1, 0), int(signal[-1]) + 2)
+    return corners[used], response[used]
 
 
 Spectrum = Annotated[SpectrumSpec, short_for("between", list, tuple)]

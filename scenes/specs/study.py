@@ -269,9 +269,9 @@ class FactorSpec(Spec):
         if self.key is None and self.keys is None and not self.scales:
             allowed = "key: [...], keys: [[...], [...]], or scales: [{key: [...]}]"
             raise Problem("a factor needs a key, a motion or scales", "no key", allowed)
-        given = [kind for kind in KINDS if getattr(self, kind) is not None]
-        if len(given) != 1:
-            found = ", ".join(given) or "none of them"
+        kinds = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if len(kinds) != 1:
+            found = ", ".join(kinds) or "none of them"
             raise Problem("a factor needs exactly one kind of values", found, f"one of {', '.join(KINDS)}")
         if self.values is not None and not self.values:
             raise Problem("the factor is empty", "an empty list", "one value or more", within=("values",))
@@ -316,9 +316,9 @@ class FactorSpec(Spec):
 
     def _check_scales(self) -> None:
         """Raise `Problem` unless a factor that scales is a positive number, and a pure number if it has no key."""
-        own = next((k for k, scale in enumerate(self.scales) if scale.key in self.places), None)
-        if own is not None:
-            raise Problem("the factor sets this value itself", None, "another key", within=("scales", own, "key"))
+        same = next((k for k, scale in enumerate(self.scales) if scale.key in self.places), None)
+        if same is not None:
+            raise Problem("the factor sets this value itself", None, "another key", within=("scales", same, "key"))
         if not self.scales or self.table is not None:
             return
         numbers = self.numbers()
@@ -533,8 +533,8 @@ class ResponseSpec(Spec):
     @property
     def stated(self) -> dict[str, KeyPath]:
         """Suffix of a column of the result -> key path of the standard deviation in it."""
-        given = {TOTAL: self.sigma, NOISE: self.noise}
-        return {ending: key for ending, key in given.items() if key is not None}
+        sigmas = {TOTAL: self.sigma, NOISE: self.noise}
+        return {ending: key for ending, key in sigmas.items() if key is not None}
 
 
 class ThresholdSpec(Spec):
@@ -650,14 +650,14 @@ class StudySpec(TitledSpec):
 
     @model_validator(mode="after")
     def _fits_together(self) -> StudySpec:
-        taken: dict[Any, str] = {}
+        factors: dict[Any, str] = {}
         for name, factor in self.factors.items():
-            for k, place in enumerate(factor.places):
-                if place in taken:
-                    text = f"the factor {taken[place]} already changes this value"
+            for k, key_path in enumerate(factor.places):
+                if key_path in factors:
+                    text = f"the factor {factors[key_path]} already changes this value"
                     within = ("factors", name, *factor.key_of(k))
-                    raise Problem(text, key_text(place), "each value changed by one factor only", within=within)
-                taken[place] = name
+                    raise Problem(text, key_text(key_path), "each value changed by one factor only", within=within)
+                factors[key_path] = name
             self._check_design(name, factor)
         clash = self._clash()
         if clash is not None:
@@ -688,8 +688,8 @@ class StudySpec(TitledSpec):
 
     def _clash(self) -> str | None:
         """Return a name that two columns of the result would have, or None."""
-        stated = [f"{name}{ending}" for name, one in self.responses.items() for ending in one.stated]
-        names = ["run", "failed", "message", "seed", *self.factors, *self.responses, *stated]
+        sigmas = [f"{name}{ending}" for name, response in self.responses.items() for ending in response.stated]
+        names = ["run", "failed", "message", "seed", *self.factors, *self.responses, *sigmas]
         return next((name for name in names if names.count(name) > 1), None)
 
 

@@ -491,7 +491,7 @@ class ToleranceBudgetSpec(Spec):
 
     @model_validator(mode="after")
     def _disturbances_have_readings(self) -> ToleranceBudgetSpec:
-        if self.disturbances is not None and not any(one.kind in OF_MONITOR for one in self.merits.values()):
+        if self.disturbances is not None and not any(merit.kind in OF_MONITOR for merit in self.merits.values()):
             allowed = f"a merit of kind {' or '.join(OF_MONITOR)}, or no disturbances"
             raise Problem("no merit depends on disturbances", None, allowed, within=("disturbances",))
         return self

@@ -279,10 +279,10 @@ class CameraChangeSpec(Spec):
     def _may_change(self) -> CameraChangeSpec:
         both = (self.lasting, self.each_pass)
         for k, name in enumerate(("d_alpha", "d_beta", "d_gamma")):
-            if not any(one.angles[k] for one in both):
+            if not any(change.angles[k] for change in both):
                 problem = f"{name} has a prior sigma of zero, which is not realistic"
                 raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
-        if not any(one.principal_distance for one in both):
+        if not any(change.principal_distance for change in both):
             problem = "the principal distance has a prior sigma of zero, which is not realistic"
             raise Problem(problem, None, "a sigma above zero in `lasting` or `each_pass`", within=("lasting",))
         return self
@@ -395,7 +395,7 @@ class OrbitAdjustSpec(PayloadTestSpec):
             if name not in self.lines:
                 raise unknown("no such line among `lines`", name, self.lines, ("changes", name))
         one_monitor(self.monitor, self.monitor_record)
-        trackers = tuple(dict.fromkeys(one.tracker for one in self.passes.values()))
+        trackers = tuple(dict.fromkeys(item.tracker for item in self.passes.values()))
         for k, angle in enumerate(self.angles):
             for j, name in enumerate(angle.between):
                 if name not in trackers:
@@ -403,7 +403,9 @@ class OrbitAdjustSpec(PayloadTestSpec):
             if len(set(angle.between)) == 1:
                 problem, place = "an angle of a star tracker with itself", ("angles", k, "between")
                 raise Problem(problem, angle.between[0], "two star trackers", within=place)
-        lasting = [one for one in self.errors.attitude.values() if (one.law, one.shared_by) == ("constant", "tracker")]
+        lasting = [
+            item for item in self.errors.attitude.values() if (item.law, item.shared_by) == ("constant", "tracker")
+        ]
         if self.angles and not lasting:
             problem = "an angle between star trackers that have no constant error"
             raise Problem(

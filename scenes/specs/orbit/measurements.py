@@ -256,19 +256,19 @@ def with_absolute_files(
     InputError
         A file that must exist is missing; reported at the owner's key.
     """
-    place = Path(spec.source.file).parent if folder is None else folder
+    base = Path(spec.source.file).parent if folder is None else folder
     changes: dict[str, Any] = {}
     for name in type(spec).model_fields:
         value, below = getattr(spec, name), (*key, name)
         if isinstance(value, Spec):
-            changes[name] = with_absolute_files(value, place, owner, below)
-        elif isinstance(value, Mapping) and any(isinstance(one, Spec) for one in value.values()):
-            inner = {k: with_absolute_files(one, place, owner, (*below, k)) for k, one in value.items()}
+            changes[name] = with_absolute_files(value, base, owner, below)
+        elif isinstance(value, Mapping) and any(isinstance(item, Spec) for item in value.values()):
+            inner = {k: with_absolute_files(item, base, owner, (*below, k)) for k, item in value.items()}
             changes[name] = FrozenMap(inner)
         elif name in (*_FILE_NAMES, *FILE_KEYS) and isinstance(value, str):
             if owner is not None:
-                owner.file_at(below, value, place, "a CSV file" if name in FILE_KEYS else "a file")
-            changes[name] = os.path.abspath(place / value)
+                owner.file_at(below, value, base, "a CSV file" if name in FILE_KEYS else "a file")
+            changes[name] = os.path.abspath(base / value)
     return spec.model_copy(update=changes)
 
 
@@ -357,18 +357,18 @@ class PassFilesSpec(Spec):
 
     @model_validator(mode="after")
     def _has_a_platform(self) -> PassFilesSpec:
-        apart = (self.orbit is not None, self.attitude is not None)
-        if (self.platform is not None) == any(apart) or (any(apart) and not all(apart)):
-            given = [k for k in ("platform", "orbit", "attitude") if getattr(self, k) is not None]
+        separate = (self.orbit is not None, self.attitude is not None)
+        if (self.platform is not None) == any(separate) or (any(separate) and not all(separate)):
+            keys = [k for k in ("platform", "orbit", "attitude") if getattr(self, k) is not None]
             allowed = "`platform: FILE`, `platform:` with files of other formats, or `orbit: FILE` and `attitude: FILE`"
-            raise Problem("orbit and attitude must be given once", " and ".join(given) or "none of them", allowed)
+            raise Problem("orbit and attitude must be given once", " and ".join(keys) or "none of them", allowed)
         return self
 
     @property
     def files(self) -> dict[str, str]:
         """Key -> path of every table; without files of other formats."""
-        found = {name: getattr(self, name) for name in FILE_KEYS}
-        return {name: file for name, file in found.items() if isinstance(file, str)}
+        files = {name: getattr(self, name) for name in FILE_KEYS}
+        return {name: file for name, file in files.items() if isinstance(file, str)}
 
 
 Passes = Annotated[Named[PassFilesSpec], not_empty("no passes", "at least one pass")]

@@ -220,8 +220,8 @@ class CorrectionSpec(Spec):
 
     def kind_of(self, key: str) -> Kind:
         """Return the kind of quantity of ``step``, ``range`` or ``dead_band``."""
-        own = self.mechanism is not None and key != "dead_band"
-        return _KINDS[self.motion[1]] if own else _QUANTITIES[self.quantity]
+        of_mechanism = self.mechanism is not None and key != "dead_band"
+        return _KINDS[self.motion[1]] if of_mechanism else _QUANTITIES[self.quantity]
 
     def _size(self, key: str) -> float | None:
         text = getattr(self, key)
@@ -519,8 +519,8 @@ class OrbitMonitorSpec(TitledSpec):
 
     def measured(self, interval: float) -> list[int]:
         """Return the numbers of the measured times at this interval, counted from the reference to both sides."""
-        every = round(interval / self.step)
-        return [k for k in range(len(self.times)) if (k - self.referred) % every == 0]
+        steps = round(interval / self.step)
+        return [k for k in range(len(self.times)) if (k - self.referred) % steps == 0]
 
     @property
     def job(self) -> JobSpec:

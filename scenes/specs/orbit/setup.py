@@ -203,9 +203,9 @@ class CalibrationSetup(PayloadSetup[OrbitCalibrationSpec]):
             return self
         _require_images_of(test, LINES, camera)
         _require_detectors(self, tuple(camera.lines), camera, self.detectors)
-        for k, place in enumerate(test.images.patches):
+        for k, patch in enumerate(test.images.patches):
             key, pixels = ("images", "patches", k, "pixel"), camera.pixels_of("nadir")
-            _require_pixel(test, key, place.pixel, pixels, f"the nadir line of {camera.name}")
+            _require_pixel(test, key, patch.pixel, pixels, f"the nadir line of {camera.name}")
         return self
 
 
@@ -420,13 +420,13 @@ def _placed(test: Any) -> Any:
     """Return the test with absolute paths of its files and of its record; the URL of a database is unchanged."""
     if isinstance(test, measurements.OrbitCheckSpec | measurements.OrbitMatchSpec):
         return measurements.with_absolute_files(test)
-    one = getattr(test, "monitor_record", None)
-    if one is None:
+    source = getattr(test, "monitor_record", None)
+    if source is None:
         return test
     folder = Path(test.source.file).parent if test.source.file else Path()
-    record = one.record if "://" in one.record else str((folder / one.record).resolve())
-    plan = None if one.plan is None else str((folder / one.plan).resolve())
-    return test.model_copy(update={"monitor_record": one.model_copy(update={"record": record, "plan": plan})})
+    record = source.record if "://" in source.record else str((folder / source.record).resolve())
+    plan = None if source.plan is None else str((folder / source.plan).resolve())
+    return test.model_copy(update={"monitor_record": source.model_copy(update={"record": record, "plan": plan})})
 
 
 DATA_FILE = "data.yaml"
@@ -443,17 +443,17 @@ def data_of(test: measurements.MeasuredTestSpec) -> measurements.OrbitDataSpec:
     """
     file = Path(test.source.file)
     if test.data is None:
-        said: dict[str, Any] = {"conventions": test.conventions, "passes": test.passes}
-        data = measurements.OrbitDataSpec.model_construct(**said).with_source(test.source)
+        sections: dict[str, Any] = {"conventions": test.conventions, "passes": test.passes}
+        data = measurements.OrbitDataSpec.model_construct(**sections).with_source(test.source)
     else:
-        place = file.parent / test.data
-        file = place / DATA_FILE if place.is_dir() else place
+        path = file.parent / test.data
+        file = path / DATA_FILE if path.is_dir() else path
         if (wrong := no_file(file)) is not None:
             allowed = f"a folder with a {DATA_FILE}, or the path of such a file"
             problem = "no such measurements" if wrong == MISSING else f"no measurements: {wrong}"
-            raise test.error(problem, ("data",), found=str(place), allowed=allowed)
+            raise test.error(problem, ("data",), found=str(path), allowed=allowed)
         data = validate(measurements.OrbitDataSpec, read_yaml(file))
-    tables = any(not isinstance(one.platform, measurements.PlatformFilesSpec) for one in data.passes.values())
+    tables = any(not isinstance(item.platform, measurements.PlatformFilesSpec) for item in data.passes.values())
     for key in ("quaternion", "body_axes"):
         if tables and getattr(data.conventions, key) is None:
             problem = f"{key} is missing: a table of an attitude does not contain this convention"
@@ -478,8 +478,8 @@ def without_sensors(setup: AnyAdjust, names: Sequence[str]) -> AnyAdjust:
     """
     if not names:
         return setup
-    every = tuple(dict.fromkeys((*setup.test.without, *names)))
-    test = setup.test.model_copy(update={"without": every})
+    excluded = tuple(dict.fromkeys((*setup.test.without, *names)))
+    test = setup.test.model_copy(update={"without": excluded})
     _require_sensors(test)
     return setup.model_copy(update={"test": test})
 
@@ -530,8 +530,8 @@ def _require_mechanisms(setup: MonitorSetup, loop: MechanismsSpec) -> None:
                 raise test.error(problem, ("mechanisms", "images"), allowed=allowed)
     for name, correction in loop.corrections.items():
         if correction.camera not in setup.pair:
-            wrong = unknown("no camera of the pair", correction.camera, setup.pair)
-            raise test.error(wrong, ("mechanisms", "corrections", name, "camera"))
+            unknown_camera = unknown("no camera of the pair", correction.camera, setup.pair)
+            raise test.error(unknown_camera, ("mechanisms", "corrections", name, "camera"))
 
 
 def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: Paths[CameraSpec]) -> None:
@@ -602,8 +602,8 @@ def _require_detectors(
     for name in lines:
         image = camera.image_of(name)
         if image is not None:
-            own = ("lines", name, "image") if camera.lines[name].image is not None else ("image",)
-            require_detector(setup, ("camera", *own, "detector"), image.detector, detectors)
+            image_key = ("lines", name, "image") if camera.lines[name].image is not None else ("image",)
+            require_detector(setup, ("camera", *image_key, "detector"), image.detector, detectors)
 
 
 def _require_ends(test: Spec, section: str, ends: tuple[float, float], pixels: int, line: str) -> None:
