@@ -6,7 +6,7 @@ the stop alone is integrated exactly; other edges are polygons of the same area 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,16 +17,21 @@ from optics.camera.ray_bundle import Field, chief_point, direction_of, launch_ra
 from optics.geometry import zernike
 from optics.geometry.polygon import covered
 from optics.numerics.array_math import UnphysicalError
+from optics.numerics.backend import default_backend
 from optics.numerics.quadrature import PupilNodes, disk
 from optics.raytrace.first_order import first_order
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.imaging import fit_part, imaging_rays, path_to_sphere, pupil_field
-from optics.waves.optical_transfer import polychromatic_transfer, with_nodes_enough
+from optics.waves.optical_transfer import transfer, with_enough_nodes
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import CUT_RINGS, DEGREE, PupilFunction, fit_pupils
+from optics.waves.pupil_stack import DEGREE, VIGNETTED_RINGS, PupilFunction, fit_pupils
 
 _STATISTICS_PHASE = 36.0
 """Phase for which twelve rings of nodes are taken, radians: enough for squares of smooth wavefronts."""
+
+
+Spectrum = Mapping[float, float]
+"""Wavelength, metres -> its weight in the light."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,44 +137,29 @@ def wavefront(camera: Camera, field: Field = (0.0, 0.0), terms: int = 28) -> Wav
     error = -(path[1:] - path[0]) / camera.wavelength
     fit = fit_part(nodes.x, nodes.y, nodes.weight, error, terms)
     flat = error - zernike.basis(3, nodes.x, nodes.y) @ fit.level
-    return Wavefront(
-        nodes.x,
-        nodes.y,
-        nodes.share,
-        camera.wavelength * flat,
-        camera.wavelength * fit.parts,
-        camera.wavelength * fit.rms,
-        camera.wavelength * fit.residual_rms,
-        fit.strehl,
-        float(np.sum(nodes.weight) / np.pi),
-    )
+    wave, light = camera.wavelength, float(np.sum(nodes.weight) / np.pi)
+    sizes = wave * flat, wave * fit.parts, wave * fit.rms, wave * fit.residual_rms
+    return Wavefront(nodes.x, nodes.y, nodes.share, *sizes, fit.strehl, light)
 
 
-def _colours(
-    camera: Camera, wavelengths: Sequence[float] | None, weights: Sequence[float] | None
-) -> list[tuple[Camera, float]]:
-    """Return the camera in light of each wavelength, and the share of that light."""
-    colours = np.atleast_1d(np.asarray([camera.wavelength] if wavelengths is None else wavelengths, float))
-    shares = np.ones(len(colours)) if weights is None else np.asarray(weights, float)
-    if shares.shape != colours.shape or not np.all(shares >= 0.0) or not np.sum(shares) > 0.0:
-        raise ValueError(f"weights must be one for each of {len(colours)} wavelengths, not negative and not all 0")
-    return [(camera.at(float(w)), float(s)) for w, s in zip(colours, shares / np.sum(shares), strict=True)]
+def _colours(camera: Camera, spectrum: Spectrum | None) -> list[tuple[Camera, float]]:
+    """Return the camera in light of each wavelength of a spectrum, and the share of that light."""
+    shares = {camera.wavelength: 1.0} if spectrum is None else spectrum
+    total = sum(shares.values())
+    if not total > 0.0 or min(shares.values()) < 0.0:
+        raise ValueError("a spectrum must have weights that are not negative, and one that is positive")
+    return [(camera.at(wavelength), share / total) for wavelength, share in shares.items()]
 
 
 def _field_at(camera: Camera, field: Field, nodes: PupilNodes, origin: np.ndarray) -> PupilField:
     """Return the plane waves about a point of the image plane (3,) from nodes of the stop, of unit power."""
     imaging, to_stop = camera.systems
-    rays = imaging_rays(camera.backend, imaging, to_stop, direction_of(field), camera.launch, camera.aperture, nodes)
+    rays = imaging_rays(default_backend(), imaging, to_stop, direction_of(field), camera.launch, camera.aperture, nodes)
     return pupil_field(rays, camera.wavelength, camera.image_pose.inverse().apply(origin))
 
 
 def psf(
-    camera: Camera,
-    step: float,
-    count: int = 129,
-    field: Field = (0.0, 0.0),
-    wavelengths: Sequence[float] | None = None,
-    weights: Sequence[float] | None = None,
+    camera: Camera, step: float, count: int = 129, field: Field = (0.0, 0.0), spectrum: Spectrum | None = None
 ) -> np.ndarray:
     """Compute the point spread function on the image plane by diffraction.
 
@@ -183,10 +173,9 @@ def psf(
         Number of samples along each axis; the chief ray's image point is in the middle of the grid.
     field : (float, float)
         Angles x and y of the far point, radians.
-    wavelengths : sequence of float, optional
-        Wavelengths of the light, metres; the place of the image is that of ``camera.wavelength`` for all of them.
-    weights : sequence of float, optional
-        Share of the light of each wavelength; equal by default.
+    spectrum : mapping of float to float, optional
+        Wavelength in metres -> its weight in the light, ``{camera.wavelength: 1.0}`` by default; the grid is about the
+        chief ray of ``camera.wavelength`` for all of them.
 
     Returns
     -------
@@ -225,38 +214,23 @@ def psf(
     origin, _ = _chief(camera, field)
     grid = Grid(-0.5 * (count - 1) * step, step, int(count))
     out = np.zeros((count, count))
-    for colour, share in _colours(camera, wavelengths, weights):
-        wave = wavefront(colour, field, 3)
-        nodes = light_nodes(colour, field, _phase(colour, float(np.ptp(wave.error)), step * count))
+    for colour, share in _colours(camera, spectrum):
+        # how far the phase runs over the pupil: in the corners of the image, and of the wavefront error
+        path = 0.55 / colour.f_number * np.sqrt(0.5) * step * count + np.ptp(wavefront(colour, field, 3).error)
+        nodes = light_nodes(colour, field, float(2.0 * np.pi / colour.wavelength * path))
         out += share * image(_field_at(colour, field, nodes, origin), grid, grid)[0]
     return out
-
-
-def _phase(camera: Camera, error: float, width: float) -> float:
-    """Return how far the phase of waves runs over the pupil at the corners of an image, radians.
-
-    Parameters
-    ----------
-    camera : Camera
-        Camera in light of its wavelength.
-    error : float
-        Range of the wavefront error, metres.
-    width : float
-        Width of the image, metres.
-    """
-    aperture = 0.5 / camera.f_number
-    return float(2.0 * np.pi / camera.wavelength * (1.1 * aperture * np.sqrt(0.5) * width + error))
 
 
 def _pupil(camera: Camera, field: Field, origin: np.ndarray) -> PupilFunction:
     """Return the exit pupil about a point of the image plane (3,) with what edges take of it."""
     pieces = shadow_pieces(camera, field)
-    nodes = disk(CUT_RINGS if pieces is not None else 12)
+    nodes = disk(VIGNETTED_RINGS if pieces is not None else 12)
     traced = _field_at(camera, field, nodes, origin)
     if pieces is None:
         return fit_pupils(traced, nodes)[0]
     lit = ~covered(pieces, np.stack([nodes.x, nodes.y], axis=-1), SMALLEST)
-    return with_nodes_enough(fit_pupils(traced, nodes, DEGREE, pieces, lit)[0], camera.wavelength)
+    return with_enough_nodes(fit_pupils(traced, nodes, DEGREE, pieces, lit)[0], camera.wavelength)
 
 
 def mtf(
@@ -264,8 +238,7 @@ def mtf(
     frequency: ArrayLike,
     field: Field = (0.0, 0.0),
     azimuth: float = 0.0,
-    wavelengths: Sequence[float] | None = None,
-    weights: Sequence[float] | None = None,
+    spectrum: Spectrum | None = None,
 ) -> np.ndarray:
     """Compute the modulation transfer function on the image plane.
 
@@ -279,10 +252,8 @@ def mtf(
         Angles x and y of the far point, radians.
     azimuth : float
         Direction in which the pattern varies, from x toward y, radians.
-    wavelengths : sequence of float, optional
-        Wavelengths of the light, metres.
-    weights : sequence of float, optional
-        Share of the light of each wavelength; equal by default.
+    spectrum : mapping of float to float, optional
+        Wavelength in metres -> its weight in the light, ``{camera.wavelength: 1.0}`` by default.
 
     Returns
     -------
@@ -313,7 +284,7 @@ def mtf(
         raise ValueError(f"frequency must be finite and of shape (M,), got shape {np.shape(frequency)}")
     origin, _ = _chief(camera, field)
     both = cycles[:, None] * np.array([np.cos(azimuth), np.sin(azimuth)])
-    colours = _colours(camera, wavelengths, weights)
-    pupils = [_pupil(colour, field, origin) for colour, _ in colours]
-    waves, shares = np.array([c.wavelength for c, _ in colours]), np.array([share for _, share in colours])
-    return np.asarray(np.abs(polychromatic_transfer(pupils, both, waves, shares, np.zeros(1))[0]))
+    total = np.zeros(len(both), complex)
+    for colour, share in _colours(camera, spectrum):
+        total += share * transfer(_pupil(colour, field, origin), both, colour.wavelength, np.zeros(1))[0]
+    return np.asarray(np.abs(total))

@@ -21,7 +21,8 @@ from optics.geometry.surface import Surface, ZernikeFigure, plane
 from optics.geometry.tree import Body, RigidTree
 from optics.materials.glass import refractive_index
 from optics.numerics.array_math import UnphysicalError, determinant
-from optics.numerics.backend import Backend, default_backend
+from optics.numerics.backend import default_backend
+from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.first_order import Paraxial, RayMatrix, paraxial, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
@@ -76,8 +77,9 @@ class OpticalSurface:
     --------
     A paraboloid of 2 m focal length whose hole has a quarter of its diameter:
 
-    >>> OpticalSurface(radius=-4.0, conic=-1.0, thickness=-2.0, material="mirror", diameter=0.4, inner_diameter=0.1)
-    OpticalSurface(radius=-4.0, thickness=-2.0, conic=-1.0, material='mirror', diameter=0.4, inner_diameter=0.1)
+    >>> m1 = OpticalSurface(-4.0, -2.0, conic=-1.0, material="mirror", diameter=0.4, inner_diameter=0.1)
+    >>> m1.thickness, m1.vanes
+    (-2.0, ())
     >>> OpticalSurface(radius=0.0)
     Traceback (most recent call last):
     ...
@@ -110,24 +112,18 @@ class OpticalSurface:
         if self.figure and not isfinite(self.diameter):
             raise ValueError("a figure needs a finite diameter: its Zernike terms are over that disk")
 
-    def __repr__(self) -> str:
-        """Show the numbers that are not the defaults."""
-        shown = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        default = OpticalSurface.__dataclass_fields__
-        parts = (f"{k}={v!r}" for k, v in shown.items() if v != default[k].default and not (k == "figure" and not v))
-        return f"OpticalSurface({', '.join(parts)})"
-
     @property
     def shape(self) -> Surface:
         """Shape of the surface in its own frame."""
         figure = ZernikeFigure(0.5 * self.diameter, self.offset, self.figure) if self.figure else None
         return Surface(1.0 / self.radius, self.conic, tuple(self.asphere), figure)
 
-    def edges(self, outer: bool = True) -> tuple[Edge, ...]:
-        """Return what stops light at the surface, with the outer edge or without it."""
-        rim = [Edge(Circle(0.5 * self.diameter, self.offset))] if outer and isfinite(self.diameter) else []
-        hole = [Edge(Circle(0.5 * self.inner_diameter, self.offset), blocks=True)] if self.inner_diameter else []
-        return (*rim, *hole, *(Edge(Ray(w, self.offset), blocks=True, rotation=angle) for w, angle in self.vanes))
+    def edges(self, rim: bool = True, hole: bool = True) -> tuple[Edge, ...]:
+        """Return what stops light at the surface, with its rim and hole or without."""
+        out = [Edge(Circle(0.5 * self.diameter, self.offset))] if rim and isfinite(self.diameter) else []
+        if hole and self.inner_diameter:
+            out.append(Edge(Circle(0.5 * self.inner_diameter, self.offset), blocks=True))
+        return (*out, *(Edge(Ray(w, self.offset), blocks=True, rotation=angle) for w, angle in self.vanes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,18 +221,14 @@ class Camera:
     @cached_property
     def assembly(self) -> Assembly:
         """Camera as the ray trace takes it."""
-        bodies, elements, before = [], {}, 1.0
-        for k, (surface, index) in enumerate(zip(self.surfaces, self.indices, strict=True)):
-            place = np.array([*surface.decenter, self.vertices[k]])
-            bodies.append(Body(f"s{k}", Pose(rotation_matrix(surface.tilt), place)))
-            bends = Interaction.PASS if index == before else Interaction.REFRACT
+        bodies, elements, before = [Body(_IMAGE, self.image_pose)], {}, 1.0
+        for k, (surface, z, index) in enumerate(zip(self.surfaces, self.vertices[:-1], self.indices, strict=True)):
+            name, bends = f"s{k}", Interaction.PASS if index == before else Interaction.REFRACT
             light = Interaction.REFLECT if surface.material == MIRROR else bends
-            elements[f"s{k}"] = Element(
-                f"s{k}", f"s{k}", surface.shape, light, index_after=index, edges=surface.edges()
-            )
+            bodies.append(Body(name, Pose(rotation_matrix(surface.tilt), np.array([*surface.decenter, z]))))
+            elements[name] = Element(name, name, surface.shape, light, None, index, edges=surface.edges())
             before = index
-        bodies.append(Body(_IMAGE, self.image_pose))
-        elements[_IMAGE] = Element(_IMAGE, _IMAGE, plane(), Interaction.PASS, index_after=before)
+        elements[_IMAGE] = Element(_IMAGE, _IMAGE, plane(), Interaction.PASS, None, before)
         return Assembly(RigidTree(tuple(bodies)), elements, {_IMAGE: tuple(elements)})
 
     @cached_property
@@ -252,21 +244,14 @@ class Camera:
         return Circle(0.5 * stop.diameter, stop.offset)
 
     @property
-    def backend(self) -> Backend:
-        """Arrays on which rays are traced."""
-        return default_backend()
-
-    @property
     def launch(self) -> np.ndarray:
         """Point on the axis before the first surface through which plane wavefronts start, metres, (3,)."""
         return np.array([0.0, 0.0, -self.surfaces[self.stop].diameter])
 
     def matrix(self, position: np.ndarray, direction: np.ndarray) -> RayMatrix:
         """Return the derivatives of a ray (position and direction (3,)) on the image plane by its launch."""
-        axes = np.stack([np.cross(direction, [0.0, -1.0, 0.0]), [0.0, 1.0, 0.0]])
-        axes[0] /= np.linalg.norm(axes[0])
-        axes[1] = np.cross(direction, axes[0])
-        return ray_matrix(self.backend, self.systems[0], self.stop, position[None], direction[None], axes[None])
+        axes = transverse_axes(direction[None], np.eye(3)[:1])
+        return ray_matrix(default_backend(), self.systems[0], self.stop, position[None], direction[None], axes)
 
     @cached_property
     def _axial(self) -> RayMatrix:

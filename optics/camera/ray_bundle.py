@@ -11,15 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optics.camera.prescription import Camera
-from optics.geometry.aperture import Edge
-from optics.numerics.array_math import PhysicalError
+from optics.numerics.array_math import PhysicalError, norm
+from optics.numerics.backend import default_backend
 from optics.numerics.quadrature import PupilNodes, disk, disk_size, nodes_for
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import make_rays
 from optics.raytrace.trace import trace as trace_systems
-from optics.waves.edge_shadow import LitStop, settled_shadows
+from optics.waves.edge_shadow import IlluminatedStop, SurfaceEdges, converged_shadows
 from optics.waves.imaging import aim_collimated
-from optics.waves.surface_edges import SurfaceEdges
 
 Field = tuple[float, float]
 """Angles (x, y) of a far point, radians."""
@@ -76,8 +75,8 @@ def direction_of(field: Field) -> np.ndarray:
     angles = np.asarray(field, float)
     if angles.shape != (2,) or not np.all(np.abs(angles) < 0.5 * np.pi):
         raise ValueError(f"field must be two angles (x, y) in radians between -pi/2 and pi/2, got {field}")
-    vector = np.array([*np.tan(angles), 1.0])
-    return np.asarray(vector / np.linalg.norm(vector))
+    vector = np.array([np.tan(angles[0]), np.tan(angles[1]), 1.0])
+    return np.asarray(vector / norm(vector))
 
 
 def launch_rays(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | None = None) -> tuple[np.ndarray, ...]:
@@ -122,7 +121,7 @@ def launch_rays(camera: Camera, field: Field = (0.0, 0.0), pupil: ArrayLike | No
     rim = camera.aperture
     light, target = direction_of(field), rim.radius * points + np.array(rim.centre)
     try:
-        position, _ = aim_collimated(camera.backend, camera.systems[1], light, camera.launch, target)
+        position, _ = aim_collimated(default_backend(), camera.systems[1], light, camera.launch, target)
     except AimError as error:
         raise LightLostError(f"no ray of the field {field} rad reaches surface {camera.stop}, the stop") from error
     return position[0], np.tile(light, (len(points), 1))
@@ -171,8 +170,8 @@ def trace(camera: Camera, position: ArrayLike, direction: ArrayLike) -> TracedRa
     if not np.all(np.isfinite(start)) or not np.all(np.isfinite(length)) or not np.all(length > 0.0):
         raise ValueError("positions must be finite, and directions finite and not zero")
     system, elements = camera.systems[0], camera.assembly.sequence("image")
-    sent = make_rays(camera.backend, start, np.broadcast_to(light / length, start.shape))
-    traced = trace_systems(camera.backend, system, sent, keep=range(len(camera.surfaces)), world=True)
+    sent = make_rays(default_backend(), start, np.broadcast_to(light / length, start.shape))
+    traced = trace_systems(default_backend(), system, sent, keep=range(len(camera.surfaces)), world=True)
     place, leaving, path, valid = (array[0] for array in traced.numpy(traced.world))
     hits = np.stack([traced.hit(k)[0] for k in range(len(camera.surfaces))], axis=1)
     for k, element in enumerate(elements[:-1]):
@@ -180,36 +179,25 @@ def trace(camera: Camera, position: ArrayLike, direction: ArrayLike) -> TracedRa
     return TracedRays(place, leaving, path, valid, hits)
 
 
-def surface_edges(camera: Camera, field: Field, ring: bool = True) -> SurfaceEdges | None:
-    """Return the edges that light of a field meets beside the rim of the stop, or None where there are none.
+def shadow_pieces(camera: Camera, field: Field, ring: bool = True) -> np.ndarray | None:
+    """Return the polygons (1, K, V, 2) of the stop's unit disk in which edges stop light, or None where none does.
 
     Parameters
     ----------
     camera : Camera
-        Camera with the edges.
+        Camera with the edges; the rim of the stop is none of them.
     field : (float, float)
         Angles x and y of the far point, radians.
     ring : bool
         Count the stop's own ``inner_diameter`` in.
     """
-    edges: dict[str, tuple[Edge, ...]] = {}
-    for k, surface in enumerate(camera.surfaces):
-        own = surface.edges(outer=k != camera.stop)
-        own = own[1:] if k == camera.stop and surface.inner_diameter and not ring else own
-        if own:
-            edges[f"s{k}"] = own
+    every = {f"s{k}": s.edges(k != camera.stop, k != camera.stop or ring) for k, s in enumerate(camera.surfaces)}
+    edges = {name: own for name, own in every.items() if own}
     if not edges:
         return None
     hits = trace(camera, *launch_rays(camera, field)).hits
-    return SurfaceEdges(edges, {name: hits[None, :, int(name[1:]), :2] for name in edges}, disk(RINGS))
-
-
-def shadow_pieces(camera: Camera, field: Field, ring: bool = True) -> np.ndarray | None:
-    """Return the polygons (1, K, V, 2) of the stop's unit disk in which edges stop light, None where none does."""
-    edges = surface_edges(camera, field, ring)
-    if edges is None:
-        return None
-    pieces, _ = settled_shadows(edges.outlines, 1)
+    places = {name: hits[None, :, int(name[1:]), :2] for name in edges}
+    pieces, _ = converged_shadows(SurfaceEdges(edges, places, disk(RINGS)).outlines, 1)
     return pieces if pieces.shape[1] else None
 
 
@@ -246,7 +234,7 @@ def light_nodes(camera: Camera, field: Field, phase: float) -> PupilNodes:
         return disk(max(rings, RINGS), max(arms, 4 * RINGS), stop.inner_diameter / stop.diameter)
     pieces = shadow_pieces(camera, field)
     assert pieces is not None
-    light = LitStop.of(pieces, max(rings, arms // 4 + 1, RINGS), nodes_for(0.5 * phase, 6))
+    light = IlluminatedStop.of(pieces, max(rings, arms // 4 + 1, RINGS), nodes_for(0.5 * phase, 6))
     if not light.light[0] > 1e-6:
         raise LightLostError(f"edges of the surfaces stop all light of the field {field} rad")
     return PupilNodes(light.x[0], light.y[0], light.weight[0])

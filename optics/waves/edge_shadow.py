@@ -5,14 +5,16 @@ are a smooth function of the stop's coordinates, as long as edges block no ray i
 polynomials and inverted at the corners of the edge's outline. The blocked part of the stop is then a set of convex
 polygons, which ``optics.waves.pupil_shadow`` subtracts from the pupil exactly.
 
-``LitStop`` is a quadrature over the illuminated part of a stop. A smooth integrand is integrated over the whole disk by
+``IlluminatedStop`` is a quadrature over the illuminated part of a stop. A smooth integrand is integrated over the whole disk by
 Gauss' rule, and each shadow is subtracted by a rule of its own that ends at its sides. So edges leave no raster.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import accumulate
 
 import numpy as np
 
@@ -35,17 +37,17 @@ its polygon.
 """
 
 FINE_SHARE, COARSE_SHARE = 3e-4, 3e-3
-"""Change of a shadow's share of the stop by twice as many sides: up to the first the fewer do, up to the second the
-more. They are right to a third of it."""
+"""Changes of a shadow's share of the stop with twice as many sides: up to the first, the smaller number of sides is
+used, up to the second the larger one, whose error is a third of the change."""
 
 MOST_PIECES = 160
 """Largest number of pieces of a shadow: the time of a transfer function grows with the square of their number."""
 
 _WINDOW, _WINDOW_SIDES = 1.2, 16
-"""Polygon about the stop's unit disk to which outlines are cut before their corners are followed to their rays."""
+"""Radius and number of sides of the polygon about the unit disk to which outlines are clipped before their projection."""
 
 _STEPS, _CLOSE = 12, 1e-9
-"""Newton's steps for a corner at most, and when it has arrived, in radii of the stop."""
+"""Largest number of Newton steps for a corner, and tolerance of its position in radii of the stop."""
 
 WORST_FIT = 3e-4
 """Largest distance of the rays from the polynomials, in units of the beam's size on the surface."""
@@ -70,9 +72,11 @@ class StopOutlines:
         """Return the outlines of both."""
         return StopOutlines(self.clear + other.clear, self.blocked + other.blocked)
 
-    def take(self, which: np.ndarray | slice) -> StopOutlines:
+    def take(self, images: np.ndarray | slice) -> StopOutlines:
         """Return the outlines of the images of the given indices."""
-        return StopOutlines(tuple(one[which] for one in self.clear), tuple(one[which] for one in self.blocked))
+        return StopOutlines(
+            tuple(polygons[images] for polygons in self.clear), tuple(polygons[images] for polygons in self.blocked)
+        )
 
     def shadows(self, count: int, further: Sequence[np.ndarray] = ()) -> np.ndarray:
         """Return the shadows of edges and of other bodies in ``count`` pupils.
@@ -89,31 +93,31 @@ class StopOutlines:
         (B, K, W, 2) ndarray
             Convex polygons that do not overlap; some are empty.
         """
-        # each image by itself: what is one piece in one of them may be many in another
-        each = [self._of_one(number, further) for number in range(count)]
-        pieces, corners = (max(shape[k] for shape in (one.shape for one in each)) for k in (0, 1))
+        # each image separately: one piece in one of them may be many in another
+        shadows = [self._of_one(number, further) for number in range(count)]
+        pieces, corners = (max(shape[k] for shape in (polygons.shape for polygons in shadows)) for k in (0, 1))
         out = np.zeros((count, pieces, corners, 2))
-        for number, one in enumerate(each):
-            out[number, : len(one)] = padded(one, corners)
+        for number, polygons in enumerate(shadows):
+            out[number, : len(polygons)] = padded(polygons, corners)
         return out
 
     def _of_one(self, number: int, further: Sequence[np.ndarray]) -> np.ndarray:
         """Return ``shadows`` of one image, (K, W, 2)."""
-        some = slice(number, number + 1)
-        lit = _window(1)
+        image = slice(number, number + 1)
+        open_area = _window(1)
         for polygon in self.clear:
-            lit = compact(intersect(lit, *sides(polygon[some])))
-        # what is dark already outside of the clear edges is no matter of the others
-        dark = [intersect(polygon[some], *sides(lit)) for polygon in (*self.blocked, *further)]
+            open_area = compact(intersect(open_area, *sides(polygon[image])))
+        # shadows matter only inside the clear edges
+        dark = [intersect(polygon[image], *sides(open_area)) for polygon in (*self.blocked, *further)]
         dark = [compact(piece) for piece in dark if area_in_disk(piece)[0] > SMALLEST]
-        beyond = [compact(piece[None]) for piece in _around(lit[0])] if self.clear else []
+        beyond = [compact(piece[None]) for piece in _outside_of(open_area[0])] if self.clear else []
         pieces, _ = separate(dark, fewest=True)
-        every = [*(pieces[0] if dark else ()), *(piece[0] for piece in beyond)]
-        width = max((len(piece) for piece in every), default=3)
-        return np.stack([padded(piece[None], width)[0] for piece in every]) if every else np.zeros((0, 3, 2))
+        all_pieces = [*(pieces[0] if dark else ()), *(piece[0] for piece in beyond)]
+        width = max((len(piece) for piece in all_pieces), default=3)
+        return np.stack([padded(piece[None], width)[0] for piece in all_pieces]) if all_pieces else np.zeros((0, 3, 2))
 
 
-def settled_shadows(
+def converged_shadows(
     outlines: Callable[[int], StopOutlines], count: int, further: Sequence[np.ndarray] = ()
 ) -> tuple[np.ndarray, float]:
     """Return the shadows of ``count`` pupils, with round edges of as many sides as needed.
@@ -140,7 +144,7 @@ def settled_shadows(
         There are too many pieces, or the largest number of sides is too small.
     """
     few, *more = ROUND_SIDES
-    pieces = _few_enough(outlines(few).shadows(count, further))
+    pieces = _require_few(outlines(few).shadows(count, further))
     share = shares_of_stop(pieces)
     for sides_of_round in more:
         finer = outlines(sides_of_round).shadows(count, further)
@@ -148,21 +152,21 @@ def settled_shadows(
         change = float(np.max(np.abs(share - before), initial=0.0))
         if change < FINE_SHARE:
             return pieces, change
-        pieces = _few_enough(finer)
+        pieces = _require_few(finer)
         if change < COARSE_SHARE:
             return pieces, change / 3.0
     raise UnphysicalError(
-        f"polygons of {more[-1]} sides for its round edges take {change:.2g} more or less of the pupil than those of "
-        "half as many: edges all but coincide"
+        f"the shadow of round edges changes by {change:.2g} of the pupil between polygons of {more[-1]} sides and of half "
+        "as many: edges nearly coincide"
     )
 
 
-def _few_enough(pieces: np.ndarray) -> np.ndarray:
+def _require_few(pieces: np.ndarray) -> np.ndarray:
     """Return pieces of shadows (B, K, V, 2); raise UnphysicalError where there are too many for a transfer function."""
     if pieces.shape[1] > MOST_PIECES:
         raise UnphysicalError(
-            f"edges cut the pupil into {pieces.shape[1]} pieces of shadow, more than {MOST_PIECES}, which its transfer "
-            "function does not take"
+            f"edges cut the pupil into {pieces.shape[1]} pieces of shadow, but its transfer "
+            f"function allows at most {MOST_PIECES}"
         )
     return pieces
 
@@ -203,17 +207,17 @@ def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.nda
 
 
 def outlines_on_stop(
-    places: np.ndarray,
+    positions: np.ndarray,
     edges: Sequence[Edge],
     nodes: PupilNodes,
     round_sides: int = ROUND_SIDES[0],
-    lit: np.ndarray | None = None,
+    bright: np.ndarray | None = None,
 ) -> StopOutlines:
     """Return the outlines of one surface's edges on the stop, for B images.
 
     Parameters
     ----------
-    places : (B, N, 2) ndarray
+    positions : (B, N, 2) ndarray
         Intersections of the rays through ``nodes`` with the surface, in its own x and y, metres; also of rays that
         edges block.
     edges : sequence of Edge
@@ -222,7 +226,7 @@ def outlines_on_stop(
         Quadrature over the stop's unit disk.
     round_sides : int
         Number of sides of the polygon that represents a round edge.
-    lit : (B, N) ndarray of bool, optional
+    bright : (B, N) ndarray of bool, optional
         Mask of the rays that no edge before the surface blocks; None for all. Where light is blocked already, there is
         nothing left to block, and the polynomials are only continued smoothly.
 
@@ -231,55 +235,55 @@ def outlines_on_stop(
     UnphysicalError
         Polynomials do not follow the intersections, as on a surface near a focus.
     """
-    known = np.all(np.isfinite(places), axis=-1)
-    lit = known if lit is None else lit & known
-    middle = np.mean(places, axis=1, keepdims=True, where=lit[..., None])
-    # far outside of the light polynomials say nothing of where an edge would be
-    around = middle + _AROUND * (places - middle)
-    edges = [edge for edge in edges if not _idle(edge, around, lit)]
+    finite = np.all(np.isfinite(positions), axis=-1)
+    bright = finite if bright is None else bright & finite
+    middle = np.mean(positions, axis=1, keepdims=True, where=bright[..., None])
+    # far outside the light the polynomials do not give the position of an edge
+    around = middle + _BEAM_MARGIN * (positions - middle)
+    edges = [edge for edge in edges if not _passes_all(edge, around, bright)]
     if not edges:
         return StopOutlines()
-    beam = 2.0 * np.max(np.abs(places - middle), axis=(1, 2), where=lit[..., None], initial=0.0)
+    beam = 2.0 * np.max(np.abs(positions - middle), axis=(1, 2), where=bright[..., None], initial=0.0)
 
-    def missed(terms: np.ndarray) -> float:
-        off = np.linalg.norm(products(nodes.x, nodes.y, DEGREE) @ terms - places, axis=-1) / beam[:, None]
-        return float(np.max(off, where=lit, initial=0.0))
+    def worst_miss(terms: np.ndarray) -> float:
+        miss = np.linalg.norm(products(nodes.x, nodes.y, DEGREE) @ terms - positions, axis=-1) / beam[:, None]
+        return float(np.max(miss, where=bright, initial=0.0))
 
-    terms = to_terms(nodes, DEGREE) @ places
-    worst = missed(terms)
-    if not worst < WORST_FIT and not np.all(lit):
-        terms = smooth_terms(products(nodes.x, nodes.y, DEGREE), nodes.weight, lit, places)
-        worst = missed(terms)
+    terms = to_terms(nodes, DEGREE) @ positions
+    worst = worst_miss(terms)
+    if not worst < WORST_FIT and not np.all(bright):
+        terms = smooth_terms(products(nodes.x, nodes.y, DEGREE), nodes.weight, bright, positions)
+        worst = worst_miss(terms)
     if not worst < WORST_FIT:
         raise UnphysicalError(
-            f"rays meet a surface with edges at places that polynomials of degree {DEGREE} miss by {worst:.2g} of the "
-            f"beam's size (at most {WORST_FIT:g}): no pupil can be cut there"
+            f"polynomials of degree {DEGREE} miss the rays on a surface with edges by {worst:.2g} of the beam's size (at "
+            f"most {WORST_FIT:g}): its shadow in the pupil cannot be computed"
         )
     clear, blocked = [], []
     for edge in edges:
         for outlines, blocks in _outlines(edge, round_sides):
-            seen = [_on_the_stop(outline, terms) for outline in outlines]
+            projected = [_on_stop(outline, terms) for outline in outlines]
             if edge.blocks and isinstance(edge.shape, Circle) and edge.shape.inner and _covers(edge, edge.shape, terms):
-                # a ring that reaches beyond every beam lets light through its hole alone
+                # a ring that extends beyond every beam passes light through its hole only
                 hole = Edge(Circle(edge.shape.inner, edge.shape.centre), rotation=edge.rotation)
-                clear += [_on_the_stop(outline, terms) for outline in next(_outlines(hole, round_sides))[0]]
+                clear += [_on_stop(outline, terms) for outline in next(_outlines(hole, round_sides))[0]]
             elif blocks:
-                blocked += seen
-            elif len(seen) == 1:
-                clear += seen
+                blocked += projected
+            elif len(projected) == 1:
+                clear += projected
             else:
-                blocked += _outside(seen, len(places))
+                blocked += _outside(projected, len(positions))
     return StopOutlines(tuple(clear), tuple(blocked))
 
 
-def _idle(edge: Edge, around: np.ndarray, lit: np.ndarray) -> bool:
+def _passes_all(edge: Edge, around: np.ndarray, bright: np.ndarray) -> bool:
     """Return True for a clear edge without a hole that passes all illuminated positions (B, N, 2)."""
     if edge.blocks or (isinstance(edge.shape, Circle) and edge.shape.inner):
         return False
-    return bool(np.all(edge.passes(around[..., 0], around[..., 1]), where=lit))
+    return bool(np.all(edge.passes(around[..., 0], around[..., 1]), where=bright))
 
 
-_AROUND = 1.1
+_BEAM_MARGIN = 1.1
 """Scale of the beam about its middle within which a clear edge may block something: nodes do not reach the beam's edge.
 """
 
@@ -289,7 +293,7 @@ def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:
     disk = Edge(replace(ring, inner=0.0), edge.blocks, edge.rotation)
     (outline,), _ = next(_outlines(disk, ROUND_SIDES[0]))
     rim = _window(len(terms), 1.0, RIM_SIDES)
-    inside = intersect(rim, *sides(_on_the_stop(outline, terms)))
+    inside = intersect(rim, *sides(_on_stop(outline, terms)))
     return bool(np.all(area(rim) - area(inside) < SMALLEST))
 
 
@@ -306,33 +310,33 @@ def _outlines(edge: Edge, round_sides: int) -> Iterator[tuple[list[np.ndarray], 
         case Circle():
             outer = shape.radius * unit
             if not shape.inner:
-                yield _turned([outer], edge), edge.blocks
+                yield _placed([outer], edge), edge.blocks
             elif edge.blocks:
-                # sectors whose corners are those of their neighbours, so that no gap opens between them on the stop
+                # sectors that share their corners, so that no gap opens between them on the stop
                 both = np.stack([outer, np.roll(outer, -1, axis=0)], axis=1)
                 sectors = np.concatenate([both, (shape.inner / shape.radius) * both[:, ::-1]], axis=1)
-                yield _turned(list(sectors), edge), True
+                yield _placed(list(sectors), edge), True
             else:
-                yield _turned([outer], edge), False
-                yield _turned([shape.inner * unit], edge), True
+                yield _placed([outer], edge), False
+                yield _placed([shape.inner * unit], edge), True
         case Ellipse():
-            yield _turned([unit * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
+            yield _placed([unit * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
         case Rectangle():
             corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-            yield _turned([_divided(corners * np.array([shape.half_x, shape.half_y]))], edge), edge.blocks
+            yield _placed([_divided(corners * np.array([shape.half_x, shape.half_y]))], edge), edge.blocks
         case Ray():
             half = 0.5 * shape.width
-            yield _turned([np.array([[0.0, -half], [_FAR, -half], [_FAR, half], [0.0, half]])], edge), edge.blocks
+            yield _placed([np.array([[0.0, -half], [_FAR, -half], [_FAR, half], [0.0, half]])], edge), edge.blocks
         case Polygon():
             corners = np.array(shape.corners) - np.array(shape.centre)
-            yield _turned(_convex_parts(corners), edge), edge.blocks
+            yield _placed(_convex_parts(corners), edge), edge.blocks
 
 
 _FAR = 100.0
 """Length of a vane, metres: beyond every beam."""
 
 
-def _turned(outlines: list[np.ndarray], edge: Edge) -> list[np.ndarray]:
+def _placed(outlines: list[np.ndarray], edge: Edge) -> list[np.ndarray]:
     """Return outlines about the origin at the edge's position and rotation."""
     c, s = np.cos(edge.rotation), np.sin(edge.rotation)
     return [outline @ np.array([[c, s], [-s, c]]) + np.array(edge.shape.centre) for outline in outlines]
@@ -344,10 +348,10 @@ def _convex_parts(corners: np.ndarray) -> list[np.ndarray]:
     out = []
     while len(rest) > 3:
         before, after = np.roll(rest, 1, axis=0), np.roll(rest, -1, axis=0)
-        turn = _cross(rest - before, after - rest)
-        if np.all(turn >= 0.0):
+        orientation = _cross(rest - before, after - rest)
+        if np.all(orientation >= 0.0):
             break
-        for k in np.flatnonzero(turn > 0.0):
+        for k in np.flatnonzero(orientation > 0.0):
             ear = np.stack([before[k], rest[k], after[k]])
             others = np.delete(rest, [(k - 1) % len(rest), k, (k + 1) % len(rest)], axis=0)
             normal, limit = sides(ear[None])
@@ -362,8 +366,8 @@ def _convex_parts(corners: np.ndarray) -> list[np.ndarray]:
 
 def _divided(corners: np.ndarray) -> np.ndarray:
     """Return a polygon (V, 2) with further corners on its sides, which may be curved on the stop."""
-    share = np.arange(_PARTS)[:, None] / _PARTS
-    return np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+    fraction = np.arange(_PARTS)[:, None] / _PARTS
+    return np.concatenate([a + fraction * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
 
 
 _PARTS = 8
@@ -382,32 +386,32 @@ def _window(count: int, radius: float = _WINDOW, number: int = _WINDOW_SIDES) ->
     return np.broadcast_to(corners, (count, *corners.shape))
 
 
-def _on_the_stop(outline: np.ndarray, terms: np.ndarray) -> np.ndarray:
+def _on_stop(outline: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Return an outline (V, 2) of the surface projected onto the stop of B images, counterclockwise, (B, W, 2).
 
     It is empty where the outline lies outside the beam.
     """
-    # place of the ray through the middle of the stop, and the derivatives of places there
-    values, rise = _followed(terms, np.zeros((len(terms), 1, 2)))
-    middle, slope = values[:, 0], rise[:, 0]
-    place = np.broadcast_to(outline, (len(terms), *outline.shape))
-    guess = np.einsum("bij,bvj->bvi", np.linalg.inv(slope), place - middle[:, None])
-    packed = np.concatenate([guess, place], axis=-1)
-    turned = area(packed) < 0.0
-    packed = np.where(turned[:, None, None], packed[:, ::-1], packed)
-    cut = intersect(packed, *sides(_window(len(terms))))
-    at, place = cut[..., :2].copy(), cut[..., 2:]
-    empty = area(cut) < SMALLEST
+    # surface position of the ray through the middle of the stop, and the derivatives there
+    values, slopes = _surface_positions(terms, np.zeros((len(terms), 1, 2)))
+    middle, slope = values[:, 0], slopes[:, 0]
+    targets = np.broadcast_to(outline, (len(terms), *outline.shape))
+    guess = np.einsum("bij,bvj->bvi", np.linalg.inv(slope), targets - middle[:, None])
+    packed = np.concatenate([guess, targets], axis=-1)
+    clockwise = area(packed) < 0.0
+    packed = np.where(clockwise[:, None, None], packed[:, ::-1], packed)
+    clipped = intersect(packed, *sides(_window(len(terms))))
+    points, targets = clipped[..., :2].copy(), clipped[..., 2:]
+    empty = area(clipped) < SMALLEST
     for _ in range(_STEPS):
-        values, rise = _followed(terms, at)
-        step = np.einsum("bvij,bvj->bvi", np.linalg.inv(rise), place - values)
-        at += np.where(empty[:, None, None], 0.0, step)
+        values, slopes = _surface_positions(terms, points)
+        step = np.einsum("bvij,bvj->bvi", np.linalg.inv(slopes), targets - values)
+        points += np.where(empty[:, None, None], 0.0, step)
         if np.max(np.abs(step), where=~empty[:, None, None], initial=0.0) < _CLOSE:
             break
-    return np.where(empty[:, None, None], at[:, :1], at)
+    return np.where(empty[:, None, None], points[:, :1], points)
 
 
-def _followed(terms: np.ndarray, at: np.ndarray, step: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
+def _surface_positions(terms: np.ndarray, at: np.ndarray, step: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
     """Return surface positions of rays through points of the stop, both (B, V, 2), and derivatives (B, V, 2, 2)."""
 
     def value(points: np.ndarray) -> np.ndarray:
@@ -418,26 +422,26 @@ def _followed(terms: np.ndarray, at: np.ndarray, step: float = 1e-5) -> tuple[np
     return value(at), rise
 
 
-def _around(lit: np.ndarray) -> np.ndarray:
+def _outside_of(bright: np.ndarray) -> np.ndarray:
     """Return the part of the stop outside a convex counterclockwise polygon (V, 2), as convex pieces (K, W, 2).
 
     There is one piece beyond each side; pieces beyond the stop are omitted.
     """
-    lit = compact(lit[None])[0]
-    if area(lit) < SMALLEST:
+    bright = compact(bright[None])[0]
+    if area(bright) < SMALLEST:
         return _window(1)
-    (normal,), (limit,) = sides(lit[None])
-    middle = np.mean(lit, axis=0)
-    # the polygon grows about its middle until it holds the stop
-    size = float(np.max((1.0 - normal @ middle) / np.maximum(limit - normal @ middle, _THINNEST)))
-    far = middle + max(size, 1.0) * (lit - middle)
-    pieces = np.stack([lit, far, np.roll(far, -1, axis=0), np.roll(lit, -1, axis=0)], axis=1)
+    (normal,), (limit,) = sides(bright[None])
+    middle = np.mean(bright, axis=0)
+    # the polygon is scaled about its middle until it contains the stop
+    size = float(np.max((1.0 - normal @ middle) / np.maximum(limit - normal @ middle, _MIN_HALF_WIDTH)))
+    far = middle + max(size, 1.0) * (bright - middle)
+    pieces = np.stack([bright, far, np.roll(far, -1, axis=0), np.roll(bright, -1, axis=0)], axis=1)
     pieces = pieces[area_in_disk(pieces) > SMALLEST]
     normal, limit = sides(_window(1))
     return intersect(pieces, *(np.broadcast_to(part, (len(pieces), *part.shape[1:])) for part in (normal, limit)))
 
 
-_THINNEST = 1e-6
+_MIN_HALF_WIDTH = 1e-6
 """Distance of a polygon's middle from its sides, in radii of the stop, below which the polygon is a line."""
 
 
@@ -449,6 +453,47 @@ def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
     return rest
 
 
+@dataclass(frozen=True, eq=False)
+class SurfaceEdges:
+    """Edges of a camera's surfaces as B images see them.
+
+    Attributes
+    ----------
+    edges : mapping of str to tuple of Edge
+        Surface -> its edges, in the order of the light, of every surface that has some.
+    places : mapping of str to (B, N, 2) ndarray
+        Surface -> points where rays meet it, stopped or not, in its own x and y, metres of nominal size.
+    nodes : PupilNodes
+        Points of the stop, through which the rays go.
+    """
+
+    edges: Mapping[str, tuple[Edge, ...]]
+    places: Mapping[str, np.ndarray]
+    nodes: PupilNodes
+
+    @cached_property
+    def passed(self) -> list[np.ndarray]:
+        """Masks (B, N) of the rays that come through each surface and those before it."""
+        through = [
+            np.all([edge.passes(place[..., 0], place[..., 1]) for edge in self.edges[name]], axis=0)
+            for name, place in self.places.items()
+        ]
+        return list(accumulate(through, np.logical_and))
+
+    def outlines(self, round_sides: int) -> StopOutlines:
+        """Return the outlines on the stop, with ``round_sides`` sides for a circle.
+
+        Raises
+        ------
+        UnphysicalError
+            Rays meet a surface at places that no polynomials follow.
+        """
+        outlines = StopOutlines()
+        for (name, place), bright in zip(self.places.items(), [None, *self.passed[:-1]], strict=True):
+            outlines += outlines_on_stop(place, self.edges[name], self.nodes, round_sides, bright)
+        return outlines
+
+
 ROUND = 1e-4
 """Relative excess of a shadow's second moment over that of a centred disk of its area up to which it counts as that
 disk.
@@ -458,7 +503,7 @@ The disk has the smallest second moment of all shapes of its area.
 
 
 @dataclass(frozen=True, eq=False)
-class LitStop:
+class IlluminatedStop:
     """Quadratures over the illuminated parts of a stop for F beams.
 
     Attributes
@@ -474,7 +519,7 @@ class LitStop:
     weight: np.ndarray
 
     @classmethod
-    def of(cls, pieces: np.ndarray, rings: int, count: int) -> LitStop:
+    def of(cls, pieces: np.ndarray, rings: int, count: int) -> IlluminatedStop:
         """Return the quadrature over the stop without shadows.
 
         Parameters
@@ -490,8 +535,8 @@ class LitStop:
         points, dark, _ = nodes_in_shadows(pieces, count)
         whole = (len(pieces), nodes.count)
         x, y = (
-            np.concatenate([np.broadcast_to(own, whole), taken], axis=1)
-            for own, taken in ((nodes.x, points.real), (nodes.y, points.imag))
+            np.concatenate([np.broadcast_to(disk_nodes, whole), shadow_nodes], axis=1)
+            for disk_nodes, shadow_nodes in ((nodes.x, points.real), (nodes.y, points.imag))
         )
         return cls(x, y, np.concatenate([np.broadcast_to(nodes.weight, whole), -dark], axis=1))
 
@@ -512,8 +557,8 @@ def holes(pieces: np.ndarray) -> np.ndarray:
         Convex polygons that do not overlap.
     """
     points, weight, _ = nodes_in_shadows(pieces, 4)
-    taken = np.sum(weight, axis=1)
+    blocked = np.sum(weight, axis=1)
     moment = np.sum(weight * np.abs(points) ** 2, axis=1)
-    least = taken**2 / (2.0 * np.pi)
+    least = blocked**2 / (2.0 * np.pi)
     is_round = moment <= (1.0 + ROUND) * least
-    return np.asarray(np.where(is_round, np.sqrt(np.maximum(taken, 0.0) / np.pi), np.nan))
+    return np.asarray(np.where(is_round, np.sqrt(np.maximum(blocked, 0.0) / np.pi), np.nan))

@@ -102,6 +102,10 @@ def mtf_from_psf(psf: ArrayLike, step: float) -> tuple[np.ndarray, np.ndarray, n
     ValueError
         The samples are not two-dimensional or finite, or sum to 0.
 
+    Notes
+    -----
+    Light beyond the samples is missing: where it is a share e of all, the MTF comes out too high by about that share.
+
     Examples
     --------
     A Gaussian image of standard deviation s has the MTF exp(-2 (pi f s)^2):

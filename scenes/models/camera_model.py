@@ -27,12 +27,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optics.camera.ray_bundle import direction_of
 from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Rectangle, outer_edge
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Body, RigidTree, State
 from optics.materials.glass import ABBE_LINES
-from optics.numerics.array_math import PhysicalError, norm, matvec
+from optics.numerics.array_math import PhysicalError, matvec
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.aim import AimError, transverse_axes
@@ -669,8 +670,7 @@ def field_direction(spec: CameraSpec, x: float, y: float) -> np.ndarray:
     """Direction in which light of field (x, y) travels, prescription frame; y counts from the biased centre,
     radians.
     """
-    vector = np.array([np.tan(x), np.tan(spec.field_bias + y), 1.0])
-    return np.asarray(vector / norm(vector))
+    return direction_of((x, spec.field_bias + y))
 
 
 def mirror_pose(mirror: MirrorSpec) -> Pose:

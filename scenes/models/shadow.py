@@ -27,11 +27,10 @@ from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.system import SystemBatch
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.edge_shadow import StopOutlines, nodes_in_shadows, settled_shadows
+from optics.waves.edge_shadow import StopOutlines, SurfaceEdges, converged_shadows, nodes_in_shadows
 from optics.waves.imaging import ImagingRays
 from optics.waves.pupil_shadow import SMALLEST, separate
 from optics.waves.pupil_terms import products, to_terms
-from optics.waves.surface_edges import SurfaceEdges
 from scenes.models.camera_model import CameraModel
 from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import convex_bodies, imaging_segments, rays_taken
@@ -133,7 +132,7 @@ class Shadows:
         UnphysicalError
             They cut a pupil into too many pieces.
         """
-        pieces, _ = settled_shadows(outlines, len(self.pieces), tuple(np.moveaxis(self.pieces, 1, 0)))
+        pieces, _ = converged_shadows(outlines, len(self.pieces), tuple(np.moveaxis(self.pieces, 1, 0)))
         whole = Shadows.within(pieces, (name,) * pieces.shape[1])
         bodies = self.shares()
         rest = np.sum(whole.areas, axis=-1) / np.pi - sum(bodies.values())
