@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from analysis.monitor.estimators import Formula, OfEachCamera
+from analysis.monitor.estimators import Formula, PerCameraEstimator
 from analysis.monitor.parameters import CameraCalibration
 from analysis.spots import CENTROIDS, Centroid
 from optics.geometry.vector_shape import Polygon
@@ -39,7 +39,7 @@ class TwoLevels:
         return
 
 
-class Half(OfEachCamera):
+class Half(PerCameraEstimator):
     """Half of what the corrected formulas say."""
 
     title = "half"

@@ -1,1 +1,1 @@
-"""From spot shifts to a camera's parameters (paper 001)."""
+"""Changes of a camera's parameters from the shifts of its monitor's spots (paper 001)."""

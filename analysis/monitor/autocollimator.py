@@ -1,24 +1,26 @@
-"""Readings of a digital autocollimator, and the relations that the principle experiment of paper 001 tests with them
-(Wang et al. 2018, section 3.1, Table 2).
+"""Readings of a digital autocollimator, and the relations between two of them that paper 001 tests.
 
-A plane mirror has two angles that an autocollimator can see, the turns of its normal about the instrument's own X and
-Y (Z is its view, X up). A turn of the mirror about its own normal changes nothing that comes back. Two autocollimators
-look at two mirrors that stand b = 2 theta apart on one turntable; frame 2 is frame 1 turned about X by b, so that
+The relations are those of the principle experiment (Wang et al. 2018, section 3.1, Table 2).
+
+An autocollimator measures two angles of a plane mirror, the rotations of its normal about the instrument's own X and Y
+(Z is its viewing direction, X up). A rotation of the mirror about its own normal does not change the returned beam. Two
+autocollimators view two mirrors that are b = 2 theta apart on one turntable; frame 2 is frame 1 rotated about X by b,
+so that
 
     Y1 = Y2 cos b - Z2 sin b,    Z1 = Y2 sin b + Z2 cos b,
 
-and a turn of the table by a small angle reads
+and a rotation of the table by a small angle reads
 
-    about X1: d_beta   mirror 1  d_beta  about X1    mirror 2  d_beta         about X2
-    about Y1: d_alpha  mirror 1  d_alpha about Y1    mirror 2  d_alpha cos b  about Y2
-    about Z1: d_gamma  mirror 1  nothing             mirror 2  d_gamma sin b  about Y2.
+    about X1: d_beta   mirror 1  d_beta  about X1    mirror 2  d_beta         about X2 about Y1: d_alpha  mirror 1
+    d_alpha about Y1    mirror 2  d_alpha cos b  about Y2 about Z1: d_gamma  mirror 1  nothing             mirror 2
+    d_gamma sin b  about Y2.
 
-The paper prints the same factors with "beta" for b, but calls the last one a turn of mirror 2 "about its own Z". That
-turn is d_gamma cos b and cannot be seen; what is d_gamma sin b, and what the autocollimator reads, is the turn about
-Y2. And it prints readings of mirror 1 about Z, where there is nothing to read.
+The paper prints the same factors with "beta" for b, but calls the last one a rotation of mirror 2 "about its own Z".
+That rotation is d_gamma cos b and cannot be measured; the one that is d_gamma sin b, and that the autocollimator reads,
+is the rotation about Y2. The paper also prints readings of mirror 1 about Z, which do not exist.
 
-Angles in radians. A reading is (about X, about Y) = (atan(n_y / -n_z), atan(-n_x / -n_z)) of the mirror's normal n in
-the autocollimator's frame; a turn about X alone or about Y alone reads exactly as itself.
+Angles are in radians. A reading is (about X, about Y) = (atan(n_y / -n_z), atan(-n_x / -n_z)) of the mirror's normal n
+in the autocollimator's frame; a rotation about X alone or about Y alone reads exactly as itself.
 """
 
 from __future__ import annotations
@@ -34,20 +36,20 @@ AXES = ("X", "Y", "Z")
 
 
 def mirror_rotation(shift_m: ArrayLike, focal_length_m: float) -> Array:
-    """Turn of a mirror, radians, from the shift of its spot, metres: L = f tan(2 theta), paper 001 eq. (1)."""
+    """Return the rotation of a mirror, rad, from the shift of its spot, m (paper 001, eq. (1))."""
     return np.asarray(0.5 * np.arctan(np.asarray(shift_m, np.float64) / focal_length_m))
 
 
 def reading_of_normal(normal: ArrayLike) -> Array:
-    """Reading (..., 2), radians, for mirror normals (..., 3) in the autocollimator's frame; (0, 0, -1) reads zero."""
+    """Return readings (..., 2), rad, for mirror normals (..., 3) in the instrument's frame; (0, 0, -1) reads zero."""
     n = np.asarray(normal, np.float64)
     return np.stack([np.arctan2(n[..., 1], -n[..., 2]), np.arctan2(-n[..., 0], -n[..., 2])], axis=-1)
 
 
 def column_component(axis: str) -> int:
-    """Which component of the readings the columns of Table 2 hold for a turn about this axis: 0 about X, 1 about Y.
+    """Return the component of the readings in Table 2 for a rotation about this axis: 0 about X, 1 about Y.
 
-    For Z it is 1: mirror 2 turns about its own Y.
+    For Z it is 1: mirror 2 rotates about its own Y.
     """
     if axis not in AXES:
         raise ValueError(f"readings: axis must be X, Y or Z, found {axis!r}")
@@ -55,9 +57,16 @@ def column_component(axis: str) -> int:
 
 
 def relation_factor(axis: str, unit: int, between: float) -> float:
-    """What autocollimator 1 or 2 reads for one unit of turn of the table, to first order.
+    """Return the reading of autocollimator 1 or 2 for one unit of rotation of the table, to first order.
 
-    axis: X, Y or Z of frame 1. unit: 1 or 2. between: b, radians.
+    Parameters
+    ----------
+    axis : str
+        Axis X, Y or Z of frame 1.
+    unit : int
+        Autocollimator, 1 or 2.
+    between : float
+        Angle b between the two, rad.
     """
     if axis not in AXES or unit not in (1, 2):
         raise ValueError(f"relations: axis must be X, Y or Z and unit 1 or 2, found {axis!r} and {unit!r}")
@@ -67,22 +76,25 @@ def relation_factor(axis: str, unit: int, between: float) -> float:
 
 
 def exact_reading(axis: str, angle: ArrayLike, unit: int, between: float) -> Array:
-    """Reading (..., 2) for turns of the table by any angle, (...), radians; mirrors square to begin with.
+    """Return readings (..., 2), rad, for rotations of the table by any angle, (...).
 
-    With u the axis in the autocollimator's frame, n = n0 cos a + (u x n0) sin a + u (u . n0)(1 - cos a), n0 = -Z. What
-    it adds to the relations: about Y2 a relative -sin^2(b) a^2 / 6 for a turn about Y1 (-cos^2(b) a^2 / 6 about Z1),
-    0.0003" at 720"; but about X2 a second-order sin(b) cos(b) a^2 / 2 in size, 0.54" at 720" and 30 or 60 deg.
+    The two mirrors are perpendicular to their autocollimators at first.
+
+    With u the axis in the autocollimator's frame, n = n0 cos a + (u x n0) sin a + u (u . n0)(1 - cos a), n0 = -Z. The
+    difference from the relations is, about Y2, a relative -sin^2(b) a^2 / 6 for a rotation about Y1 (-cos^2(b) a^2 / 6
+    about Z1), 0.0003" at 720"; about X2, a second-order term of size sin(b) cos(b) a^2 / 2, 0.54" at 720" and 30 or 60
+    deg.
 
     Parameters
     ----------
     axis : str
-        Of the turn: X, Y or Z.
-    angle : ArrayLike
-        (...), radians.
+        Axis of the rotation: X, Y or Z of frame 1.
+    angle : array_like
+        Angles, rad.
     unit : int
-        Which autocollimator, 1 or 2.
+        Autocollimator, 1 or 2.
     between : float
-        Angle b between the two, radians.
+        Angle b between the two, rad.
     """
     a = np.asarray(angle, np.float64)
     b = between if unit == 2 else 0.0
@@ -101,24 +113,33 @@ def exact_reading(axis: str, angle: ArrayLike, unit: int, between: float) -> Arr
 
 
 def mean_difference(first: ArrayLike, second: ArrayLike) -> float:
-    """Mean of |first - second| over the rows of a table.
+    """Return the mean of |first - second| over the rows of a table.
 
-    So Table 2 gets its last line: about X and Y between mirror 1 and scaled mirror 2; about Z, however, between scaled
-    mirror 2 and the *turntable's* angle.
+    It is the last line of Table 2: about X and Y the difference of mirror 1 and the scaled mirror 2; about Z, however,
+    that of the scaled mirror 2 and the *turntable's* angle.
     """
     return float(np.mean(np.abs(np.asarray(first, np.float64) - np.asarray(second, np.float64))))
 
 
 @dataclass(frozen=True, eq=False)
 class ReadingMap:
-    """Calibration of an autocollimator: polynomial from the place of its spot to the reading.
+    """Calibration of an autocollimator: polynomial from the position of its spot to the reading.
 
-    The lens images f tan(2 theta) only to first order: it distorts by some 1e-4. As makers do, the map is found once by
-    turning a mirror by known angles, and holds from then on.
+    The lens images f tan(2 theta) only to first order: it distorts by some 1e-4. As manufacturers do, the map is
+    determined once by rotating a mirror by known angles, and is used from then on.
 
-    centre: (row, column) px that the polynomial counts from. scale: px, of the range.
-    degree: of the polynomial in row and column together. coefficients: (terms, 2), radians.
-    residual: rms misfit of the calibration, radians.
+    Attributes
+    ----------
+    centre : (2,) ndarray
+        Origin (row, column) of the polynomial, px.
+    scale : float
+        Half range of the spots, px.
+    degree : int
+        Degree of the polynomial in row and column together.
+    coefficients : (terms, 2) ndarray
+        Coefficients, rad.
+    residual : float
+        Rms residual of the calibration, rad.
     """
 
     centre: Array
@@ -129,18 +150,21 @@ class ReadingMap:
 
     @classmethod
     def fit(cls, place: ArrayLike, reading: ArrayLike, degree: int = 5) -> ReadingMap:
-        """Least squares over P known turns.
-
-        Raises ValueError when there are too few of them.
+        """Fit the map by least squares over P known rotations.
 
         Parameters
         ----------
-        place : ArrayLike
-            (P, 2) spots (row, column), px.
-        reading : ArrayLike
-            (P, 2) about X, about Y, radians.
+        place : (P, 2) array_like
+            Positions of the spot (row, column), px.
+        reading : (P, 2) array_like
+            Known rotations about X and about Y, rad.
         degree : int
-            Of the polynomials.
+            Degree of the polynomials.
+
+        Raises
+        ------
+        ValueError
+            There are too few rotations.
         """
         spots, known = np.asarray(place, np.float64), np.asarray(reading, np.float64)
         if spots.ndim != 2 or spots.shape[1] != 2 or known.shape != spots.shape:
@@ -155,23 +179,23 @@ class ReadingMap:
         return cls(centre, scale, degree, np.asarray(solution, dtype=np.float64), rms)
 
     def __call__(self, place: ArrayLike) -> Array:
-        """Readings (..., 2), radians, for spots (..., 2) in px."""
+        """Return readings (..., 2), rad, for spots (..., 2) in px."""
         reduced = (np.asarray(place, np.float64) - self.centre) / self.scale
         return np.asarray(_monomials(reduced, self.degree) @ self.coefficients)
 
     def slope(self, place: ArrayLike) -> Array:
-        """d(reading)/d(row, column), (..., 2, 2), rad/px."""
+        """Return the derivatives of the reading by (row, column), (..., 2, 2) rad/px."""
         spot = np.asarray(place, np.float64)
         step = 0.5 * np.eye(2)
         return np.stack([self(spot + step[k]) - self(spot - step[k]) for k in range(2)], axis=-1)
 
     def covariance(self, place: ArrayLike, spot_covariance: ArrayLike) -> Array:
-        """Covariance (..., 2, 2) rad^2 of readings from that of the spots, (..., 2, 2) px^2."""
+        """Return the covariance of readings, (..., 2, 2) rad^2, from that of the spots, (..., 2, 2) px^2."""
         slope = self.slope(place)
         return np.asarray(slope @ np.asarray(spot_covariance, np.float64) @ np.swapaxes(slope, -1, -2))
 
 
 def _monomials(spot: Array, degree: int) -> Array:
-    """All products row^i column^j with i + j <= degree, (..., terms)."""
+    """Return all products row^i column^j with i + j <= degree, (..., terms)."""
     row, column = spot[..., 0], spot[..., 1]
     return np.stack([row**i * column**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)

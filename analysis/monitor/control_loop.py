@@ -1,15 +1,15 @@
-"""Loops that act on what a monitor reads: integrators with a delay, by readings.
+"""Control loops that act on a monitor's readings: integrators with a delay, in discrete time.
 
-At reading k an estimate says what is left of a quantity, e = p + m a, where p is what would be there without a
-correction, a the position of a mechanism and m what it does to the quantity. The command changes by
+At reading k an estimate gives the residual of a quantity, e = p + m a, where p is its value without correction, a the
+position of a mechanism and m the mechanism's effect on the quantity. The command changes by
 
     c(k) = c(k - 1) - g e(k) / m,
 
-and the mechanism stands at it d readings later, so that the reading after the next but d sees it. The open loop is
+and the mechanism reaches it d readings later, so that the reading after the next but d sees it. The open loop is
 
     L(z) = g z^-(d + 1) / (1 - 1/z),
 
-as of every integrator with a delay (Astrom, Wittenmark, Computer-Controlled Systems, 1997, ch. 3; in adaptive optics:
+as for every integrator with a delay (Astrom, Wittenmark, Computer-Controlled Systems, 1997, ch. 3; in adaptive optics:
 Gendron, Lena, Astron. Astrophys. 291, 1994, 337). Its phase is -180 degrees at w = pi / (2 d + 1) per reading, where
 its size is g / (2 sin(w / 2)): the loop is stable below
 
@@ -31,47 +31,47 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.arrays import Array
 
 DECAYING = 1.0 - 1e-12
-"""Largest eigenvalue of loops that are stable: of one that only comes to rest somewhere else rounding makes either."""
+"""Largest eigenvalue of stable loops; the margin to 1 covers rounding for loops that are marginally stable."""
 _LEAST, _MOST = 1e-6, 1e6
 """Gain margins that are as bad and as good as any."""
 _CLOSE = 1e-12
-"""Relative, to which a gain margin is found."""
+"""Relative accuracy of a gain margin."""
 _SETTLING, _WATCHED = 400, 400
 """Readings before a limit cycle is looked at, and for which it is."""
 _OFFSETS = 41
-"""Places of the uncorrected quantity between two steps for which limit cycles are looked for."""
+"""Number of values of the uncorrected quantity between two steps for which limit cycles are searched."""
 
 
 def open_loop(gain: float, delay: int, frequency: ArrayLike) -> NDArray[np.complex128]:
-    """Transfer L of the open loop.
+    """Return the transfer function L of the open loop.
 
     Parameters
     ----------
     gain : float
-        g.
+        Gain g.
     delay : int
-        d, readings.
-    frequency : ArrayLike
-        Of any shape, cycles per reading, above 0 up to 0.5.
+        Delay d, readings.
+    frequency : array_like
+        Frequency, of any shape, cycles per reading, above 0 up to 0.5.
     """
     turn = np.exp(-2j * np.pi * np.asarray(frequency, np.float64))
     return np.asarray(gain * turn ** (delay + 1) / (1.0 - turn))
 
 
 def rejection(gain: float, delay: int, frequency: ArrayLike) -> Array:
-    """Size of what is left of a quantity that swings, over the swing: |1 + m a / p| when images are taken.
+    """Return the size of the rejection: residual over oscillation of a quantity, |1 + m a / p|, when images are taken.
 
-    Images are taken after the command of the same reading: of delay 0 and gain 1 nothing is left, whatever the
+    Images are taken after the command of the same reading: with delay 0 and gain 1 the residual is zero at any
     frequency.
 
     Parameters
     ----------
     gain : float
-        g.
+        Gain g.
     delay : int
-        d, readings.
-    frequency : ArrayLike
-        Of any shape, cycles per reading, above 0 up to 0.5.
+        Delay d, readings.
+    frequency : array_like
+        Frequency, of any shape, cycles per reading, above 0 up to 0.5.
     """
     turn = np.exp(-2j * np.pi * np.asarray(frequency, np.float64))
     return np.asarray(np.abs(1.0 - gain * turn**delay / (1.0 - turn + gain * turn ** (delay + 1))))
@@ -79,18 +79,18 @@ def rejection(gain: float, delay: int, frequency: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class Margins:
-    """How far a loop is from becoming unstable.
+    """Stability margins of a loop.
 
     Attributes
     ----------
     limit : float
         Gain below which a loop with this delay is stable.
     gain : float
-        The limit over the loop's own gain; infinite for gain 0.
+        Gain margin: the limit over the loop's own gain; infinite for gain 0.
     phase_deg : float
-        What the phase may lose where the open loop's size is 1; NaN where it is larger or smaller at all frequencies.
+        Phase margin where the open loop's size is 1; NaN where it is larger or smaller at all frequencies.
     crossover : float
-        That frequency, cycles per reading; NaN likewise.
+        Frequency at which the open loop's size is 1, cycles per reading; NaN if there is none.
     """
 
     limit: float
@@ -100,19 +100,19 @@ class Margins:
 
     @property
     def stable(self) -> bool:
-        """Whether errors decay."""
+        """True if errors decay."""
         return self.gain > 1.0
 
 
 def margins(gain: float, delay: int) -> Margins:
-    """Margins of one loop by itself.
+    """Return the margins of a single loop.
 
     Parameters
     ----------
     gain : float
-        g, 0 or more.
+        Gain g, 0 or more.
     delay : int
-        d, readings.
+        Delay d, readings.
     """
     limit = 2.0 * math.sin(math.pi / (4 * delay + 2))
     if not 0.0 < gain <= 2.0:
@@ -125,22 +125,22 @@ def margins(gain: float, delay: int) -> Margins:
 def spectral_radius(
     coupling: ArrayLike, gains: Sequence[float], delays: Sequence[int], quantities: Sequence[int] | None = None
 ) -> float:
-    """Largest size of the eigenvalues of n loops together: below 1 all errors decay.
+    """Return the largest size of the eigenvalues of n coupled loops: below 1 all errors decay.
 
-    A loop of gain 0, which does nothing, does not count. Loops on one quantity add up the same numbers, so that what
-    their mechanisms do against each other is not a state of its own.
+    A loop of gain 0, which does nothing, does not count. Loops on one quantity add up the same numbers, so that motions
+    of their mechanisms that cancel are not a state of their own.
 
     Parameters
     ----------
-    coupling : ArrayLike
-        (n, n) what the mechanism of a column does to the quantity of a row, over what the row's own mechanism does to
-        it; 1 on the diagonal.
-    gains : Sequence[float]
-        (n,) of the loops.
-    delays : Sequence[int]
-        (n,) of them, readings.
-    quantities : Sequence[int] | None
-        (n,) which quantity each acts on, by number; by default each on its own.
+    coupling : (n, n) array_like
+        Effect of the mechanism of a column on the quantity of a row, over the effect of the row's own mechanism; 1 on
+        the diagonal.
+    gains : (n,) sequence of float
+        Gains of the loops.
+    delays : (n,) sequence of int
+        Delays of the loops, readings.
+    quantities : (n,) sequence of int or None
+        Index of the quantity that each loop acts on; by default each has its own.
     """
     every, g = np.asarray(coupling, np.float64), np.asarray(gains, np.float64)
     acting = np.flatnonzero(g != 0.0).tolist()
@@ -165,18 +165,18 @@ def spectral_radius(
 def common_margin(
     coupling: ArrayLike, gains: Sequence[float], delays: Sequence[int], quantities: Sequence[int] | None = None
 ) -> float:
-    """By how much all gains together may be larger (or must be smaller) for the loops to be at the limit of stability.
+    """Return the factor of all gains together at which the loops reach the limit of stability.
 
     Parameters
     ----------
-    coupling : ArrayLike
-        (n, n) as of `spectral_radius`.
-    gains : Sequence[float]
-        (n,) likewise.
-    delays : Sequence[int]
-        (n,) likewise.
-    quantities : Sequence[int] | None
-        (n,) likewise.
+    coupling : (n, n) array_like
+        Coupling of the loops, as in `spectral_radius`.
+    gains : (n,) sequence of float
+        Gains of the loops.
+    delays : (n,) sequence of int
+        Delays of the loops, readings.
+    quantities : (n,) sequence of int or None
+        Quantities that the loops act on, as in `spectral_radius`.
     """
     g = np.asarray(gains, np.float64)
     if not np.any(g):
@@ -200,16 +200,16 @@ def common_margin(
 
 @dataclass(frozen=True)
 class LimitCycle:
-    """How a mechanism of whole steps goes on moving although nothing changes, at the worst place between two steps.
+    """Limit cycle of a mechanism with whole steps at a constant quantity, for the worst position between two steps.
 
     Attributes
     ----------
     steps : int
-        Largest distance between positions that it goes to and fro, steps; 0 where it comes to rest everywhere.
+        Largest distance between positions of the cycle, steps; 0 where the mechanism always comes to rest.
     left : float
-        Largest of what is then left of the quantity, in what one step does to it.
+        Largest residual of the quantity during the cycle, in units of the effect of one step.
     period : float
-        Readings of the longest cycle; 0 for none, NaN where it does not come back within the time watched.
+        Number of readings of the longest cycle; 0 for none, NaN where it does not repeat within the simulated time.
     """
 
     steps: int
@@ -218,16 +218,16 @@ class LimitCycle:
 
 
 def limit_cycle(gain: float, delay: int, dead_band: float = 0.0) -> LimitCycle:
-    """The limit cycle of a mechanism of whole steps, by going through the recursion.
+    """Return the limit cycle of a mechanism with whole steps, by simulation of the recursion.
 
     Parameters
     ----------
     gain : float
-        g.
+        Gain g.
     delay : int
-        d, readings.
+        Delay d, readings.
     dead_band : float
-        What is left and is smaller is left alone, in what one step does.
+        Residual, in units of the effect of one step, below which no correction is made.
     """
     offset = np.linspace(0.0, 1.0, _OFFSETS) + 0.5 / _OFFSETS
     command = np.zeros((delay + 2, len(offset)))
@@ -245,7 +245,7 @@ def limit_cycle(gain: float, delay: int, dead_band: float = 0.0) -> LimitCycle:
 
 
 def _period(places: Array) -> float:
-    """Readings after which places repeat themselves; NaN for never."""
+    """Return the number of readings after which positions repeat; NaN if they do not."""
     for length in range(1, len(places) // 2):
         if np.array_equal(places[length:], places[:-length]):
             return float(length)

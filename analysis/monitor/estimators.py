@@ -1,7 +1,7 @@
-"""Estimators of the cameras' changes from the shifts of their monitors' spots, under one interface.
+"""Estimators of the cameras' changes from the shifts of their monitors' spots, with a common interface.
 
-Each is linear to first order: parameters = gain x shifts. With the gain, the noise of the shifts and what is stated to
-move (``analysis.monitor.disturbances``) the covariance of its error follows in the same way for all of them:
+Each is linear to first order: parameters = gain x shifts. With the gain, the noise of the shifts and the prior of the
+disturbances (``analysis.monitor.disturbances``) the covariance of the error follows in the same way for all:
 
     noise: gain R gain',   misfit: (gain A - B) C (gain A - B)',   total: their sum.
 
@@ -25,24 +25,24 @@ from analysis.monitor.monitor_formulas import CameraParameters, MonitorGeometry
 from analysis.monitor.parameters import CameraCalibration
 from optics.numerics.extension_table import ExtensionTable
 
-PARAMETERS_EACH = 4
-"""Parameters of one camera."""
+PARAMETERS_PER_CAMERA = 4
+"""Number of parameters of one camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shifts:
-    """What an estimator is given: S states of K cameras with C spots together.
+    """Input of an estimator: S states of K cameras with C spots together.
 
     Attributes
     ----------
-    before, after : Array
-        (S, C, 2) spot positions (row, column), px, one camera's after the other's.
-    covariance : Array
-        (S, 2 C, 2 C) px^2 of after - before; zeros without noise.
-    cameras : Mapping[str, CameraCalibration]
-        What is calibrated of each.
-    disturbances : Disturbances | None
-        What is stated to move, None for nothing.
+    before, after : (S, C, 2) ndarray
+        Spot positions (row, column), px, one camera's after the other's.
+    covariance : (S, 2 C, 2 C) ndarray
+        Covariance of after - before, px^2; zeros without noise.
+    cameras : mapping of str to CameraCalibration
+        Calibration of each camera.
+    disturbances : Disturbances or None
+        Prior of the disturbances; None for none.
     """
 
     before: Array
@@ -53,32 +53,32 @@ class Shifts:
 
     @property
     def vector(self) -> Array:
-        """(S, 2 C) after - before, px."""
+        """Shifts after - before, (S, 2 C) px."""
         return (self.after - self.before).reshape(len(self.after), -1)
 
     @property
     def spots(self) -> dict[str, slice]:
-        """Camera -> its spots among all."""
+        """Range of each camera's spots among all."""
         ends = np.cumsum([0, *(len(camera.channels) for camera in self.cameras.values())]).tolist()
         return {name: slice(a, b) for name, a, b in zip(self.cameras, ends[:-1], ends[1:], strict=True)}
 
     @property
     def coordinates(self) -> dict[str, slice]:
-        """Camera -> the coordinates of its spots among all."""
+        """Range of each camera's spot coordinates among all."""
         return {name: slice(2 * own.start, 2 * own.stop) for name, own in self.spots.items()}
 
 
 class Estimator(ABC):
-    """Makes changes of all cameras of the shifts of all spots.
+    """Estimator of the changes of all cameras from the shifts of all spots.
 
     Attributes
     ----------
     title : str
-        For readers, its name in files with blanks.
+        Name for readers: its name in files with blanks.
     note : str
-        For readers, what it is.
+        Description for readers.
     stated : bool
-        Whether it needs stated disturbances; without any it does not stand in the results.
+        True if it needs a prior of the disturbances; without one it is not in the results.
     """
 
     title: str
@@ -86,59 +86,59 @@ class Estimator(ABC):
     stated: bool = False
 
     def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
-        """Whether it can be used with these cameras and with what is stated.
+        """Return True if it can be used with these cameras and this prior.
 
         Parameters
         ----------
-        cameras : Mapping[str, CameraCalibration]
-            What is calibrated of each.
-        disturbances : Disturbances | None
-            What is stated to move, None for nothing.
+        cameras : mapping of str to CameraCalibration
+            Calibration of each camera.
+        disturbances : Disturbances or None
+            Prior of the disturbances; None for none.
         """
         return disturbances is not None or not self.stated
 
     @abstractmethod
     def gain(self, shifts: Shifts) -> Array:
-        """Parameters per pixel of shift, (S, 4 K, 2 C).
+        """Return the gain, parameters per pixel of shift, (S, 4 K, 2 C).
 
         Parameters
         ----------
         shifts : Shifts
-            What was measured.
+            Measured shifts.
         """
 
     def read(self, shifts: Shifts) -> Array:
-        """The parameters, (S, 4 K): gain x shifts, unless an estimator has something better.
+        """Return the parameters, (S, 4 K): gain x shifts, unless an estimator improves on that.
 
         Parameters
         ----------
         shifts : Shifts
-            What was measured.
+            Measured shifts.
         """
         return np.einsum("spd,sd->sp", self.gain(shifts), shifts.vector)
 
 
-class OfEachCamera(Estimator):
-    """An estimator that takes each camera's spots for themselves."""
+class PerCameraEstimator(Estimator):
+    """Estimator that treats each camera's spots separately."""
 
     @abstractmethod
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
-        """(4, 2 n) or (S, 4, 2 n) parameters of one camera per pixel.
+        """Return the gain for one camera, (4, 2 n) or (S, 4, 2 n) parameters per pixel.
 
         Parameters
         ----------
         camera : CameraCalibration
-            Its calibration.
-        covariance : Array
-            (S, 2 n, 2 n) of its shifts, px^2.
+            Calibration of the camera.
+        covariance : (S, 2 n, 2 n) ndarray
+            Covariance of its shifts, px^2.
         """
 
     def gain(self, shifts: Shifts) -> Array:
-        """Block by block, camera by camera."""
-        count = PARAMETERS_EACH * len(shifts.cameras)
+        """Return the block-diagonal gain, camera by camera."""
+        count = PARAMETERS_PER_CAMERA * len(shifts.cameras)
         out = np.zeros((len(shifts.covariance), count, shifts.covariance.shape[-1]))
         for k, (name, own) in enumerate(shifts.coordinates.items()):
-            rows = slice(PARAMETERS_EACH * k, PARAMETERS_EACH * (k + 1))
+            rows = slice(PARAMETERS_PER_CAMERA * k, PARAMETERS_PER_CAMERA * (k + 1))
             out[:, rows, own] = self.camera_gain(shifts.cameras[name], shifts.covariance[:, own, own])
         return out
 
@@ -147,17 +147,17 @@ Exact = Callable[[ArrayLike, ArrayLike, ArrayLike, MonitorGeometry], CameraParam
 
 
 @dataclass(frozen=True)
-class Formula(OfEachCamera):
-    """A set of formulas of `analysis.monitor.monitor_formulas`.
+class Formula(PerCameraEstimator):
+    """Set of formulas of `analysis.monitor.monitor_formulas`.
 
     Attributes
     ----------
     name : str
-        There and in files.
+        Name in that module and in files.
     note : str
-        For readers.
-    exact : Exact | None
-        The formulas as they are, where they are not linear.
+        Description for readers.
+    exact : callable or None
+        Exact formulas, where they are not linear.
     """
 
     name: str
@@ -166,31 +166,31 @@ class Formula(OfEachCamera):
 
     @property
     def title(self) -> str:  # type: ignore[override]
-        """The name with blanks."""
+        """Name with blanks."""
         return self.name.replace("_", " ")
 
     def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
-        """To cameras with a left and a right spot.
+        """Return True for cameras with a left and a right spot.
 
         Parameters
         ----------
-        cameras : Mapping[str, CameraCalibration]
-            What is calibrated of each.
-        disturbances : Disturbances | None
-            Of no matter.
+        cameras : mapping of str to CameraCalibration
+            Calibration of each camera.
+        disturbances : Disturbances or None
+            Not used.
         """
         return all(camera.pair is not None for camera in cameras.values())
 
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
-        """The formulas' coefficients; further spots have no say."""
-        out = np.zeros((PARAMETERS_EACH, 2 * len(camera.channels)))
+        """Return the formulas' coefficients; further spots have zero weight."""
+        out = np.zeros((PARAMETERS_PER_CAMERA, 2 * len(camera.channels)))
         out[:, [2 * k + axis for k in _pair(camera) for axis in (0, 1)]] = monitor_formulas.coefficients(
             self.name, camera.geometry
         )
         return out
 
     def read(self, shifts: Shifts) -> Array:
-        """Changes by the exact formulas where there are such."""
+        """Return the changes by the exact formulas where there are such."""
         if self.exact is None:
             return super().read(shifts)
         parts = []
@@ -211,21 +211,22 @@ def _pair(camera: CameraCalibration) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class LeastSquares(OfEachCamera):
-    """Gauss-Markov estimate of the motions of paper 001's own family, by `analysis.monitor.model_fit`."""
+class LeastSquares(PerCameraEstimator):
+    """Gauss-Markov estimate of the motions that paper 001 considers, by `analysis.monitor.model_fit`."""
 
     title: str = "model"
     note: str = "weighted least squares on all spot coordinates with the Jacobian of the traced instrument"
 
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
-        """Gain of the weighted fit."""
+        """Return the gain of the weighted fit."""
         return model_fit.gain(covariance, camera.spot_jacobian, camera.parameter_jacobian, camera.motions)
 
 
 @dataclass(frozen=True)
 class Posterior(Estimator):
-    """Minimum-variance linear estimate (best linear unbiased prediction): of all linear functions of all spots the one
-    with the least mean square error under the stated disturbances and the noise.
+    """Minimum-variance linear estimate (best linear unbiased prediction).
+
+    Of all linear functions of all spots it has the least mean square error under the prior and the noise:
 
         p = B C A' (A C A' + R)^-1 s
 
@@ -238,7 +239,7 @@ class Posterior(Estimator):
     stated: bool = True
 
     def gain(self, shifts: Shifts) -> Array:
-        """Needs disturbances. Raises ValueError without."""
+        """Return the gain of the best prediction; raise ValueError without a prior."""
         stated = shifts.disturbances
         if stated is None:
             raise ValueError("posterior: needs stated disturbances")
@@ -259,43 +260,43 @@ _ESTIMATORS: dict[str, Estimator] = {
     "posterior": Posterior(),
 }
 ESTIMATORS = ExtensionTable("estimators", _ESTIMATORS, Estimator)
-"""Name in the results -> estimator, in the order of tables. A new one is added here: it then stands in recovered.json,
-crosstalk.json, the tables and the figures.
+"""Estimators by their name in the results, in the order of tables. A new one is added here: it is then in
+recovered.json, crosstalk.json, the tables and the figures.
 """
 
 
-JUDGED = ("posterior", "model")
-"""By which a measurement is judged: the first that stands in its results."""
+PREFERRED = ("posterior", "model")
+"""Estimators for verdicts: the first one in the results is used."""
 
 
-def judged(names: Iterable[str]) -> str:
-    """The estimator that verdicts, quoted sigmas and studies are about: the best one that could be used.
+def preferred_estimator(names: Iterable[str]) -> str:
+    """Return the name of the estimator for verdicts, quoted sigmas and studies: the best one in the results.
 
     Parameters
     ----------
-    names : Iterable[str]
-        Of those that stand in the results.
+    names : iterable of str
+        Names of the estimators in the results.
 
     Raises
     ------
     ValueError
-        None of them is judged by.
+        None of the preferred estimators is among them.
     """
     known = list(names)
-    for name in JUDGED:
+    for name in PREFERRED:
         if name in known:
             return name
-    raise ValueError(f"results without {' or '.join(JUDGED)}: there are {', '.join(known)}")
+    raise ValueError(f"results without {' or '.join(PREFERRED)}: there are {', '.join(known)}")
 
 
 def applicable(cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> dict[str, Estimator]:
-    """The estimators that can be used with these cameras and with what is stated.
+    """Return the estimators that can be used with these cameras and this prior.
 
     Parameters
     ----------
-    cameras : Mapping[str, CameraCalibration]
-        What is calibrated of each.
-    disturbances : Disturbances | None
-        What is stated to move, None for nothing.
+    cameras : mapping of str to CameraCalibration
+        Calibration of each camera.
+    disturbances : Disturbances or None
+        Prior of the disturbances; None for none.
     """
     return {name: one for name, one in ESTIMATORS.items() if one.applies(cameras, disturbances)}

@@ -1,37 +1,33 @@
-"""State of the filter of a series: its readings, their innovations, and the estimate with its covariance.
+"""State of the filter of a series, with tests of bad readings and probabilities of jumps that are not yet detected.
 
-Jumps that the readings hint at and that are not told, since chance might explain them: their chances, and what they
-add to the state.
-
-A jump is told where hardly any series without one would look like it; long before that, and where it stays too small
-for ever, one is likelier than none. Score b and information J of a step of independent amounts at one place, of
-variance s^2 each, make it
+**Undetected jumps.** A jump is reported where hardly any series without one would look like it; long before that, and
+where it stays too small for ever, a jump may be more likely than none. Score b and information J of a step of
+independent amounts before one reading, of variance s^2 each, make it
 
     B = exp(b' (J + I/s^2)^-1 b / 2) / det(I + s^2 J)^(1/2)
 
-times likelier than none (`jump_detection` has b and J), its amounts then being normal about (J + I/s^2)^-1 b. The
-statement gives the root mean square of the sizes alone, of which few large ones make nearly all: s is one of several
-sizes down to an eighth of that, each as likely. With the gap between readings over the mean time between two jumps as
-chance beforehand, and one jump at most within a window, the chance of one at a place is
+times more likely than none (`jump_detection` defines b and J), its amounts then being normal about (J + I/s^2)^-1 b.
+The prior gives only the root mean square of the sizes, to which few large ones contribute nearly all: s is one of
+several sizes down to an eighth of that, with equal probabilities. With the gap between readings over the mean time
+between two jumps as prior probability, and one jump at most within a window, the probability of a jump before a reading
+is
 
     p = w / (1 + sum w),   w = B gap / every,
 
-sums over the places of the window and over bodies.
+with sums over the readings of the window and over bodies.
 
-A reading that is wrong by itself, weighed against a jump whose size is bounded by what is stated.
-
-Both explain a reading that is far from its prediction. Beforehand a reading is bad with a small chance c, a body jumps
-before it with the chance gap / every of a jump, above. A bad reading has errors at some of its D coordinates, of
+**Bad readings.** A reading that is wrong by itself is weighed against a jump whose size is bounded by the prior. Both
+explain a reading that is far from its prediction. A priori a reading is bad with a small probability c, and a body
+jumps before it with the probability gap / every, as above. A bad reading has errors at some of its D coordinates, of
 variance v each, and none at the others. With nu the difference from the prediction and S its covariance,
 
     B(bad) = c N(nu; 0, S + V) / N(nu; 0, S)
 
 is averaged over the sizes of errors, over the number of coordinates and over which they are: the worst is added first,
-then the one that explains most of what is left, and so on. For a jump the ratio of likelihoods with it and without it,
-averaged over its size, is that above; sizes well above those stated have small chances of their own, so
-that a very large jump is believed when the next reading shows it once more, and not before. A step of the readings
-that no body explains has a place among jumps, too, with the least chance: several readings that agree with each other
-are not bad.
+then the one that explains most of the rest, and so on. For a jump the ratio of likelihoods with it and without it,
+averaged over its size, is that above; sizes well above the prior's have small probabilities of their own, so that a
+very large jump is accepted only when the next reading confirms it. A step of the readings that no body explains is a
+jump too, with the smallest probability: several readings that agree with each other are not bad.
 
 Reference: Box, Tiao, A Bayesian approach to some outlier problems, Biometrika 55, 1968, 119.
 """
@@ -52,20 +48,20 @@ from analysis.monitor.jump_detection import Amounts, Candidate, Jump
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """One reading: of all spots, or of d sensors or combinations of parameters.
+    """Reading of all spots, or of d sensors or combinations of parameters.
 
     Attributes
     ----------
     time : float
-        seconds.
-    value : Array
-        (D,) shifts of the spots since the reference, px; (d,) of another reading, in its unit.
-    noise : Array
-        Its covariance.
-    sensors : tuple[int, ...]
-        Numbers of the sensors of `HeatInputs` that read it, d of them.
-    parameters : Array | None
-        (d, P) rows on the parameters that it reads.
+        Time of the reading, s.
+    value : ndarray
+        (D,) shifts of the spots since the reference, px; (d,) values of another reading, in its unit.
+    noise : ndarray
+        Covariance of the values.
+    sensors : tuple of int
+        Indices of the d sensors of `HeatInputs` that were read.
+    parameters : (d, P) ndarray or None
+        Combinations of the parameters that were read.
     """
 
     time: float
@@ -76,7 +72,7 @@ class Observed:
 
     @property
     def spots(self) -> bool:
-        """Return whether the reading is one of the spots."""
+        """True for a reading of the spots."""
         return not self.sensors and self.parameters is None
 
 
@@ -87,11 +83,11 @@ class BadReading:
     Attributes
     ----------
     log_ratio : float
-        Logarithm of the likelihood if it is bad, chance beforehand included, over that if it is not.
+        Logarithm of the likelihood if it is bad, including the prior probability, over that if it is not.
     z : float
-        The coordinate that is furthest from what all others and the past make of it, in standard deviations.
+        Deviation of the worst coordinate from its prediction by all others and the past, in standard deviations.
     coordinate : int
-        Number of it.
+        Index of that coordinate.
     """
 
     log_ratio: float
@@ -101,24 +97,24 @@ class BadReading:
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """A reading against what was expected of it before it came.
+    """Difference of a reading from its prediction, with the decisions that followed from it.
 
     Attributes
     ----------
     observed : Observed
-        The reading.
-    white : Array
-        (d,) the difference in independent standard deviations.
+        Reading.
+    white : (d,) ndarray
+        Difference in independent standard deviations.
     log_score : float
-        Logarithm of the density that was stated for what came.
-    jump : Jump | None
-        Told at this reading; None for none.
-    bad : BadReading | None
-        What speaks for the reading being bad, where it was set aside; None where it was taken.
-    earlier : Innovation | None
-        The reading that was set aside before it, if that was taken after all.
+        Logarithm of the predicted density at the reading.
+    jump : Jump or None
+        Jump detected at this reading; None for none.
+    bad : BadReading or None
+        Evidence that the reading is bad, where it was set aside; None where it was accepted.
+    earlier : Innovation or None
+        Innovation of the reading that was set aside before, if that was accepted now.
     settled : bool
-        Whether one was set aside before it, of which it is decided now whether it is taken or left out.
+        True if a reading was set aside before, and its acceptance or exclusion is decided now.
     """
 
     observed: Observed
@@ -131,22 +127,26 @@ class Innovation:
 
     @property
     def chi_square(self) -> float:
-        """Return chi-square, of as many degrees of freedom as numbers were read."""
+        """Chi-square, with as many degrees of freedom as values were read."""
         return float(self.white @ self.white)
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A filter, and what steps just before each of L readings would do to it.
+    """Kalman filter with the effect of a step just before each of the last L readings.
 
     Attributes
     ----------
-    mean : Array
-        (n,); covariance: (n, n).
-    response : Array
-        (L, n, q) of the mean to steps of unit outputs.
-    score : Array
-        (L, q) b of the module's text; information: (L, q, q) J.
+    mean : (n,) ndarray
+        Mean of the states.
+    covariance : (n, n) ndarray
+        Covariance of the states.
+    response : (L, n, q) ndarray
+        Response of the mean to steps of unit outputs.
+    score : (L, q) ndarray
+        Score b of each step (see the module).
+    information : (L, q, q) ndarray
+        Information J of each step.
     """
 
     mean: Array
@@ -156,22 +156,26 @@ class Track:
     information: Array
 
     def alone(self) -> Track:
-        """The filter without steps that are looked for."""
+        """Return the filter without the step hypotheses."""
         return replace(self, response=self.response[:0], score=self.score[:0], information=self.information[:0])
 
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """A reading divided by the root of its covariance.
+    """Reading divided by the root of its covariance.
 
     Attributes
     ----------
-    root : Array
-        Cholesky factor (d, d) of its covariance, noise included.
-    white : Array
-        (d,) root^-1 (value - what was expected).
-    rows : Array
-        (d, n) root^-1 H; gain: (d, n) root^-1 H P; picked: (d, q) root^-1 what unit outputs do to it.
+    root : (d, d) ndarray
+        Cholesky factor of its covariance, noise included.
+    white : (d,) ndarray
+        Whitened innovation, root^-1 (value - prediction).
+    rows : (d, n) ndarray
+        Whitened observation matrix, root^-1 H.
+    gain : (d, n) ndarray
+        Product root^-1 H P with the covariance P of the states.
+    picked : (d, q) ndarray
+        Whitened effect of unit outputs on the reading.
     """
 
     root: Array
@@ -182,44 +186,46 @@ class Whitened:
 
 
 @dataclass(frozen=True, eq=False)
-class Aside:
-    """A reading that was set aside until the next one, since it may be bad or the first after a jump.
+class PendingReading:
+    """Reading that is set aside until the next one, since it may be bad or the first after a jump.
 
     Attributes
     ----------
-    taken : Belief
-        What is known if it is good.
+    ingested : FilterState
+        State of the filter if the reading is good.
     innovation : Innovation
-        Of it.
+        Innovation of the reading.
     log_odds : float
         Logarithm of the odds that it is bad.
     """
 
-    taken: Belief
+    ingested: FilterState
     innovation: Innovation
     log_odds: float
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
-    """All that is known from the readings so far.
+class FilterState:
+    """State of the filter after the readings so far.
 
     Attributes
     ----------
     time : float
-        Of the newest reading or of the start, seconds.
+        Time of the newest reading or of the start, s.
     last : float
-        Time of the newest reading of spots; NaN before the first.
-    after, until : Array
-        (L,) between which times each step that is looked for comes, seconds.
+        Time of the newest reading of spots, s; NaN before the first.
+    after, until : (L,) ndarray
+        Interval in which each step hypothesis occurs, s.
     state : Track
-        The filter. search: the one that looks for jumps, which knows of no walk; None where they are the same.
-    left : Array
-        (m,) what share of the mean square of jumps cannot be told, of each motion of a stated rate.
-    recent : tuple[bool, ...]
-        Whether each of the last readings of spots was left out as a bad one.
-    aside : Aside | None
-        a reading after which this is what is known if it is bad; None for none.
+        Filter of the estimate.
+    search : Track or None
+        Filter that detects jumps, which does not include the random walk; None where they are the same.
+    undetected : (m,) ndarray
+        Share of the mean square of jumps that is too small to be detected, for each motion with a known jump rate.
+    recent : tuple of bool
+        For each of the last readings of spots, True if it was excluded as bad.
+    pending : PendingReading or None
+        Reading set aside; this state is then the one in which it is bad.
     """
 
     time: float
@@ -228,47 +234,48 @@ class Belief:
     until: Array
     state: Track
     search: Track | None
-    left: Array
+    undetected: Array
     recent: tuple[bool, ...] = ()
-    aside: Aside | None = None
+    pending: PendingReading | None = None
 
     @property
     def mean(self) -> Array:
-        """(n,) of the states."""
+        """Mean of the states, (n,)."""
         return self.state.mean
 
     @property
     def covariance(self) -> Array:
-        """(n, n) of the states."""
+        """Covariance of the states, (n, n)."""
         return self.state.covariance
 
     @property
-    def looking(self) -> Track:
-        """The filter that looks for jumps."""
+    def jump_track(self) -> Track:
+        """Filter that detects jumps."""
         return self.state if self.search is None else self.search
 
 
 _SCALES = (0.125, 0.25, 0.5, 1.0, 2.0)
-"""Sizes of jumps over those stated."""
+"""Sizes of jumps relative to the prior."""
 _AGAIN = 2.0
-"""Factor of what a hinted jump adds for a smoother: the readings that said that it came, and how large, pull at it once
-more."""
+"""Factor of the variance that an undetected jump adds for a smoother, since the readings that indicated the jump and
+its size are used once more.
+"""
 
 
 @dataclass(frozen=True, eq=False)
-class Jumper:
-    """A body that jumps at a stated rate.
+class JumpingBody:
+    """Body that jumps at a known rate.
 
     Attributes
     ----------
-    motions : tuple[int, ...]
-        r numbers of all its motions that jump.
-    spots : Array
-        (q, r) what independent amounts of unit variance do that make the stated motions.
-    root : Array
-        (r, r) the motions by these amounts.
+    motions : tuple of int
+        Indices of its r motions that jump.
+    spots : (q, r) ndarray
+        Effect of independent amounts of unit variance that make up the motions.
+    root : (r, r) ndarray
+        Motions by these amounts.
     every_s : float
-        Mean time between two jumps, seconds.
+        Mean time between two jumps, s.
     """
 
     motions: tuple[int, ...]
@@ -277,17 +284,19 @@ class Jumper:
     every_s: float
 
 
-def jumpers(stated: Disturbances, may: Sequence[Candidate], otherwise: float | None = None) -> tuple[Jumper, ...]:
-    """Bodies of which all motions that jump do so at a stated rate.
+def jumping_bodies(
+    stated: Disturbances, may: Sequence[Candidate], otherwise: float | None = None
+) -> tuple[JumpingBody, ...]:
+    """Return the bodies of which all jumping motions have a known rate.
 
     Parameters
     ----------
     stated : Disturbances
-        disturbances.
-    may : Sequence[Candidate]
-        What may jump.
-    otherwise : float | None
-        Seconds between two jumps of a motion of which no rate is stated; None for bodies with a rate alone.
+        Prior of the disturbances.
+    may : sequence of Candidate
+        Candidates for jumps.
+    otherwise : float or None
+        Mean time between two jumps, s, of motions without a known rate; None to return only bodies with a rate.
     """
     out = []
     for body in dict.fromkeys(one.body for one in may):
@@ -295,22 +304,22 @@ def jumpers(stated: Disturbances, may: Sequence[Candidate], otherwise: float | N
         rates = [otherwise if (rate := stated.laws[k].every_s) is None else rate for k in one.motions]
         every = [rate for rate in rates if rate is not None]
         if len(every) == len(rates):
-            out.append(Jumper(one.motions, one.spots, one.root, min(every)))
+            out.append(JumpingBody(one.motions, one.spots, one.root, min(every)))
     return tuple(out)
 
 
 @dataclass(frozen=True, eq=False)
 class Hint:
-    """Of a jump of a body whose size is not known, for each of L places.
+    """Hypotheses of a jump of unknown size of one body before each of L readings.
 
     Attributes
     ----------
-    log_weight : Array
-        (L,) logarithm of w.
-    mean : Array
-        (L, r) of the amounts if it came there.
-    covariance : Array
-        (L, r, r) of them.
+    log_weight : (L,) ndarray
+        Logarithm of the weight w.
+    mean : (L, r) ndarray
+        Mean of the amounts if the jump occurred there.
+    covariance : (L, r, r) ndarray
+        Covariance of the amounts.
     """
 
     log_weight: Array
@@ -319,18 +328,18 @@ class Hint:
 
     @classmethod
     def of(cls, looked: tuple[Array, Array], own: tuple[Array, Array], outputs: Array, expected: Array) -> Hint:
-        """From scores and information.
+        """Compute the hypotheses from scores and information.
 
         Parameters
         ----------
-        looked : tuple[Array, Array]
-            Score (L, q) and information (L, q, q) by which it is judged.
-        own : tuple[Array, Array]
-            Likewise, by which its amounts are.
-        outputs : Array
-            (q, r) what unit amounts do.
-        expected : Array
-            (L,) mean number of jumps in the gap of each place; 0 where there is no gap.
+        looked : tuple of ndarray
+            Score (L, q) and information (L, q, q) by which the weights are computed.
+        own : tuple of ndarray
+            Score and information by which the amounts are computed.
+        outputs : (q, r) ndarray
+            Effect of unit amounts.
+        expected : (L,) ndarray
+            Mean number of jumps in the gap before each reading; 0 where there is no gap.
         """
         logs, means, squares = [], [], []
         for times in _SCALES:
@@ -349,7 +358,10 @@ class Hint:
 
 
 def _chances(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
-    """(L,) chance p of a jump of each body at each place, one at most among so many places on either side, or all."""
+    """Return the probability of a jump of each body before each reading, (L,), at most one jump within a window.
+
+    The window extends over the given number of readings on either side, or over all.
+    """
     every = np.logaddexp.reduce([one.log_weight for one in hints], axis=0)
     if window is None:
         total = np.logaddexp(0.0, np.logaddexp.reduce(every))
@@ -360,19 +372,19 @@ def _chances(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
     return [np.exp(one.log_weight - total) for one in hints]
 
 
-def blended(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequence[Array]) -> tuple[Array, Array]:
-    """Mean (n,) and covariance (n, n) of states where a jump that is not told counts by its chance.
+def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequence[Array]) -> tuple[Array, Array]:
+    """Return mean (n,) and covariance (n, n) of the states with undetected jumps weighted by their probabilities.
 
     Parameters
     ----------
-    mean : Array
-        (n,) of the states without one.
-    covariance : Array
-        (n, n) likewise.
-    hints : Sequence[Hint]
-        Of each body.
-    moved : Sequence[Array]
-        (L, n, r) of each body, what unit amounts at each place have done to the states by now.
+    mean : (n,) ndarray
+        Mean of the states without a jump.
+    covariance : (n, n) ndarray
+        Covariance of the states without a jump.
+    hints : sequence of Hint
+        Hypotheses of each body.
+    moved : sequence of (L, n, r) ndarrays
+        Effect of unit amounts before each reading on the present states, for each body.
     """
     found = _chances(hints)
     away = [np.einsum("knr,kr->kn", m, one.mean) for m, one in zip(moved, hints, strict=True)]
@@ -384,24 +396,25 @@ def blended(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequen
     return mean + shift, 0.5 * (out + out.T)
 
 
-def added(
-    score: Sequence[Array], information: Sequence[Array], gap: Array, bodies: Sequence[Jumper], window: int
+def hinted_variance(
+    score: Sequence[Array], information: Sequence[Array], gap: Array, bodies: Sequence[JumpingBody], window: int
 ) -> list[Array]:
-    """(N, r) of each body, what a smoother takes jumps to add that were not told, over the mean square that the motions
-    are stated to have at their rate.
+    """Return the variance that a smoother adds for undetected jumps, (N, r) for each body.
+
+    It is relative to the mean square of the motions at their prior rate.
 
     Parameters
     ----------
-    score : Sequence[Array]
-        (N, r) of each body, of unit amounts before each of N readings, by all readings.
-    information : Sequence[Array]
-        (N, r, r) of each, likewise.
-    gap : Array
-        (N,) seconds from the reading before, 0 where none is.
-    bodies : Sequence[Jumper]
-        That jump.
+    score : sequence of (N, r) ndarrays
+        Score of unit amounts before each of N readings, by all readings, for each body.
+    information : sequence of (N, r, r) ndarrays
+        Information on these, for each body.
+    gap : (N,) ndarray
+        Time since the reading before, s; 0 where there is none.
+    bodies : sequence of JumpingBody
+        Bodies that jump.
     window : int
-        Readings among which one jump is looked for.
+        Number of readings among which one jump is assumed.
     """
     if not bodies:
         return []
@@ -417,42 +430,43 @@ def added(
     return out
 
 
-# chance beforehand that a reading is bad
+# prior probability that a reading is bad
 _SHARE = 1e-3
-# logarithms of the odds above which a reading is set aside, against one to which nothing has happened and against the
-# first one after a jump: the second is low, since an error at one coordinate and a jump of a body that moves spots in
-# any way look alike, and since nobody knows well how often readings are bad
+# logarithms of the odds above which a reading is set aside, against an undisturbed one and against the first one after
+# a jump: the second is low, since an error at one coordinate and a jump of a body that moves spots in any way look
+# alike, and since the rate of bad readings is not known well
 _UNSURE, _SURE = math.log(0.05 / 0.95), math.log(1e-3)
-# chance at most that a reading which was set aside counts with as the first after a jump, for the same reason
+# largest probability with which a reading that is set aside counts as the first after a jump, for the same reason
 _MOST_FOR_JUMP = 0.8
-# where so many of the last readings were left out, none more is: then the prior is wrong, and not the readings
+# number of last readings, and of these the number of excluded ones above which no further reading is excluded: then the
+# prior is wrong, and not the readings
 RECENT, _MOST = 10, 5
-# sizes of errors over the noise of a coordinate, each as likely
+# sizes of errors relative to the noise of a coordinate, with equal probabilities
 _ERRORS = np.array([10.0, 50.0, 250.0, 1250.0, 6250.0])
-# sizes of jumps over those stated, and the logarithms of their chances
+# sizes of jumps relative to the prior, and the logarithms of their probabilities
 _SIZES = np.array([0.125, 0.25, 0.5, 1.0, 2.0, 8.0, 64.0])
 _LOG_SIZE = np.log([0.2, 0.2, 0.2, 0.2, 0.2, 1e-2, 1e-4])
-# logarithm of the chance of a step that nothing stated explains, over that of a jump of one body in the whole life
+# logarithm of the probability of a step that no body explains, relative to a jump of one body in the whole life
 _UNSTATED = math.log(1e-3)
 
 
 def may_be_bad(bad: BadReading | None, log_odds: float, recent: Sequence[bool]) -> bool:
-    """Return whether a reading is set aside until the next one.
+    """Return True if a reading is to be set aside until the next one.
 
     Parameters
     ----------
-    bad : BadReading | None
-        What speaks for it being bad; None where nothing does.
+    bad : BadReading or None
+        Evidence that it is bad; None without any.
     log_odds : float
-        Logarithm of the odds of that against all else.
-    recent : Sequence[bool]
-        Whether each of the last readings was left out.
+        Logarithm of the odds that it is bad.
+    recent : sequence of bool
+        For each of the last readings, True if it was excluded.
     """
     return bad is not None and bad.log_ratio > _UNSURE and log_odds > _SURE and sum(recent) < _MOST
 
 
 def chance_good(log_odds: float) -> float:
-    """Return the chance with which a reading that is set aside counts as a good one meanwhile.
+    """Return the probability with which a reading that is set aside counts as good in the meantime.
 
     Parameters
     ----------
@@ -463,19 +477,19 @@ def chance_good(log_odds: float) -> float:
 
 
 def bad_reading(white: Array, root: Array, noise: Array) -> BadReading | None:
-    """Return a reading as one with errors weighed against one without; None where it cannot be set aside.
+    """Return the evidence for errors in a reading; None where it cannot be set aside.
 
     Parameters
     ----------
-    white : Array
-        (D,) root^-1 times its difference from the prediction.
-    root : Array
-        (D, D) Cholesky factor of the covariance of that difference.
-    noise : Array
-        (D, D) of the reading.
+    white : (D,) ndarray
+        Whitened difference from the prediction.
+    root : (D, D) ndarray
+        Cholesky factor of the covariance of that difference.
+    noise : (D, D) ndarray
+        Covariance of the reading.
     """
     count = len(white)
-    if 0.5 * float(white @ white) + math.log(_SHARE) < _UNSURE:  # no errors explain more than all of it
+    if 0.5 * float(white @ white) + math.log(_SHARE) < _UNSURE:  # no errors explain more than chi-square
         return None
     back = np.linalg.inv(root)
     precision = back.T @ back
@@ -492,7 +506,7 @@ def bad_reading(white: Array, root: Array, noise: Array) -> BadReading | None:
 
 
 def _with_errors(precision: Array, pulled: Array, variance: Array) -> Array:
-    """(D,) log likelihood ratio with errors at the 1, 2, ... coordinates that explain most."""
+    """Return the log likelihood ratio with errors at the 1, 2, ... coordinates that explain most, (D,)."""
     free, total, out = np.ones(len(pulled), bool), 0.0, np.empty(len(pulled))
     for number in range(len(pulled)):
         inner = 1.0 + variance * np.diag(precision)
@@ -506,21 +520,21 @@ def _with_errors(precision: Array, pulled: Array, variance: Array) -> Array:
     return out
 
 
-def jump_evidence(track: Track, gap: Array, bodies: Sequence[Jumper], life: float, noise: Array) -> float:
-    """Logarithm of the likelihood of all readings with a jump at one of L places or none, over that with none.
+def jump_evidence(track: Track, gap: Array, bodies: Sequence[JumpingBody], life: float, noise: Array) -> float:
+    """Return the log likelihood ratio of all readings with at most one jump at any of L places, to that without a jump.
 
     Parameters
     ----------
     track : Track
-        The filter, with what steps at the L places would do.
-    gap : Array
-        (L,) seconds within which each comes.
-    bodies : Sequence[Jumper]
-        That jump.
+        Filter with the step hypotheses at the L places.
+    gap : (L,) ndarray
+        Length of the interval in which each occurs, s.
+    bodies : sequence of JumpingBody
+        Bodies that jump.
     life : float
-        Seconds in which a step that nothing explains comes with a small chance.
-    noise : Array
-        (D, D) of the reading, whose multiples are the sizes of such a step.
+        Time, s, in which a step that no body explains occurs with a small probability.
+    noise : (D, D) ndarray
+        Covariance of the reading, whose multiples are the sizes of such a step.
     """
     if not len(gap):
         return 0.0

@@ -1,28 +1,27 @@
-"""Jumps: steps of a body at a time that nobody knows, found in a series of measurements.
+"""Detection of jumps: steps of a body at an unknown time in a series of measurements.
 
-Whitened shifts u = L^-1 s of a series in which nothing jumps are independent numbers of unit variance, with L the
-Cholesky factor of their covariance by all else that moves and by noise. A step of amounts z of some motions between the
+Whitened shifts u = L^-1 s of a series without jumps are independent numbers of unit variance, with L the Cholesky
+factor of their covariance by all other motions and by noise. A step of amounts z of some motions between the
 measurements k - 1 and k adds G_k A z to them, G_k = L^-1 (e_k x 1), e_k being 1 from measurement k on. The generalised
 likelihood ratio of that step against none, its amounts being free, is
 
     2 log ratio = b' J^-1 b,   b = A' G_k' u,   J = A' G_k' G_k A,
 
-which without a step is chi-square of as many degrees of freedom as the spots see motions (Willsky, Jones, IEEE Trans.
-Automat. Contr. 21, 1976, 108; Basseville, Nikiforov, Detection of Abrupt Changes, 1993, ch. 7). It is looked for at
-every measurement, with every motion alone and with all motions of a body together. The chance of as large a ratio
-anywhere is at most the sum of the chances of all these looks (Boole's inequality), whatever their correlations, and a
-jump is reported where this sum is below the chance that is stated: a bound that needs no simulation, and from which
-false alarms are rarer than stated. A jump that was found becomes an event, and the next one is looked for in what that
-leaves; the last look, the one that finds nothing, is the one that can be wrong in a series whose jumps have all been
-found, so that further looks do not add up (as in Holm's procedure).
+which without a step is chi-square distributed with as many degrees of freedom as there are motions that the spots
+observe (Willsky, Jones, IEEE Trans. Automat. Contr. 21, 1976, 108; Basseville, Nikiforov, Detection of Abrupt Changes,
+1993, ch. 7). The step is tested at every measurement, with every motion alone and with all motions of a body together.
+The probability of as large a ratio anywhere is at most the sum of the probabilities of all these tests (Boole's
+inequality), whatever their correlations, and a jump is reported where this sum is below the specified probability: a
+bound that needs no simulation, so that false alarms are rarer than specified. A detected jump becomes an event, and the
+next one is searched for with it known; the last search, which finds nothing, is the one that can be wrong in a series
+whose jumps have all been detected, so that further searches do not add up (as in Holm's procedure).
 
-Jumps that are too small to be found remain in the readings. Where it is stated how often a motion jumps, the smoother
-takes them for a walk of their mean square.
+Jumps that are too small to be detected remain in the readings. Where the rate of jumps is known, the smoother
+represents them by a random walk of their mean square.
 
-Whose jump it was: a jump that was told, by the chances of all bodies and places that can explain it.
-
-Which body jumped the spots often cannot tell, and what it did to the line depends on it. Each body counts by its
-chance, all of its motions being free, before each reading before which the step can have come.
+The spots often cannot determine which body has jumped, and the effect on the line of sight depends on it. After a
+detection each body is weighted by its probability, all of its motions being free, before each reading before which the
+step can have occurred (`Bodies`).
 """
 
 from __future__ import annotations
@@ -42,21 +41,22 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.statistics import limit_of
 
 MOST = 100
-"""Jumps that are looked for in one series."""
-UNSEEN = 1e-9
-"""Of the largest eigenvalue of J, in standard deviations that are stated: what the spots see less of is not looked for,
-since there float64 leaves nothing of it."""
+"""Greatest number of jumps that are searched for in one series."""
+UNOBSERVABLE = 1e-9
+"""Eigenvalue of J, relative to the largest, below which a combination of motions counts as unobservable: float64 has no
+significant digits of it.
+"""
 _UNLIKELY = 1e-4
-"""Likelihood over that of the likeliest time, below which the step did not come at a time."""
+"""Likelihood relative to that of the most likely time below which a time is excluded."""
 _AHEAD = 100.0
-"""Lengths of the series after its end for which a forecast knows that jumps go on."""
+"""Length after the end of a series, in units of its length, over which a forecast includes further jumps."""
 _AGAIN, _TWO_VALUED = 1.0, 1.5
-"""Times that, for a smoother, what spots leave unknown of a told jump counts once more, and what it did counts."""
+"""For a smoother: weight of the repeated uncertainty of a detected jump in the spots, and of the jump's own square."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
-"""By how much the variance of a jump is tried to be larger than stated."""
+"""Factors by which the variance of a jump is increased to find the most likely one."""
 _SIZES = np.linspace(0.0, 8.0, 401)
 _MEAN_SQUARE = 2.0 * (_SIZES[1] - _SIZES[0]) * _SIZES**2 * np.exp(-0.5 * _SIZES**2) / np.sqrt(2.0 * np.pi)
-"""Shares of the mean square of a normal number by its size in standard deviations."""
+"""Contributions to the mean square of a normal number by its size in standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +66,13 @@ class Candidate:
     Attributes
     ----------
     body : str
-        Whose they are.
-    motions : tuple[int, ...]
-        Their numbers among the disturbances.
-    spots : Array
-        (D, r) px, for independent amounts of unit variance that make the stated motions.
-    root : Array
-        (r, r) the motions by these amounts.
+        Body of the motions.
+    motions : tuple of int
+        Indices of the motions among the disturbances.
+    spots : (D, r) ndarray
+        Spot shifts, px, by independent amounts of unit variance that make up the motions.
+    root : (r, r) ndarray
+        Motions by these amounts.
     """
 
     body: str
@@ -83,16 +83,16 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """Of steps at K times, what all of them need; `likeliest` takes it for motions of any body.
+    """Score and information of steps at K times, from which `most_likely_jump` tests the motions of any body.
 
     Attributes
     ----------
-    after, until : Array
-        (K,) the step comes after the one and not after the other, seconds.
-    score : Array
-        (K, D) G' u.
-    information : Array
-        (K, D, D) G' G.
+    after, until : (K,) ndarray
+        Interval in which the step occurs, s.
+    score : (K, D) ndarray
+        Score G' u.
+    information : (K, D, D) ndarray
+        Information G' G.
     """
 
     after: Array
@@ -103,36 +103,42 @@ class Steps:
 
 @dataclass(frozen=True)
 class Jump:
-    """A jump that was found.
+    """Detected jump.
 
     Attributes
     ----------
     body : str
-        That explains it best.
-    motions : tuple[int, ...]
-        Numbers of its motions among the disturbances; labels, units: theirs.
-    sizes : tuple[float, ...]
-        Of the jump in these units; sigmas: their standard deviations.
+        Body that explains it best.
+    motions : tuple of int
+        Indices of its motions among the disturbances.
+    labels, units : tuple of str
+        Names and units of these motions.
+    sizes, sigmas : tuple of float
+        Sizes of the jump in these units, and their standard deviations.
     after, until : float
-        Between which measurements it is likeliest, seconds.
-    chances : tuple[tuple[float, float], ...]
-        (time, chance that it has come by then), seconds, linear between.
+        Times of the measurements between which it is most likely, s.
+    chances : tuple of (float, float)
+        Pairs (time, probability that it has occurred by then), s, linear between.
     log_ratio : float
-        Of the likelihoods with it and without it.
+        Logarithm of the ratio of the likelihoods with it and without it.
     chance : float
-        Of as large a ratio anywhere in the series if nothing jumps, at most.
-    rivals : Mapping[str, float]
-        Other bodies -> their best log ratio at the same time, best first.
+        Upper bound of the probability of as large a ratio anywhere in a series without a jump.
+    rivals : mapping of str to float
+        Best log ratio of other bodies at the same time, best first.
     times : float
-        Standard deviations of the jump over those stated, which the smoother takes it to have.
-    parts : tuple[tuple[tuple[int, ...], float], ...]
-        (motions, variance) of each body that may have jumped, over that stated and times the chance that it was this
-        body; empty for the motions above alone.
-    change : tuple[float, ...]
-        (D + P) of the spots, px, and of the parameters by the jump, whichever body it was; empty where that is not
-        worked out. spread: covariance of its error; width: D.
-    rest : tuple[float, int]
-        Chi-square and degrees of freedom of what no jump of this body explains of a step at the same time.
+        Ratio of the jump's standard deviations to the prior ones, as used by the smoother.
+    parts : tuple of (tuple of int, float)
+        For each body that may have jumped, its motions and its variance, relative to the prior and multiplied by the
+        probability of the body; empty for the motions above alone.
+    change : tuple of float
+        Change of the D spot coordinates, px, and of the P parameters by the jump, whichever body it was; empty where it
+        is not computed.
+    spread : tuple of tuples of float
+        Covariance of the error of `change`.
+    width : int
+        Number of spot coordinates D in `change`.
+    rest : tuple of (float, int)
+        Chi-square and degrees of freedom of the part of a step at the same time that no jump of this body explains.
     """
 
     body: str
@@ -156,11 +162,11 @@ class Jump:
 
     @cached_property
     def law(self) -> TimeLaw:
-        """What it is once it was found."""
+        """Law in time of the jump once it is detected."""
         return TimeLaw(event=self.chances)
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON files have it."""
+        """Return the jump as JSON files contain it."""
         amounts = zip(self.labels, self.units, self.sizes, self.sigmas, strict=True)
         return {
             "body": self.body,
@@ -175,17 +181,17 @@ class Jump:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """Motions that step once, by amounts that nobody knows: at an event, or a jump that was told.
+    """Motions that step once by unknown amounts: at an event, or a detected jump.
 
     Attributes
     ----------
-    parts : tuple[tuple[tuple[int, ...], float], ...]
-        (motions, variance over that stated) of what steps, independent of each other.
-    chances : tuple[tuple[float, float], ...]
-        (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a known
-        moment, seconds.
-    moment : Array | None
-        (D + P, D + P) mean square of what it does to spots and parameters; None for that of independent parts.
+    parts : tuple of (tuple of int, float)
+        Motions and variance relative to the prior of each independent part of the step.
+    chances : tuple of (float, float)
+        Pairs (time, probability that it has occurred by then), s, in the order of time, linear between; one pair (time,
+        1) for a known time.
+    moment : (D + P, D + P) ndarray or None
+        Mean square of its effect on spots and parameters; None for that of independent parts.
     """
 
     parts: tuple[tuple[tuple[int, ...], float], ...]
@@ -194,10 +200,12 @@ class Step:
 
     @classmethod
     def of(cls, jump: Jump) -> Step:
-        """Of a jump that was told, for a smoother: its mean square as it was found, one body having made it. What the
-        readings said of it they will say once more, so that what they left unknown of what spots see counts twice; what
-        spots do not see stays as it is. Between the readings around it the state is one of two, the jump away from each
-        other, and no normal: half of its square more.
+        """Return the step of a detected jump for a smoother, with the mean square found at the detection.
+
+        One body is assumed to have jumped. The information of the readings on the jump is used once more by the
+        smoother, so that the uncertainty that they left in the spots counts twice; unobservable parts are unchanged.
+        Between the readings around the jump the state is one of two values, which is not normal: half of the jump's
+        square is added.
         """
         moment = None
         if jump.change:
@@ -207,8 +215,8 @@ class Step:
             moment = _TWO_VALUED * np.outer(change, change) + spread + _AGAIN * seen
         return cls(jump.parts or ((jump.motions, jump.times**2),), jump.chances, moment)
 
-    def come(self, time: float) -> float:
-        """Chance that it has come by a time, seconds."""
+    def step_probability(self, time: float) -> float:
+        """Return the probability that it has occurred by a time, s."""
         at, chance = np.array(self.chances).T
         if len(at) == 1:
             return float((time >= at[0]) * chance[0])
@@ -217,7 +225,7 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Amounts:
-    """How much motions have jumped, for each place of the step: mean (L, r), covariance (L, r, r), log weights (L,)."""
+    """Amounts of a jump for each of L places: mean (L, r), covariance (L, r, r), log weights (L,)."""
 
     mean: Array
     covariance: Array
@@ -225,18 +233,18 @@ class Amounts:
 
     @classmethod
     def of(cls, score: Array, information: Array, outputs: Array, times: float) -> Amounts:
-        """By what is known of steps.
+        """Compute the amounts from the score and information of steps.
 
         Parameters
         ----------
-        score : Array
-            (L, q) as of `Steps`.
-        information : Array
-            (L, q, q) likewise.
-        outputs : Array
-            (q, r) what the motions do.
+        score : (L, q) ndarray
+            Score, as in `Steps`.
+        information : (L, q, q) ndarray
+            Information, as in `Steps`.
+        outputs : (q, r) ndarray
+            Effect of the motions.
         times : float
-            Their standard deviations over those of ``outputs``.
+            Ratio of their standard deviations to those of ``outputs``.
         """
         information = outputs.T @ information @ outputs
         score = score @ outputs
@@ -248,12 +256,12 @@ class Amounts:
 
 
 def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
-    """What may jump: each motion whose law is `jump` alone, and those of a body together.
+    """Return the candidates for jumps: each motion whose law is `jump`, and those of a body together.
 
     Parameters
     ----------
     stated : Disturbances
-        Disturbances; motions that move no spot are left out.
+        Prior of the disturbances; motions that move no spot are excluded.
     """
     jumping = [k for k, law in enumerate(stated.laws) if law.jump and np.any(stated.spots[:, k])]
     bodies: dict[str, list[int]] = {}
@@ -269,21 +277,21 @@ def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
 
 
 def steps(root: Array, white: Array, when: Array, inside: slice, reference: float | None) -> Steps:
-    """Steps between any two measurements that follow each other.
+    """Return score and information of steps between any two consecutive measurements.
 
     Parameters
     ----------
-    root : Array
-        L, (n D, n D) lower triangular.
-    white : Array
-        (n D,) L^-1 s.
-    when : Array
-        (n,) times of the measurements, seconds, ascending.
+    root : (n D, n D) ndarray
+        Lower triangular Cholesky factor L.
+    white : (n D,) ndarray
+        Whitened shifts L^-1 s.
+    when : (n,) ndarray
+        Times of the measurements, s, ascending.
     inside : slice
-        Measurements of which each may be the first after the step; of all, of the piece that is looked at.
-    reference : float | None
-        From when changes are counted, seconds; None for the calibration, and a step before the first measurement is
-        then no step.
+        Measurements that may be the first after the step.
+    reference : float or None
+        Time from which changes are counted, s; None for the calibration, and a step before the first measurement is
+        then excluded.
     """
     each = len(white) // len(when)
     before = np.concatenate([[np.inf if reference is None else reference], when[:-1]])
@@ -298,17 +306,17 @@ def steps(root: Array, white: Array, when: Array, inside: slice, reference: floa
     return Steps(after[at], when[at], every @ white, every @ every.transpose(0, 2, 1))
 
 
-def likeliest(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturbances) -> Jump | None:
-    """The jump that is hardest to explain by chance; None where nothing can be looked for. Its sizes are not yet known.
+def most_likely_jump(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturbances) -> Jump | None:
+    """Return the jump that is least likely to be due to chance, without its sizes; None if nothing can be tested.
 
     Parameters
     ----------
-    found : Sequence[Steps]
-        Steps at all times that are looked at, piece by piece.
-    may : Sequence[Candidate]
-        What may jump.
+    found : sequence of Steps
+        Steps at all times that are tested, piece by piece.
+    may : sequence of Candidate
+        Candidates for jumps.
     stated : Disturbances
-        Disturbances that have these motions.
+        Prior that contains these motions.
     """
     parts = [one for one in found if len(one.until)]
     if not parts or not may:
@@ -319,7 +327,7 @@ def likeliest(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturba
     for c, one in enumerate(may):
         values, vectors = np.linalg.eigh(one.spots.T @ information @ one.spots)
         along = np.einsum("kij,ki->kj", vectors, score @ one.spots)
-        seen = values > UNSEEN * values.max()
+        seen = values > UNOBSERVABLE * values.max()
         squares[c] = np.sum(np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0), axis=1)
         logs[c] = _log_chance(squares[c], np.sum(seen, axis=1))
     which, k = np.unravel_index(int(np.argmin(logs)), logs.shape)
@@ -342,12 +350,12 @@ def likeliest(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturba
         log_ratio=0.5 * float(squares[which, k]),
         chance=float(np.exp(min(0.0, logs[which, k] + np.log(logs.size)))),
         rivals=dict(sorted(rivals.items(), key=lambda item: -item[1])),
-        times=larger(best.spots.T @ information[k] @ best.spots, score[k] @ best.spots),
+        times=jump_scale(best.spots.T @ information[k] @ best.spots, score[k] @ best.spots),
     )
 
 
 def _log_chance(square: Array, degrees: NDArray[np.int_]) -> Array:
-    """Logarithm of the chance of a larger chi-square, also where the chance is too small for float64."""
+    """Return the logarithm of the probability of a larger chi-square, also where it underflows in float64."""
     half, shape = 0.5 * square, 0.5 * np.maximum(degrees, 1)
     chance = gammaincc(shape, half)
     far = (shape - 1.0) * np.log(np.maximum(half, 1.0)) - half - gammaln(shape)
@@ -355,23 +363,23 @@ def _log_chance(square: Array, degrees: NDArray[np.int_]) -> Array:
 
 
 def _chances(after: Array, until: Array, log_ratio: Array) -> tuple[tuple[float, float], ...]:
-    """When the step came, all times between the first and the last being as likely before the measurements."""
+    """Return the distribution of the time of a step, all times having equal prior probability."""
     weight = np.exp(log_ratio - log_ratio.max())
     weight = np.where(weight < _UNLIKELY, 0.0, weight * (until - after))
     return knots(after, until, weight / weight.sum())
 
 
 def knots(after: Array, until: Array, weight: Array) -> tuple[tuple[float, float], ...]:
-    """(time, chance that a step has come by then), linear between.
+    """Return pairs (time, probability that a step has occurred by then), linear between.
 
     Parameters
     ----------
-    after : Array
-        (L,) seconds, ascending; the step comes after the one and not after the other.
-    until : Array
-        (L,) likewise.
-    weight : Array
-        (L,) chances of each place, together 1.
+    after : (L,) ndarray
+        Start of the interval in which the step occurs, s, ascending.
+    until : (L,) ndarray
+        End of that interval, s.
+    weight : (L,) ndarray
+        Probability of each interval; their sum is 1.
     """
     sure = np.minimum(np.cumsum(weight), 1.0)
     out: dict[float, float] = {}
@@ -381,15 +389,17 @@ def knots(after: Array, until: Array, weight: Array) -> tuple[tuple[float, float
     return tuple(sorted(out.items()))
 
 
-def larger(information: Array, score: Array) -> float:
-    """Standard deviation over that stated that makes a jump most likely, not less than the jump itself, nor than 1.
+def jump_scale(information: Array, score: Array) -> float:
+    """Return the ratio of a jump's most likely standard deviation to the prior one.
+
+    It is at least the size of the jump itself, and at least 1.
 
     Parameters
     ----------
-    information : Array
-        (r, r) of its amounts.
-    score : Array
-        (r,) of them.
+    information : (r, r) ndarray
+        Information on its amounts.
+    score : (r,) ndarray
+        Score of its amounts.
     """
     values, vectors = np.linalg.eigh(information)
     values, along = np.maximum(values, 0.0), vectors.T @ score
@@ -401,13 +411,13 @@ def larger(information: Array, score: Array) -> float:
 
 
 def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
-    """Disturbances in which jumps that were found are events, after all that was stated and in this order.
+    """Return the prior with detected jumps appended as events, in this order.
 
     Parameters
     ----------
     stated : Disturbances
-        disturbances.
-    found : Sequence[Jump]
+        Prior of the disturbances.
+    found : sequence of Jump
         Jumps of their motions.
     """
     for one in found:
@@ -415,37 +425,38 @@ def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
     return stated
 
 
-def untold_share(limit: float, seen: Array) -> Array:
-    """(n,) share of the mean square of normal jumps that is of those which are not told.
+def subthreshold_share(limit: float, seen: Array) -> Array:
+    """Return the share of the mean square of normal jumps that is due to those below the detection limit, (n,).
 
     Parameters
     ----------
     limit : float
-        Standard deviations from which on a jump is told.
-    seen : Array
-        (n,) standard deviations by which a jump of the stated size is seen.
+        Detection limit, in standard deviations of the measured jump.
+    seen : (n,) ndarray
+        Size of a jump of one prior standard deviation, in the same unit.
     """
     return np.asarray(ndtr(limit - _SIZES * seen[:, None]) @ _MEAN_SQUARE)
 
 
-def with_unfound(
+def with_subthreshold_jumps(
     model: Disturbances, found: Sequence[Steps], stated: Disturbances, looks: int, last: float
 ) -> Disturbances:
-    """Disturbances with what jumps leave that are too small to be found, where it is stated how often a motion jumps: a
-    walk whose variance grows by the mean square of such steps, the more where measurements are few.
+    """Return the prior with a random walk for jumps too small to be detected, for motions with a known jump rate.
+
+    The variance of the walk grows by the mean square of such steps, faster where measurements are few.
 
     Parameters
     ----------
     model : Disturbances
-        Disturbances with the jumps that were found.
-    found : Sequence[Steps]
+        Prior with the detected jumps.
+    found : sequence of Steps
         Steps at all times, with those jumps known.
     stated : Disturbances
-        Disturbances as stated, which the first motions of ``model`` are.
+        Original prior, whose motions are the first of ``model``.
     looks : int
-        Of the search.
+        Number of tests of the search.
     last : float
-        Time of the last measurement, seconds; from there on no jump is found.
+        Time of the last measurement, s, after which no jump is detected.
     """
     after, until, information = (
         np.concatenate([getattr(one, name) for one in found]) for name in ("after", "until", "information")
@@ -458,7 +469,7 @@ def with_unfound(
             continue
         column = stated.spots[:, k]
         seen = np.sqrt(np.maximum(column @ information @ column, 0.0))
-        left = untold_share(limit, seen)
+        left = subthreshold_share(limit, seen)
         grown = np.cumsum(left * (until - after)) / law.every_s
         ahead = _AHEAD * (last - float(after[0]))
         knots = [(float(after[0]), 0.0), *zip(until.tolist(), grown.tolist(), strict=True)]
@@ -467,27 +478,30 @@ def with_unfound(
     return model
 
 
-def sized(one: Jump, stated: Disturbances, root: Array, white: Array, when: Array, reference: float | None) -> Jump:
-    """The jump with its sizes, as all measurements and all other jumps leave them.
+def with_sizes(
+    one: Jump, stated: Disturbances, root: Array, white: Array, when: Array, reference: float | None
+) -> Jump:
+    """Return the jump with its sizes, estimated from all measurements with all other jumps known.
 
     Parameters
     ----------
     one : Jump
-        a jump of some motions.
+        Jump of some motions.
     stated : Disturbances
-        Disturbances that have these motions.
-    root : Array
-        L, with all jumps that were found as events.
-    white : Array
-        L^-1 s.
-    when : Array
-        Times of the measurements, seconds.
-    reference : float | None
-        From when changes are counted, seconds; None for the calibration.
+        Prior that contains these motions.
+    root : (n D, n D) ndarray
+        Cholesky factor L, with all detected jumps as events.
+    white : (n D,) ndarray
+        Whitened shifts L^-1 s.
+    when : (n,) ndarray
+        Times of the measurements, s.
+    reference : float or None
+        Time from which changes are counted, s; None for the calibration.
     """
     own = list(one.motions)
     prior = one.times**2 * stated.correlation[np.ix_(own, own)]
-    come = one.law.come(when) - (0.0 if reference is None else float(one.law.come(reference)))
+    come = one.law.step_probability(when)
+    come -= 0.0 if reference is None else float(one.law.step_probability(reference))
     weights = solve_triangular(root, np.kron(come[:, None], stated.spots[:, own] @ prior), lower=True)
     sizes = stated.sigmas[own] * (weights.T @ white)
     left = np.maximum(np.diag(prior) - np.sum(weights**2, axis=0), 0.0)
@@ -496,18 +510,20 @@ def sized(one: Jump, stated: Disturbances, root: Array, white: Array, when: Arra
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """Bodies that may have jumped, B of them, before each of L readings.
+    """Hypotheses that one of B bodies has jumped before one of L readings.
 
     Attributes
     ----------
-    own : tuple[Candidate, ...]
-        All motions of each that may jump.
-    times : tuple[float, ...]
-        (B,) standard deviations of its jump over those stated.
-    weight : Array
-        (B, L) chances, together 1.
-    judged : tuple[Amounts, ...]
-        Amounts by the filter that looks for jumps; amounts: by the other.
+    own : tuple of Candidate
+        All motions of each body that may jump.
+    times : tuple of float
+        Ratio of each body's jump to the prior standard deviations.
+    weight : (B, L) ndarray
+        Probabilities; their sum is 1.
+    judged : tuple of Amounts
+        Amounts by the filter that detects jumps.
+    amounts : tuple of Amounts
+        Amounts by the filter of the estimate.
     """
 
     own: tuple[Candidate, ...]
@@ -526,28 +542,28 @@ class Bodies:
         looking: tuple[Array, Array],
         state: tuple[Array, Array],
     ) -> Bodies:
-        """All that are not much less likely than the likeliest.
+        """Return all hypotheses that are not much less likely than the most likely one.
 
         Parameters
         ----------
-        may : Sequence[Candidate]
-            What may jump.
+        may : sequence of Candidate
+            Candidates for jumps.
         jump : Jump
-            That was told.
-        until : Array
-            (L,) times of the readings, seconds.
-        gap : Array
-            (L,) seconds from the reading before each.
-        looking : tuple[Array, Array]
-            Score (L, q) and information (L, q, q) by which bodies and places are judged.
-        state : tuple[Array, Array]
-            Likewise, by which amounts are for the estimate.
+            Detected jump.
+        until : (L,) ndarray
+            Times of the readings, s.
+        gap : (L,) ndarray
+            Time since the reading before each, s.
+        looking : tuple of ndarray
+            Score (L, q) and information (L, q, q) that give the probabilities of bodies and places.
+        state : tuple of ndarray
+            Score and information that give the amounts for the estimate.
         """
         place, found = int(np.argmin(np.abs(until - jump.until))), []
         for body in dict.fromkeys(one.body for one in may):
             one = max((one for one in may if one.body == body), key=lambda one: len(one.motions))
             known = one.spots.T @ looking[1][place] @ one.spots, looking[0][place] @ one.spots
-            times = jump.times if body == jump.body else larger(*known)
+            times = jump.times if body == jump.body else jump_scale(*known)
             found.append((one, times, Amounts.of(*looking, one.spots, times), Amounts.of(*state, one.spots, times)))
         logs = np.array([judged.log_weight for _, _, judged, _ in found])
         weight = np.exp(logs - logs.max()) * gap
@@ -558,12 +574,12 @@ class Bodies:
 
     @property
     def spots(self) -> list[Array]:
-        """(q, r) of each what unit amounts do to the outputs that are read."""
+        """Effect of unit amounts of each body on the outputs, (q, r)."""
         return [one.spots for one in self.own]
 
     @property
     def parts(self) -> tuple[tuple[tuple[int, ...], float], ...]:
-        """Motions of each, and their variance over that stated times the chance that it was this body."""
+        """Motions of each body, and their relative variance times the probability of the body."""
         chance = self.weight.sum(axis=1)
         every = zip(self.own, chance.tolist(), self.times, strict=True)
         return tuple((one.motions, share * times**2) for one, share, times in every)
@@ -571,20 +587,20 @@ class Bodies:
     def known(
         self, mean: Array, covariance: Array, response: Array, levels: Sequence[Array], amounts: Sequence[Amounts]
     ) -> tuple[Array, Array]:
-        """States of a filter as if it had known of the jump: mean (n,) and covariance (n, n), over bodies and places.
+        """Return mean (n,) and covariance (n, n) of a filter as if it had known of the jump.
 
         Parameters
         ----------
-        mean : Array
-            (n,) of the filter.
-        covariance : Array
-            (n, n) of it.
-        response : Array
-            (L, n, q) of the mean to steps of unit outputs at each place.
-        levels : Sequence[Array]
-            (n, r) of each body, what unit amounts do to the states.
-        amounts : Sequence[Amounts]
-            Of each.
+        mean : (n,) ndarray
+            Mean of the filter.
+        covariance : (n, n) ndarray
+            Covariance of the filter.
+        response : (L, n, q) ndarray
+            Response of the mean to steps of unit outputs before each reading.
+        levels : sequence of (n, r) ndarrays
+            Effect of unit amounts on the states, for each body.
+        amounts : sequence of Amounts
+            Amounts of each body.
         """
         shift, spread = np.zeros(len(mean)), np.zeros(covariance.shape)
         for one, share, level, does in zip(amounts, self.weight, levels, self.spots, strict=True):
@@ -598,17 +614,17 @@ class Bodies:
         return mean + shift, 0.5 * (out + out.T)
 
 
-def mixed(amounts: Sequence[Amounts], does: Sequence[Array], weight: Array) -> tuple[Array, Array]:
-    """Mean and covariance of what jumps do, each body and place counting by its chance.
+def mixture_moments(amounts: Sequence[Amounts], does: Sequence[Array], weight: Array) -> tuple[Array, Array]:
+    """Return mean and covariance of the effect of jumps, averaged over bodies and places by their probabilities.
 
     Parameters
     ----------
-    amounts : Sequence[Amounts]
-        Of B bodies at L places.
-    does : Sequence[Array]
-        (o, r) of each body, what unit amounts do.
-    weight : Array
-        (B, L) chances, together 1.
+    amounts : sequence of Amounts
+        Amounts of B bodies at L places.
+    does : sequence of (o, r) ndarrays
+        Effect of unit amounts, for each body.
+    weight : (B, L) ndarray
+        Probabilities; their sum is 1.
     """
     each = np.stack([one.mean @ do.T for one, do in zip(amounts, does, strict=True)])
     mean = np.einsum("bk,bko->o", weight, each)

@@ -1,23 +1,23 @@
-"""What limits the readings of a monitor: the variance of every quantity motion by motion, and by each stated number.
+"""Error budget of a monitor: contributions of every motion and of every number of the prior to the variances.
 
-With spots s = A x + noise, parameters p = B x, x ~ N(0, C) and a quantity q = r p, an estimate g s is wrong by
-(g A - r B) x + g noise. With e = g A - r B the share of motion i in the variance e C e' is e_i (C e)_i: the shares add
-up to the variance, and those of motions that go together can be negative.
+With spots s = A x + noise, parameters p = B x, x ~ N(0, C) and a quantity q = r p, an estimate g s has the error (g A -
+r B) x + g noise. With e = g A - r B the contribution of motion i to the variance e C e' is e_i (C e)_i: the
+contributions add up to the variance, and those of correlated motions can be negative.
 
-A number of the statement is one standard deviation that a cause gives to motions of several bodies: ``figure Z7: 2 nm``
-of all mirrors. Of an estimate with the error (g A - r B) x + g noise, e = g A - r B, motions i and j make the part
-e_i C_ij e_j of the variance V, which goes with the square of the numbers, so that sigma follows a number s with
+A number of the prior is one standard deviation that a cause gives to motions of several bodies: ``figure Z7: 2 nm`` of
+all mirrors. Motions i and j contribute e_i C_ij e_j to the variance V of an estimate's error, which is proportional to
+the square of the numbers, so that sigma depends on a number s by
 
     d ln sigma / d ln s = sum of e_i (C e)_i / V over the number's motions,
 
 its elasticity: a number of elasticity 0.4 that is 10 % larger makes sigma 4 % larger. For the best estimator this holds
-whether it is told of the change or not, since its gain is where the variance is least (the envelope theorem); how large
-sigma becomes if the number is twice as large is worked out for both.
+whether its prior is changed as well or not, since its gain is where the variance is least (the envelope theorem); sigma
+for a number twice as large is computed for both cases.
 
-A statement that is a guess has heavier tails than a normal one. With each number multiplied by 1 / sqrt(w), w from a
-gamma distribution of shape nu / 2 and mean 1, motions have Student's distribution with nu degrees of freedom (Lange,
-Little and Taylor, Journal of the American Statistical Association 84, 881 (1989)): rare states are far out, and a
-number is then wrong for all bodies at once.
+A prior that is a guess has heavier tails than a normal one. With each number multiplied by 1 / sqrt(w), w from a gamma
+distribution of shape nu / 2 and mean 1, motions have Student's distribution with nu degrees of freedom (Lange, Little
+and Taylor, Journal of the American Statistical Association 84, 881 (1989)): rare states are far out, and a number is
+then wrong for all bodies at once.
 """
 
 from __future__ import annotations
@@ -37,16 +37,17 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibra
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """Something that is read, to first order a row on the parameters of all cameras.
+    """Quantity read by the monitor, to first order a linear combination of the parameters of all cameras.
 
     Attributes
     ----------
     group : str
-        a camera, ``intersection_angle`` or ``ground``.
+        Name of a camera, ``intersection_angle`` or ``ground``.
     parameter : Parameter
-        Which of its readings.
-    row : Array
-        (4 K,) in the reading's unit per rad and m of d_alpha, d_beta, d_gamma, d_f of one camera after the other.
+        Reading of that group.
+    row : (4 K,) ndarray
+        Coefficients, in the reading's unit per rad and m of d_alpha, d_beta, d_gamma, d_f of one camera after the
+        other.
     """
 
     group: str
@@ -55,25 +56,27 @@ class Quantity:
 
     @property
     def key(self) -> str:
-        """In results, ends in its unit."""
+        """Key in results, which ends in the unit."""
         return self.parameter.key
 
     @property
     def name(self) -> str:
-        """Group and key, as plans of operation name it: ``forward d_f_um``."""
+        """Group and key, as operation plans name it: ``forward d_f_um``."""
         return f"{self.group} {self.parameter.key}"
 
 
 def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry | None = None) -> tuple[Quantity, ...]:
-    """All that is read of an instrument: every parameter; of a pair the intersection angle; where its altitude is
-    known the errors at the middle of the line on the ground.
+    """Return all quantities that are read of an instrument.
+
+    They are every parameter; for a pair the intersection angle; where the altitude is known, the errors on the ground
+    at the middle of the line.
 
     Parameters
     ----------
-    cameras : Mapping[str, CameraCalibration]
-        By name, in the order of the spots.
-    ground : GroundGeometry | None
-        Of a pair.
+    cameras : mapping of str to CameraCalibration
+        Calibration of each camera, in the order of the spots.
+    ground : GroundGeometry or None
+        Ground geometry of a pair.
     """
     count = 4
     unit = np.eye(count * len(cameras))
@@ -84,7 +87,7 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
     ]
     if len(cameras) == 2:
         first, second = (camera.look_rad for camera in cameras.values())
-        # positive where the lines of sight open: the forward one's d_alpha minus the other's
+        # positive if the angle opens: d_alpha of the forward camera minus that of the other
         sign = parameters.ANGLE.per_si if first > second else -parameters.ANGLE.per_si
         out.append(Quantity(ANGLE_GROUP, parameters.ANGLE, sign * (unit[0] - unit[count])))
     if ground is not None:
@@ -96,11 +99,11 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
 
 
 _UNMOVED, _NEGLIGIBLE = 1e-7, 1e-9
-"""Share of what a motion does to a camera, angles and relative changes alike, and of what any motion does, below which
-derivatives are rounding."""
+"""Fractions of the effect of a motion on a camera (angles and relative changes alike), and of the largest effect of any
+motion, below which derivatives are rounding."""
 
 
-def unmoved(
+def unchanged_quantities(
     stated: Disturbances, cameras: Mapping[str, CameraCalibration], ground: GroundGeometry | None = None
 ) -> frozenset[tuple[str, str]]:
     """Return group and key of the quantities that no motion of the prior changes, so that they have no posterior.
@@ -108,11 +111,11 @@ def unmoved(
     Parameters
     ----------
     stated : Disturbances
-        The prior.
-    cameras : Mapping[str, CameraCalibration]
-        What is calibrated of each.
-    ground : GroundGeometry | None
-        Of a pair whose altitude is known.
+        Prior of the disturbances.
+    cameras : mapping of str to CameraCalibration
+        Calibration of each camera.
+    ground : GroundGeometry or None
+        Ground geometry of a pair whose altitude is known.
     """
     unit = np.concatenate([(1.0, 1.0, 1.0, one.geometry.principal_distance_m) for one in cameras.values()])
     size = np.max(np.abs(stated.parameters) / unit[:, None], axis=0, initial=0.0)
@@ -126,16 +129,16 @@ def unmoved(
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """The variance of Q quantities by the M stated motions.
+    """Contributions of the M motions to the variances of Q quantities.
 
     Attributes
     ----------
-    before : Array
-        (Q, M) shares without any measurement, units of the quantities squared.
-    after : Array
-        (Q, M) shares of what an estimator makes wrong; negative ones are possible where motions go together.
-    noise : Array
-        (Q,) what the noise of the images adds to ``after``.
+    before : (Q, M) ndarray
+        Contributions without any measurement, units of the quantities squared.
+    after : (Q, M) ndarray
+        Contributions to the variance of an estimator's error; they can be negative where motions are correlated.
+    noise : (Q,) ndarray
+        Variance that the noise of the images adds to ``after``.
     """
 
     before: Array
@@ -144,42 +147,44 @@ class Split:
 
     @property
     def sigma_before(self) -> Array:
-        """(Q,) standard deviations without a measurement."""
+        """Standard deviations without a measurement, (Q,)."""
         return np.sqrt(self.before.sum(axis=1))
 
     @property
     def sigma(self) -> Array:
-        """(Q,) of the estimate's error."""
+        """Standard deviations of the estimate's error, (Q,)."""
         return np.sqrt(self.after.sum(axis=1) + self.noise)
 
     @staticmethod
     def by(shares: Array, names: Sequence[str]) -> dict[str, Array]:
-        """Shares summed over the motions of one name each, (Q,); in the order of the names' first mention.
+        """Return the contributions summed over the motions of each name, (Q,).
+
+        The names are in the order of their first occurrence.
 
         Parameters
         ----------
-        shares : Array
-            (Q, M).
-        names : Sequence[str]
-            (M,), for example their bodies.
+        shares : (Q, M) ndarray
+            Contributions of the motions.
+        names : (M,) sequence of str
+            Name of each motion's group, for example its body.
         """
         own = np.array(names)
         return {name: shares[:, own == name].sum(axis=1) for name in dict.fromkeys(names)}
 
 
 def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split:
-    """The variance of quantities by motions, before a measurement and after it.
+    """Compute the contributions of the motions to the variances of quantities, before and after a measurement.
 
     Parameters
     ----------
-    rows : Array
-        (Q, 4 K) of the quantities.
+    rows : (Q, 4 K) ndarray
+        Coefficients of the quantities.
     stated : Disturbances
-        What moves.
-    noise : Array
-        (D, D) of the shifts, px^2.
-    gain : Array
-        (4 K, D) of an estimator.
+        Prior of the disturbances.
+    noise : (D, D) ndarray
+        Covariance of the shifts, px^2.
+    gain : (4 K, D) ndarray
+        Gain of an estimator.
     """
     prior, reading = rows @ stated.parameters, rows @ gain
     error = reading @ stated.spots - prior
@@ -188,34 +193,34 @@ def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split
 
 
 def posterior_sigma(rows: Array, stated: Disturbances, noise: Array) -> Array:
-    """(Q,) standard deviations that the best linear unbiased prediction leaves.
+    """Return the posterior standard deviations of the best linear unbiased prediction, (Q,).
 
     Parameters
     ----------
-    rows : Array
-        (Q, 4 K) of the quantities.
+    rows : (Q, 4 K) ndarray
+        Coefficients of the quantities.
     stated : Disturbances
-        What moves, with any number of spots.
-    noise : Array
-        (D, D) of their shifts, px^2.
+        Prior of the disturbances, with any number of spots.
+    noise : (D, D) ndarray
+        Covariance of their shifts, px^2.
     """
     return split(rows, stated, noise, stated.best_gain(noise)).sigma
 
 
 @dataclass(frozen=True, eq=False)
-class LeastSeen:
-    """The most likely motions by which a quantity is wrong by one sigma though all spots have been measured.
+class LeastObservable:
+    """Most likely motions by which a quantity is wrong by one sigma although all spots have been measured.
 
     Attributes
     ----------
-    amounts : Array
-        (M,) in standard deviations.
+    amounts : (M,) ndarray
+        Motions in standard deviations.
     change : float
-        Of the quantity, its posterior standard deviation.
-    spots : Array
-        (D,) px by which the spots move with them.
-    noise : Array
-        (D,) px, standard deviations of the measured shifts.
+        Change of the quantity, its posterior standard deviation.
+    spots : (D,) ndarray
+        Spot shifts by these motions, px.
+    noise : (D,) ndarray
+        Standard deviations of the measured shifts, px.
     """
 
     amounts: Array
@@ -224,20 +229,20 @@ class LeastSeen:
     noise: Array
 
 
-def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastSeen:
-    """The combination of motions that hides best from the spots and still changes a quantity.
+def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastObservable:
+    """Return the combination of motions that the spots observe least and that still changes a quantity.
 
     With Q the posterior covariance of the motions and b = row B it is Q b / sqrt(b' Q b): of all combinations that
     change the quantity by its posterior sigma the one of the largest posterior probability.
 
     Parameters
     ----------
-    row : Array
-        (4 K,) of the quantity.
+    row : (4 K,) ndarray
+        Coefficients of the quantity.
     stated : Disturbances
-        What moves.
-    noise : Array
-        (D, D) of the shifts, px^2.
+        Prior of the disturbances.
+    noise : (D, D) ndarray
+        Covariance of the shifts, px^2.
     """
     b = row @ stated.parameters
     spread = stated.spot_covariance + noise
@@ -246,22 +251,22 @@ def least_seen(row: Array, stated: Disturbances, noise: Array) -> LeastSeen:
     change = float(np.sqrt(max(float(b @ direction), 0.0)))
     if change > 0.0:
         direction = direction / change
-    return LeastSeen(direction, change, stated.spots @ direction, np.sqrt(np.diagonal(noise)))
+    return LeastObservable(direction, change, stated.spots @ direction, np.sqrt(np.diagonal(noise)))
 
 
-def known_sigma(rows: Array, stated: Disturbances, noise: Array, groups: Sequence[Sequence[str]]) -> Array:
-    """(G, Q) standard deviations that the best linear unbiased prediction leaves, if some motions were known exactly.
+def sigma_if_known(rows: Array, stated: Disturbances, noise: Array, groups: Sequence[Sequence[str]]) -> Array:
+    """Return the posterior standard deviations if some motions were known exactly, (G, Q).
 
     Parameters
     ----------
-    rows : Array
-        (Q, 4 K) of the quantities.
+    rows : (Q, 4 K) ndarray
+        Coefficients of the quantities.
     stated : Disturbances
-        What moves.
-    noise : Array
-        (D, D) of the shifts, px^2.
-    groups : Sequence[Sequence[str]]
-        G times the labels of motions that are known; those that go with them are then known better, too.
+        Prior of the disturbances.
+    noise : (D, D) ndarray
+        Covariance of the shifts, px^2.
+    groups : sequence of sequences of str
+        For each of G cases, the labels of the known motions; motions correlated with them are then known better, too.
     """
     prior, c, labels = rows @ stated.parameters, stated.correlation, np.array(stated.labels)
     both = np.concatenate([stated.spots, prior])
@@ -278,18 +283,18 @@ def known_sigma(rows: Array, stated: Disturbances, noise: Array, groups: Sequenc
     return out
 
 
-def extended(stated: Disturbances, spots: Array, own: Sequence[bool]) -> Disturbances:
-    """Disturbances seen by further spots that are measured at the same time.
+def with_further_spots(stated: Disturbances, spots: Array, own: Sequence[bool]) -> Disturbances:
+    """Return the prior with further spots that are measured at the same time.
 
     Parameters
     ----------
     stated : Disturbances
-        What moves.
-    spots : Array
-        (D', M) px for one standard deviation of the motions.
-    own : Sequence[bool]
-        (M,) whether a body exists once more for the further spots, as the prisms of their channels do, and moves there
-        as much but independently.
+        Prior of the disturbances.
+    spots : (D', M) ndarray
+        Shifts of the further spots for one standard deviation of the motions, px.
+    own : (M,) sequence of bool
+        True for a body that the further spots have a separate copy of, as the prisms of their channels, which moves as
+        much but independently.
     """
     apart = np.array(own, bool)
     copies = np.flatnonzero(apart)
@@ -324,16 +329,18 @@ def extended(stated: Disturbances, spots: Array, own: Sequence[bool]) -> Disturb
 def field_covariance(
     direction_rad: float, cameras: Mapping[str, CameraCalibration], half_field: Sequence[float]
 ) -> Array:
-    """(4 K, 4 K) of parameters that points on the ground give, when they fix the directions of the line's middle and of
-    each half of the line against the other to some angle: d_gamma and d_f are that angle at the line's end.
+    """Return the covariance of the parameters from ground control points, (4 K, 4 K).
+
+    The points determine the direction of the line's middle, and of each half of the line relative to the other, to some
+    angle: d_gamma and d_f are that angle at the line's end.
 
     Parameters
     ----------
     direction_rad : float
         Standard deviation of a direction, rad.
-    cameras : Mapping[str, CameraCalibration]
-        By name.
-    half_field : Sequence[float]
+    cameras : mapping of str to CameraCalibration
+        Calibration of each camera.
+    half_field : sequence of float
         Tangent of half the field along the line, of each camera.
     """
     sigma = [
@@ -344,23 +351,25 @@ def field_covariance(
 
 
 def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Array, gap_s: float) -> Array:
-    """(Q,) standard deviations when a test field on the ground gave the parameters some time ago and the monitor
-    measured then as well as now: what is the same as then is known, what went on is not.
+    """Return the standard deviations some time after a calibration on a test field, (Q,).
+
+    The test field on the ground gave the parameters, and the monitor measured then as well as now: unchanged motions
+    are known, later changes are not.
 
     Parameters
     ----------
-    rows : Array
-        (Q, 4 K) of the quantities.
+    rows : (Q, 4 K) ndarray
+        Coefficients of the quantities.
     stated : Disturbances
-        What moves, with its laws in time; motions that go together have the same one.
-    noise : Array
-        (D, D) of the shifts, px^2, of each of the two measurements.
-    field : Array
-        (4 K, 4 K) covariance of what the test field gives.
+        Prior of the disturbances with its laws in time; correlated motions have the same law.
+    noise : (D, D) ndarray
+        Covariance of the shifts of each of the two measurements, px^2.
+    field : (4 K, 4 K) ndarray
+        Covariance of the parameters from the test field.
     gap_s : float
-        Since then, seconds.
+        Time since then, s.
     """
-    before, across, after = np.array([law.over(0.0, gap_s) for law in stated.laws]).reshape(-1, 3).T
+    before, across, after = np.array([law.two_time_moments(0.0, gap_s) for law in stated.laws]).reshape(-1, 3).T
     now, then, old_now = stated.correlation * after, stated.correlation * across, stated.correlation * before
     a, b = stated.spots, stated.parameters
     measured = np.concatenate([a, a, b])
@@ -373,45 +382,45 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
     spread[parts[0] : parts[1], parts[0] : parts[1]] += noise
     spread[parts[1] :, parts[1] :] += field
     across = rows @ b @ np.where(old, then @ measured.T, now @ measured.T)
-    # pixels and radians side by side: solved in units of their own spread
+    # pixels and radians are mixed: solved in units of their standard deviations
     unit = np.sqrt(np.diagonal(spread))
     solved = np.linalg.solve(spread / (unit[:, None] * unit), (across / unit).T)
     prior = np.einsum("qm,mn,qn->q", rows @ b, now, rows @ b)
     return np.sqrt(np.maximum(prior - np.einsum("qd,dq->q", across / unit, solved), 0.0))
 
 
-UNSEEN = 0.1
-"""Share of the noise of a shift. The derivative by a motion that moves spots by less is nearly zero."""
+UNOBSERVED = 0.1
+"""Shift relative to its noise below which a motion counts as having no effect on a spot."""
 SHARE = 0.01
-"""Share of the variance of a quantity from which an unseen body is reported."""
+"""Share of the variance of a quantity from which an unobserved body is reported."""
 DEGREES = 4.0
-"""Degrees of freedom of Student's distribution, for numbers that nobody measured."""
+"""Degrees of freedom of Student's distribution, for numbers of the prior that are not measured."""
 _DRAWS = 8_000
 _STEPS = 100
 _ROUNDING = 1e-12
-"""Of a half width, at which Newton's steps end; each doubles the digits."""
+"""Relative step of a half width at which Newton's method ends; each step doubles the digits."""
 _LEVELS = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
-"""Levels of 1, 2 and 3 standard deviations of a normal error."""
+"""Probabilities within 1, 2 and 3 standard deviations of a normal error."""
 
 
 @dataclass(frozen=True, eq=False)
 class Elasticity:
-    """Answer of Q quantities to one stated number.
+    """Sensitivity of Q quantities to one number of the prior.
 
     Attributes
     ----------
     number : str
-        Its cause and motion: ``mirror_figure figure Z7``.
-    size, unit : float
-        As stated.
-    bodies : tuple[str, ...]
-        That have it.
-    elasticity : Array
-        (Q,) relative change of sigma per relative change of the number.
-    doubled : Array
-        (Q,) sigma of the error if it is twice as large and nobody says so.
-    told : Array
-        (Q,) sigma if it is twice as large and stated so.
+        Cause and motion of the number: ``mirror_figure figure Z7``.
+    size, unit : float, str
+        Value of the number and its unit.
+    bodies : tuple of str
+        Bodies that have it.
+    elasticity : (Q,) ndarray
+        Relative change of sigma per relative change of the number.
+    doubled : (Q,) ndarray
+        Sigma of the error if the number is twice as large and the prior is not changed.
+    told : (Q,) ndarray
+        Sigma of the error if the number is twice as large in the prior as well.
     """
 
     number: str
@@ -425,18 +434,18 @@ class Elasticity:
 
 @dataclass(frozen=True, eq=False)
 class HeavyTail:
-    """What a statement with heavy tails would leave of Q quantities, read by the same estimator.
+    """Errors of Q quantities under a prior with heavy tails, read by the same estimator.
 
     Attributes
     ----------
     degrees : float
-        Of freedom.
-    rms : Array
-        (Q,) root of the mean square error.
-    held : Array
-        (3, Q) half widths that hold as many errors as 1, 2 and 3 sigma of a normal statement do.
-    beyond : Array
-        (Q,) chance of an error beyond 3 of the stated sigmas, 0.0027 of a normal statement.
+        Degrees of freedom of Student's distribution.
+    rms : (Q,) ndarray
+        Root of the mean square error.
+    held : (3, Q) ndarray
+        Half widths of the intervals with the probabilities of 1, 2 and 3 sigma of a normal prior.
+    beyond : (Q,) ndarray
+        Probability of an error beyond 3 of the reported sigmas, 0.0027 for a normal prior.
     """
 
     degrees: float
@@ -445,13 +454,13 @@ class HeavyTail:
     beyond: Array
 
 
-def stated_numbers(stated: Disturbances) -> dict[str, list[int]]:
-    """Number -> its motions. Axes that a cause gives the same standard deviation are one number.
+def prior_numbers(stated: Disturbances) -> dict[str, list[int]]:
+    """Return the motions of each number of the prior. Axes with the same standard deviation of a cause are one number.
 
     Parameters
     ----------
     stated : Disturbances
-        What moves.
+        Prior of the disturbances.
     """
     sizes: dict[tuple[str, str], set[float]] = {}
     whats = [label.removeprefix(f"{body} ") for label, body in zip(stated.labels, stated.bodies, strict=True)]
@@ -466,18 +475,18 @@ def stated_numbers(stated: Disturbances) -> dict[str, list[int]]:
 
 
 def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> tuple[Elasticity, ...]:
-    """Elasticities of all stated numbers, the one first that makes most of the first quantity's variance.
+    """Return the elasticities of all numbers of the prior, the largest for the first quantity first.
 
     Parameters
     ----------
-    rows : Array
-        (Q, 4 K) of the quantities.
+    rows : (Q, 4 K) ndarray
+        Coefficients of the quantities.
     stated : Disturbances
-        What moves.
-    noise : Array
-        (D, D) of the shifts, px^2.
-    gain : Array
-        (4 K, D) of the estimator.
+        Prior of the disturbances.
+    noise : (D, D) ndarray
+        Covariance of the shifts, px^2.
+    gain : (4 K, D) ndarray
+        Gain of the estimator.
     """
     reading = rows @ gain
     error = reading @ stated.spots - rows @ stated.parameters
@@ -485,7 +494,7 @@ def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -
     total = shares.sum(axis=1) + np.einsum("qd,de,qe->q", reading, noise, reading)
     safe = np.where(total > 0.0, total, np.inf)
     out = []
-    for number, own in stated_numbers(stated).items():
+    for number, own in prior_numbers(stated).items():
         factors = np.ones(len(stated.labels))
         factors[own] = 2.0
         wider = error * factors
@@ -504,22 +513,23 @@ def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -
     return tuple(sorted(out, key=lambda one: -float(one.elasticity[0])))
 
 
-def unseen(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> dict[str, Array]:
-    """Body -> (Q,) shares of the variances that are made by stated motions of it which have next to no derivative in
-    the spots; of bodies for which a share is more than `SHARE`.
+def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> dict[str, Array]:
+    """Return the shares of the variances by motions that hardly move the spots, (Q,), of each body.
+
+    Only bodies for which a share exceeds `SHARE` are returned.
 
     Parameters
     ----------
-    rows : Array
-        (Q, 4 K) of the quantities.
+    rows : (Q, 4 K) ndarray
+        Coefficients of the quantities.
     stated : Disturbances
-        What moves.
-    noise : Array
-        (D, D) of the shifts, px^2.
-    gain : Array
-        (4 K, D) of the estimator.
+        Prior of the disturbances.
+    noise : (D, D) ndarray
+        Covariance of the shifts, px^2.
+    gain : (4 K, D) ndarray
+        Gain of the estimator.
     """
-    still = np.all(np.abs(stated.spots) < UNSEEN * np.sqrt(np.diag(noise))[:, None], axis=0)
+    still = np.all(np.abs(stated.spots) < UNOBSERVED * np.sqrt(np.diag(noise))[:, None], axis=0)
     found = split(rows, stated, noise, gain)
     shares = found.after / np.where(found.sigma > 0.0, found.sigma**2, np.inf)[:, None]
     by_body: dict[str, Array] = {}
@@ -529,29 +539,30 @@ def unseen(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> dict
 
 
 def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, degrees: float = DEGREES) -> HeavyTail:
-    """Errors of an estimator whose statement has Student's distribution, each number in place of its standard deviation
-    with one scale for all its motions.
+    """Compute the errors of an estimator if each number of the prior has Student's distribution.
+
+    Each number has one random scale for all its motions, in place of its standard deviation.
 
     Parameters
     ----------
-    rows : Array
-        (Q, 4 K) of the quantities.
+    rows : (Q, 4 K) ndarray
+        Coefficients of the quantities.
     stated : Disturbances
-        What moves; its standard deviations are the scales.
-    noise : Array
-        (D, D) of the shifts, px^2.
-    gain : Array
-        (4 K, D) of the estimator.
+        Prior of the disturbances; its standard deviations are the scales.
+    noise : (D, D) ndarray
+        Covariance of the shifts, px^2.
+    gain : (4 K, D) ndarray
+        Gain of the estimator.
     degrees : float
-        Of freedom, above 2.
+        Degrees of freedom, above 2.
     """
     if degrees <= 2.0:
         raise ValueError(f"heavy tails: Student's distribution has a variance above 2 degrees, found {degrees}")
     reading = rows @ gain
     error = reading @ stated.spots - rows @ stated.parameters
-    groups = list(stated_numbers(stated).values())
+    groups = list(prior_numbers(stated).values())
     parts = np.stack([_of(error, own) for own in groups], axis=1)
-    # (Q, G, G) what numbers g and h together make of the variance
+    # (Q, G, G) contribution of the numbers g and h together to the variance
     pairs = np.einsum("qgm,mn,qhn->qgh", parts, stated.correlation, parts)
     by_noise = np.einsum("qd,de,qe->q", reading, noise, reading)
     scales = np.random.default_rng(1).gamma(0.5 * degrees, 2.0 / degrees, (_DRAWS, len(groups))) ** -0.5
@@ -572,20 +583,20 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
 
 
 def _of(error: Array, own: Sequence[int]) -> Array:
-    """(Q, M) the part of some motions alone."""
+    """Return the error (Q, M) with all but some motions set to zero."""
     out = np.zeros_like(error)
     out[:, own] = error[:, own]
     return out
 
 
 def _half_widths(sigma: Array, level: float) -> Array:
-    """(Q,) half widths that hold a share of normal errors of these standard deviations (N, Q).
+    """Return the half widths of intervals with a given probability for normal errors of random sigmas (N, Q), (Q,).
 
-    The share that is held grows with the half width ever more slowly. So Newton's method from 0 comes nearer from below
+    The probability grows with the half width ever more slowly. Newton's method from 0 therefore approaches from below
     at every step.
     """
     inverse = np.divide(1.0, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
-    sure = np.mean(sigma <= 0.0, axis=0)  # errors that are none
+    sure = np.mean(sigma <= 0.0, axis=0)  # errors of zero variance
     width = np.zeros(sigma.shape[1])
     for _ in range(_STEPS):
         ratio = width * inverse
@@ -595,4 +606,4 @@ def _half_widths(sigma: Array, level: float) -> Array:
         width = width + step
         if np.all(step <= _ROUNDING * width):
             return width
-    raise ArithmeticError(f"half widths of heavy tails: Newton's method finds no end in {_STEPS} steps")
+    raise ArithmeticError(f"half widths of heavy tails: Newton's method does not converge in {_STEPS} steps")

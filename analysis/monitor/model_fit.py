@@ -1,24 +1,22 @@
 """Estimator `model`: weighted least squares on all spot coordinates with the Jacobian of the traced instrument.
 
-The instrument is linear over the small motions that a monitor sees: spot shifts s = A m (px) and changes of the
-camera's parameters p = B m, for P motions m. `gain` maps s to the Gauss-Markov estimate of m and on to p. It can tell
-apart only the family of motions that it assumes; `observability` says, with numbers, what happens to all others.
+The instrument is linear over the small motions of a monitor: spot shifts s = A m (px) and changes of the camera's
+parameters p = B m, for P motions m. `gain` maps s to the Gauss-Markov estimate of m and on to p. It can separate only
+the family of motions that it assumes; `observability` reports quantitatively how it misreads all others.
 
 Order of spot coordinates: row and column of one spot after the other, [left row, left column, right row, right column]
-of a plain pair, px, after - before. Order of parameters:
-d_alpha, d_beta, d_gamma (rad), d_f (m).
+of a plain pair, px, after - before. Order of parameters: d_alpha, d_beta, d_gamma (rad), d_f (m).
 
-What of the stated motions no spot shows, whatever reads the spots and however long.
-
-Spots see A x, quantities are B x. Of motions with one law in time, covariance C, the part that moves no spot has the
-covariance
+**Unobservable modes.** Motions of the prior that move no spot cannot be estimated from the spots, however long they are
+measured. Spots see A x, quantities are B x. Of motions with one law in time and covariance C, the part that moves no
+spot has the covariance
 
     C - C A' (A C A')^+ A C,
 
-and what it does to the quantities is known by nobody who has the spots alone. Motions of different laws may be told
-apart by how they go on in time; with each law's share of the spots known apart, the sum over laws of what is left is
-the floor that every estimate from the spots has, of every time (`floor`). An eigenvector of the floor is a mode of
-quantities, and the likeliest motions that make it are a combination that leaves the spots where they are.
+and its effect on the quantities is unobservable. Motions of different laws may be separated by their behaviour in time;
+with each law's share of the spots known separately, the sum over laws of the rest is a lower bound of the error
+covariance of every estimate from the spots, at every time (`error_floor`). An eigenvector of this floor is a mode of
+quantities, and the most likely motions that cause it are a combination that leaves the spots unchanged.
 """
 
 from __future__ import annotations
@@ -41,18 +39,21 @@ _SHOWN = (
 )
 # Least ratio of singular values of a spot Jacobian with its columns scaled to length one.
 _RANK_TOLERANCE = 1e-8
-# Below this shift of any spot, px per unit of motion, a motion is called invisible; monitors resolve some 1e-3 px.
+# Shift of any spot, px per unit of motion, below which a motion is called invisible; monitors resolve some 1e-3 px.
 _INVISIBLE_PX = 1e-5
-# Statements leave out what is smaller than this part of the largest component beside it ...
+# Statements omit components that are smaller than this fraction of the largest component beside them ...
 _NEGLIGIBLE = 1e-5
-# ... and what is below this, arcsec or um per unit of motion: the rounding of Jacobians taken by differences.
+# ... and those below this, arcsec or um per unit of motion: the rounding of Jacobians by differences.
 _ROUNDING = 1e-6
 
 
 class RankError(MeasurementError, ValueError):
-    """The spots cannot separate the motions.
+    """Error raised when the spots cannot separate the motions.
 
-    `null_vectors` (K, P): combinations of motions that move no spot.
+    Attributes
+    ----------
+    null_vectors : (K, P) ndarray
+        Combinations of motions that move no spot.
     """
 
     def __init__(self, message: str, null_vectors: Array) -> None:
@@ -66,20 +67,25 @@ def gain(
     parameter_jacobian: ArrayLike,
     motion_names: Sequence[str] | None = None,
 ) -> Array:
-    """Parameters per pixel of shift, (..., 4, D).
-
-    Raises RankError naming the combination of motions that no spot sees; ValueError for bad input.
+    """Return the gain of the weighted least-squares fit, parameters per pixel of shift, (..., 4, D).
 
     Parameters
     ----------
-    covariance : ArrayLike
-        (..., D, D) px^2, positive definite, or all zero (no noise: equal weights).
-    spot_jacobian : ArrayLike
-        (D, P) px per unit of motion.
-    parameter_jacobian : ArrayLike
-        (4, P), rad and m per unit of motion. P from 1 to D.
-    motion_names : Sequence[str] | None
-        Of the P motions, for messages.
+    covariance : (..., D, D) array_like
+        Covariance of the shifts, px^2, positive definite, or all zero (no noise: equal weights).
+    spot_jacobian : (D, P) array_like
+        Shifts in px per unit of motion.
+    parameter_jacobian : (4, P) array_like
+        Parameters in rad and m per unit of motion; P from 1 to D.
+    motion_names : sequence of str or None
+        Names of the P motions, for messages.
+
+    Raises
+    ------
+    RankError
+        The spots cannot separate the motions; the message names the combination that moves no spot.
+    ValueError
+        Shapes or values are invalid.
     """
     spread = np.asarray(covariance, dtype=np.float64)
     spots, parameters = _jacobians(spot_jacobian, parameter_jacobian)
@@ -99,13 +105,22 @@ def gain(
 
 @dataclass(frozen=True, eq=False)
 class MotionReport:
-    """What the spots and the model make of one unit (scale) of one motion.
+    """Response of spots and model to one unit (scale) of one motion.
 
-    name: of the motion. signature_px: (D,) spot shifts.
-    explained: fraction [0, 1] of the signature, weighted by its noise, that the family's motions can imitate.
-    imitation: (F,) the amounts of the family's motions (in their units) that the fit puts in its place.
-    reported, true: (4,) parameters that the model reports, and the true change; rad and m.
-    nearest, cosine: the single family motion (other than itself) with the most similar signature, and their cosine.
+    Attributes
+    ----------
+    name : str
+        Name of the motion.
+    signature_px : (D,) ndarray
+        Spot shifts, px.
+    explained : float
+        Fraction [0, 1] of the signature, weighted by its noise, that the family's motions can imitate.
+    imitation : (F,) ndarray
+        Amounts of the family's motions (in their units) that the fit finds instead.
+    reported, true : (4,) ndarray
+        Parameters that the model reports, and the true change; rad and m.
+    nearest, cosine : str or None, float
+        Family motion (other than itself) with the most similar signature, and the cosine of both signatures.
     """
 
     name: str
@@ -120,18 +135,18 @@ class MotionReport:
 
 @dataclass(frozen=True, eq=False)
 class ObservabilityReport:
-    """Response of the spots to M motions, and which of the motions are separable.
+    """Response of the spots to M motions, and separability of these motions.
 
     Attributes
     ----------
     rank : int
-        Of the noise-weighted, unit-scaled signatures of all motions.
-    family : tuple[str, ...]
+        Rank of the noise-weighted, unit-scaled signatures of all motions.
+    family : tuple of str
         Names of the P motions that the model fits.
-    motions : tuple[MotionReport, ...]
-        a report on each.
-    statements : tuple[str, ...]
-        Plain English that names what cannot be separated.
+    motions : tuple of MotionReport
+        Report on each motion.
+    statements : tuple of str
+        Sentences that name the motions that cannot be separated.
     """
 
     rank: int
@@ -148,24 +163,27 @@ def observability(
     covariance: ArrayLike,
     family: Sequence[int],
 ) -> ObservabilityReport:
-    """Which motions are separable.
-
-    Raises RankError if the family itself is degenerate.
+    """Report which motions the spots can separate.
 
     Parameters
     ----------
-    motion_names : Sequence[str]
-        M names.
-    spot_jacobian : ArrayLike
-        (D, M), px per SI unit of motion.
-    parameter_jacobian : ArrayLike
-        (4, M), rad and m per SI unit of motion.
-    scales : ArrayLike
-        (M,) size of one unit of each motion in SI (1e-6 for one micrometre).
-    covariance : ArrayLike
-        (D, D) px^2 of the shifts, positive definite.
-    family : Sequence[int]
+    motion_names : sequence of str
+        Names of the M motions.
+    spot_jacobian : (D, M) array_like
+        Shifts in px per SI unit of motion.
+    parameter_jacobian : (4, M) array_like
+        Parameters in rad and m per SI unit of motion.
+    scales : (M,) array_like
+        Size of one unit of each motion in SI (1e-6 for one micrometre).
+    covariance : (D, D) array_like
+        Covariance of the shifts, px^2, positive definite.
+    family : sequence of int
         Indices of the motions that the model fits.
+
+    Raises
+    ------
+    RankError
+        The family itself is degenerate.
     """
     spots, parameters = _jacobians(spot_jacobian, parameter_jacobian, limited=False)
     names, size = tuple(motion_names), np.asarray(scales, dtype=np.float64)
@@ -218,10 +236,10 @@ def observability(
 
 
 def _statements(reports: list[MotionReport], family: list[str], rank: int, coordinates: int) -> list[str]:
-    """Sentences on the family as a whole, then on each motion that is not reported as what it is."""
+    """Return sentences on the family as a whole, then on each motion that is misreported."""
     seen = "Four" if coordinates == 4 else str(coordinates)
     lines = [
-        f"{seen} spot coordinates see {rank} independent combination{'s' if rank != 1 else ''} of {len(reports)} "
+        f"{seen} spot coordinates observe {rank} independent combination{'s' if rank != 1 else ''} of {len(reports)} "
         f"motions; the model fits {len(family)}: {', '.join(family)}."
     ]
     reach = {report.name: float(np.max(np.abs(report.signature_px))) for report in reports}
@@ -242,21 +260,21 @@ def _statements(reports: list[MotionReport], family: list[str], rank: int, coord
         if report.explained > 1 - 1e-6:
             text = "is not separable from the family"
         else:
-            text = f"is {100 * report.explained:.3g}% like the family and leaves a residual"
+            text = f"is explained to {100 * report.explained:.3g}% by the family and leaves a residual"
         amounts = [(float(a), other) for a, other in zip(report.imitation, family, strict=True)]
         shown = [(a, other) for a, other in amounts if abs(a) * reach[other] > _NEGLIGIBLE * reach[name]]
         mix = _sum(sorted(shown, key=lambda item: -abs(item[0]) * reach[item[1]])) or "nothing"
-        floor = _NEGLIGIBLE * float(np.max(np.abs(np.concatenate([_table(report.reported), _table(report.true)]))))
+        smallest = _NEGLIGIBLE * float(np.max(np.abs(np.concatenate([_table(report.reported), _table(report.true)]))))
         lines.append(
             f"{name}: {text}; one unit moves a spot by {reach[name]:.3g} px and reads as {mix}: the model gives"
-            f" {_show(report.reported, floor) or 'no change'}; the true change is "
-            f"{_show(report.true, floor) or 'none'}."
+            f" {_show(report.reported, smallest) or 'no change'}; the true change is "
+            f"{_show(report.true, smallest) or 'none'}."
         )
     return lines
 
 
 def _sum(terms: Sequence[tuple[float, str]]) -> str:
-    """A sum such as ``-0.755 x one + 0.535 x other``."""
+    """Return a sum as text, such as ``-0.755 x one + 0.535 x other``."""
     text = ""
     for amount, name in terms:
         sign = (" - " if amount < 0 else " + ") if text else ("-" if amount < 0 else "")
@@ -265,21 +283,21 @@ def _sum(terms: Sequence[tuple[float, str]]) -> str:
 
 
 def _table(values: Array) -> Array:
-    """(4,) rad and m in the units of ``_SHOWN``."""
+    """Return values (4,) in rad and m in the units of ``_SHOWN``."""
     return values * np.array([factor for _, factor, _ in _SHOWN])
 
 
-def _show(values: Array, floor: float = 0.0) -> str:
-    """The components above ``floor`` (arcsec, um) and above rounding, empty when there is none."""
+def _show(values: Array, smallest: float = 0.0) -> str:
+    """Return the components above ``smallest`` (arcsec, um) and above rounding as text; empty if there are none."""
     return ", ".join(
         f"{name} {value:+.3g}{unit}"
         for value, (name, _, unit) in zip(_table(values), _SHOWN, strict=True)
-        if abs(value) > max(floor, _ROUNDING)
+        if abs(value) > max(smallest, _ROUNDING)
     )
 
 
 def _check_rank(spots: Array, names: Sequence[str] | None) -> None:
-    """RankError when the columns of (4, P) are dependent, naming the null vectors in units of the motions."""
+    """Raise RankError if the columns of the spot Jacobian are dependent, with the null vectors."""
     count = spots.shape[1]
     length = np.linalg.norm(spots, axis=0)
     scaled = spots / np.where(length > 0, length, 1.0)
@@ -314,26 +332,26 @@ def _jacobians(spots: ArrayLike, parameters: ArrayLike, limited: bool = True) ->
 
 
 _NOTHING = 1e-12
-"""Of the largest eigenvalue of what a law's motions do to the spots, below which there is rounding alone."""
+"""Eigenvalue of the effect of a law's motions on the spots, relative to the largest, that is due to rounding alone."""
 
 
 @shows("sigma", "bodies")
 @dataclass(frozen=True, eq=False)
-class UnseenMode:
-    """Motions that move quantities and no spot.
+class UnobservableMode:
+    """Motions that change quantities but move no spot.
 
     Attributes
     ----------
-    quantities : Array
-        (Q,) what one standard deviation of the mode does, in their units.
+    quantities : (Q,) ndarray
+        Effect of one standard deviation of the mode, in the quantities' units.
     sigma : float
-        Root of the sum of its squares over the quantities' scales.
-    motions : Array
-        (M,) of that standard deviation, in stated standard deviations: the likeliest that make it.
-    bodies : Mapping[str, float]
-        Body -> share of the mode's variance, the largest first; negative where motions go together.
+        Root of the sum of its squares in units of the quantities' scales.
+    motions : (M,) ndarray
+        Most likely motions that cause it, in prior standard deviations.
+    bodies : mapping of str to float
+        Share of each body in the mode's variance, the largest first; negative where motions are correlated.
     spots : float
-        Largest of what the motions do to a spot, px: rounding.
+        Largest spot shift by the motions, px: rounding.
     """
 
     quantities: Array
@@ -343,8 +361,8 @@ class UnseenMode:
     spots: float
 
 
-def _hidden(stated: Disturbances) -> Array:
-    """(M, M) covariance of the motions that is left where each law's share of the spots is known."""
+def _unobservable(stated: Disturbances) -> Array:
+    """Return the covariance of the motions if each law's share of the spots were known, (M, M)."""
     out = np.zeros_like(stated.correlation)
     for law in dict.fromkeys(stated.laws):
         own = np.flatnonzero([one == law for one in stated.laws])
@@ -358,38 +376,38 @@ def _hidden(stated: Disturbances) -> Array:
     return out
 
 
-def floor(stated: Disturbances, rows: Array) -> Array:
-    """(Q, Q) covariance of quantities that no estimate from the spots can have less of.
+def error_floor(stated: Disturbances, rows: Array) -> Array:
+    """Return the lower bound of the error covariance of quantities for every estimate from the spots, (Q, Q).
 
     Parameters
     ----------
     stated : Disturbances
-        What moves.
-    rows : Array
-        (Q, P) of the quantities on the parameters.
+        Prior of the disturbances.
+    rows : (Q, P) ndarray
+        Coefficients of the quantities on the parameters.
     """
     effect = rows @ stated.parameters
-    return np.asarray(effect @ _hidden(stated) @ effect.T)
+    return np.asarray(effect @ _unobservable(stated) @ effect.T)
 
 
 _LEAST_MODE = 1e-3
-"""Share of the first mode's sigma below which a mode is left out."""
+"""Sigma relative to that of the first mode below which a mode is excluded."""
 
 
-def unseen_modes(stated: Disturbances, rows: Array, scale: Array) -> tuple[UnseenMode, ...]:
-    """Modes of the floor, the largest first.
+def unobservable_modes(stated: Disturbances, rows: Array, scale: Array) -> tuple[UnobservableMode, ...]:
+    """Return the modes of the error floor, the largest first.
 
     Parameters
     ----------
     stated : Disturbances
-        What moves.
-    rows : Array
-        (Q, P) of the quantities on the parameters.
-    scale : Array
-        (Q,) of each quantity what counts as much as one of another.
+        Prior of the disturbances.
+    rows : (Q, P) ndarray
+        Coefficients of the quantities on the parameters.
+    scale : (Q,) ndarray
+        Scale of each quantity, in which they are compared.
     """
     effect = rows @ stated.parameters
-    hidden = _hidden(stated)
+    hidden = _unobservable(stated)
     values, vectors = np.linalg.eigh((effect / scale[:, None]) @ hidden @ (effect / scale[:, None]).T)
     out = []
     for k in np.argsort(-values):
@@ -402,10 +420,10 @@ def unseen_modes(stated: Disturbances, rows: Array, scale: Array) -> tuple[Unsee
         bodies = {
             body: float(shares[[one == body for one in stated.bodies]].sum()) for body in dict.fromkeys(stated.bodies)
         }
-        # an eigenvector has no sign of its own: its largest quantity counts positive
+        # the sign of an eigenvector is arbitrary: its largest quantity is made positive
         doing = effect @ motions
         sign = float(np.sign(doing[np.argmax(np.abs(doing / scale))]))
         largest = float(np.abs(stated.spots @ motions).max(initial=0.0))
         ordered = dict(sorted(bodies.items(), key=lambda item: -item[1]))
-        out.append(UnseenMode(sign * doing, sigma, sign * motions, ordered, largest))
+        out.append(UnobservableMode(sign * doing, sigma, sign * motions, ordered, largest))
     return tuple(out)

@@ -1,42 +1,39 @@
-"""From spot shifts to camera parameters: the formulas of paper 001 (Wang et al., Acta Photonica Sinica 47(10) 1012001,
-2018).
+"""Formulas of paper 001: camera parameters from spot shifts, change of the intersection angle, errors on the ground.
 
-Axes: the column direction of an area CCD is the paper's x (flight direction), the row direction its y (along the line
-CCD). Sides: index 0 = left CCD (at the +Y end of the line, index 1 of the paper), 1 = right CCD (index 2 of the
-paper). A shift is after - before; the paper's X_L = x01 - x11 and Y_L = y01 - y11 are before - after.
+Paper 001 is Wang et al., Acta Photonica Sinica 47(10) 1012001, 2018.
+
+**Camera parameters.** Axes: the column direction of an area CCD is the paper's x (flight direction), the row direction
+its y (along the line CCD). Sides: index 0 = left CCD (at the +Y end of the line, index 1 of the paper), 1 = right CCD
+(index 2 of the paper). A shift is after - before; the paper's X_L = x01 - x11 and Y_L = y01 - y11 are before - after.
 Vector of pixel coordinates: [left row, left column, right row, right column]. Vector of parameters: [d_alpha, d_beta,
 d_gamma (rad), d_f (m)].
 
-Three sets of formulas, which differ only where the paper does:
+There are three sets of formulas, which differ only where the paper is inconsistent:
 
 - `paper_single`: eq. (2), (3), (5), (7) as printed, with the arctangent.
-- `paper_joint`: Table 1, "expression of uncertain changes", as printed. The table does not say how Y_L is signed, and
-  uses it in both d_beta and d_f; each row here takes the sign that agrees with the single-change formula beside it:
-  Y_L = y01 - y11 for d_beta, Y_L = y11 - y01 for d_f. Its d_f is then +1/2 of eq. (7), and its d_gamma equals eq. (5).
-- `derived`: what a plane-mirror return gives to first order. A shift s of the focal plane moves the spot by 2 s
+- `paper_joint`: Table 1, "expression of uncertain changes", as printed. The table does not define the sign of Y_L, and
+  uses it in both d_beta and d_f; each row here takes the sign that agrees with the single-change formula beside it: Y_L
+  = y01 - y11 for d_beta, Y_L = y11 - y01 for d_f. Its d_f is then +1/2 of eq. (7), and its d_gamma equals eq. (5).
+- `derived`: the response of a plane-mirror return to first order. A shift s of the focal plane moves the spot by 2 s
   against it, so d_alpha and d_beta are shift/(2f) without the cos^2 (which is a field-angle factor of the line of
   sight, not of the spot); d_gamma = (X_L - X_R) delta / (2 L), half of the printed (5); d_f by (7). A field-biased
   camera adds three calibrated numbers: its plate scale across the line f_x (d_alpha divides by it, d_gamma carries
-  f/f_x) and the gradients of principal distance and of line tilt over the field, which enter d_f by d_alpha and
-  d_gamma by d_beta. With f_x = f and no gradients the formulas are those of a distortion-free camera.
+  f/f_x) and the gradients of principal distance and of line tilt over the field, which enter d_f by d_alpha and d_gamma
+  by d_beta. With f_x = f and no gradients the formulas are those of a distortion-free camera.
 
-Change of the angle between the lines of sight of two cameras, from what their monitors measured (paper 001,
-Fig. 4).
+**Intersection angle.** The change of the angle between the lines of sight of two cameras follows from the readings of
+their monitors (paper 001, Fig. 4). Each camera is mounted in the base frame at a look angle: a rotation about Y,
+positive toward +X (forward). Its line of sight rotates in its own frame by the rotation vector (d_beta about X, d_alpha
+about Y, 0); d_gamma rotates about the line of sight and leaves it unchanged. To first order only the rotation about the
+common axis Y counts: change = d_alpha_forward - d_alpha_backward, where "forward" is the camera of the larger look
+angle. Unless the covariance between the two cameras is given, their errors are taken as independent.
 
-Each camera hangs in the base frame at a look angle: a rotation about Y, positive toward +X (forward). Its line of
-sight turns in its own frame by the rotation vector (d_beta about X, d_alpha about Y, 0); d_gamma turns about the line
-of sight and leaves it. To first order only the rotation about the common axis Y counts:
-change = d_alpha_forward - d_alpha_backward, where "forward" is the camera of the larger look angle. Unless the
-covariance between the two cameras is given, their errors are taken as independent.
-
-What changes of a stereo pair's cameras do to points on the ground that are located with the cameras as they were.
-
-Both cameras fly along one circular orbit over a sphere, look down along the track at their look angles, and see a point
-one after the other; attitude and orbit are known. A ray at the look angle a meets the ground at the incidence i,
-R sin i = (R + h) sin a, after the slant range R sin(i - a) / sin a. A changed camera's ray is the nominal one turned
-and, off the line's middle, scaled by the change of its principal distance; the point is found where both rays are
-nearest to each other (least squares of the distances). Axes on the ground: along the track, across it (to the right),
-up.
+**Errors on the ground.** Points are located with a stereo pair's cameras as they were before the change. Both cameras
+fly along one circular orbit over a sphere, look down along the track at their look angles, and see a point one after
+the other; attitude and orbit are known. A ray at the look angle a meets the ground at the incidence i, R sin i = (R +
+h) sin a, after the slant range R sin(i - a) / sin a. A changed camera's ray is the nominal one rotated and, off the
+line's middle, scaled by the change of its principal distance; the point is located where both rays are nearest to each
+other (least squares of the distances). Axes on the ground: along the track, across it (to the right), up.
 """
 
 from __future__ import annotations
@@ -55,21 +52,37 @@ FORMULAS = ("paper_single", "paper_joint", "derived")
 PARAMETERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
 """Keys of the parameters in results, which end in their unit."""
 PER_SI = np.array([1 / ARCSEC, 1 / ARCSEC, 1 / ARCSEC, UM_PER_M])
-"""How many of these units make one SI unit (rad, m)."""
+"""Number of these units in one SI unit (rad, m)."""
 
 
 @shows("principal_distance_m [m]", "separation_m [mm]", "pitch_m [um]", "field_alpha_rad [deg]", "field_beta_rad [deg]")
 @dataclass(frozen=True)
 class MonitorGeometry:
-    """What the formulas need to know of one camera's monitor. Raises ValueError, naming the field.
+    """Geometry of one camera's monitor for the formulas.
 
-    principal_distance_m: f, m. separation_m: L, distance of the two area CCDs, m. pitch_m: delta, m.
-    field_alpha_rad, field_beta_rad: alpha and beta in the cos^2 of (2), (3) and Table 1, rad.
-    principal_distance_across_m: plate scale across the line, m, where calibration finds it different from f
-        (anamorphism); default principal_distance_m. Only `derived` uses it.
-    d_f_per_alpha_m: change of the principal distance per rad of d_alpha, m, from the calibrated distortion: turning
-        the line of sight brings the line to a field where the plate scale differs. Only `derived` uses it.
-    d_gamma_per_beta: likewise the turn of the imaged line per rad of d_beta. Only `derived` uses it.
+    Attributes
+    ----------
+    principal_distance_m : float
+        Principal distance f, m.
+    separation_m : float
+        Distance L of the two area CCDs, m.
+    pitch_m : float
+        Pixel pitch delta, m.
+    field_alpha_rad, field_beta_rad : float
+        Angles alpha and beta in the cos^2 of (2), (3) and Table 1, rad.
+    principal_distance_across_m : float or None
+        Plate scale across the line, m, where calibration finds it different from f (anamorphism); default
+        `principal_distance_m`. Only `derived` uses it.
+    d_f_per_alpha_m : float
+        Change of the principal distance per rad of d_alpha, m, from the calibrated distortion: a rotation of the line
+        of sight moves the line to a field where the plate scale differs. Only `derived` uses it.
+    d_gamma_per_beta : float
+        Rotation of the imaged line per rad of d_beta, for the same reason. Only `derived` uses it.
+
+    Raises
+    ------
+    ValueError
+        A value is invalid; the message names the field.
 
     Examples
     --------
@@ -110,11 +123,16 @@ class MonitorGeometry:
 class CameraParameters(StateArrays):
     """Changes of one camera, scalars or arrays of one shape (...).
 
-    d_alpha_rad, d_beta_rad, d_gamma_rad: rotations of the camera about Y, X, Z. d_f_m: change of the principal
-        distance.
-    covariance: (..., 4, 4) in order d_alpha, d_beta, d_gamma (rad), d_f (m): of the noise of the images.
-    total: likewise, of the noise and of what the estimator makes wrong of stated disturbances; None where none are
-        stated.
+    Attributes
+    ----------
+    d_alpha_rad, d_beta_rad, d_gamma_rad : ndarray
+        Rotations of the camera about Y, X, Z, rad.
+    d_f_m : ndarray
+        Change of the principal distance, m.
+    covariance : (..., 4, 4) ndarray
+        Covariance of d_alpha, d_beta, d_gamma (rad), d_f (m) by the noise of the images.
+    total : (..., 4, 4) ndarray or None
+        Covariance by the noise and by the estimator's error under the disturbances of the prior; None without a prior.
     """
 
     d_alpha_rad: Array
@@ -126,16 +144,16 @@ class CameraParameters(StateArrays):
 
     @classmethod
     def from_vector(cls, values: ArrayLike, covariance: ArrayLike, total: ArrayLike | None = None) -> CameraParameters:
-        """From plain arrays.
+        """Return the changes from plain arrays.
 
         Parameters
         ----------
-        values : ArrayLike
-            (..., 4) d_alpha, d_beta, d_gamma (rad), d_f (m).
-        covariance : ArrayLike
-            (..., 4, 4) of the noise.
-        total : ArrayLike | None
-            (..., 4, 4) of noise and misfit; None where no disturbances are stated.
+        values : (..., 4) array_like
+            Changes d_alpha, d_beta, d_gamma (rad), d_f (m).
+        covariance : (..., 4, 4) array_like
+            Covariance by the noise.
+        total : (..., 4, 4) array_like or None
+            Covariance by noise and misfit; None without a prior.
         """
         vector, spread = np.asarray(values, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
         if vector.shape[-1:] != (4,) or spread.shape[-2:] != (4, 4):
@@ -146,27 +164,28 @@ class CameraParameters(StateArrays):
 
     @property
     def vector(self) -> Array:
-        """(..., 4): [d_alpha, d_beta, d_gamma (rad), d_f (m)]."""
+        """Changes [d_alpha, d_beta, d_gamma (rad), d_f (m)], (..., 4)."""
         return np.stack([self.d_alpha_rad, self.d_beta_rad, self.d_gamma_rad, self.d_f_m], axis=-1)
 
     @property
     def error_covariance(self) -> Array:
-        """(..., 4, 4): the total one; where no disturbances are stated, that of the noise."""
+        """Covariance of the total error, (..., 4, 4); without a prior, that of the noise."""
         return self.covariance if self.total is None else self.total
 
     @property
     def sigma(self) -> Array:
-        """(..., 4): standard deviations of the error, in the order and units of `vector`; see `error_covariance`."""
+        """Standard deviations of the error, (..., 4), in the order and units of `vector`; see `error_covariance`."""
         return np.sqrt(np.diagonal(self.error_covariance, axis1=-2, axis2=-1))
 
     @property
     def sigma_noise(self) -> Array:
-        """(..., 4): standard deviations by the noise of the images alone."""
+        """Standard deviations by the noise of the images alone, (..., 4)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
 
     def to_dict(self) -> dict[str, Any]:
-        """d_alpha_arcsec, d_beta_arcsec, d_gamma_arcsec, d_f_um, <key>_sigma and <key>_sigma_noise: floats, or nested
-        lists for arrays.
+        """Return the changes with <key>_sigma and <key>_sigma_noise as floats, or nested lists for arrays.
+
+        The keys are d_alpha_arcsec, d_beta_arcsec, d_gamma_arcsec and d_f_um.
         """
         values, sigma, noise = self.vector, self.sigma, self.sigma_noise
         out: dict[str, Any] = {}
@@ -178,11 +197,11 @@ class CameraParameters(StateArrays):
 
 
 def coefficients(name: str, geometry: MonitorGeometry) -> Array:
-    """(4, 4) matrix, parameter [d_alpha, d_beta, d_gamma, d_f] (rad, m) per pixel of shift [left row, left column,
-    right row, right column], after - before, of an estimator in FORMULAS. For `paper_single` it is the argument of
-    the arctangents.
+    """Return the coefficients of an estimator in FORMULAS, (4, 4) parameters per pixel of shift.
 
-    Multiplied with the Jacobian (4, M) of spot shifts per motion it gives a crosstalk table.
+    Rows are [d_alpha, d_beta, d_gamma, d_f] (rad, m), columns [left row, left column, right row, right column], after -
+    before. For `paper_single` it is the argument of the arctangents. Multiplied with the Jacobian (4, M) of spot shifts
+    per motion it gives a crosstalk table.
     """
     if name not in FORMULAS:
         raise ValueError(f"monitoring: no estimator {name!r}; there are {', '.join(FORMULAS)}")
@@ -205,19 +224,19 @@ def coefficients(name: str, geometry: MonitorGeometry) -> Array:
 def paper_single(
     before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
 ) -> CameraParameters:
-    """Eq. (2), (3), (5), (7) of paper 001 as printed, with the arctangent.
+    """Return the changes by eq. (2), (3), (5), (7) of paper 001 as printed, with the arctangent.
 
     Parameters
     ----------
-    before : ArrayLike
-        (..., 2 channels, 2) spot positions (row, column) of the nominal state, px.
-    after : ArrayLike
-        Of the changed state, likewise.
-    covariance : ArrayLike
-        (..., 4, 4) of after - before, px^2, in order [left row, left column, right row, right column]; zeros where
-        there is no noise.
+    before : (..., 2 channels, 2) array_like
+        Spot positions (row, column) of the nominal state, px.
+    after : (..., 2 channels, 2) array_like
+        Spot positions of the changed state, px.
+    covariance : (..., 4, 4) array_like
+        Covariance of after - before, px^2, in order [left row, left column, right row, right column]; zeros without
+        noise.
     geometry : MonitorGeometry
-        Of the camera.
+        Geometry of the camera's monitor.
     """
     argument, spread = linear(coefficients("paper_single", geometry), before, after, covariance)
     values = argument.copy()
@@ -230,56 +249,57 @@ def paper_single(
 def paper_joint(
     before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry
 ) -> CameraParameters:
-    """Table 1 of paper 001, last column, as printed; arguments as `paper_single`, sign of Y_L: see the module.
+    """Return the changes by Table 1 of paper 001, last column, as printed.
+
+    For the sign of Y_L see the module.
 
     Parameters
     ----------
-    before : ArrayLike
-        Spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
-    after : ArrayLike
-        Of the changed state, likewise.
-    covariance : ArrayLike
-        Of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column; zeros where
-        there is no noise.
+    before : (..., 2 channels, 2) array_like
+        Spot positions (row, column) of the nominal state, px.
+    after : (..., 2 channels, 2) array_like
+        Spot positions of the changed state, px.
+    covariance : (..., 4, 4) array_like
+        Covariance of after - before, px^2, in order [left row, left column, right row, right column]; zeros without
+        noise.
     geometry : MonitorGeometry
-        Of the camera.
+        Geometry of the camera's monitor.
     """
     return CameraParameters.from_vector(*linear(coefficients("paper_joint", geometry), before, after, covariance))
 
 
 def derived(before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry: MonitorGeometry) -> CameraParameters:
-    """The corrected factors (see the module's text); arguments as `paper_single`.
+    """Return the changes by the corrected formulas (see the module).
 
     Parameters
     ----------
-    before : ArrayLike
-        Spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
-    after : ArrayLike
-        Of the changed state, likewise.
-    covariance : ArrayLike
-        Of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column; zeros where
-        there is no noise.
+    before : (..., 2 channels, 2) array_like
+        Spot positions (row, column) of the nominal state, px.
+    after : (..., 2 channels, 2) array_like
+        Spot positions of the changed state, px.
+    covariance : (..., 4, 4) array_like
+        Covariance of after - before, px^2, in order [left row, left column, right row, right column]; zeros without
+        noise.
     geometry : MonitorGeometry
-        Of the camera.
+        Geometry of the camera's monitor.
     """
     return CameraParameters.from_vector(*linear(coefficients("derived", geometry), before, after, covariance))
 
 
 def linear(matrix: Array, before: ArrayLike, after: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
-    """What a matrix (4, 4) as of `coefficients` makes of the shifts, (..., 4), and its covariance (..., 4, 4); the
-    other arguments as `paper_single`.
+    """Return the product of a coefficient matrix with the shifts, (..., 4), and its covariance, (..., 4, 4).
 
     Parameters
     ----------
-    matrix : Array
-        As of `coefficients`, (4, 4).
-    before : ArrayLike
-        Spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
-    after : ArrayLike
-        Of the changed state, likewise.
-    covariance : ArrayLike
-        Of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column; zeros where
-        there is no noise.
+    matrix : (4, 4) ndarray
+        Coefficients, as from `coefficients`.
+    before : (..., 2 channels, 2) array_like
+        Spot positions (row, column) of the nominal state, px.
+    after : (..., 2 channels, 2) array_like
+        Spot positions of the changed state, px.
+    covariance : (..., 4, 4) array_like
+        Covariance of after - before, px^2, in order [left row, left column, right row, right column]; zeros without
+        noise.
     """
     start, end = np.asarray(before, dtype=np.float64), np.asarray(after, dtype=np.float64)
     spread = np.asarray(covariance, dtype=np.float64)
@@ -298,8 +318,16 @@ def linear(matrix: Array, before: ArrayLike, after: ArrayLike, covariance: Array
 @shows()
 @dataclass(frozen=True, eq=False)
 class IntersectionAngleChange(StateArrays):
-    """change_rad: (...) new angle minus nominal angle, rad; sigma_rad: (...) standard deviation of its error;
-    sigma_noise_rad: of that what the noise of the images does, None where that is all.
+    """Change of the angle between two cameras' lines of sight.
+
+    Attributes
+    ----------
+    change_rad : (...) ndarray
+        New angle minus nominal angle, rad.
+    sigma_rad : (...) ndarray
+        Standard deviation of its error, rad.
+    sigma_noise_rad : (...) ndarray or None
+        Standard deviation by the noise of the images, rad; None where that is the whole error.
     """
 
     change_rad: Array
@@ -308,7 +336,7 @@ class IntersectionAngleChange(StateArrays):
 
     @property
     def noise_rad(self) -> Array:
-        """(...) standard deviation by the noise of the images alone, rad."""
+        """Standard deviation by the noise of the images alone, (...) rad."""
         return self.sigma_rad if self.sigma_noise_rad is None else self.sigma_noise_rad
 
 
@@ -320,24 +348,27 @@ def exact(
     across: Array | None = None,
     across_total: Array | None = None,
 ) -> IntersectionAngleChange:
-    """Change of the angle between the two turned lines of sight in space, without approximation.
-
-    Raises ValueError for look angles that are not within +-pi/2 and different.
+    """Return the change of the angle between the two rotated lines of sight in space, without approximation.
 
     Parameters
     ----------
     forward : CameraParameters
         Changes of the camera of the larger look angle.
     backward : CameraParameters
-        Of the other.
+        Changes of the other camera.
     forward_look_rad : float
-        Its look angle, rad.
+        Look angle of the first camera, rad.
     backward_look_rad : float
-        likewise.
-    across : Array | None
-        (..., 4, 4) covariance of the forward with the backward parameters by noise, None for none.
-    across_total : Array | None
-        Likewise of the whole error.
+        Look angle of the other camera, rad.
+    across : (..., 4, 4) ndarray or None
+        Covariance of the forward with the backward parameters by noise; None for none.
+    across_total : (..., 4, 4) ndarray or None
+        Covariance of the forward with the backward parameters of the total error; None for none.
+
+    Raises
+    ------
+    ValueError
+        Look angles are not within +-pi/2, or are equal.
     """
     for name, look in (("forward", forward_look_rad), ("backward", backward_look_rad)):
         if not (math.isfinite(look) and abs(look) < math.pi / 2):
@@ -349,7 +380,7 @@ def exact(
         )
     rotations = (forward.d_alpha_rad, forward.d_beta_rad, backward.d_alpha_rad, backward.d_beta_rad)
     given = np.stack(np.broadcast_arrays(*(np.asarray(one, np.float64) for one in rotations)))
-    # the angle as it is, and with each rotation a step further and back
+    # the angle at the rotations, and with a step forward and back in each
     step = 1e-5
     moves = np.concatenate([np.zeros((1, 4)), step * np.eye(4), -step * np.eye(4)]).T
     d_alpha, d_beta, other_alpha, other_beta = given[:, None] + moves.reshape(4, 9, *(1,) * (given.ndim - 1))
@@ -375,15 +406,16 @@ def exact(
 
 
 def _between(u: tuple[Array, Array, Array], v: tuple[Array, Array, Array]) -> Array:
-    """Angle between unit vectors given by their components."""
+    """Return the angle between unit vectors given by their components."""
     (ux, uy, uz), (vx, vy, vz) = u, v
     sine = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
     return np.asarray(np.arctan2(sine, ux * vx + uy * vy + uz * vz))
 
 
 def _line_of_sight(d_alpha: Array, d_beta: Array, look: float) -> tuple[Array, Array, Array]:
-    """Components of the unit vector in the base frame: +Z turned by the rotation vector (d_beta, d_alpha, 0), then by
-    the look angle.
+    """Return the components of the line of sight, a unit vector in the base frame.
+
+    It is +Z rotated by the rotation vector (d_beta, d_alpha, 0), then by the look angle.
     """
     turn = np.hypot(d_alpha, d_beta)
     ratio = np.sinc(turn / np.pi)
@@ -393,9 +425,9 @@ def _line_of_sight(d_alpha: Array, d_beta: Array, look: float) -> tuple[Array, A
 
 
 EARTH_RADIUS_M = 6_371_000.0
-"""Mean radius (IUGG). The Earth's flattening and turn change the figures here by less than 1 %."""
+"""Mean radius (IUGG). The Earth's flattening and rotation change the results here by less than 1 %."""
 _PLACES = 9
-"""Places along the line over which RMS values are taken."""
+"""Number of positions along the line over which rms values are taken."""
 
 
 @shows()
@@ -405,14 +437,15 @@ class GroundError(StateArrays):
 
     Attributes
     ----------
-    error_m : Array
-        (S, 3) along the track, across it and up at the middle of the line, when the cameras' changes are ignored: found
-        minus true.
-    sigma_m : Array
-        (S, 3) what is left of it when the cameras are corrected by the estimate, one standard deviation; sigma_noise_m:
-        of that what the noise does.
-    plan_rms_m, height_rms_m : Array
-        (S,) likewise, RMS over the line: of both plan axes together, and of the height.
+    error_m : (S, 3) ndarray
+        Located minus true position along the track, across it and up, at the middle of the line, when the cameras'
+        changes are ignored.
+    sigma_m : (S, 3) ndarray
+        Standard deviation of the error after correction by the estimate.
+    sigma_noise_m : (S, 3) ndarray
+        Part of `sigma_m` by the noise of the images.
+    plan_rms_m, height_rms_m : (S,) ndarray
+        Standard deviations after correction, rms over the line: of both plan axes together, and of the height.
     """
 
     error_m: Array
@@ -424,23 +457,23 @@ class GroundError(StateArrays):
 
 @dataclass(frozen=True)
 class GroundGeometry:
-    """A pair of line cameras over the ground.
+    """Pair of line cameras over the ground.
 
     Attributes
     ----------
     altitude_m : float
-        Of the orbit.
-    cameras : tuple[str, str]
-        Names of the two, in the calibration's order.
-    looks_rad : tuple[float, float]
-        Their look angles, forward positive.
-    half_field : tuple[float, float]
-        Tangent of half the field across the track that both lines see, of each.
+        Altitude of the orbit, m.
+    cameras : tuple of str
+        Names of the two cameras, in the calibration's order.
+    looks_rad : tuple of float
+        Their look angles, forward positive, rad.
+    half_field : tuple of float
+        Tangent of half the field across the track that both lines see, of each camera.
 
     Raises
     ------
     ValueError
-        a camera does not look at the Earth, or both look the same way.
+        A camera does not look at the Earth, or both look in the same direction.
     """
 
     altitude_m: float
@@ -449,7 +482,7 @@ class GroundGeometry:
     half_field: tuple[float, float]
 
     def __post_init__(self) -> None:
-        """Check the geometry."""
+        """Raise UndeterminedError if the geometry does not give an intersection."""
         if any(abs(math.sin(a)) * (EARTH_RADIUS_M + self.altitude_m) >= EARTH_RADIUS_M for a in self.looks_rad):
             raise UndeterminedError("ground error: a camera looks past the Earth")
         if abs(self.looks_rad[0] - self.looks_rad[1]) < 1e-3:
@@ -457,14 +490,14 @@ class GroundGeometry:
 
     @cached_property
     def incidences_rad(self) -> tuple[float, float]:
-        """Angles of the rays from the vertical at the ground."""
+        """Angles of the rays from the vertical at the ground, rad."""
         ratio = 1.0 + self.altitude_m / EARTH_RADIUS_M
         first, second = (math.asin(ratio * math.sin(a)) for a in self.looks_rad)
         return first, second
 
     @cached_property
     def ranges_m(self) -> tuple[float, float]:
-        """Slant ranges in the plane of the orbit."""
+        """Slant ranges in the plane of the orbit, m."""
         first, second = (
             EARTH_RADIUS_M * math.sin(i - a) / math.sin(a) if abs(a) > 1e-9 else self.altitude_m
             for i, a in zip(self.incidences_rad, self.looks_rad, strict=True)
@@ -473,19 +506,21 @@ class GroundGeometry:
 
     @cached_property
     def matrices(self) -> Array:
-        """(places, 3, 8): metres along, across and up for changes of the first camera, then of the second: d_alpha,
-        d_beta, d_gamma (rad), d_f / f. The middle of the line is the middle one.
+        """Shifts on the ground along, across and up, m, for changes of the two cameras, (places, 3, 8).
+
+        The changes are d_alpha, d_beta, d_gamma (rad), d_f / f of the first camera, then of the second. The middle of
+        the line is the middle place.
         """
         reach = min(r * t for r, t in zip(self.ranges_m, self.half_field, strict=True))
         return np.stack([self._at(c) for c in np.linspace(-reach, reach, _PLACES)])
 
     def _at(self, across: float) -> Array:
-        """(3, 8) at one distance across the track, metres."""
+        """Return the matrix (3, 8) at one distance across the track, m."""
         normal, right = np.zeros((3, 3)), []
         for incidence, far in zip(self.incidences_rad, self.ranges_m, strict=True):
             t = across / far
             ray = np.array([0.0, t, 1.0])
-            # turns (d_beta, d_alpha, d_gamma) about X, Y, Z of the camera; a longer f narrows the field
+            # rotations (d_beta, d_alpha, d_gamma) about X, Y, Z of the camera; a longer f narrows the field
             change = np.array([[1.0, 0.0, -t, 0.0], [0.0, -1.0, 0.0, -t], [0.0, t, 0.0, 0.0]])
             c, s = math.cos(incidence), math.sin(incidence)
             level = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])  # along, right, down
@@ -493,18 +528,18 @@ class GroundGeometry:
             square = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
             normal += square
             right.append(square @ change * far)
-        # rays are taken to lie where they lay: points are found where the change is missing
+        # points are located with the nominal rays, hence minus the effect of the change
         found = -np.linalg.solve(normal, np.concatenate(right, axis=1))
         found[2] *= -1.0  # up
         return found
 
     def rows(self, principal_distances_m: tuple[float, float]) -> Array:
-        """(places, 3, 8) as `matrices`, for d_f in metres.
+        """Return the matrices, (places, 3, 8), for d_f in metres.
 
         Parameters
         ----------
-        principal_distances_m : tuple[float, float]
-            Of the two cameras.
+        principal_distances_m : tuple of float
+            Principal distances of the two cameras, m.
         """
         out = self.matrices.copy()
         for k, f in enumerate(principal_distances_m):
@@ -512,14 +547,14 @@ class GroundGeometry:
         return out
 
     def found(self, true: Array, assumed: Array) -> Array:
-        """Error (..., 3) along, across and up of points that are located along assumed rays, exactly.
+        """Return the exact error along, across and up, (..., 3), of points that are located along assumed rays.
 
         Parameters
         ----------
-        true : Array
-            (..., 2, 3) directions of the two rays in the base frame as they are (X along the track, Z down).
-        assumed : Array
-            Likewise, as they are taken to be.
+        true : (..., 2, 3) ndarray
+            True directions of the two rays in the base frame (X along the track, Z down).
+        assumed : (..., 2, 3) ndarray
+            Assumed directions of the two rays.
         """
         normal: Any = 0.0
         right: Any = 0.0
@@ -542,18 +577,18 @@ class GroundGeometry:
     def error(
         self, values: Array, noise: Array, total: Array, principal_distances_m: tuple[float, float]
     ) -> GroundError:
-        """Errors on the ground by estimated changes, and what correcting by them leaves.
+        """Return the errors on the ground by estimated changes, and the standard deviations after correction.
 
         Parameters
         ----------
-        values : Array
-            (S, 8) estimated changes, rad and m.
-        noise : Array
-            (S, 8, 8) their covariance by noise.
-        total : Array
-            (S, 8, 8) of their error.
-        principal_distances_m : tuple[float, float]
-            Of the two cameras.
+        values : (S, 8) ndarray
+            Estimated changes, rad and m.
+        noise : (S, 8, 8) ndarray
+            Covariance of the changes by noise.
+        total : (S, 8, 8) ndarray
+            Covariance of their total error.
+        principal_distances_m : tuple of float
+            Principal distances of the two cameras, m.
         """
         rows = self.rows(principal_distances_m)
         middle = rows[_PLACES // 2]

@@ -1,22 +1,21 @@
-"""From the monitor's images to the changes of every camera: centroids, all estimators, the intersection angle.
+"""Changes of every camera from the monitor's images: centroids, all estimators, the intersection angle.
 
-What the fits of all spots of a measurement say together: does sigma hold, by how much was it widened, and why.
+**Goodness of fit.** The fits of all spots of a measurement are tested together: whether sigma is valid, by which factor
+it was increased, and why. Three causes make spots differ from the fit, and are separated by where the difference is.
+Noise that differs from the data sheet is in every pixel of every frame, a changed shape in the core of a spot alone,
+and a wrongly calibrated shape in the spots before as in those after.
 
-Three causes make spots differ from the fit, and the place of the difference separates them. Noise that differs from
-the data sheet is in every pixel of every frame, a changed shape in the core of a spot alone, and a wrongly calibrated
-shape in the spots before as in those after.
-
-Are the motions that a reading stands for small enough to be linear? The reading is compared with a retraced state.
-
-An estimator reads parameters by motions x of which it knows, s = A x and p = B x for the spots and the parameters; its
-x = G s are an estimate of them. Traced again, the instrument in the state x has the spots s(x) and the parameters p(x).
-One step of Gauss and Newton about x,
+**Linearity.** Whether the motions of a reading are small enough for a linear estimator is tested with a retraced state.
+An estimator reads parameters by a set of motions x, s = A x and p = B x for the spots and the parameters; x = G s
+estimates them. Traced again, the instrument in the state x has the spots s(x) and the parameters p(x). One Gauss-Newton
+step about x,
 
     p(x) + B (x' - x),   x' = G (s - s(x) + A x),
 
-differs from the linear reading B G s by what is not linear. Where that is more than `BEYOND` standard deviations of
-any quantity the steps go on to their end, and the reading is p of it (Nocedal and Wright, Numerical Optimization, 2006,
-sec. 10.3). Derivatives stay those of the instrument at rest: they change by as many parts as the motions are radians.
+differs from the linear reading B G s by its non-linearity. Where that is more than `NONLINEAR_SIGMAS` standard
+deviations of any quantity the steps are iterated to convergence, and the reading is p of the result (Nocedal and
+Wright, Numerical Optimization, 2006, sec. 10.3). The derivatives remain those of the nominal instrument: their relative
+change is of the size of the motions in radians.
 """
 
 from __future__ import annotations
@@ -46,27 +45,27 @@ from analysis.spots.likelihood import FALSE_ALARM, FitStates, fit_states, requir
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
 
 ALIKE = 2.0
-"""Times that a core's chi-square may be that of the frames' noise where this explains both."""
+"""Ratio of a core's chi-square to that of the frames' noise up to which the noise explains both."""
 LOUD = 1.3
-"""Noise of the frames over the stated one, squared, above which it is too large: 6 sigma of an image's median."""
+"""Squared ratio of the frames' noise to the specified one above which it is too large: 6 sigma of an image's median."""
 NOISE, BEFORE, AFTER = "noise", "before", "shape"
 """Causes: noise of the frames, the shape of the spots before, their shape after alone."""
 
 
 @dataclass(frozen=True)
 class SpotWarning:
-    """Why sigma does not hold for a state.
+    """Reason why sigma is not valid for a state.
 
     Attributes
     ----------
     cause : str
-        `noise`, `before` or `shape`.
-    spots : tuple[int, ...]
-        Which of the C spots do not fit.
+        Cause: `noise`, `before` or `shape`.
+    spots : tuple of int
+        Indices of the spots that do not fit.
     widening : float
-        Largest factor by which the sigma of a spot was widened.
+        Largest factor by which the sigma of a spot was increased.
     text : str
-        In words, without a sentence's end.
+        Text without a full stop.
     """
 
     cause: str
@@ -77,78 +76,78 @@ class SpotWarning:
 
 @dataclass(frozen=True, eq=False)
 class SpotEvidence:
-    """Fits of C spots in S states.
+    """Goodness of fit of C spots in S states.
 
     Attributes
     ----------
     before : FitStates
-        (1, C) or (S, C), of the nominal state.
+        Fits of the nominal state, (1, C) or (S, C).
     after : FitStates
-        (S, C).
+        Fits of the states, (S, C).
     """
 
     before: FitStates
     after: FitStates
 
     def at(self, states: slice) -> SpotEvidence:
-        """The evidence of some states.
+        """Return the evidence of a slice of the states.
 
         Parameters
         ----------
         states : slice
-            which.
+            Range of the states.
         """
         before = self.before if len(self.before.whole) == 1 else self.before.at(states)
         return SpotEvidence(before, self.after.at(states))
 
     @classmethod
     def joined(cls, parts: Sequence[SpotEvidence]) -> SpotEvidence:
-        """The evidence of several series against one nominal state, one after the other.
+        """Return the evidence of several series against one nominal state, joined.
 
         Parameters
         ----------
-        parts : Sequence[SpotEvidence]
+        parts : sequence of SpotEvidence
             At least one.
         """
         return cls(parts[0].before, FitStates.joined([one.after for one in parts]))
 
     @property
     def holds(self) -> NDArray[np.bool_]:
-        """(S,) whether all spots before and after are as assumed."""
+        """True for states whose spots before and after are as assumed, (S,)."""
         return np.asarray(np.all(self.before.fits, axis=1) & np.all(self.after.fits, axis=1))
 
     @property
     def widening(self) -> Array:
-        """(S, C) factor of the sigma of each spot's place, before and after whichever is larger."""
+        """Factor of the sigma of each spot's position, the larger of before and after, (S, C)."""
         return np.asarray(np.maximum(self.before.widening, self.after.widening))
 
     @property
     def worst(self) -> int:
-        """Number of the state whose spots fit least."""
+        """Index of the state whose spots fit worst."""
         return int(np.argmax(np.max(self.widening, axis=1)))
 
     def course_doubt(self, moments: Sequence[str], names: Sequence[str]) -> str | None:
-        """Why sigma does not hold at the worst of the states; None where it holds at all.
+        """Return the reason why sigma is not valid at the worst of the states; None where it always is.
 
         Parameters
         ----------
-        moments : Sequence[str]
-            Of the states, in words.
-        names : Sequence[str]
-            Of the spots.
+        moments : sequence of str
+            Descriptions of the states' times.
+        names : sequence of str
+            Names of the spots.
         """
         told, bad = self.doubt(self.worst, names), int(np.count_nonzero(~self.holds))
         return None if told is None else f"at {moments[self.worst]}, the worst of {bad} times: {told.text}"
 
     def doubt(self, state: int = 0, names: Sequence[str] = ()) -> SpotWarning | None:
-        """Why sigma does not hold for a state; None where it does.
+        """Return the reason why sigma is not valid for a state; None where it is.
 
         Parameters
         ----------
         state : int
-            Its number.
-        names : Sequence[str]
-            Of the spots; their numbers if not given.
+            Index of the state.
+        names : sequence of str
+            Names of the spots; their indices if not given.
         """
         if self.holds[state]:
             return None
@@ -186,16 +185,16 @@ class SpotEvidence:
         )
         text = (
             f"σ does not hold: the fit of the spots {named} is not good, {size}; {why}. The noise of their positions "
-            f"was widened up to {_number(worst[0])} times, which does not cover the effect of a changed shape"
+            f"was increased up to {_number(worst[0])}-fold, which does not cover the effect of a changed shape"
             if cause != NOISE
             else f"σ does not hold: the fit of the spots {named} is not good, {size}; {why}. The noise of "
-            f"their positions was widened up to {_number(worst[0])} times"
+            f"their positions was increased up to {_number(worst[0])}-fold"
         )
         return SpotWarning(cause, spots, worst[0], text)
 
 
 def _noisy(one: FitStates, k: int) -> bool:
-    """Whether the noise of the frames explains the fit of spot k: all pixels have it, its core not much more."""
+    """Return True if the noise of the frames explains the fit of spot k: all pixels have it, its core not much more."""
     noise, whole, core = (float(v[0, k]) for v in (one.noise, one.whole, one.core))
     return noise > LOUD and whole < LOUD * noise and core < ALIKE * noise
 
@@ -204,23 +203,23 @@ def _number(value: float) -> str:
     return f"{value:.3g}" if value < 1e3 else f"{value:.0f}"
 
 
-BEYOND = 3.0
-"""Sigmas of a quantity by which a linear reading may be off before it is worked out anew."""
+NONLINEAR_SIGMAS = 3.0
+"""Error of a linear reading, in sigmas of a quantity, above which the reading is iterated."""
 _REST = 1e-2
-"""Sigmas by which the last step may move a quantity."""
+"""Largest change of a quantity by the last step, in sigmas."""
 _MOST_STEPS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Retraced:
-    """What S states do, exactly.
+    """Exact effects of S states.
 
     Attributes
     ----------
-    spots : Array
-        (S, D) shifts, px; NaN in a state whose light is lost.
-    parameters : Array
-        (S, 4 K) changes, rad and m, likewise.
+    spots : (S, D) ndarray
+        Shifts, px; NaN in a state whose light is lost.
+    parameters : (S, 4 K) ndarray
+        Changes, rad and m; NaN in a state whose light is lost.
     """
 
     spots: Array
@@ -229,22 +228,22 @@ class Retraced:
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """The motions that an estimator knows of.
+    """Motions assumed by an estimator.
 
     Attributes
     ----------
-    spots : Array
-        A, (D, P) px per unit of each motion.
-    parameters : Array
-        B, (4 K, P) rad and m, likewise.
-    amounts : Callable[[Array], Array]
-        Covariance of the shifts (S, D, D), px^2 -> G, (S, P, D) units per px.
-    states : Callable[[Array], Sequence[Any]]
-        Amounts (S, P) -> the states that they make.
-    trace : Callable[[Sequence[Any]], Retraced]
-        S states -> what they do. Models that have the same one are traced together.
+    spots : (D, P) ndarray
+        Shifts A, px per unit of each motion.
+    parameters : (4 K, P) ndarray
+        Changes B, rad and m per unit of each motion.
+    amounts : callable
+        Function from the covariance of the shifts (S, D, D), px^2, to G (S, P, D), units per px.
+    states : callable
+        Function from amounts (S, P) to the states that they make.
+    trace : callable
+        Function from S states to their exact effects. Models that share one are traced together.
     near_px : float
-        States in which no spot moves by more are taken as linear and not traced, px.
+        Shift of the spots up to which a state counts as linear and is not traced, px.
     """
 
     spots: Array
@@ -257,16 +256,16 @@ class MotionModel:
 
 @dataclass(frozen=True, eq=False)
 class Curvature(StateArrays):
-    """What retraced states say of the linear readings of an estimator in S states.
+    """Test of the linear readings of an estimator in S states by retraced states.
 
     Attributes
     ----------
-    off : Array
-        (S, Q) what the linear reading of each quantity is off by, sigmas; NaN where the state cannot be traced.
-    beyond : NDArray[np.bool_]
-        (S,) whether it is too much, so that the readings are those of the last step.
-    rests : NDArray[np.bool_]
-        (S,) whether the steps came to rest; true where none were needed.
+    off : (S, Q) ndarray
+        Error of the linear reading of each quantity, sigmas; NaN where the state cannot be traced.
+    beyond : (S,) ndarray of bool
+        True where the error is too large, so that the reading is that of the last step.
+    rests : (S,) ndarray of bool
+        True where the steps converged, or none were needed.
     """
 
     off: Array
@@ -275,11 +274,11 @@ class Curvature(StateArrays):
 
     @property
     def holds(self) -> NDArray[np.bool_]:
-        """(S,) whether the readings are right, linear or not."""
+        """True where the readings are valid, linear or not, (S,)."""
         return self.rests
 
     def worst(self, state: int = 0) -> tuple[int, float]:
-        """Number of the quantity whose linear reading is off by most, and by how many sigmas."""
+        """Return the index of the quantity whose linear reading has the largest error, and this error in sigmas."""
         size = np.abs(self.off[state])
         if not np.any(np.isfinite(size)):
             return 0, np.inf
@@ -289,16 +288,16 @@ class Curvature(StateArrays):
 
 @dataclass(frozen=True, eq=False)
 class LinearReading:
-    """What an estimator reads by derivatives in S states.
+    """Linear readings of an estimator in S states.
 
     Attributes
     ----------
-    values : Array
-        (S, 4 K), rad and m.
-    total : Array
-        (S, 4 K, 4 K) covariance of their errors.
+    values : (S, 4 K) ndarray
+        Readings, rad and m.
+    total : (S, 4 K, 4 K) ndarray
+        Covariance of their errors.
     model : MotionModel
-        The motions by which it reads.
+        Motions that the estimator assumes.
     """
 
     values: Array
@@ -309,18 +308,18 @@ class LinearReading:
 def read_again(
     readings: Mapping[str, LinearReading], shift: Array, noise: Array, rows: Array
 ) -> dict[str, tuple[Array, Curvature]]:
-    """Readings (S, 4 K) of each estimator, worked out anew where they are not linear, and what was found.
+    """Return the readings (S, 4 K) of each estimator, iterated where they are not linear, and the tests.
 
     Parameters
     ----------
-    readings : Mapping[str, LinearReading]
-        Estimator -> its linear readings.
-    shift : Array
-        (S, D) px.
-    noise : Array
-        (S, D, D) px^2 of them.
-    rows : Array
-        (Q, 4 K) of the quantities that are judged.
+    readings : mapping of str to LinearReading
+        Linear readings of each estimator.
+    shift : (S, D) ndarray
+        Shifts, px.
+    noise : (S, D, D) ndarray
+        Covariance of the shifts, px^2.
+    rows : (Q, 4 K) ndarray
+        Coefficients of the quantities that are tested.
     """
     steps = {title: _Steps.of(reading, shift, noise, rows) for title, reading in readings.items()}
     found = _traced_together({title: (own.model, own.x[own.far]) for title, own in steps.items()})
@@ -328,7 +327,7 @@ def read_again(
 
 
 def _traced_together(wanted: Mapping[str, tuple[MotionModel, Array]]) -> dict[str, Retraced]:
-    """What the states of amounts (S, P) of each model do."""
+    """Return the exact effects of the amounts (S, P) of each model; models with the same trace are traced together."""
     ways: dict[int, list[str]] = {}
     for title, (model, _) in wanted.items():
         ways.setdefault(id(model.trace), []).append(title)
@@ -346,18 +345,24 @@ def _traced_together(wanted: Mapping[str, tuple[MotionModel, Array]]) -> dict[st
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """Steps of Gauss and Newton about the states that S readings of an estimator stand for.
+    """Gauss-Newton steps about the states of S readings of an estimator.
 
     Attributes
     ----------
     model : MotionModel
-        Of its motions.
-    shift : Array
-        (S, D) px; gain: G, (S, P, D); x: (S, P) motions that the readings stand for.
-    sigma : Array
-        (S, Q) of the quantities; rows: theirs, (Q, 4 K).
-    far : NDArray[np.intp]
-        States that are traced.
+        Motions of the estimator.
+    shift : (S, D) ndarray
+        Shifts, px.
+    gain : (S, P, D) ndarray
+        Gain G.
+    x : (S, P) ndarray
+        Motions of the readings.
+    sigma : (S, Q) ndarray
+        Standard deviations of the quantities.
+    rows : (Q, 4 K) ndarray
+        Coefficients of the quantities.
+    far : ndarray of int
+        Indices of the states that are traced.
     """
 
     model: MotionModel
@@ -385,14 +390,14 @@ class _Steps:
         return np.asarray(np.einsum("spd,sd->sp", self.gain[states], rest))
 
     def judged(self, values: Array, traced: Retraced) -> tuple[Array, Curvature]:
-        """Readings (S, 4 K), worked out anew where they are not linear, by what the states that are far do."""
+        """Return the readings (S, 4 K), iterated where they are not linear, and the test, from the traced states."""
         model, x, every = self.model, self.x, slice(None)
         found = Retraced(x @ model.spots.T, x @ model.parameters.T)
         found.spots[self.far], found.parameters[self.far] = traced.spots, traced.parameters
         # the two are one number where everything is linear
         curved = found.parameters + (self.step(x, found, every) - x) @ model.parameters.T - x @ model.parameters.T
         off = self.in_sigmas(curved, every)
-        beyond = ~np.all(off <= BEYOND, axis=1)
+        beyond = ~np.all(off <= NONLINEAR_SIGMAS, axis=1)
         out, rests = values.copy(), ~beyond
         left = np.flatnonzero(beyond & np.all(np.isfinite(off), axis=1))
         x, last = x[left], Retraced(found.spots[left], found.parameters[left])
@@ -410,18 +415,24 @@ class _Steps:
 
 
 MeasuredSpots: TypeAlias = tuple[SpotPositions, FitStates]
-"""Spots with how good their fits are."""
+"""Spot positions with the goodness of their fits."""
 
 
 @shows()
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """What all estimators make of spot positions, for S states.
+    """Results of all estimators from spot positions, for S states.
 
-    parameters: camera -> estimator -> changes with arrays of shape (S,).
-    angle: estimator -> change of the intersection angle, arrays (S,); empty unless there are two cameras.
-    ground: estimator -> errors on the ground, arrays (S,); empty unless the altitude of a pair is known.
-    curvature: estimator -> whether its motions are small enough to be linear; of those that were traced again.
+    Attributes
+    ----------
+    parameters : mapping of str to mapping of str to CameraParameters
+        Changes by camera and estimator, arrays (S,).
+    angle : mapping of str to IntersectionAngleChange
+        Change of the intersection angle by estimator, arrays (S,); empty unless there are two cameras.
+    ground : mapping of str to GroundError
+        Errors on the ground by estimator, arrays (S,); empty unless the altitude of a pair is known.
+    curvature : mapping of str to Curvature
+        Tests of linearity by estimator, of those that were traced again.
     """
 
     parameters: Mapping[str, Mapping[str, CameraParameters]]
@@ -433,16 +444,28 @@ class Estimates:
 @shows("parameters", "before [px]", "after [px]", "sigma_after [px]")
 @dataclass(frozen=True, eq=False)
 class Recovery(StateArrays):
-    """What the images say, for S states.
+    """Results of the monitor's images for S states.
 
-    before, after: (S, C, 2) spot positions (row, column), px; sigma_before, sigma_after: their standard deviations.
-    shift_covariance: (S, 2 C, 2 C) px^2 of ``shift``; spots are independent of each other.
-    parameters: camera -> estimator -> changes with arrays of shape (S,).
-    angle: estimator -> change of the intersection angle, arrays (S,); empty unless there are two cameras.
-    ground: estimator -> errors on the ground, arrays (S,); empty unless the altitude of a pair is known.
-    parts: noise of the positions before (C spots) and after (S C), for series of measurements; None unless kept.
-    evidence: what the fits of the spots say of their sigmas; None where nobody judged them.
-    curvature: estimator -> whether its motions are small enough to be linear; of those that were traced again.
+    Attributes
+    ----------
+    before, after : (S, C, 2) ndarray
+        Spot positions (row, column), px.
+    sigma_before, sigma_after : (S, C, 2) ndarray
+        Standard deviations of the positions, px.
+    shift_covariance : (S, 2 C, 2 C) ndarray
+        Covariance of `shift`, px^2; spots are independent of each other.
+    parameters : mapping of str to mapping of str to CameraParameters
+        Changes by camera and estimator, arrays (S,).
+    angle : mapping of str to IntersectionAngleChange
+        Change of the intersection angle by estimator, arrays (S,); empty unless there are two cameras.
+    ground : mapping of str to GroundError
+        Errors on the ground by estimator, arrays (S,); empty unless the altitude of a pair is known.
+    parts : tuple of NoiseParts or None
+        Noise of the positions before (C spots) and after (S C), for series of measurements; None unless kept.
+    evidence : SpotEvidence or None
+        Goodness of the fits of the spots; None where they were not tested.
+    curvature : mapping of str to Curvature
+        Tests of linearity by estimator, of those that were traced again.
     """
 
     before: Array
@@ -458,33 +481,33 @@ class Recovery(StateArrays):
     curvature: Mapping[str, Curvature] = field(default_factory=dict)
 
     def at(self, states: slice) -> Recovery:
-        """The recovery of some states, without ``parts``.
+        """Return the results of a slice of the states, without ``parts``.
 
         Parameters
         ----------
         states : slice
-            which.
+            Range of the states.
         """
         return StateArrays.at(replace(self, parts=None), states)
 
     @property
     def shift(self) -> Array:
-        """(S, 2 C) after - before in the order of the spots, row and column, px."""
+        """Shifts after - before in the order of the spots, row and column, (S, 2 C) px."""
         return (self.after - self.before).reshape(len(self.after), -1)
 
     def consistency(
         self, disturbances: Disturbances, state: int = 0, others: Mapping[str, Array] | None = None
     ) -> Consistency:
-        """Do the shifts of one state agree with what is stated?
+        """Test the shifts of one state against a prior.
 
         Parameters
         ----------
         disturbances : Disturbances
-            stated.
+            Prior of the disturbances.
         state : int
-            Its number.
-        others : Mapping[str, Array] | None
-            See `analysis.monitor.disturbances.consistency`.
+            Index of the state.
+        others : mapping of str to ndarray, or None
+            Further bodies, as in `analysis.monitor.disturbances.consistency`.
         """
         return consistency(self.shift[state], self.shift_covariance[state], disturbances, others)
 
@@ -492,45 +515,50 @@ class Recovery(StateArrays):
 def measure_spots(
     mean: Array, frames: int, calibration: MonitorCalibration, centroid: str = "ml", threads: int = 1
 ) -> SpotPositions:
-    """Centre of every spot of mean frames (B, H, W), B a multiple of the number of spots, in the calibration's order.
-
-    Raises SpotError for spots that cannot be measured, and for those whose fit does not come to rest.
+    """Measure every spot of mean frames (B, H, W), B a multiple of the number of spots, in the calibration's order.
 
     Parameters
     ----------
-    mean : Array
-        Mean frames, (B, H, W), grey values.
+    mean : (B, H, W) ndarray
+        Mean frames, grey values.
     frames : int
-        Number of frames of each mean.
+        Number of frames averaged into each image.
     calibration : MonitorCalibration
-        Of the nominal instrument.
+        Calibration of the nominal instrument.
     centroid : str
         Name of a method of `analysis.spots.CENTROIDS`.
     threads : int
-        For the fits; results do not depend on it.
+        Number of threads for the fits; results do not depend on it.
+
+    Raises
+    ------
+    SpotError
+        A spot cannot be measured, or its fit does not converge.
     """
     if centroid not in CENTROIDS:
         raise ValueError(f"recovery: no centroid {centroid!r}; there are {', '.join(CENTROIDS)}")
-    return require_convergence(CENTROIDS[centroid].measure(mean, frames, calibration.noise, calibration.template, threads))
+    return require_convergence(
+        CENTROIDS[centroid].measure(mean, frames, calibration.noise, calibration.template, threads)
+    )
 
 
 def judged_spots(
     mean: Array, frames: int, calibration: MonitorCalibration, centroid: str = "ml", threads: int = 1
 ) -> tuple[SpotPositions, FitStates]:
-    """Measure spots with the sigmas that their fits leave them, and judge the fits, (B / C, C).
+    """Measure spots with sigmas scaled by the goodness of their fits; return them with the fits' tests, (B / C, C).
 
     Parameters
     ----------
-    mean : Array
-        As of `measure_spots`, as all others.
+    mean : (B, H, W) ndarray
+        Mean frames, grey values.
     frames : int
-        Of each mean.
+        Number of frames averaged into each image.
     calibration : MonitorCalibration
-        Of the nominal instrument.
+        Calibration of the nominal instrument.
     centroid : str
-        `ml`, `gaussian` or `energy`.
+        Method: `ml`, `gaussian` or `energy`.
     threads : int
-        For the fits.
+        Number of threads for the fits.
     """
     found = measure_spots(mean, frames, calibration, centroid, threads)
     states = fit_states(found)
@@ -642,26 +670,26 @@ def recovery_of(
     evidence: SpotEvidence | None = None,
     motions: Mapping[str, MotionModel] | None = None,
 ) -> Recovery:
-    """What spots say that have been measured already.
+    """Return the changes of all cameras from spots that have been measured already.
 
     Parameters
     ----------
     first : SpotPositions
         C spots of the nominal state, or S C, with their maps.
     second : SpotPositions
-        S C spots of the states to be measured, state by state, likewise.
-    covariance : Array
-        (S C, 2, 2) px^2 of their differences.
+        S C spots of the states to be measured, state by state, with their maps.
+    covariance : (S C, 2, 2) ndarray
+        Covariance of their differences, px^2.
     calibration : MonitorCalibration
-        Of the nominal instrument; C must be its number of spots.
-    disturbances : Disturbances | None
-        As of `recover_monitor`.
+        Calibration of the nominal instrument with C spots.
+    disturbances : Disturbances or None
+        Prior of the disturbances, as in `recover_monitor`.
     keep_parts : bool
-        Of the noise, which are large.
-    evidence : SpotEvidence | None
-        What the fits say; the positions are those of `judged_spots`.
-    motions : Mapping[str, MotionModel] | None
-        As of `recover_monitor`.
+        True to keep the noise of every spot, which is large.
+    evidence : SpotEvidence or None
+        Goodness of the fits; the positions are those of `judged_spots`.
+    motions : mapping of str to MotionModel, or None
+        Motions that are traced again, as in `recover_monitor`.
     """
     spots = calibration.spots
     states = second.row.size // spots
@@ -693,24 +721,24 @@ def estimates(
     ground: GroundGeometry | None = None,
     motions: Mapping[str, MotionModel] | None = None,
 ) -> Estimates:
-    """All estimators on spot positions.
+    """Apply all estimators to spot positions.
 
     Parameters
     ----------
-    start : Array
-        (S, C, 2) spot positions (row, column) before, px, one camera's after the other's.
-    end : Array
-        Those after, likewise.
-    covariance : Array
-        (S, 2 C, 2 C) of after - before, px^2; all zero for positions without noise.
-    cameras : Mapping[str, CameraCalibration]
-        What is calibrated of each.
-    disturbances : Disturbances | None
-        What is stated to move, None for nothing.
-    ground : GroundGeometry | None
-        Of a pair whose altitude is known.
-    motions : Mapping[str, MotionModel] | None
-        As of `recover_monitor`.
+    start : (S, C, 2) ndarray
+        Spot positions (row, column) before, px, one camera's after the other's.
+    end : (S, C, 2) ndarray
+        Spot positions after, px.
+    covariance : (S, 2 C, 2 C) ndarray
+        Covariance of after - before, px^2; all zero for positions without noise.
+    cameras : mapping of str to CameraCalibration
+        Calibration of each camera.
+    disturbances : Disturbances or None
+        Prior of the disturbances; None for none.
+    ground : GroundGeometry or None
+        Ground geometry of a pair whose altitude is known.
+    motions : mapping of str to MotionModel, or None
+        Motions that are traced again, as in `recover_monitor`.
     """
     shifts = Shifts(start, end, covariance, cameras, disturbances)
     found: dict[str, tuple[Array, Array, Array | None]] = {}
@@ -735,17 +763,17 @@ def estimates_of(
     cameras: Mapping[str, CameraCalibration],
     ground: GroundGeometry | None = None,
 ) -> Estimates:
-    """What follows from changes of all cameras together: those of each, of their angle, on the ground.
+    """Return the results that follow from changes of all cameras: of each camera, of their angle, on the ground.
 
     Parameters
     ----------
-    found : Mapping[str, tuple[Array, Array, Array | None]]
-        Estimator -> (S, 4 K) changes, and (S, 4 K, 4 K) covariances by noise and of the whole error; None for the last
-        where nothing is stated to move.
-    cameras : Mapping[str, CameraCalibration]
-        What is calibrated of each.
-    ground : GroundGeometry | None
-        Of a pair whose altitude is known.
+    found : mapping of str to tuple of ndarrays
+        For each estimator, changes (S, 4 K) and their covariances (S, 4 K, 4 K) by noise and of the total error; None
+        for the last without a prior.
+    cameras : mapping of str to CameraCalibration
+        Calibration of each camera.
+    ground : GroundGeometry or None
+        Ground geometry of a pair whose altitude is known.
     """
     parameters: dict[str, dict[str, CameraParameters]] = {name: {} for name in cameras}
     angle: dict[str, IntersectionAngleChange] = {}
@@ -793,6 +821,6 @@ def _sigma(positions: SpotPositions) -> Array:
 
 
 def _pair(cameras: Mapping[str, CameraCalibration]) -> tuple[str, str]:
-    """The forward camera, the reference of the angle between two, and the other."""
+    """Return the forward camera, the reference of the angle between two, and the other."""
     one, two = sorted(cameras, key=lambda name: -cameras[name].look_rad)
     return one, two

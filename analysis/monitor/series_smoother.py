@@ -1,25 +1,25 @@
-"""Changes of the cameras over a series of measurements, at the times of the measurements and between them.
+"""Filtered and smoothed changes of the cameras over a series of measurements, at any times.
 
-What is stated to move is a normal process: the motions of one law go on with the covariance rho(t, t') of that law,
-so that shifts s and parameters p at two times have the covariances
+The motions of the prior are a normal process: those of one law have the covariance rho(t, t') of that law in time, so
+that shifts s and parameters p at two times have the covariances
 
     cov(s, s') = sum rho A C A',   cov(p, s') = sum rho B C A',   cov(p, p') = sum rho B C B',
 
 sums over the laws. Changes are counted from the calibration, where nothing had moved, or from a reference time of the
 same process; rho(t, t') is then rho(t, t') - rho(t, t0) - rho(t', t0) + rho(t0, t0). With the noise N of all shifts
-together the Cholesky factor of S = cov(s, s') + N, in the order of time, whitens the shifts one after the other:
-u = L^-1 s are the innovations of a Kalman filter, each from what the shifts before it do not say. The estimate from the
-first n shifts is then the sum of the first n products
+together the Cholesky factor of S = cov(s, s') + N, in the order of time, whitens the shifts one after the other: u =
+L^-1 s are the innovations of a Kalman filter, the parts of each shift that the shifts before it do not predict. The
+estimate from the first n shifts is then the sum of the first n products
 
     p(t) = sum_n (L^-1 cov(s, p(t)))_n u_n,
 
-filtered where the sum ends with the last shift up to t, smoothed where it takes all: the values and covariances of the
-Kalman filter and of the Rauch-Tung-Striebel smoother, without their state space, and for noise that is not white in
-time, too (Kailath, Sayed, Hassibi, Linear Estimation, 2000, ch. 4; Rasmussen, Williams, Gaussian Processes for Machine
-Learning, 2006, ch. 2). The sum of squares of u is the chi-square of the series.
+filtered where the sum ends with the last shift up to t, smoothed where it includes all: the values and covariances of
+the Kalman filter and of the Rauch-Tung-Striebel smoother, without their state space, and also for noise that is not
+white in time (Kailath, Sayed, Hassibi, Linear Estimation, 2000, ch. 4; Rasmussen, Williams, Gaussian Processes for
+Machine Learning, 2006, ch. 2). The sum of squares of u is the chi-square of the series.
 
-Where motions are stated to jump, jumps are looked for first (`jump_detection`), and those found are events of the
-process: steps of unknown size, between two measurements of unknown time, so that sigma is wide there.
+Where the prior has jumps, these are searched for first (`jump_detection`), and those detected are events of the
+process: steps of unknown size, between two measurements at an unknown time, so that sigma is wide there.
 """
 
 from __future__ import annotations
@@ -41,32 +41,33 @@ from analysis.monitor.jump_detection import (
     Steps,
     candidates,
     most_likely_jump,
-    with_sizes,
     steps,
     with_jumps,
+    with_sizes,
     with_subthreshold_jumps,
 )
 from analysis.statistics import limit_of
 
 Numbers = NDArray[np.int_]
 LARGEST = 2400
-"""Shifts in one factorisation, 46 MB: 300 times of two cameras. A longer series is worked on in pieces of a third of
-that, each from the measurements of its own and of as many before and after it, so that its sigmas are those of the
-measurements used."""
+"""Largest number of shifts in one factorisation, 46 MB: 300 times of two cameras. A longer series is processed in
+pieces of a third of that, each from its own measurements and as many before and after it, so that its sigmas are
+those of the measurements used.
+"""
 _AT_ONCE = 64
-"""Times whose covariances with all shifts are held at once."""
+"""Number of times whose covariances with all shifts are held at once."""
 
 
 class ShiftNoise(Protocol):
     """Noise of a series of shifts."""
 
     def covariance(self, images: Numbers) -> Array:
-        """(n D, n D) px^2 of the shifts of some measurements, one measurement after the other.
+        """Return the covariance of the shifts of some measurements, (n D, n D) px^2, one measurement after the other.
 
         Parameters
         ----------
-        images : Numbers
-            (n,) their numbers in the order of the shifts.
+        images : (n,) ndarray of int
+            Indices of the measurements in the order of the shifts.
         """
         ...
 
@@ -77,12 +78,12 @@ class SeriesChanges:
 
     Attributes
     ----------
-    values : Array
-        (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
-    noise : Array
-        (T, 4 K, 4 K) covariance of their errors by the noise of the shifts.
-    total : Array
-        Likewise of the whole error.
+    values : (T, 4 K) ndarray
+        Changes d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
+    noise : (T, 4 K, 4 K) ndarray
+        Covariance of their errors by the noise of the shifts.
+    total : (T, 4 K, 4 K) ndarray
+        Covariance of the total error.
     """
 
     values: Array
@@ -97,17 +98,17 @@ class SmoothedSeries:
     Attributes
     ----------
     filtered : SeriesChanges
-        From the measurements up to each time.
+        Changes from the measurements up to each time.
     smoothed : SeriesChanges
-        From all measurements.
-    innovations : Array
-        (M,) chi-square of each measurement, in the order given, against what those before it say, each of D degrees of
-        freedom.
+        Changes from all measurements.
+    innovations : (M,) ndarray
+        Chi-square of each measurement, in the order given, against its prediction by those before, each with D degrees
+        of freedom.
     consistency : Consistency
-        Chi-square of the whole series.
-    jumps : tuple[Jump, ...] | None
-        That were found, in the order of time; None where nothing is stated to jump. Filtered changes know of them from
-        their time on, as if they had been known then.
+        Test of the whole series.
+    jumps : tuple of Jump or None
+        Detected jumps in the order of time; None where the prior has no jumps. Filtered changes include them from their
+        time on, as if they had been known then.
     """
 
     filtered: SeriesChanges
@@ -244,7 +245,7 @@ def smooth_series(
         part = _Factor(model, when[window], shifts[own], noise.covariance(own))
         inside = slice(piece.start - window.start, piece.stop - window.start)
         squares[own[inside]] = part.squares[inside]
-        # from the first time of the piece to that of the next; those before all measurements to the first piece
+        # times from the first of the piece to that of the next; those before all measurements belong to the first piece
         first = -np.inf if piece.start == 0 else when[piece.start]
         last = np.inf if piece.stop == len(when) else when[piece.stop]
         mine = np.flatnonzero((wanted >= first) & (wanted < last))
@@ -319,22 +320,22 @@ def detect_jumps(
 
 
 class _Search:
-    """Looks for jumps in a series.
+    """Search for jumps in a series.
 
     Parameters
     ----------
-    stated
-        What moves, and how it goes on in time.
-    when
-        (M,) times of the measurements, seconds, ascending.
-    shifts
-        (M, D) px, in their own order.
-    noise
-        Of these.
-    order
-        (M,) numbers of the shifts in the order of time.
-    reference
-        As of `smooth_series`.
+    stated : Disturbances
+        Prior of the motions with their laws in time.
+    when : (M,) ndarray
+        Times of the measurements, s, ascending.
+    shifts : (M, D) ndarray
+        Shifts in their original order, px.
+    noise : ShiftNoise
+        Noise of the shifts.
+    order : (M,) ndarray of int
+        Indices of the shifts in the order of time.
+    reference : float or None
+        Time from which changes are counted, as in `smooth_series`.
     """
 
     def __init__(
@@ -350,10 +351,10 @@ class _Search:
         self.reference, self.may = reference, candidates(stated)
 
     def jumps(self) -> tuple[tuple[Jump, ...], Disturbances]:
-        """All that are found, in the order of time, with their sizes; and what moves, now that they are known."""
+        """Return all detected jumps with their sizes, in the order of time, and the prior with these jumps."""
         found = self._further([])
         if len(found) > 1:
-            # the first were found when the others were still unknown
+            # the first jumps were found without knowledge of the others
             for k in reversed(range(len(found))):
                 others = found[:k] + found[k + 1 :]
                 again = self._look(others)
@@ -373,7 +374,7 @@ class _Search:
         return found
 
     def _look(self, known: list[Jump]) -> Jump | None:
-        """The likeliest jump beside those known, if chance does not explain it."""
+        """Return the most likely further jump if it is significant; None otherwise."""
         one = most_likely_jump(self._steps(with_jumps(self.stated, known)), self.may, self.stated)
         return one if one is not None and one.chance <= self.stated.jump_false_alarm else None
 
@@ -387,7 +388,7 @@ class _Search:
         raise AssertionError(f"a jump at {one.until} s is at no measurement")
 
     def _factors(self, model: Disturbances) -> Iterator[tuple[_Factor, slice]]:
-        """The measurements of each window by what moves, and the piece of them that is the window's own."""
+        """Yield the factorised measurements of each window, and the range of them that is the window's own piece."""
         process = _Process(model, self.reference)
         for piece, window in _pieces(len(self.when), window_of(self.shifts.shape[1])):
             own = self.order[window]
@@ -396,7 +397,7 @@ class _Search:
 
 
 def _pieces(count: int, window: int) -> Iterator[tuple[slice, slice]]:
-    """Pieces of a series, and the measurements that each is worked out from."""
+    """Yield the pieces of a series, and the range of measurements that each is computed from."""
     if count <= window:
         yield slice(0, count), slice(0, count)
         return
@@ -423,7 +424,7 @@ class _Process:
             self.parts.append((law, spots @ correlation @ spots.T, across @ spots.T, across @ parameters.T))
 
     def _covariance(self, law: TimeLaw, one: Array, two: Array) -> Array:
-        """(n, m) of a law between two sets of times."""
+        """Return the covariance of a law between two sets of times, (n, m)."""
         out = law.covariance(one[:, None], two)
         if self.reference is None:
             return out
@@ -431,15 +432,15 @@ class _Process:
         return np.asarray(out - since[:, None] - until + law.covariance(self.reference, self.reference))
 
     def shifts(self, times: Array) -> Array:
-        """(n D, n D) px^2."""
+        """Return the covariance of the shifts, (n D, n D) px^2."""
         return _together([(self._covariance(law, times, times), spots) for law, spots, _, _ in self.parts])
 
     def across(self, times: Array, wanted: Array) -> Array:
-        """(n D, m 4 K) shifts against parameters."""
+        """Return the covariance of shifts with parameters, (n D, m 4 K)."""
         return _together([(self._covariance(law, times, wanted), cross.T) for law, _, cross, _ in self.parts])
 
     def parameters(self, wanted: Array) -> Array:
-        """(m, 4 K, 4 K) of the parameters at each time."""
+        """Return the covariance of the parameters at each time, (m, 4 K, 4 K)."""
         width = len(self.parts[0][3])
         out = np.zeros((len(wanted), width, width))
         for law, _, _, own in self.parts:
@@ -452,7 +453,7 @@ class _Process:
 
 
 def _together(parts: list[tuple[Array, Array]]) -> Array:
-    """Sum of Kronecker products."""
+    """Return the sum of Kronecker products."""
     return np.asarray(sum(np.kron(time, own) for time, own in parts))
 
 
@@ -464,14 +465,14 @@ class _Factor:
         try:
             self.root = np.asarray(np.linalg.cholesky(process.shifts(when) + noise), np.float64)
         except np.linalg.LinAlgError as error:
-            raise UndeterminedError("smoother: shifts that say the same twice need noise") from error
+            raise UndeterminedError("smoother: shifts that repeat the same information need noise") from error
         self.white = solve_triangular(self.root, shifts.ravel(), lower=True)
         self._noise = noise
         self.squares = np.sum(self.white.reshape(shifts.shape) ** 2, axis=1)
 
     @cached_property
     def noise(self) -> Array:
-        """(n D, n D) covariance of the whitened shifts by their noise."""
+        """Covariance of the whitened shifts by their noise, (n D, n D)."""
         left = solve_triangular(self.root, self._noise, lower=True)
         return np.asarray(solve_triangular(self.root, left.T, lower=True))
 
@@ -480,14 +481,14 @@ class _Factor:
 
         Parameters
         ----------
-        times : Array
-            all.
-        at : Numbers
-            Which of them.
+        times : (T,) ndarray
+            All times, s.
+        at : ndarray of int
+            Indices of the times to process.
         filtered : SeriesChanges
-            To be filled.
+            Filtered changes to fill in.
         smoothed : SeriesChanges
-            likewise.
+            Smoothed changes to fill in.
         """
         wanted = times[at]
         prior = self.process.parameters(wanted)
@@ -503,7 +504,7 @@ class _Factor:
 
 
 def _positive(prior: Array, gained: Array) -> Array:
-    """Prior - gained, without the negative variances that rounding leaves where nothing remains."""
+    """Return prior - gained, without the negative variances that rounding leaves."""
     size = np.sqrt(np.diag(prior))
     scale = np.where(size > 0.0, size, 1.0)
     left = (prior - gained) / scale[:, None] / scale

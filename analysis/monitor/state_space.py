@@ -1,17 +1,17 @@
-"""State space of stated disturbances: what moves as a process that goes on from one reading to the next.
+"""State space of the disturbances: the motions of the prior as a process from one reading to the next.
 
-Every law in time of `analysis.monitor.disturbances` but its products with chance is a process of finitely many states,
-so that the covariances
+Every law in time of `analysis.monitor.disturbances`, except its products with probabilities, is a process of finitely
+many states, so that the covariances
 
     g(t) g(t') exp(-|t - t'| / D) cos(2 pi (t - t') / T) C(min(t, t'))
 
-are those of states with a decay, a turn, an amplitude g and a variance C(t) that steps add to (Sarkka, Solin, Applied
-Stochastic Differential Equations, 2019, ch. 12). Motions of one law that move spots and parameters alike need no state
-of their own: of M motions the states are the singular vectors of what they do to the D + P outputs, at most D + P of
-them. Steps, those of events and those of jumps, change one common level.
+are those of states with a decay, a rotation, an amplitude g and a variance C(t) that steps add to (Sarkka, Solin,
+Applied Stochastic Differential Equations, 2019, ch. 12). Motions of one law with the same effect on spots and
+parameters need no separate states: for M motions the states are the singular vectors of their effect on the D + P
+outputs, at most D + P of them. Steps, those of events and those of jumps, change one common level.
 
-Temperatures of bodies that have a sensor keep states of their own, since sensors read them, and so does the factor by
-which what heat really does to light is larger than computed: the product of the two is taken to second order.
+Temperatures of bodies that have a sensor keep separate states, since sensors read them, and so does the factor by which
+the real effect of heat on light exceeds the computed one: the product of the two is taken to second order.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ from analysis.arrays import Array
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 
 _INTERVALS = 200
-"""Between readings, of which the transitions are kept."""
+"""Number of intervals between readings whose transitions are kept."""
 _NOTHING = 1e-12
-"""Of the largest singular value of outputs that are scaled to each other, below which nothing but rounding is left."""
+"""Singular value of scaled outputs, relative to the largest, below which only rounding is left."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeatInputs:
-    """Temperatures that sensors read, as inputs with errors.
+    """Temperatures read by sensors, as inputs with errors.
 
     Attributes
     ----------
-    motions : NDArray[np.int_]
-        (m,) numbers of the disturbances that are temperatures or gradients of bodies with sensors.
-    sensors : tuple[str, ...]
+    motions : (m,) ndarray of int
+        Indices of the disturbances that are temperatures or gradients of bodies with sensors.
+    sensors : tuple of str
         Names of the S sensors.
-    rows : Array
-        (S, m) kelvin at each sensor for one standard deviation of each motion.
-    factors : NDArray[np.int_]
-        (m,) number of the factor by which what each motion does to light differs from what was computed.
-    names : tuple[str, ...]
-        Of the factors, bodies.
+    rows : (S, m) ndarray
+        Temperature at each sensor for one standard deviation of each motion, K.
+    factors : (m,) ndarray of int
+        Index of the factor by which the effect of each motion on light differs from the computed one.
+    names : tuple of str
+        Names of the factors, bodies.
     sigma : float
         Standard deviation of a factor before any reading.
     """
@@ -73,20 +73,20 @@ class _Block:
 
     Attributes
     ----------
-    kind : _Kind
+    kind : str
         `level` of all that steps, `law` of another law, `heat` of temperatures with sensors, `factor` and `reference`.
     law : TimeLaw
-        In time.
+        Law in time.
     at : slice
-        Their numbers; of a law with a period the first half goes as a cosine, the second as a sine.
-    outputs : Array
-        (D + P, r) of the first r states, for amplitude 1.
-    covariance : Array
-        (r, r) of the states where the law's own variance is 1.
-    motions : tuple[int, ...]
-        Numbers of the disturbances that they stand for.
-    steps : _Stepping
-        (law, (r, r)) of events and jumps, of the level alone.
+        Range of the states; for a law with a period the first half is the cosine part, the second the sine part.
+    outputs : (D + P, r) ndarray
+        Effect of the first r states, for amplitude 1.
+    covariance : (r, r) ndarray
+        Covariance of the states where the law's own variance is 1.
+    motions : tuple of int
+        Indices of the disturbances that they represent.
+    steps : tuple of (TimeLaw, (r, r) ndarray)
+        Laws and covariances of events and jumps, for the level alone.
     """
 
     kind: _Kind
@@ -104,16 +104,18 @@ class _Block:
 
 @dataclass(frozen=True, eq=False)
 class _Transition:
-    """Of the states over an interval.
+    """Transition of the states over an interval.
 
     Attributes
     ----------
-    kept : Array
-        (n,) what is left of each; kept_both: (n, n) of the product of two.
-    turned : tuple[tuple[slice, Array], ...]
-        Of each law with a period its states, and the matrix by which they turn.
-    gained : Array
-        (n, n) covariance that laws without events add meanwhile.
+    kept : (n,) ndarray
+        Factor of the decay of each state.
+    kept_both : (n, n) ndarray
+        Factor of the decay of products of two states.
+    turned : tuple of (slice, ndarray)
+        For each law with a period its states, and the matrix of their rotation.
+    gained : (n, n) ndarray
+        Covariance that laws without events add in the interval.
     """
 
     kept: Array
@@ -124,18 +126,18 @@ class _Transition:
 
 @dataclass(frozen=True, eq=False)
 class StateSpace:
-    """The process of all disturbances, and of the error of the reference that all shifts are counted from.
+    """Process of all disturbances, and of the error of the reference that all shifts are counted from.
 
     Attributes
     ----------
     stated : Disturbances
-        What moves, D spot coordinates and P parameters.
-    reference_noise : Array | None
-        (D, D) px^2 of the reference's spots, the same error in every shift; None for none.
-    heat : HeatInputs | None
+        Prior with D spot coordinates and P parameters.
+    reference_noise : (D, D) ndarray or None
+        Noise of the reference's spots, the same error in every shift, px^2; None for none.
+    heat : HeatInputs or None
         Temperatures that sensors read; None for none.
-    stepping : tuple[int, ...]
-        Numbers of motions of any law that may step, beside those of which this is the law.
+    stepping : tuple of int
+        Indices of motions of any law that may step, beside those with a law of steps.
 
     Raises
     ------
@@ -188,8 +190,8 @@ class StateSpace:
             for law in filter(_is_level, laws):
                 mine = own[law] & ~raw
                 at = basis.T @ (outputs[:, mine] / scale)
-                come = at @ stated.correlation[np.ix_(mine, mine)] @ at.T
-                steps.append((law, 0.5 * (come + come.T)))
+                effect = at @ stated.correlation[np.ix_(mine, mine)] @ at.T
+                steps.append((law, 0.5 * (effect + effect.T)))
             none = np.zeros((basis.shape[1],) * 2)
             add("level", TimeLaw(), scale * basis, none, np.flatnonzero(level), tuple(steps))
         for law in laws:
@@ -216,37 +218,37 @@ class StateSpace:
 
     @cached_property
     def size(self) -> int:
-        """Number of states."""
+        """Number of states n."""
         return self._blocks[-1].at.stop if self._blocks else 0
 
     @property
     def width(self) -> int:
-        """D, spot coordinates."""
+        """Number of spot coordinates D."""
         return int(self.stated.spots.shape[0])
 
     def outputs_of(self, motions: Sequence[int] | range) -> Array:
-        """(D + P, m) of motions, for one standard deviation: px of spots, then parameters.
+        """Return the effect of motions of one standard deviation, (D + P, m): spots in px, then parameters.
 
         Parameters
         ----------
-        motions : Sequence[int] | range
-            m numbers.
+        motions : sequence of int
+            Indices of m motions.
         """
         own = list(motions)
         return np.concatenate([self.stated.spots[:, own], self.stated.parameters[:, own]])
 
     @property
     def level(self) -> slice:
-        """States that steps change, all others being untouched by them."""
+        """Range of the states that steps change; steps leave all others unchanged."""
         return self._blocks[0].at if self._blocks else slice(0, 0)
 
     def level_of(self, motions: Sequence[int]) -> Array:
-        """(n, m) change of the states by steps of motions of one standard deviation each.
+        """Return the change of the states by steps of one standard deviation of motions, (n, m).
 
         Parameters
         ----------
-        motions : Sequence[int]
-            m numbers of motions that jump or have events.
+        motions : sequence of int
+            Indices of m motions that jump or have events.
         """
         out = np.zeros((self.size, len(motions)))
         block = self._blocks[0]
@@ -254,8 +256,8 @@ class StateSpace:
         return out
 
     @cached_property
-    def level_doing(self) -> Array:
-        """(n, D + P) states of the level that do what is asked for, in the sense of least squares."""
+    def level_inverse(self) -> Array:
+        """Least-squares inverse from outputs to the level states, (n, D + P)."""
         block = self._blocks[0]
         scale = np.abs(block.outputs).max(axis=1, initial=0.0)
         scale = np.where(scale > 0.0, scale, 1.0)
@@ -264,24 +266,24 @@ class StateSpace:
         return out
 
     def _coordinates(self, block: _Block, motions: Sequence[int]) -> Array:
-        """(r, m) states of a block that do what motions do."""
+        """Return the states of a block with the effect of motions, (r, m)."""
         scale = np.abs(block.outputs).max(axis=1, initial=0.0)
         scale = np.where(scale > 0.0, scale, 1.0)[:, None]
         return np.asarray(np.linalg.lstsq(block.outputs / scale, self.outputs_of(motions) / scale, rcond=None)[0])
 
     def start(self, time: float) -> tuple[Array, Array]:
-        """States before any reading: mean (n,) and covariance (n, n).
+        """Return mean (n,) and covariance (n, n) of the states before any reading.
 
         Parameters
         ----------
         time : float
-            seconds.
+            Time, s.
         """
         spread = np.zeros((self.size, self.size))
         for block in self._blocks:
             self._add(spread, block, block.covariance * _variance(block.law, time))
             for law, steps in block.steps:
-                self._add(spread, block, _come(law, time) * steps)
+                self._add(spread, block, _step_variance(law, time) * steps)
         return np.zeros(self.size), spread
 
     @staticmethod
@@ -291,18 +293,18 @@ class StateSpace:
             spread[part, part] += what
 
     def moved(self, states: Array, then: float, now: float, back: bool = False) -> Array:
-        """What states, or anything that goes on as they do, are at another time; (..., n, k).
+        """Return states, or quantities that propagate as they do, at another time, (..., n, k).
 
         Parameters
         ----------
-        states : Array
-            (..., n, k).
+        states : (..., n, k) ndarray
+            States.
         then : float
-            Their time, seconds.
+            Time of the states, s.
         now : float
-            The later one.
+            Later time, s.
         back : bool
-            By the transposed transition: what a smoother carries from ``now`` to ``then``.
+            True to use the transposed transition, which a smoother needs from ``now`` to ``then``.
         """
         if now == then:
             return states
@@ -313,18 +315,20 @@ class StateSpace:
         return out
 
     def moved_both(self, square: Array, then: float, now: float, back: bool = False) -> Array:
-        """A covariance, or anything that goes on as one, at another time; (n, n), symmetric to the bit if it is now.
+        """Return a covariance, or a matrix that propagates as one, at another time, (n, n).
+
+        The result is symmetric to the last bit if the input is.
 
         Parameters
         ----------
-        square : Array
-            (n, n).
+        square : (n, n) ndarray
+            Covariance.
         then : float
-            Its time, seconds.
+            Time of the covariance, s.
         now : float
-            The later one.
+            Later time, s.
         back : bool
-            As of `moved`.
+            True to use the transposed transition, as in `moved`.
         """
         if now == then:
             return square
@@ -355,7 +359,7 @@ class StateSpace:
 
     @cached_property
     def _turning(self) -> list[tuple[slice, float, Array, Array]]:
-        """Of each law with a period its states, the period, and the turns of them by nothing and by a quarter."""
+        """For each law with a period its states, the period, and the rotations by zero and by a quarter."""
         own = [block for block in self._blocks if block.law.period_s is not None]
         quarters = [np.kron([[0.0, -1.0], [1.0, 0.0]], np.eye(block.rank)) for block in own]
         periods = [float(block.law.period_s or 0.0) for block in own]
@@ -366,20 +370,20 @@ class StateSpace:
 
     @cached_property
     def _transitions(self) -> dict[float, _Transition]:
-        """Those of the last intervals: readings mostly come at the same few."""
+        """Transitions of the last intervals: readings mostly come at the same few intervals."""
         return {}
 
     def spread(self, covariance: Array, then: float, now: float) -> Array:
-        """(n, n) covariance of states at a later time, with what has been added since.
+        """Return the covariance of the states at a later time, with the process noise since then, (n, n).
 
         Parameters
         ----------
-        covariance : Array
-            (n, n) at ``then``.
+        covariance : (n, n) ndarray
+            Covariance at ``then``.
         then : float
-            Its time, seconds.
+            Time of the covariance, s.
         now : float
-            The later one.
+            Later time, s.
         """
         if now == then:
             return covariance
@@ -391,41 +395,44 @@ class StateSpace:
                 gained = _variance(block.law, now) - kept * _variance(block.law, then)
                 self._add(out, block, max(gained, 0.0) * block.covariance)
             for law, steps in block.steps:
-                if (come := _come(law, now) - _come(law, then)) > 0.0:
-                    self._add(out, block, come * steps)
+                if (gained := _step_variance(law, now) - _step_variance(law, then)) > 0.0:
+                    self._add(out, block, gained * steps)
         return out
 
     @cached_property
     def _stepping_blocks(self) -> tuple[_Block, ...]:
-        """Those that events change: what they gain depends on the time, and not on the interval alone."""
+        """Blocks with events, whose process noise depends on the time and not on the interval alone."""
         return tuple(one for one in self._blocks if one.law.event or any(law.event for law, _ in one.steps))
 
     def outputs(self, mean: Array, covariance: Array, time: float) -> tuple[Array, Array, Array]:
-        """What states do: values (D + P,), rows on the states (D + P, n), and the covariance of what rows leave out.
+        """Return the outputs of states: values, derivatives and covariance of the second-order rest.
+
+        The shapes are (D + P,), (D + P, n) and (D + P, D + P).
 
         Parameters
         ----------
-        mean : Array
-            (n,) of the states at ``time``.
-        covariance : Array
-            (n, n) of them.
+        mean : (n,) ndarray
+            Mean of the states at ``time``.
+        covariance : (n, n) ndarray
+            Covariance of the states.
         time : float
-            seconds.
+            Time, s.
         """
         return self.acting(self._rows(time), mean, covariance)
 
     def acting(self, rows: Array, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
-        """What rows on the states make of them where heat does more or less to light than computed: values (R,), rows
-        (R, n) and covariance of what these leave out, as `outputs`.
+        """Return linear combinations of the states with the factors of the effect of heat on light.
+
+        The results are values (R,), derivatives (R, n) and the covariance of the second-order rest, as in `outputs`.
 
         Parameters
         ----------
-        rows : Array
-            (R, n), of temperatures as if heat did what was computed.
-        mean : Array
-            (n,) of the states.
-        covariance : Array
-            (n, n) of them.
+        rows : (R, n) ndarray
+            Coefficients, for temperatures with the computed effect of heat.
+        mean : (n,) ndarray
+            Mean of the states.
+        covariance : (n, n) ndarray
+            Covariance of the states.
         """
         left = np.zeros((len(rows), len(rows)))
         if self.heat is None:
@@ -441,16 +448,16 @@ class StateSpace:
         return values, rows, self._second(plain, plain, covariance)
 
     def _second(self, rows: Array, others: Array, across: Array) -> Array:
-        """(R, R') covariance of the products of factors and temperatures beyond what rows make of them.
+        """Return the covariance of the products of factors and temperatures beyond first order, (R, R').
 
         Parameters
         ----------
-        rows : Array
-            (R, n), of temperatures as if heat did what was computed.
-        others : Array
-            (R', n) likewise, of the states at another time or the same.
-        across : Array
-            (n, n) covariance of the states with those.
+        rows : (R, n) ndarray
+            Coefficients, for temperatures with the computed effect of heat.
+        others : (R', n) ndarray
+            Coefficients on the states at another time or the same.
+        across : (n, n) ndarray
+            Covariance of the states with those at the other time.
         """
         out = np.zeros((len(rows), len(others)))
         for factor, at in self._heated if self.heat is not None else ():
@@ -459,16 +466,16 @@ class StateSpace:
         return out
 
     def outputs_jointly(self, means: Array, covariance: Array, times: Array) -> tuple[Array, Array]:
-        """What states at T times do together: values (T, D + P) and their covariance (T, D + P, T, D + P).
+        """Return the outputs at T times, (T, D + P), and their joint covariance, (T, D + P, T, D + P).
 
         Parameters
         ----------
-        means : Array
-            (T, n) of the states.
-        covariance : Array
-            (T, n, T, n) of them.
-        times : Array
-            (T,) seconds.
+        means : (T, n) ndarray
+            Means of the states.
+        covariance : (T, n, T, n) ndarray
+            Joint covariance of the states.
+        times : (T,) ndarray
+            Times, s.
         """
         count, plain = len(times), [self._rows(float(time)).copy() for time in times]
         own = [self.acting(plain[k], means[k], covariance[k, :, k]) for k in range(count)]
@@ -490,7 +497,7 @@ class StateSpace:
 
     @cached_property
     def _growing_blocks(self) -> tuple[_Block, ...]:
-        """Those of trends and relaxations, whose amplitude depends on the time."""
+        """Blocks with trends and relaxations, whose amplitude depends on the time."""
         return tuple(one for one in self._blocks if (one.law.trend_s, one.law.relaxation_s) != (None, None))
 
     @cached_property
@@ -499,7 +506,7 @@ class StateSpace:
 
     @cached_property
     def basis(self) -> Array:
-        """(D + P, n) what the states do where all amplitudes are 1."""
+        """Effect of the states where all amplitudes are 1, (D + P, n)."""
         rows = np.zeros((self.width + self.stated.parameters.shape[0], self.size))
         for block in self._blocks:
             rows[:, block.at.start : block.at.start + block.rank] = block.outputs
@@ -507,13 +514,13 @@ class StateSpace:
 
     @cached_property
     def _heat_states(self) -> dict[int, int]:
-        """Number of a motion with a sensor -> that of its state."""
+        """Index of the state of each motion with a sensor."""
         heat = [block for block in self._blocks if block.kind == "heat"]
         return {motion: block.at.start + k for block in heat for k, motion in enumerate(block.motions)}
 
     @cached_property
     def factors(self) -> slice:
-        """States that are factors of what heat does."""
+        """Range of the states that are factors of the effect of heat."""
         return next((block.at for block in self._blocks if block.kind == "factor"), slice(0, 0))
 
     @cached_property
@@ -524,14 +531,14 @@ class StateSpace:
         return [(self.factors.start + f, states[self.heat.factors == f]) for f in range(len(self.heat.names))]
 
     def heat_outputs(self, mean: Array, time: float) -> Array:
-        """(D + P,) of the outputs what heat of bodies with sensors does.
+        """Return the part of the outputs due to the heat of bodies with sensors, (D + P,).
 
         Parameters
         ----------
-        mean : Array
-            (n,) of the states.
+        mean : (n,) ndarray
+            Mean of the states.
         time : float
-            seconds.
+            Time, s.
         """
         rows, out = self._rows(time), np.zeros(self.width + self.stated.parameters.shape[0])
         for factor, at in self._heated if self.heat is not None else ():
@@ -539,14 +546,14 @@ class StateSpace:
         return out
 
     def sensor_rows(self, sensors: Sequence[int], time: float) -> Array:
-        """(s, n) kelvin that sensors read of the states.
+        """Return the derivatives of sensor temperatures with respect to the states, (s, n) K.
 
         Parameters
         ----------
-        sensors : Sequence[int]
-            Their numbers.
+        sensors : sequence of int
+            Indices of the sensors.
         time : float
-            seconds.
+            Time, s.
         """
         assert self.heat is not None
         out = np.zeros((len(sensors), self.size))
@@ -555,15 +562,16 @@ class StateSpace:
         return out
 
     def motion_gain(self, time: float, steps: Sequence[tuple[Sequence[int], float]] = ()) -> tuple[Array, Array]:
-        """Motions by the states: rows (M, n), and (M, M) covariance of what the states leave of them, in standard
-        deviations.
+        """Return the motions as functions of the states: coefficients (M, n) and covariance of the rest (M, M).
+
+        Motions are in standard deviations.
 
         Parameters
         ----------
         time : float
-            seconds.
-        steps : Sequence[tuple[Sequence[int], float]]
-            Motions that have stepped beside their laws, and by which variance over the stated one.
+            Time, s.
+        steps : sequence of (sequence of int, float)
+            Motions that have stepped in addition to their laws, and the variance of the step relative to the prior.
         """
         count = len(self.stated.labels)
         rows, left = np.zeros((count, self.size)), np.zeros((count, count))
@@ -580,7 +588,9 @@ class StateSpace:
             own = list(block.motions)
             if block.kind == "level":
                 own = sorted({*own, *np.flatnonzero(np.diag(stepped)).tolist()})
-                root = np.array([math.sqrt(_come(law, time)) if _is_level(law) else 0.0 for law in map(self._law, own)])
+                root = np.array(
+                    [math.sqrt(_step_variance(law, time)) if _is_level(law) else 0.0 for law in map(self._law, own)]
+                )
                 prior = root[:, None] * self.stated.correlation[np.ix_(own, own)] * root + stepped[np.ix_(own, own)]
             else:
                 prior = _variance(block.law, time) * self.stated.correlation[np.ix_(own, own)]
@@ -597,13 +607,13 @@ class StateSpace:
 
 
 def _is_level(law: TimeLaw) -> bool:
-    """Whether it changes by steps alone."""
+    """Return True for a law that changes by steps alone."""
     plain = (law.drift_s, law.period_s, law.trend_s, law.relaxation_s) == (None,) * 4
     return plain and not law.white
 
 
 def _spanned(columns: Array) -> tuple[Array, Array]:
-    """Orthonormal vectors that span columns, and their singular values."""
+    """Return orthonormal vectors that span the columns, and their singular values."""
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     own = sizes > _NOTHING * max(sizes[0], 1e-300)
     return np.asarray(left[:, own]), np.asarray(sizes[own])
@@ -615,25 +625,25 @@ def _halves(at: slice) -> tuple[slice, slice]:
 
 
 def _kept(law: TimeLaw, over: float) -> float:
-    """What is left of a state after some seconds."""
+    """Return the factor of a state's decay over a time, s."""
     if law.white:
         return 0.0 if over > 0.0 else 1.0
     return 1.0 if law.drift_s is None else math.exp(-over / law.drift_s)
 
 
 def _variance(law: TimeLaw, time: float) -> float:
-    return float(law.come(time)) if law.event else 1.0
+    return float(law.step_probability(time)) if law.event else 1.0
 
 
-def _come(law: TimeLaw, time: float) -> float:
-    """Variance of the steps of a law up to a time, over that of one."""
+def _step_variance(law: TimeLaw, time: float) -> float:
+    """Return the variance of the steps of a law up to a time, relative to that of one step."""
     if law.jump:
         return 0.0
-    return float(law.come(time)) if law.event else 1.0
+    return float(law.step_probability(time)) if law.event else 1.0
 
 
 def _gain(law: TimeLaw, time: float) -> float:
-    """Amplitude of a trend or a relaxation."""
+    """Return the amplitude of a trend or a relaxation."""
     if law.trend_s is None and law.relaxation_s is None:
         return 1.0
     return float(law.amplitude(np.array(time)))

@@ -470,9 +470,7 @@ def _numbers(frames: NDArray[np.intp]) -> str:
 
 
 def _illuminated(stack: _Stack, inside: Mask, noise: NoiseModel, findings: list[Finding]) -> NDArray[np.intp]:
-    """Return the indices of the frames that contain the light; ``inside`` are the pixels that are usable in all of
-    them.
-    """
+    """Return the indices of the frames that contain the light; ``inside`` are pixels usable in all of them."""
     edge = np.ones(stack.shape, dtype=bool)
     edge[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = False
     border = inside & edge if np.any(inside & edge) else edge
@@ -600,10 +598,11 @@ def noise_ratio(
     where: Mask | None = None,
     released: Released = _in_memory,
 ) -> float | None:
-    """Return the ratio of the frames' noise to the specified one; None if they agree or it cannot be measured.
+    """Return the ratio of the frames' noise to the specified one; None if they agree.
 
-    The noise is that of the differences of each frame to the next, among frames that contain the light. The result is
-    the median over all pairs, so that one corrupted frame is not taken for noise.
+    The noise is that of the differences of each frame to the next, beside the spot, among frames that contain the
+    light. The result is the median over all pairs, so that one corrupted frame is not taken for noise. It is also None
+    if the frames cannot show the noise.
 
     Parameters
     ----------

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.filter_state import Belief, Innovation, Observed
+from analysis.monitor.filter_state import FilterState, Innovation, Observed
 from analysis.monitor.jump_detection import Jump, Step, Steps, steps
-from analysis.monitor.kalman_filter import SeriesFilter, hinted, smoothed
+from analysis.monitor.kalman_filter import SeriesFilter, smoothed, with_hinted_jumps
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import StateSpace
 
@@ -49,7 +49,7 @@ class Followed:
     smoothed: SeriesChanges
     innovations: tuple[Innovation, ...]
     jumps: tuple[Jump, ...]
-    belief: Belief
+    belief: FilterState
     left_out: tuple[int, ...] = ()
 
 
@@ -67,13 +67,13 @@ def follow(how: SeriesFilter, observed: Sequence[Observed], wanted: ArrayLike) -
         if found.bad is not None:
             bad.append(k)
     known = np.searchsorted(moments, times, side="right").tolist()
-    now = {n: how.blended(beliefs[n]) for n in set(known)}
+    now = {n: how.mixture(beliefs[n]) for n in set(known)}
     filtered = [how.parameters(now[n], time) for n, time in zip(known, times.tolist(), strict=True)]
     jumps = tuple(one.jump for one in innovations if one.jump is not None)
     knowing = replace(how, steps=(*how.steps, *map(Step.of, jumps)), window=0)
     good = [k for k in range(len(observed)) if k not in bad]
     taken = [observed[k] for k in good]
-    begin, left = hinted(how, knowing, knowing.start(earliest), taken, [beliefs[k].left for k in good])
+    begin, left = with_hinted_jumps(how, knowing, knowing.start(earliest), taken, [beliefs[k].undetected for k in good])
     late = smoothed(knowing, begin, taken, times, left, knowing.parameters_of)
     return Followed(series_of(filtered), series_of(late), tuple(innovations), jumps, beliefs[-1], tuple(bad))
 

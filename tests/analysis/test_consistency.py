@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw, consistency
-from analysis.monitor.estimators import ESTIMATORS, applicable, judged
+from analysis.monitor.estimators import ESTIMATORS, applicable, preferred_estimator
 from tests.analysis.refusals import refuses
 from tests.analysis.stated_motions import disturbances
 
@@ -48,7 +48,7 @@ def test_noise_moves_the_chi_square_by_what_is_said(stated) -> None:
 
 
 def test_judged_is_the_best_that_stands_in_the_results(stated) -> None:
-    assert judged(applicable({}, stated)) == "posterior"
-    assert judged(applicable({}, None)) == "model"
-    assert judged(reversed(list(ESTIMATORS))) == "posterior"
-    refuses(ValueError, "results without posterior or model: there are derived", judged, ["derived"])
+    assert preferred_estimator(applicable({}, stated)) == "posterior"
+    assert preferred_estimator(applicable({}, None)) == "model"
+    assert preferred_estimator(reversed(list(ESTIMATORS))) == "posterior"
+    refuses(ValueError, "results without posterior or model: there are derived", preferred_estimator, ["derived"])

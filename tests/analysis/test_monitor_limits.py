@@ -91,7 +91,7 @@ def test_motions_of_no_size_change_nothing():
     left = limits.posterior_sigma(rows, fewer, noise)
     np.testing.assert_allclose(limits.posterior_sigma(rows, some, noise), left, rtol=1e-10)
     # without correlations a motion that is known is one of no size
-    np.testing.assert_allclose(limits.known_sigma(rows, stated, noise, [stated.labels[:5]])[0], left, rtol=1e-9)
+    np.testing.assert_allclose(limits.sigma_if_known(rows, stated, noise, [stated.labels[:5]])[0], left, rtol=1e-9)
 
 
 def test_the_motions_that_hide_change_the_quantity_by_what_is_left():

@@ -7,7 +7,7 @@ import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.filter_state import Observed
-from analysis.monitor.kalman_filter import SeriesFilter, jointly
+from analysis.monitor.kalman_filter import SeriesFilter, smooth_jointly
 from analysis.monitor.series_smoother import smooth_series
 from analysis.monitor.state_space import HeatInputs, StateSpace
 from tests.analysis.followed_series import follow, of_shifts, whole_steps
@@ -78,7 +78,7 @@ def test_times_together_are_those_of_the_joint_normal() -> None:
     read = of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS))
     left = [np.zeros(0)] * len(times)
     for asked in (wanted, np.append(wanted, [66.0, 70.0])):
-        mean, covariance = jointly(how, how.start(-3.0), read, asked, left)
+        mean, covariance = smooth_jointly(how, how.start(-3.0), read, asked, left)
         gain, before, after, _ = joint_normal(told, times, BOTH, asked, None)
         sigma, start = np.sqrt(np.diag(after)), np.sqrt(np.diag(before))
         assert np.all(np.abs(mean.ravel() - gain @ shifts.ravel()) <= 1e-9 * sigma + 1e-10 * start)
@@ -188,7 +188,7 @@ def test_a_sensor_says_what_a_body_does() -> None:
     read, shift = np.array([0.3, -0.2]), np.full(SPOTS, 0.4)
     belief, _ = how.update(belief, Observed(1.0, read, 1e-4 * np.eye(2), (0, 1)))
     belief, _ = how.update(belief, Observed(1.0, shift, NOISE**2 * np.eye(SPOTS)))
-    values, total = how.parameters(how.blended(belief), 1.0)
+    values, total = how.parameters(how.mixture(belief), 1.0)
     rows = np.concatenate([np.pad(heat.rows, ((0, 0), (0, 2))), told.spots])
     noise = np.diag([1e-4, 1e-4, *[NOISE**2] * SPOTS])
     across = told.parameters @ rows.T

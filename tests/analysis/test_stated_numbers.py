@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import TimeLaw
-from analysis.monitor.limits import elasticities, heavy_tails, posterior_sigma, stated_numbers, unseen
+from analysis.monitor.limits import elasticities, heavy_tails, posterior_sigma, prior_numbers, unobserved_bodies
 from tests.analysis.refusals import refuses
 from tests.analysis.stated_motions import disturbances
 
@@ -37,7 +37,7 @@ def scaled(own, factor):
 
 def test_a_number_is_what_a_cause_gives_alike() -> None:
     """Both turns have one number, shifts of different size two, figure terms one each; bodies share them."""
-    found = stated_numbers(STATED)
+    found = prior_numbers(STATED)
     assert list(found) == [f"mounts {what}" for what in ("rotate", "shift x", "shift y", "figure Z4", "figure Z5")]
     assert found["mounts rotate"] == [0, 1, 6, 7]
     assert sorted(k for own in found.values() for k in own) == list(range(COUNT))
@@ -47,7 +47,7 @@ def test_elasticities_are_derivatives_of_sigma() -> None:
     """Against a change by 1e-4 of the number, told and not told; all and the noise's share together make 1."""
     before = posterior_sigma(ROWS, STATED, NOISE)
     found = {one.number: one for one in elasticities(ROWS, STATED, NOISE, GAIN)}
-    for number, own in stated_numbers(STATED).items():
+    for number, own in prior_numbers(STATED).items():
         step = 1e-4
         told = posterior_sigma(ROWS, scaled(own, 1.0 + step), NOISE)
         # of second order is the square of the step
@@ -69,7 +69,7 @@ def test_heavy_tails_are_those_of_drawn_states() -> None:
     rng = np.random.default_rng(3)
     values, vectors = np.linalg.eigh(CORRELATION)
     x = rng.standard_normal((count, COUNT)) @ ((vectors * np.sqrt(values)) @ vectors.T)
-    for own in stated_numbers(STATED).values():
+    for own in prior_numbers(STATED).values():
         x[:, own] /= np.sqrt(rng.gamma(0.5 * degrees, 2.0 / degrees, count))[:, None]
     noise = rng.multivariate_normal(np.zeros(4), NOISE, count)
     error = x @ (GAIN @ STATED.spots - STATED.parameters).T + noise @ GAIN.T
@@ -90,10 +90,10 @@ def test_many_degrees_of_freedom_are_the_normal_statement() -> None:
 
 
 def test_a_body_that_moves_no_spot_is_found() -> None:
-    assert unseen(ROWS, STATED, NOISE, GAIN) == {}
+    assert unobserved_bodies(ROWS, STATED, NOISE, GAIN) == {}
     spots = STATED.spots.copy()
     spots[:, 6:] *= 1e-6
     still = replace(STATED, spots=spots)
-    found = unseen(ROWS, still, NOISE, still.best_gain(NOISE))
+    found = unobserved_bodies(ROWS, still, NOISE, still.best_gain(NOISE))
     assert list(found) == ["base/two"]
     assert np.all(found["base/two"] > 0.3)

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import null_space
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.model_fit import floor, unseen_modes
+from analysis.monitor.model_fit import error_floor, unobservable_modes
 from tests.analysis.stated_motions import correlation_of, disturbances
 
 MOTIONS, SPOTS, PARAMETERS = 14, 4, 3
@@ -33,16 +33,16 @@ def hidden(one: Disturbances, rows: np.ndarray, own: np.ndarray) -> np.ndarray:
 def test_the_floor_is_what_the_null_space_of_the_spots_does(seed: int) -> None:
     rows = np.random.default_rng(seed + 10).standard_normal((2, PARAMETERS))
     one = stated(seed)
-    np.testing.assert_allclose(floor(one, rows), hidden(one, rows, np.arange(MOTIONS)), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(error_floor(one, rows), hidden(one, rows, np.arange(MOTIONS)), rtol=1e-9, atol=1e-12)
     two = stated(seed, (SWING,) * 8 + (DRIFT,) * 6)
     parts = hidden(two, rows, np.arange(8)) + hidden(two, rows, np.arange(8, MOTIONS))
-    np.testing.assert_allclose(floor(two, rows), parts, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(error_floor(two, rows), parts, rtol=1e-9, atol=1e-12)
 
 
 def test_modes_move_quantities_and_no_spot() -> None:
     one, rows = stated(3), np.eye(PARAMETERS)
     scale = np.array([1.0, 2.0, 0.5])
-    modes = unseen_modes(one, rows, scale)
+    modes = unobservable_modes(one, rows, scale)
     assert len(modes) == PARAMETERS
     for mode in modes:
         assert np.abs(one.spots @ mode.motions).max() < 1e-9
@@ -52,5 +52,5 @@ def test_modes_move_quantities_and_no_spot() -> None:
         assert sum(mode.bodies.values()) == pytest.approx(1.0, rel=1e-9)
     # together they are the floor
     whole = sum(np.outer(mode.quantities, mode.quantities) for mode in modes)
-    np.testing.assert_allclose(whole, floor(one, rows), rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(whole, error_floor(one, rows), rtol=1e-8, atol=1e-12)
     assert [mode.sigma for mode in modes] == sorted((mode.sigma for mode in modes), reverse=True)

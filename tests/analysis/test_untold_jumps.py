@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.kalman_filter import SeriesFilter, hinted, smoothed
+from analysis.monitor.kalman_filter import SeriesFilter, smoothed, with_hinted_jumps
 from tests.analysis.followed_series import follow, of_shifts, whole_steps
 from tests.analysis.stated_motions import disturbances
 from tests.tiers import quick
@@ -52,7 +52,7 @@ def test_what_is_known_now_is_the_mixture_of_all_jumps_there_may_be(amounts: tup
         belief, found = how.update(belief, one)
         assert found.jump is None
     # the mixture is of the filter that knows of no walk
-    now = how.blended(replace(belief, state=belief.looking, search=None))
+    now = how.mixture(replace(belief, state=belief.looking, search=None))
     value, spread = how.parameters(now, times[-1])
 
     still = toy(every=None)
@@ -121,7 +121,7 @@ def test_a_hint_adds_to_the_walk_where_it_is() -> None:
         knowing = replace(how, window=0)
         nothing = [np.zeros(3)] * len(times)
         read = of_shifts(times, shifts, noise)
-        found = np.array(hinted(how, knowing, knowing.start(times[0]), read, nothing)[1])[1:]
+        found = np.array(with_hinted_jumps(how, knowing, knowing.start(times[0]), read, nothing)[1])[1:]
         return found * (np.diff(times) / EVERY)[:, None]
 
     quiet, hint = more(0.0), more(0.9)

@@ -258,8 +258,8 @@ def commanded(model: LoopModel, course: np.ndarray) -> np.ndarray:
     """(T, n) where mechanisms stand after each reading of a course (T, n)."""
     commands, out = Commands.none(model, False), []
     for row in course:
-        commands = commands.given(row)
-        out.append(commands.standing)
+        commands = commands.after_reading(row)
+        out.append(commands.positions_now)
     return np.array(out)
 
 
@@ -285,7 +285,7 @@ def test_above_the_limit_commands_grow_until_the_range_ends() -> None:
     assert np.abs(commanded(model, course)).max() == pytest.approx(3.0 * ARCSEC)
     commands = [Commands.none(model, False)]
     for row in course:
-        commands.append(commands[-1].given(row))
+        commands.append(commands[-1].after_reading(row))
     assert any(one.held[0] for one in commands)
 
 
@@ -294,7 +294,7 @@ def test_gain_nothing_dead_bands_and_the_open_loop_leave_mechanisms_alone() -> N
     assert not commanded(loop_of({"gain": 0.0}, {"gain": 0.0}), course).any()
     assert not commanded(loop_of({"gain": 0.5, "dead_band": "9 arcsec"}, {"gain": 0.0}), course).any()
     commands = Commands.none(loop_of({"gain": 0.5}, {"gain": 0.5}), True)
-    assert not commands.given(course[0]).given(course[1]).standing.any()
+    assert not commands.after_reading(course[0]).after_reading(course[1]).positions_now.any()
 
 
 @pytest.fixture(scope="module")

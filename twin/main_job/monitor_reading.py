@@ -12,11 +12,11 @@ import numpy as np
 
 from analysis.arrays import shows
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, chi_squares, consistency
-from analysis.monitor.estimators import Estimator, applicable, judged
-from analysis.monitor.limits import Quantity, posterior_sigma, quantities, unmoved
+from analysis.monitor.estimators import Estimator, applicable, preferred_estimator
+from analysis.monitor.limits import Quantity, posterior_sigma, quantities, unchanged_quantities
 from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import CameraCalibration
-from analysis.monitor.recovery import BEYOND, Recovery
+from analysis.monitor.recovery import NONLINEAR_SIGMAS, Recovery
 from analysis.spots.likelihood import FALSE_ALARM as SPOT_ALARM
 from analysis.spots.likelihood import FitStates
 from twin.framework.artefact import significant
@@ -79,7 +79,7 @@ class MonitorReading:
     @property
     def judged(self) -> str:
         """The estimator of the verdict: `posterior` where stated disturbances change any reading, else `model`."""
-        return judged(name for name in self.estimators if self.table.of(name))
+        return preferred_estimator(name for name in self.estimators if self.table.of(name))
 
     @cached_property
     def table(self) -> ReadingTable:
@@ -162,7 +162,7 @@ class MonitorReading:
         rows = np.stack([quantity.row for quantity in self._quantities])
         left, unseen = (posterior_sigma(rows, stated, spread) for spread in (noise, 0.0 * noise))
         out: dict[str, dict[str, float | None]] = {}
-        without = unmoved(stated, self.cameras, self.ground)
+        without = unchanged_quantities(stated, self.cameras, self.ground)
         for quantity, sigma, alone in zip(self._quantities, left, unseen, strict=True):
             share = round(min(float(alone / sigma) ** 2, 1.0) if sigma > 0.0 else 0.0, SHARE)
             missing = (quantity.group, quantity.key) in without
@@ -229,7 +229,7 @@ class MonitorReading:
             size = found.worst()[1]
             if math.isfinite(size):
                 done = "worked out anew" if found.beyond[0] and found.holds[0] else "linear"
-                says = f"readings are {done}; beyond {BEYOND:g} sigma they are worked out anew, or sigma does not hold"
+                says = f"readings are {done}; beyond {NONLINEAR_SIGMAS:g} sigma they are worked out anew, or sigma does not hold"
                 yield SelfCheck(f"linear readings of {name} against the state traced again", size, None, "sigma", says)
 
     def recovered_dict(self) -> dict[str, Any]:

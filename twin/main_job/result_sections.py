@@ -15,7 +15,7 @@ from scenes.models.disturbances import Component
 from scenes.models.job_state import motions_of
 from scenes.specs.course import moment
 from scenes.specs.disturbances import JOINT
-from scenes.specs.perturbation import in_words
+from scenes.specs.perturbation import perturbation_text
 from twin.framework.artefact import (
     FAR,
     MINUS,
@@ -404,7 +404,7 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
     resolved, instrument = run.resolved, run.experiment.instrument
     spec, stated = resolved.instrument, run.experiment.stated is not None
     own = ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name)
-    built = () if not spec.as_built else (("As built", f"{in_words(spec.as_built)}. {_BUILT}"),)
+    built = () if not spec.as_built else (("As built", f"{perturbation_text(spec.as_built)}. {_BUILT}"),)
     free = (
         "Structures expand freely and carry the bodies on them, mirrors and prisms bend (finite elements), and glass "
     )

@@ -17,7 +17,7 @@ from analysis.arrays import ARCSEC
 from analysis.monitor import parameters
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.estimators import ESTIMATORS
-from analysis.monitor.limits import unmoved
+from analysis.monitor.limits import unchanged_quantities
 from analysis.monitor.monitor_formulas import GroundGeometry
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, CameraCalibration, Parameter
 from analysis.monitor.recovery import Estimates, Recovery
@@ -284,7 +284,7 @@ def reading_table(
         On which the estimators rest that need one; None for none.
     """
     rows: list[Reading] = []
-    fixed_changes = frozenset() if prior is None else unmoved(prior, cameras, ground)
+    fixed_changes = frozenset() if prior is None else unchanged_quantities(prior, cameras, ground)
 
     def add(
         group: str, which: Iterable[Parameter], true: np.ndarray | None, read: Mapping[str, Sequence[np.ndarray]]

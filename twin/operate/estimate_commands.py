@@ -25,7 +25,7 @@ from twin.operate.terminal import (
 )
 
 if TYPE_CHECKING:
-    from analysis.monitor.kalman_filter import Power
+    from analysis.monitor.kalman_filter import DetectionPower
     from twin.framework.report import Report
     from twin.operate.estimate.operation_filter import Operation
     from twin.operate.estimate.reported_estimate import Course, Following
@@ -340,7 +340,7 @@ def _show_course(course: Course, console: Console) -> None:
     show_table(console, ("change of", *utc), rows, range(1, len(utc) + 1))
 
 
-def show_power(found: Sequence[Power], console: Console) -> None:
+def show_power(found: Sequence[DetectionPower], console: Console) -> None:
     """A row for each body: the smallest jumps that are found, over the stated sizes."""
     heads = ("smallest jump found, over the stated", *(key.replace("_", " ") for key in found[0].plain))
     sizes = ([one.body, *("none" if size is None else f"{size:.2g}" for size in one.plain.values())] for one in found)

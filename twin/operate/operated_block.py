@@ -110,7 +110,7 @@ def posterior(
             raise Problem("no such quantity", name, f"one of: {', '.join(known)}")
     quantities = tuple(known[name] for name in wanted)
     rows = np.array([one.row for one in quantities]).reshape(len(wanted), -1)
-    values, covariance = operation.jointly(times)
+    values, covariance = operation.smooth_jointly(times)
     return Posterior(
         times, quantities, values @ rows.T, np.einsum("qi,tiuj,rj->tqur", rows, covariance, rows, optimize=True)
     )

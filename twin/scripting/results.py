@@ -15,7 +15,7 @@ import xarray as xr
 
 from analysis.arrays import shows
 from analysis.monitor import parameters
-from analysis.monitor.estimators import judged
+from analysis.monitor.estimators import preferred_estimator
 from analysis.monitor.monitor_formulas import CameraParameters
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from optics.numerics.backend import Backend
@@ -186,7 +186,7 @@ class Found:
         """The estimator whose sigma and error ``compare`` tells: ``posterior`` where disturbances are stated, else
         ``model``.
         """
-        return judged(self.values.estimator.values.tolist())
+        return preferred_estimator(self.values.estimator.values.tolist())
 
     def _root(self, covariance: xr.DataArray) -> xr.DataArray:
         return self.values.copy(data=np.sqrt(np.diagonal(covariance.values, axis1=-2, axis2=-1)))

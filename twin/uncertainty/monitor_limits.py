@@ -11,7 +11,16 @@ import numpy as np
 from analysis.arrays import ARCSEC
 from analysis.monitor import limits
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.limits import Elasticity, HeavyTail, LeastSeen, Quantity, Split, elasticities, heavy_tails, unseen
+from analysis.monitor.limits import (
+    Elasticity,
+    HeavyTail,
+    LeastObservable,
+    Quantity,
+    Split,
+    elasticities,
+    heavy_tails,
+    unobserved_bodies,
+)
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.monitor.recovery import MeasuredSpots, joint, judged_spots
 from analysis.spots.likelihood import EDGE_PX
@@ -100,7 +109,7 @@ class MonitorLimits:
     noise: np.ndarray
     frames: int
     splits: Mapping[str, Split]
-    least_seen: tuple[LeastSeen, ...]
+    least_seen: tuple[LeastObservable, ...]
     remedies: tuple[Remedy, ...]
     outside: float
     without: str = ""
@@ -160,7 +169,7 @@ class MonitorLimits:
         names = {name for q in range(len(self.quantities)) for name, _ in self.lines(BEST, q)[:LINES]}
         # in the order of the statement: a set has none
         labels = [label for label in dict.fromkeys(self.stated.labels) if label in names]
-        left = limits.known_sigma(self.rows, self.stated, self.noise, [(label,) for label in labels])
+        left = limits.sigma_if_known(self.rows, self.stated, self.noise, [(label,) for label in labels])
         return dict(zip(labels, left, strict=True))
 
 
@@ -245,7 +254,7 @@ def find_limits(
     why = ""
     if second_monitor:
         try:
-            more = limits.extended(stated, _second_monitor(experiment).spots, _own(stated))
+            more = limits.with_further_spots(stated, _second_monitor(experiment).spots, _own(stated))
             remedies.append(
                 Remedy(
                     "second_monitor",
@@ -328,7 +337,7 @@ def unseen_texts(
     """
     rows = np.stack([quantity.row for quantity in quantities])
     out = []
-    for body, shares in unseen(rows, stated, noise, gain).items():
+    for body, shares in unobserved_bodies(rows, stated, noise, gain).items():
         worst = int(np.argmax(shares))
         out.append(
             f"{body}: its motions that are stated move no spot; {100.0 * float(shares[worst]):.0f} % of the variance "
@@ -377,7 +386,7 @@ def combination_text(limits: MonitorLimits, number: int, most: int = 4) -> str:
     return f"{', '.join(named)}: {change}, while no spot moves by more than {_moved(seen)}"
 
 
-def _moved(seen: LeastSeen) -> str:
+def _moved(seen: LeastObservable) -> str:
     """How far spots move with a combination, beside their noise."""
     moved, noise = float(abs(seen.spots).max()), float(seen.noise.max())
     return f"{moved:.1g} px (noise {noise:.1g} px)"

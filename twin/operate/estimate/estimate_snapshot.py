@@ -20,7 +20,7 @@ from scipy.special import erf
 
 from analysis.arrays import Array
 from analysis.monitor.disturbances import FALSE_ALARM, Disturbances, TimeLaw
-from analysis.monitor.filter_state import Aside, BadReading, Belief, Innovation, Observed, Track
+from analysis.monitor.filter_state import BadReading, FilterState, Innovation, Observed, PendingReading, Track
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.kalman_filter import SeriesFilter
 from analysis.monitor.limits import Quantity
@@ -30,7 +30,7 @@ from analysis.statistics import limit_of
 from twin.operate.estimate.operation_model import OperationModel
 from twin.operate.record.entries import MICRO
 
-_FILTER = (Aside, BadReading, Belief, Disturbances, HeatInputs, Innovation, Jump, Observed, Quantity)
+_FILTER = (PendingReading, BadReading, FilterState, Disturbances, HeatInputs, Innovation, Jump, Observed, Quantity)
 _CLASSES = (*_FILTER, SeriesFilter, TimeLaw, Track)
 _PARAMETERS = ChainMap(CAMERA_PARAMETERS, {one.key: one for one in (ANGLE, *GROUND)})
 
@@ -289,7 +289,7 @@ class Standing:
         Bodies whose sensors have disagreed with what is stated at the same time as others.
     """
 
-    belief: Belief
+    belief: FilterState
     time: int
     scores: Scores = field(default_factory=Scores)
     innovations: tuple[tuple[int, float, int], ...] = ()
@@ -468,7 +468,7 @@ class Taking:
         used = np.append(standing.used, np.int64(entry["id"]))
         # of no motion that may jump there is nothing to count rows by
         before = standing.left.reshape(len(standing.used), len(self.how.walking))
-        left = np.concatenate([before, standing.belief.left[None]])
+        left = np.concatenate([before, standing.belief.undetected[None]])
         return replace(standing, belief=belief, used=used, left=left), found
 
     def _temperature(self, standing: Standing, entry: Mapping[str, Any]) -> Standing:
@@ -489,7 +489,7 @@ class Taking:
         standing = replace(standing, sensors={**standing.sensors, body: sensor})
         if body in standing.together:  # then it is not the sensor that is wrong
             times = max(abs(white), 1.0)
-            loose = self.how.loosened(there, observed, times) if times > LOOSE else there
+            loose = self.how.inflated(there, observed, times) if times > LOOSE else there
             accused = tuple(sorted({*standing.accused, *standing.together}))
             standing = replace(standing, belief=loose, accused=accused)
         elif abs(white) > FAR and not included:
@@ -501,7 +501,7 @@ class Taking:
         time = int(entry["time_us"])
         if entry["content"]["numbers"].get("sigma_holds") is False:
             return standing.without(time, "monitor", "monitor", "its own sigma does not hold")
-        observed, before = self.observed(entry), standing.belief.aside
+        observed, before = self.observed(entry), standing.belief.pending
         standing, found = self._updated(standing, entry, observed)
         if found.settled and standing.pending is not None and before is not None:
             number, when = standing.pending

@@ -19,9 +19,16 @@ from scipy.special import pdtrc
 
 from analysis.arrays import Array
 from analysis.monitor.disturbances import FALSE_ALARM
-from analysis.monitor.filter_state import Belief, Observed
+from analysis.monitor.filter_state import FilterState, Observed
 from analysis.monitor.jump_detection import Jump, Step
-from analysis.monitor.kalman_filter import Power, SeriesFilter, detection_power, hinted, jointly, smoothed
+from analysis.monitor.kalman_filter import (
+    DetectionPower,
+    SeriesFilter,
+    detection_power,
+    smooth_jointly,
+    smoothed,
+    with_hinted_jumps,
+)
 from analysis.monitor.limits import Quantity
 from optics.numerics.backend import load_backend, one_blas_thread
 from scenes.specs.operation import OperationSetup
@@ -263,7 +270,7 @@ class Operation:
             self._too_small(),
         )
 
-    def power(self) -> tuple[Power, ...]:
+    def power(self) -> tuple[DetectionPower, ...]:
         """Return the smallest jump of each body that is found, at the mean interval of the readings so far; empty where
         there is one reading.
         """
@@ -333,9 +340,9 @@ class Operation:
         return self._course(times, found, np.full(len(times), self._widened))
 
     @cached_property
-    def _now(self) -> Belief:
+    def _now(self) -> FilterState:
         """What is known after all readings, jumps that are not told counted by their chances."""
-        return self._taking.how.blended(self.standing.belief)
+        return self._taking.how.mixture(self.standing.belief)
 
     @cached_property
     def _widened(self) -> float:
@@ -461,7 +468,7 @@ class Operation:
             how, start, observed, left = self._knowing(int(times.min()))
             return smoothed(how, start, observed, seconds, left, each)
 
-    def jointly(self, times_us: Sequence[int] | NDArray[np.int64]) -> tuple[Array, Array]:
+    def smooth_jointly(self, times_us: Sequence[int] | NDArray[np.int64]) -> tuple[Array, Array]:
         """What all readings say of several times together; of one time it is what `smoothed` says.
 
         Parameters
@@ -485,11 +492,11 @@ class Operation:
         seconds = [taking.seconds(int(time)) for time in times]
         with one_blas_thread():
             if not len(times) or times[0] >= self.standing.time:
-                values, covariance = jointly(taking.how, self._now, (), seconds, ())
+                values, covariance = smooth_jointly(taking.how, self._now, (), seconds, ())
             else:
                 self._require_known(int(times[0]))
                 how, start, observed, left = self._knowing(int(times[0]))
-                values, covariance = jointly(how, start, observed, seconds, left)
+                values, covariance = smooth_jointly(how, start, observed, seconds, left)
         wide = self._widened_at(times)
         return values, covariance * wide[:, None, None, None] * wide[:, None]
 
@@ -499,7 +506,7 @@ class Operation:
             allowed = f"times from {utc_text(begin)} on, that of the first reading"
             raise Problem("a time before all readings", utc_text(time), allowed)
 
-    def _knowing(self, time: int) -> tuple[SeriesFilter, Belief, list[Observed], list[Array]]:
+    def _knowing(self, time: int) -> tuple[SeriesFilter, FilterState, list[Observed], list[Array]]:
         """What a look back to a time rests on: the filter that knows of all jumps that were told, where it begins, the
         readings from there on, and what of jumps could not be told before each.
         """
@@ -514,7 +521,7 @@ class Operation:
         belief = (taking.start(self._begin()) if start is None else start).belief
         belief = _alone(belief)
         knowing = replace(taking.how, steps=steps, window=0)
-        belief, with_hints = hinted(taking.how, knowing, belief, observed, list(left))
+        belief, with_hints = with_hinted_jumps(taking.how, knowing, belief, observed, list(left))
         return knowing, belief, observed, with_hints
 
     def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
@@ -554,7 +561,7 @@ class Operation:
             time = min(earlier)
 
 
-def _alone(belief: Belief) -> Belief:
+def _alone(belief: FilterState) -> FilterState:
     """What is known without the steps that are looked for, which take most of its memory."""
     state, none = belief.state.alone(), belief.after[:0]
-    return replace(belief, state=state, search=None, after=none, until=none, aside=None)
+    return replace(belief, state=state, search=None, after=none, until=none, pending=None)

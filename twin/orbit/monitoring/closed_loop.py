@@ -34,7 +34,7 @@ from optics.numerics.number_tree import FrozenMap
 from scenes.models.disturbances import drawn_motions
 from scenes.models.disturbances import states_of as amounts_as_states
 from scenes.specs.course import moment
-from scenes.specs.motion_text import AXES, node_named
+from scenes.specs.motion_text import AXES, find_node
 from scenes.specs.orbit.monitor import PARAMETERS, CorrectionSpec, OrbitMonitorSpec
 from scenes.specs.perturbation import not_allowed
 from scenes.yaml.errors import InputError, Problem, unknown
@@ -258,7 +258,7 @@ def _mechanism(
     node, kind, axis, pivot = spec.motion
     nodes = experiment.instrument.nodes
     try:
-        path = node_named(node, nodes)
+        path = find_node(node, nodes)
     except Problem as problem:
         raise test.error(problem, key) from None
     if kind not in nodes[path].allows:
