@@ -11,6 +11,8 @@ from scenes.specs.load import load_camera
 from twin.camera.camera_optics import CameraOptics
 
 pytestmark = pytest.mark.oracle
+VANE = 0.45 / 64
+"""Width of a vane, metres: 16 cells of a raster of 1024 over the aperture."""
 
 
 def ritchey_chretien(tilt: float = 0.0, vanes: float = 0.0) -> optics.Camera:
@@ -22,9 +24,9 @@ def ritchey_chretien(tilt: float = 0.0, vanes: float = 0.0) -> optics.Camera:
 
 
 @pytest.mark.skipif(find_spec("poppy") is None, reason="poppy not installed (extra `oracles`)")
-@pytest.mark.parametrize("vanes", [0.0, 0.0075])
+@pytest.mark.parametrize("vanes", [0.0, VANE])
 def test_an_obscured_image_is_that_of_poppy(vanes: float) -> None:
-    """poppy has a raster in its pupil, on which vanes are 17 cells wide."""
+    """poppy has a raster in its pupil."""
     import poppy
 
     count, scale, camera = 64, 550e-9 / 0.45 / 4.0, ritchey_chretien(vanes=vanes)
@@ -36,15 +38,15 @@ def test_an_obscured_image_is_that_of_poppy(vanes: float) -> None:
     system.add_detector(pixelscale=np.degrees(scale) * 3600.0, fov_pixels=count)
     theirs = system.calc_psf(wavelength=550e-9)[0].data
     ours, theirs = ours / ours.sum(), theirs / theirs.sum()
-    assert np.max(np.abs(ours - theirs)) < 5e-4 * theirs.max()
+    assert np.max(np.abs(ours - theirs)) < 2e-4 * theirs.max()
 
 
 @pytest.mark.skipif(find_spec("poppy") is None, reason="poppy not installed (extra `oracles`)")
 def test_an_mtf_is_the_autocorrelation_of_poppys_pupil() -> None:
     import poppy
 
-    cells, camera = 1024, ritchey_chretien(vanes=0.0075)
-    spider = poppy.SecondaryObscuration(secondary_radius=0.06, n_supports=4, support_width=0.0075)
+    cells, camera = 1024, ritchey_chretien(vanes=VANE)
+    spider = poppy.SecondaryObscuration(secondary_radius=0.06, n_supports=4, support_width=VANE)
     pupil = poppy.CompoundAnalyticOptic([poppy.CircularAperture(radius=0.225), spider]).sample(
         npix=cells, grid_size=0.45
     )
