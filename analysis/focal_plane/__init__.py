@@ -1,1 +1,1 @@
-"""Focal-plane alignment: best focus from curves through focus, the plane through it, shims (paper 004)."""
+"""Focal-plane alignment: best focus from through-focus curves, the plane through it, and shims (paper 004)."""

@@ -1,4 +1,4 @@
-"""Fit of a focal plane to measured defocus, the rigid motion that corrects it, and the shims that realise the motion.
+"""Focal plane fitted to measured defocus, the rigid motion that corrects it, and shims for the motion.
 
 **Plane.** The frame is the assembly's own, O'-X'Y'Z': X' flight direction, Y' along the line CCD, Z' along the normal,
 in the direction of the light; O' is the line's centre. The defocus of a position is the distance of the best focus from
@@ -37,7 +37,6 @@ from scipy.spatial.transform import Rotation
 from analysis import statistics
 from analysis.arrays import Array, MeasurementError
 
-# Two directions are told apart when the places spread across them by more than this part of their largest spread.
 _LEAST_SPREAD = 1e-6
 """Smallest spread of the positions in one direction, relative to their largest, that determines a slope."""
 
@@ -78,16 +77,18 @@ class RigidMotion:
         ValueError
             A shape is wrong, or a value is not finite.
         """
-        turn, move = np.asarray(rotation, np.float64), np.asarray(shift, np.float64)
+        rotation_vector, translation = np.asarray(rotation, np.float64), np.asarray(shift, np.float64)
         spread = np.zeros((6, 6)) if covariance is None else np.asarray(covariance, np.float64)
-        if turn.shape != (3,) or move.shape != (3,) or spread.shape != (6, 6):
+        if rotation_vector.shape != (3,) or translation.shape != (3,) or spread.shape != (6, 6):
             raise ValueError(
                 "rigid motion: rotation and shift must be (3,), covariance (6, 6), found"
-                f" {turn.shape}, {move.shape}, {spread.shape}"
+                f" {rotation_vector.shape}, {translation.shape}, {spread.shape}"
             )
-        if not (np.all(np.isfinite(turn)) and np.all(np.isfinite(move)) and np.all(np.isfinite(spread))):
+        if not (
+            np.all(np.isfinite(rotation_vector)) and np.all(np.isfinite(translation)) and np.all(np.isfinite(spread))
+        ):
             raise ValueError("rigid motion: rotation, shift and covariance must be finite")
-        return cls(turn, move, spread)
+        return cls(rotation_vector, translation, spread)
 
     @property
     def matrix(self) -> Array:
@@ -96,8 +97,7 @@ class RigidMotion:
 
     @property
     def line_turn(self) -> float:
-        """Angle about +Z', in radians, by which the line CCD (the Y' axis) rotates in its projection on the X'Y' plane.
-        """
+        """Rotation of the line CCD (the Y' axis) about +Z', projected on the X'Y' plane, in radians."""
         line = self.matrix[:, 1]
         return float(np.arctan2(-line[0], line[1]))
 
@@ -198,16 +198,15 @@ class FocalPlaneFit:
         design = _design(self.place)
         weight = 1.0 / (self.sigma**2 + self.extra_sigma**2)
         hat = design @ self.covariance @ (design.T * weight)
-        own = np.eye(len(weight))
-        shrink = (self.extra_sigma**2 * weight)[:, None] * (own - hat)
+        identity = np.eye(len(weight))
+        shrink = (self.extra_sigma**2 * weight)[:, None] * (identity - hat)
         # error = e - hat (e + n) - shrink (e + n) for deviations e and noise n
         gain = -(hat + shrink)
-        spread = self.extra_sigma**2 * (own + gain) @ (own + gain).T + (gain * self.sigma**2) @ gain.T
+        spread = self.extra_sigma**2 * (identity + gain) @ (identity + gain).T + (gain * self.sigma**2) @ gain.T
         return self.extra_sigma**2 * weight * self.residual, spread
 
     def correction(self, level: LineLevel | None = None) -> RigidMotion:
-        """Return the motion of the assembly about O' that brings every position to the fitted plane and levels the
-        line.
+        """Return the motion about O' that brings every position to the fitted plane and levels the line.
 
         The finite rotation first rotates the line by -level about Z' and then tilts the plane about the horizontal
         axis.
@@ -222,13 +221,13 @@ class FocalPlaneFit:
         ratio = np.arctan(steepness) / steepness if steepness > 0 else 1.0
         tilt = Rotation.from_rotvec(ratio * np.array([self.slope_y, -self.slope_x, 0.0]))
         angle, variance = (0.0, 0.0) if level is None else (level.angle, level.sigma**2)
-        turn = tilt * Rotation.from_rotvec([0.0, 0.0, -angle])
+        rotation = tilt * Rotation.from_rotvec([0.0, 0.0, -angle])
         # (wx, wy, wz, x, y, z) from (piston, slope_x, slope_y, level), first order
         map_ = np.zeros((6, 4))
         map_[0, 2], map_[1, 1], map_[2, 3], map_[5, 0] = 1.0, -1.0, -1.0, 1.0
         source = np.zeros((4, 4))
         source[:3, :3], source[3, 3] = self.covariance, variance
-        return RigidMotion.of(turn.as_rotvec(), [0.0, 0.0, self.piston], map_ @ source @ map_.T)
+        return RigidMotion.of(rotation.as_rotvec(), [0.0, 0.0, self.piston], map_ @ source @ map_.T)
 
 
 def fit_focal_plane(
@@ -284,10 +283,12 @@ def fit_focal_plane(
     """
     spots, height = np.asarray(position, np.float64), np.asarray(defocus, np.float64)
     if spots.ndim != 2 or spots.shape[1] != 2 or height.shape != spots.shape[:1]:
-        raise ValueError(f"focal plane: place must be (N, 2) and defocus (N,), found {spots.shape} and {height.shape}")
+        raise ValueError(
+            f"focal plane: position must be (N, 2) and defocus (N,), found {spots.shape} and {height.shape}"
+        )
     spread = np.asarray(np.broadcast_to(np.asarray(sigma, np.float64), height.shape))
     if not (np.all(np.isfinite(spots)) and np.all(np.isfinite(height)) and np.all(np.isfinite(spread))):
-        raise ValueError("focal plane: place, defocus and sigma must be finite; leave out places without a focus")
+        raise ValueError("focal plane: position, defocus and sigma must be finite; exclude positions without a focus")
     if not np.all(spread > 0):
         raise ValueError("focal plane: every sigma must be positive")
     _check_places(spots)
@@ -304,7 +305,7 @@ def fit_focal_plane(
     found, covariance, chi_square = solve(0.0)
     extra = 0.0
     if estimate_extra and freedom > 0 and chi_square > freedom:
-        # chi-square falls with the extra scatter; with this much of it, it is below the degrees of freedom for sure
+        # chi-square decreases with the extra scatter and is below the degrees of freedom at this upper bound
         most = float(np.sqrt(np.sum((height - design @ found) ** 2) / freedom))
         extra = float(brentq(lambda s: solve(s)[2] - freedom, 0.0, most, xtol=1e-6 * most))
         found, covariance, _ = solve(extra)
@@ -332,15 +333,15 @@ def _check_places(place: Array) -> None:
     """Raise ObservabilityError, with the geometric reason, if the positions do not determine both slopes."""
     if len(place) < 3:
         raise ObservabilityError(
-            f"focal plane: {len(place)} places cannot tell piston, slope_x, slope_y; measure at least 3"
+            f"focal plane: {len(place)} positions do not determine piston, slope_x, slope_y; measure at least 3"
         )
-    arm = place - place.mean(axis=0)
-    _, values, axes = np.linalg.svd(arm, full_matrices=False)
+    offset = place - place.mean(axis=0)
+    _, values, axes = np.linalg.svd(offset, full_matrices=False)
     scale = max(float(values[0]), 1e-6 * float(np.max(np.abs(place))))
     if values[-1] > _LEAST_SPREAD * scale:
         return
     if values[0] <= _LEAST_SPREAD * scale:
-        raise ObservabilityError("focal plane: all places are one; neither slope can be told")
+        raise ObservabilityError("focal plane: all positions coincide and determine neither slope")
     direction = axes[0]
     if abs(direction[0]) < 1e-3:
         where, slope = "X' = constant (the line CCD alone)", "slope_x"
@@ -349,12 +350,11 @@ def _check_places(place: Array) -> None:
     else:
         where, slope = f"one straight line along ({direction[0]:+.3g}, {direction[1]:+.3g})", "the slope across it"
     raise ObservabilityError(
-        f"focal plane: all places lie on {where}, so {slope} cannot be told; measure another band as well or place some"
-        " of them off that line"
+        f"focal plane: all positions lie on {where} and do not determine {slope}; measure another band as well or move"
+        " some of them off that line"
     )
 
 
-# Holes carry a tilt when the smaller spread of their places is at least this part of the larger: 0.3 mm in 0.3 m.
 _LEAST_WIDTH = 1e-3
 """Smallest spread of the holes, relative to their largest, that supports a tilt: 0.3 mm in 0.3 m."""
 
@@ -419,25 +419,25 @@ class Mount:
         ValueError
             Other input is invalid.
         """
-        place, up = np.asarray(holes, np.float64), np.asarray(normal, np.float64)
-        if place.ndim != 2 or place.shape[1] != 3 or up.shape != (3,):
-            raise ValueError(f"mount: holes must be (H, 3) and normal (3,), found {place.shape} and {up.shape}")
-        length = float(np.linalg.norm(up))
-        if not (np.all(np.isfinite(place)) and np.isfinite(length) and length > 0):
+        pads, unit_normal = np.asarray(holes, np.float64), np.asarray(normal, np.float64)
+        if pads.ndim != 2 or pads.shape[1] != 3 or unit_normal.shape != (3,):
+            raise ValueError(f"mount: holes must be (H, 3) and normal (3,), found {pads.shape} and {unit_normal.shape}")
+        length = float(np.linalg.norm(unit_normal))
+        if not (np.all(np.isfinite(pads)) and np.isfinite(length) and length > 0):
             raise ValueError("mount: holes must be finite and the normal a finite vector other than zero")
         if not (0 <= clearance < np.inf and 0 < step < np.inf):
             raise ValueError(f"mount: clearance {clearance} must not be negative and step {step} must be positive")
-        if len(place) < 3:
-            raise ShimError(f"mount: {len(place)} holes cannot hold a plane; at least three are needed")
-        up = up / length
-        arm = place - place.mean(axis=0)
-        spread = np.linalg.svd(arm - np.outer(arm @ up, up), compute_uv=False)
+        if len(pads) < 3:
+            raise ShimError(f"mount: {len(pads)} holes do not fix a plane; at least three are needed")
+        unit_normal = unit_normal / length
+        offset = pads - pads.mean(axis=0)
+        spread = np.linalg.svd(offset - np.outer(offset @ unit_normal, unit_normal), compute_uv=False)
         if spread[1] <= _LEAST_WIDTH * spread[0] or spread[0] == 0:
             raise ShimError(
                 "mount: the holes lie on one line (seen along the normal), so shims cannot tilt the assembly about it;"
                 " add a hole off that line"
             )
-        return cls(place, up, float(clearance), float(step))
+        return cls(pads, unit_normal, float(clearance), float(step))
 
 
 @dataclass(frozen=True, eq=False)
@@ -518,26 +518,26 @@ def shim_plan(correction: RigidMotion, mount: Mount, present: ArrayLike) -> Shim
     ValueError
         A thickness is not finite.
     """
-    up, holes = mount.normal, mount.holes
-    move = correction.displacement(holes)
-    change = move @ up
-    slide = move - np.outer(change, up)
+    normal, holes = mount.normal, mount.holes
+    displacement = correction.displacement(holes)
+    change = displacement @ normal
+    slide = displacement - np.outer(change, normal)
     _check_clearance(slide, mount.clearance)
-    now = np.asarray(np.broadcast_to(np.asarray(present, np.float64), change.shape))
-    if not np.all(np.isfinite(now)):
+    present_thickness = np.asarray(np.broadcast_to(np.asarray(present, np.float64), change.shape))
+    if not np.all(np.isfinite(present_thickness)):
         raise ValueError("shims: the present thicknesses must be finite")
-    thickness = np.round((now + change) / mount.step) * mount.step
-    _check_thickness(thickness, now, mount.step)
-    rounded = thickness - now
+    thickness = np.round((present_thickness + change) / mount.step) * mount.step
+    _check_thickness(thickness, present_thickness, mount.step)
+    rounded = thickness - present_thickness
     # change = (r x n) . rotation + n . shift to first order
-    slope = np.concatenate([np.cross(holes, up), np.broadcast_to(up, holes.shape)], axis=1)
+    slope = np.concatenate([np.cross(holes, normal), np.broadcast_to(normal, holes.shape)], axis=1)
     # Twist of the rotation about n (swing-twist decomposition of its quaternion).
     quaternion = Rotation.from_rotvec(correction.rotation).as_quat()
-    turn = 2 * float(np.arctan2(quaternion[:3] @ up, quaternion[3]))
+    twist = 2 * float(np.arctan2(quaternion[:3] @ normal, quaternion[3]))
     achieved = _seated(correction, mount, rounded)
     centre = holes.mean(axis=0)
-    untwisted = Rotation.from_rotvec(correction.rotation) * Rotation.from_rotvec(-turn * up)
-    lifted = centre + up * float(np.mean(change))
+    untwisted = Rotation.from_rotvec(correction.rotation) * Rotation.from_rotvec(-twist * normal)
+    lifted = centre + normal * float(np.mean(change))
     start = RigidMotion.of(untwisted.as_rotvec(), lifted - untwisted.apply(centre))
     return ShimPlan(
         mount=mount,
@@ -547,7 +547,7 @@ def shim_plan(correction: RigidMotion, mount: Mount, present: ArrayLike) -> Shim
         rounded_change=rounded,
         thickness=thickness,
         slide=slide,
-        turn=turn,
+        turn=twist,
         achieved=achieved,
         shims_only=_seated(start, mount, change),
     )
@@ -565,14 +565,14 @@ def _seated(motion: RigidMotion, mount: Mount, change: Array) -> RigidMotion:
     first = first / np.linalg.norm(first)
     second = np.cross(up, first)
     rotation, shift = Rotation.from_rotvec(motion.rotation), motion.shift
-    # The first step is right to a few 1e-6 of itself, the others to rounding.
+    # The first step is accurate to a few 1e-6 of itself, the next ones to rounding.
     for _ in range(3):
-        place = rotation.apply(mount.holes) + shift
-        misfit = change - (place - mount.holes) @ up
-        centre = place.mean(axis=0)
-        arm = place - centre
+        positions = rotation.apply(mount.holes) + shift
+        misfit = change - (positions - mount.holes) @ up
+        centre = positions.mean(axis=0)
+        offset = positions - centre
         # a tilt by (a, b) about (first, second) lifts a hole by a (second . arm) - b (first . arm)
-        design = np.stack([arm @ second, -(arm @ first), np.ones(len(arm))], axis=1)
+        design = np.stack([offset @ second, -(offset @ first), np.ones(len(offset))], axis=1)
         step = np.linalg.lstsq(design, misfit, rcond=None)[0]
         tilt = Rotation.from_rotvec(step[0] * first + step[1] * second)
         rotation, shift = tilt * rotation, tilt.apply(shift - centre) + centre + step[2] * up
@@ -582,15 +582,15 @@ def _seated(motion: RigidMotion, mount: Mount, change: Array) -> RigidMotion:
 def _check_clearance(slide: Array, clearance: float) -> None:
     """Raise ShimError, naming the holes and their slides, if holes would slide beyond the clearance."""
     size = np.linalg.norm(slide, axis=1)
-    over = np.flatnonzero(size > clearance)
-    if not over.size:
+    beyond = np.flatnonzero(size > clearance)
+    if not beyond.size:
         return
-    text = ", ".join(f"hole {h + 1} by {1e3 * size[h]:.4g} mm" for h in over)
+    text = ", ".join(f"hole {h + 1} by {1e3 * size[h]:.4g} mm" for h in beyond)
     raise ShimError(
-        f"shims: the motion slides {text}; the screws allow {1e3 * clearance:.4g} mm, which is"
+        f"shims: the motion would slide {text}; the screws allow {1e3 * clearance:.4g} mm, which is"
         f" {1e3 * (size.max() - clearance):.4g} mm too little; widen the holes by as much",
-        tuple(int(h) for h in over),
-        tuple(float(size[h]) for h in over),
+        tuple(int(h) for h in beyond),
+        tuple(float(size[h]) for h in beyond),
     )
 
 

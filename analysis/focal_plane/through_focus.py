@@ -42,11 +42,9 @@ FRACTION = 0.5
 """Fraction of the peak above which the fitted curve uses points."""
 LEAST_POINTS = 5
 """Smallest number of positions of a fit."""
-# Where the window holds too few points it may reach down to this part of the peak.
 WIDEST_FRACTION = 0.3
 """Fraction of the peak to which the window may extend if it holds too few points."""
 _ROUNDS, _NEWTON_STEPS = 12, 4
-# Relative change in a step below which a curve rests: a round more would change it by rounding.
 _AT_REST = 1e-6
 """Relative change in a step below which a curve has converged; further rounds would change it only by rounding."""
 
@@ -72,12 +70,12 @@ def _main_peak(z: Array, v: Array, weight: Array) -> tuple[NDArray[np.intp], NDA
             0.5 * item + 0.25 * (np.pad(item, ((0, 0), (1, 0)))[:, :-1] + np.pad(item, ((0, 0), (0, 1)))[:, 1:])
             for item in (top, bottom)
         )
-    # Only at points that were measured themselves.
+    # Use only points that were measured.
     smooth = np.where(weight > 0, top / np.where(bottom > 0, bottom, 1.0), -np.inf)
     start = np.argmax(smooth, axis=1)
     low = (smooth < FRACTION * smooth[np.arange(count), start][:, None]) & (weight > 0)
     index = np.arange(size)[None, :]
-    # At least two measured neighbours either way, so that the first fit has a curvature.
+    # Keep at least two measured neighbours on each side, so that the first fit has a curvature.
     rank = np.cumsum(weight > 0, axis=1)
     near = np.abs(rank - rank[np.arange(count), start][:, None]) <= 2
     left = np.max(np.where(low & (index < start[:, None]), index, -1), axis=1)
@@ -100,9 +98,9 @@ class _Lobe:
         self.ends = np.stack(
             [np.min(np.where(measured, self.x, np.inf), 1), np.max(np.where(measured, self.x, -np.inf), 1)]
         )
-        # Counts positions and not points: repeats at one place do not make a curve.
+        # Count positions and not points, because repeats at one position do not make a curve.
         self.group = np.cumsum(np.diff(z, axis=1, prepend=z[:, :1]) > 0, axis=1)
-        # A parabola to begin with; where it opens upward, a peak at the largest value that fills the window.
+        # Start with a parabola; where it opens upward, with a peak at the largest value that fills the window.
         design = np.stack([np.ones_like(self.x), self.x, self.x**2], axis=2)
         c0, c1, c2 = _solve(design, np.where(mask, weight, 0.0), v).T
         sound = (c2 < 0) & (c0 > 0)
@@ -118,20 +116,20 @@ class _Lobe:
         A curve that does not converge gets all rounds, whether alone or among others.
         """
         for _ in range(_ROUNDS):
-            moved = self._newton(mask, _NEWTON_STEPS)
-            chosen, wider = self.window(FRACTION), self.window(WIDEST_FRACTION)
-            chosen = np.where((self.positions(chosen) < LEAST_POINTS)[:, None], wider, chosen)
-            chosen = np.where((self.positions(chosen) < LEAST_POINTS)[:, None], mask, chosen)
-            if np.array_equal(chosen, mask) and np.all(moved < _AT_REST):
+            change = self._newton(mask, _NEWTON_STEPS)
+            selected, wider = self.window(FRACTION), self.window(WIDEST_FRACTION)
+            selected = np.where((self.positions(selected) < LEAST_POINTS)[:, None], wider, selected)
+            selected = np.where((self.positions(selected) < LEAST_POINTS)[:, None], mask, selected)
+            if np.array_equal(selected, mask) and np.all(change < _AT_REST):
                 break
-            mask = chosen
+            mask = selected
         self._newton(mask, 2 * _NEWTON_STEPS)
         return mask
 
     def window(self, fraction: float) -> NDArray[np.bool_]:
         """Return a mask (B, Z) of measured points where the fitted curve exceeds a fraction of its peak."""
-        away = np.abs(self.x - self.x0[:, None]) * self.scale[:, None]
-        return (away <= self.reach(fraction)[:, None]) & (self.weight > 0)
+        distance = np.abs(self.x - self.x0[:, None]) * self.scale[:, None]
+        return (distance <= self.reach(fraction)[:, None]) & (self.weight > 0)
 
     def reach(self, fraction: float) -> Array:
         """Return the distance (B,) from the vertex at which the fitted curve has fallen to a fraction of its peak."""
@@ -147,11 +145,11 @@ class _Lobe:
 
     def _values(self) -> tuple[Array, Array]:
         """Return the curve (B, Z) and its derivatives with respect to p, x0 and a, (B, Z, 3)."""
-        away = self.x - self.x0[:, None]
+        distance = self.x - self.x0[:, None]
         p, a = self.p[:, None], self.a[:, None]
-        u = a * away**2
+        u = a * distance**2
         form, slope = 1.0 - u + QUARTIC * u**2, 2 * QUARTIC * u - 1.0
-        return p * form, np.stack([form, -2 * a * away * p * slope, p * slope * away**2], axis=2)
+        return p * form, np.stack([form, -2 * a * distance * p * slope, p * slope * distance**2], axis=2)
 
     def _newton(self, mask: NDArray[np.bool_], steps: int) -> Array:
         """Take bounded Gauss-Newton steps with the points of the mask.
@@ -162,7 +160,7 @@ class _Lobe:
             Largest relative change in the last step; that of x0 in widths of the lobe.
         """
         weight = np.where(mask, self.weight, 0.0)
-        moved = np.full(len(mask), np.inf)
+        change = np.full(len(mask), np.inf)
         for _ in range(steps):
             p, x0, a = self.p, self.x0, self.a
             value, slope = self._values()
@@ -173,16 +171,16 @@ class _Lobe:
             self.x0 = np.clip(self.x0, self.ends[0] - 2.0 * width, self.ends[1] + 2.0 * width)
             self.a = np.clip(self.a + step[:, 2], 0.5 * self.a, 2.0 * self.a)
             self.a = np.clip(self.a, 1e-6, 1e6)
-            moved = np.max(np.abs([self.p / p - 1.0, (self.x0 - x0) / width, self.a / a - 1.0]), axis=0)
-        return moved
+            change = np.max(np.abs([self.p / p - 1.0, (self.x0 - x0) / width, self.a / a - 1.0]), axis=0)
+        return change
 
     def result(self, mask: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
         """Return peak, position and second derivative, each (B,), and their covariance (B, 3, 3)."""
         covariance = _covariance(self._values()[1], np.where(mask, self.weight, 0.0))
-        turn = np.zeros_like(covariance)
-        turn[:, 0, 0], turn[:, 1, 1] = 1.0, self.scale
-        turn[:, 2, 0], turn[:, 2, 2] = -2 * self.a / self.scale**2, -2 * self.p / self.scale**2
-        covariance = turn @ covariance @ np.swapaxes(turn, 1, 2)
+        jacobian = np.zeros_like(covariance)
+        jacobian[:, 0, 0], jacobian[:, 1, 1] = 1.0, self.scale
+        jacobian[:, 2, 0], jacobian[:, 2, 2] = -2 * self.a / self.scale**2, -2 * self.p / self.scale**2
+        covariance = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
         return self.p, self.centre + self.x0 * self.scale, -2 * self.p * self.a / self.scale**2, covariance
 
     def skew(self, mask: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -219,35 +217,30 @@ def _solve(design: Array, weight: Array, data: Array) -> Array:
     right = np.einsum("bzi,bz->bi", design, weight * data)
     size = np.sqrt(np.einsum("bii->bi", normal))
     size = np.where(size > 0, size, 1.0)
-    # The ridge is far below any noise and far above rounding: it keeps dead curves from stopping the others.
+    # The ridge is far below any noise and far above rounding: it keeps degenerate curves from stopping the others.
     scaled = normal / (size[:, :, None] * size[:, None, :]) + 1e-12 * np.eye(design.shape[2])
     return np.asarray(np.linalg.solve(scaled, (right / size)[:, :, None])[:, :, 0] / size)
 
 
-# A curvature, a slope or a contrast is there above this many sigma. The highest of many places is looked at, so this
-# is more than for a single one.
 _SIGNIFICANT = 5.0
 """Significance, in sigmas, of a curvature, a slope or a contrast. It is higher than for a single test because the
 highest of many positions is tested.
 """
-# A curvature of this many sigma is enough where the peak stands out from the rest of the scan as well.
 _HINT = 3.0
 """Significance, in sigmas, of a curvature that suffices if the peak exceeds the rest of the scan as well."""
-# Near an end of the scan a chi-square this many times the degrees of freedom means a flank and not a peak.
 _MISFIT = 10.0
 """Chi-square per degree of freedom that, near an end of the scan, means a flank and not a peak."""
-# What curves of pupils may differ from the fitted form by, as a share of the peak: 1.8 % half way down.
 _FORM = 0.02
 """Largest deviation of real pupils' curves from the fitted form, as a share of the peak: 1.8 % half way down."""
-# A curve with outliers has this many points for each of them at least; one with a larger chance has none. Pairs that
-# hide each other are sought among so many points at most.
+# A curve has at least _SOUND_TO_BAD points for each outlier; one with a p-value above _EXPLAINED has none. Pairs that
+# mask each other are sought among at most _MOST_PAIRED points.
 _SOUND_TO_BAD, _EXPLAINED, _MOST_PAIRED = 4, 0.01, 50
 _REMEDY = {
     "peak below": "the peak lies beyond the lower end of the scan, {low:.6g}, or too near to it; move the scan down",
     "peak above": "the peak lies beyond the upper end of the scan, {high:.6g}, or too near to it; move the scan up",
     "few points": "fewer than {least} positions near the peak (about {place:.6g}); take steps of at most {step:.2g}",
     "flat": "no curvature above the noise; scan a wider range or lower the noise (more frames or edge rows)",
-    "not finite": "a position or a value is not finite; leave the point out or give it an infinite sigma",
+    "not finite": "a position or a value is not finite; exclude the point or set its sigma to infinity",
 }
 """Message for each reason, with the remedy."""
 
@@ -413,22 +406,22 @@ def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, s
     shape = data.shape
     size = shape[-1]
     z, v, s = (np.broadcast_to(item, shape).reshape(-1, size) for item in (where, data, spread))
-    broken = ~np.isfinite(z) | ~np.isfinite(v)
-    z, v = np.where(broken, 0.0, z), np.where(broken, 0.0, v)
+    invalid = ~np.isfinite(z) | ~np.isfinite(v)
+    z, v = np.where(invalid, 0.0, z), np.where(invalid, 0.0, v)
     order = np.argsort(z, axis=1, kind="stable")
     z, v = np.take_along_axis(z, order, 1), np.take_along_axis(v, order, 1)
-    weight = np.take_along_axis(np.where(broken, 0.0, s**-2.0), order, 1)
+    weight = np.take_along_axis(np.where(invalid, 0.0, s**-2.0), order, 1)
 
     start, mask = _main_peak(z, v, weight)
     model = _Lobe(z, v, weight, start, mask)
     mask = model.settle(mask)
-    peak, place, bend, covariance = model.result(mask)
+    peak, vertex, second_derivative, covariance = model.result(mask)
     skew, skew_sigma = model.skew(mask)
 
-    fault = _faults(model, mask, place, bend, covariance)
-    fault[broken.any(axis=1)] = "not finite"
+    fault = _faults(model, mask, vertex, second_derivative, covariance)
+    fault[invalid.any(axis=1)] = "not finite"
     if strict:
-        _raise(fault, shape, z, weight, place, model.reach(WIDEST_FRACTION))
+        _raise(fault, shape, z, weight, vertex, model.reach(WIDEST_FRACTION))
     used = np.zeros(z.shape, dtype=bool)
     np.put_along_axis(used, order, mask, axis=1)
     used[fault != ""] = False
@@ -439,11 +432,11 @@ def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, s
         return np.where(failed, np.nan, values).reshape(lead)
 
     return FocusVertices(
-        position=number(place),
+        position=number(vertex),
         sigma=number(np.sqrt(covariance[:, 1, 1])),
         peak=number(peak),
         peak_sigma=number(np.sqrt(covariance[:, 0, 0])),
-        curvature=number(bend),
+        curvature=number(second_derivative),
         skew=number(skew),
         skew_sigma=number(skew_sigma),
         chi_square=number(model.chi_square(mask)),
@@ -473,68 +466,68 @@ def outlying_points(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, lim
         Deviation, in sigmas, from which a point is an outlier.
     """
     z, v, s = (np.array(item, np.float64) for item in (position, value, sigma))
-    out = np.zeros(z.size)
+    deviations = np.zeros(z.size)
     for _ in range(z.size // _SOUND_TO_BAD):
-        left = np.flatnonzero(np.isfinite(s))
-        if left.size <= LEAST_POINTS + 1:
+        remaining = np.flatnonzero(np.isfinite(s))
+        if remaining.size <= LEAST_POINTS + 1:
             break
         fitted = focus_vertices(z, v, s, strict=False)
         if not fitted.fault and chance_beyond(fitted.chi_square, max(fitted.degrees_of_freedom, 1)) > _EXPLAINED:
             break
-        pairs = np.stack(np.triu_indices(left.size if left.size <= _MOST_PAIRED else 0, 1), axis=1)
-        for groups in (left[:, None], left[pairs]):
-            away, sigmas = _deviations(z, v, s, groups)
+        pairs = np.stack(np.triu_indices(remaining.size if remaining.size <= _MOST_PAIRED else 0, 1), axis=1)
+        for groups in (remaining[:, None], remaining[pairs]):
+            deviation, sigmas = _deviations(z, v, s, groups)
             worst = np.min(sigmas, axis=1, initial=np.inf)
             if worst.size and worst.max() > limit:
                 best = int(np.argmax(worst))
-                out[groups[best]], s[groups[best]] = away[best], np.inf
+                deviations[groups[best]], s[groups[best]] = deviation[best], np.inf
                 break
         else:
             break
-    return out
+    return deviations
 
 
 def _deviations(z: Array, v: Array, s: Array, groups: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Return the deviations of point groups (G, K) from the curves without them, and those in sigmas; 0 without a
-    curve.
-    """
+    """Return the deviations of point groups (G, K) from curves without them, also in sigmas; 0 without a curve."""
     spread = np.tile(s, (len(groups), 1))
     np.put_along_axis(spread, groups, np.inf, axis=1)
     fits = focus_vertices(z, np.broadcast_to(v, spread.shape), spread, strict=False)
-    peak, bend = fits.peak[:, None], fits.curvature[:, None]
-    away = z[groups] - fits.position[:, None]
-    u = -bend * away**2 / (2.0 * peak)
+    peak, curvature = fits.peak[:, None], fits.curvature[:, None]
+    distance = z[groups] - fits.position[:, None]
+    u = -curvature * distance**2 / (2.0 * peak)
     inside = 1.0 - u + QUARTIC * u**2
     near = (inside > FRACTION) & (u < 0.5 / QUARTIC)
-    rest = np.where(near, v[groups] - peak * inside, np.maximum(v[groups] - FRACTION * peak, 0.0))
+    deviation = np.where(near, v[groups] - peak * inside, np.maximum(v[groups] - FRACTION * peak, 0.0))
     fall = 2.0 * QUARTIC * u - 1.0
-    slope = np.stack([1.0 - QUARTIC * u**2, fall * bend * away, -0.5 * fall * away**2], axis=2)
+    slope = np.stack([1.0 - QUARTIC * u**2, fall * curvature * distance, -0.5 * fall * distance**2], axis=2)
     variance = np.where(near, np.einsum("gki,gij,gkj->gk", slope, fits.covariance, slope), 0.0) + s[groups] ** 2
     variance += (_FORM * peak) ** 2
     scale = np.maximum(fits.chi_square / np.maximum(fits.degrees_of_freedom, 1), 1.0)[:, None]
-    return rest, np.nan_to_num(np.abs(rest) / np.sqrt(variance * scale))
+    return deviation, np.nan_to_num(np.abs(deviation) / np.sqrt(variance * scale))
 
 
-def _faults(model: _Lobe, mask: NDArray[np.bool_], place: Array, bend: Array, covariance: Array) -> NDArray[np.str_]:
+def _faults(
+    model: _Lobe, mask: NDArray[np.bool_], vertex: Array, second_derivative: Array, covariance: Array
+) -> NDArray[np.str_]:
     """Return the reason (B,) why a curve has no vertex; empty if it has one."""
-    fault = np.full(len(place), "", dtype="<U12")
+    fault = np.full(len(vertex), "", dtype="<U12")
     scarce = model.positions(model.window(WIDEST_FRACTION)) < LEAST_POINTS
     enough = model.positions(model.weight > 0) >= LEAST_POINTS
     fault[scarce] = "few points"
-    bent = -bend / np.sqrt(np.maximum(covariance[:, 2, 2], 1e-300))
-    standing = _contrast(model, mask) > _SIGNIFICANT
-    curved = (bent > _SIGNIFICANT) | ((bent > _HINT) & standing)
-    fault[~curved & ~(scarce & standing)] = "flat"
-    # A flank: the vertex beyond an end, or so near to it that too few points are left or that the lobe does not fit
-    # them, or no curvature but values that rise toward the end.
+    curvature_sigmas = -second_derivative / np.sqrt(np.maximum(covariance[:, 2, 2], 1e-300))
+    contrasted = _contrast(model, mask) > _SIGNIFICANT
+    curved = (curvature_sigmas > _SIGNIFICANT) | ((curvature_sigmas > _HINT) & contrasted)
+    fault[~curved & ~(scarce & contrasted)] = "flat"
+    # Flank: the vertex lies beyond an end, or so near to it that too few points are left or that the lobe does not fit
+    # them; or there is no curvature, and the values rise toward the end.
     misfit = model.chi_square(mask) > _MISFIT * np.maximum(mask.sum(axis=1) - 3, 1)
-    place_sigma = np.sqrt(covariance[:, 1, 1]) / model.scale
+    vertex_sigma = np.sqrt(covariance[:, 1, 1]) / model.scale
     trend, half = _trend(model, mask), model.reach(WIDEST_FRACTION) / model.scale
     for sign, name, room in ((-1, "peak below", model.x0 - model.ends[0]), (1, "peak above", model.ends[1] - model.x0)):
         rising = sign * trend > _SIGNIFICANT
-        # Within two sigma of the end it is not seen to be inside.
-        fault[(room < 2 * place_sigma) & (curved | rising)] = name
-        fault[(room < half) & ((scarce & enough & (curved | standing)) | misfit)] = name
+        # A vertex within two sigma of the end is not significantly inside.
+        fault[(room < 2 * vertex_sigma) & (curved | rising)] = name
+        fault[(room < half) & ((scarce & enough & (curved | contrasted)) | misfit)] = name
         fault[~curved & rising] = name
     return fault
 
@@ -551,13 +544,13 @@ def _trend(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
     """Return the slope (B,) of the straight line through the selected points, in sigmas."""
     weight = np.where(mask, model.weight, 0.0)
     middle = (weight * model.x).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
-    arm = model.x - middle[:, None]
-    moment = np.maximum((weight * arm**2).sum(axis=1), 1e-300)
-    return np.asarray((weight * arm * model.v).sum(axis=1) / np.sqrt(moment))
+    offset = model.x - middle[:, None]
+    moment = np.maximum((weight * offset**2).sum(axis=1), 1e-300)
+    return np.asarray((weight * offset * model.v).sum(axis=1) / np.sqrt(moment))
 
 
 def _raise(
-    fault: NDArray[np.str_], shape: tuple[int, ...], z: Array, weight: Array, place: Array, reach: Array
+    fault: NDArray[np.str_], shape: tuple[int, ...], z: Array, weight: Array, vertex: Array, reach: Array
 ) -> None:
     """Raise FocusError, naming the first few, if curves are faulty."""
     bad = np.flatnonzero(fault != "")
@@ -568,13 +561,13 @@ def _raise(
     for b in bad:
         index = tuple(int(i) for i in np.unravel_index(b, shape[:-1])) if len(shape) > 1 else ()
         faults[index] = str(fault[b])
-        seen = z[b][weight[b] > 0]
+        measured = z[b][weight[b] > 0]
         values: dict[str, Any] = {
-            "low": seen[0] if seen.size else np.nan,
-            "high": seen[-1] if seen.size else np.nan,
+            "low": measured[0] if measured.size else np.nan,
+            "high": measured[-1] if measured.size else np.nan,
             "least": LEAST_POINTS,
-            "place": place[b],
-            # LEAST_POINTS in the window wherever the steps fall; less a quarter, for too few points look too wide.
+            "place": vertex[b],
+            # LEAST_POINTS in the window for any phase of the steps; less a quarter, because too few points look wide.
             "step": 0.75 * 2 * reach[b] / LEAST_POINTS,
         }
         text = _REMEDY[faults[index]].format(**values)
@@ -592,7 +585,7 @@ def _check(where: Array, data: Array, spread: Array) -> None:
         np.broadcast_to(spread, data.shape)
     except ValueError as error:
         raise ValueError(
-            f"through focus: position {where.shape} and sigma {spread.shape} do not fit value {data.shape}"
+            f"through focus: position {where.shape} and sigma {spread.shape} do not match value {data.shape}"
         ) from error
     if not np.all(spread > 0):
         raise ValueError("through focus: every sigma must be positive")

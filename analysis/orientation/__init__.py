@@ -1,1 +1,1 @@
-"""Interior orientation and distortion from angles and spot positions (paper 004)."""
+"""Interior orientation of line cameras: principal distance, principal point and distortion."""

@@ -1,65 +1,59 @@
-"""Interior orientation of a line camera from (angle, position) pairs, and whether its principal point is observable.
+"""Interior orientation and distortion of a line camera from angles and image positions (paper 004).
 
-Over a narrow field tan^2 W is tiny: an error of 1 um at the edge of +-1.25 deg is 2 mm of p. Paper 004 solves for p all
-the same (eq. 2) and remarks that p is about a pixel; this says with numbers when p = 0 (eq. 3) is the better choice.
-
-`fit_interior_orientation` fits the model below (paper 004, eqs. 1-4, with a constant and
-radial terms). Errors of a turntable are common to many points (eccentricity, graduation, the zero), so the noise is a
-full covariance. The paper weights all points alike; its estimates stay unbiased under such noise, but sigmas from the
-scatter of the residuals are wrong, for a common error hides in the parameters. Here every sigma comes from the given
-covariance (sandwich). Generalised least squares, which has the smallest sigmas, serves for chi-square.
-
-A point of the line at y looks, from the camera's Z, at
-
-    tan theta = (y - y0) (1 + k1 (y - y0)^2) / f        (Brown, Photogramm. Eng. 37(8), 1971)
-
-and a test reads W = axis + theta, where `axis` is the reading of the camera's Z, counted from the zero of the test. To
-lowest order these are the terms below: k1 = -k3 / f^3 (the other sign: a pincushion, k3 > 0, images
-farther out than f tan W, so that places have to be moved inward), y0 (1 + 3 k3 / f) = p (a shift of the distortion's
-centre is a tan^2 term as well), axis = (y0 - c) / f. The f is that of the model with k3, the slope in the middle of the
-field, and not the balanced one of paper 004's eq. (3), the slope that leaves the smallest distortion: over a field of
-+- W they differ by about 0.6 k3 tan^2 W.
-
-Angles in radians, lengths in metres, k1 in 1/m^2.
-
-Interior orientation and distortion along a line CCD: the equations of paper 004 as printed, and the terms of the
-model that goes beyond them.
-
-A collimator stands still and the camera turns on a turntable. W (rad) is the angle of a direction from the one that
-images to the centre O of the line, L (m) the place of its spot from O. Both count in the same sense, so that f > 0.
-Paper 004 (Li et al., doi 10.3788/IRLA20200143) defines the distortion of a point
+**Equations of paper 004** (Li et al., doi 10.3788/IRLA20200143). A collimator is fixed and the camera rotates on a
+turntable. W (rad) is the angle of a direction from the one that images to the centre O of the line, L (m) the position
+of its spot from O. Both count in the same sense, so that f > 0. The paper defines the distortion of a point
 
     D = L - f tan W + p tan^2 W    (1)
 
 and chooses f and p such that sum D^2 over the points is least (2), f alone with p = 0 (3), or p alone (4).
 
-What (1) means: a camera without distortion whose principal point lies p from O images to
-L = f tan(W - w) + f tan w with tan w = p / f, which is f tan W - p tan^2 W up to terms of the order p^2 / f. There is
-no constant term as long as W counts exactly from the direction that images to O. An error d of that zero of W adds
--f d (1 + tan^2 W): (3) leaves f d in the distortion of every point, and (2) puts f d (1 + 5 / (3 tan^2 W_edge)) into p,
-which is 3500 f d for a field of +-1.25 deg. The model with a constant is free of this:
+Interpretation of (1): a camera without distortion whose principal point lies p from O images to L = f tan(W - w) + f
+tan w with tan w = p / f, which is f tan W - p tan^2 W up to terms of the order p^2 / f. There is no constant term as
+long as W counts exactly from the direction that images to O. An error d of that zero of W adds -f d (1 + tan^2 W): (3)
+leaves f d in the distortion of every point, and (2) puts f d (1 + 5 / (3 tan^2 W_edge)) into p, which is 3500 f d for a
+field of +-1.25 deg. The model with a constant avoids this:
 
     L = c + f tan W - p tan^2 W + k3 tan^3 W
 
-- `constant` c, `principal_distance` f, `principal_point` p: the interior orientation, metres. In one dimension a
+- `constant` c, `principal_distance` f, `principal_point` p: the interior orientation, in metres. In one dimension a
   decentring distortion d2 tan^2 W is the same function as a principal point p = -d2, and so is, to first order, a
   radial distortion whose centre lies off the zero of W by w: -3 k3 w tan^2 W. No measurement along one line separates
-  them;
-- `radial3` k3, m: radial distortion. With r = f tan W it is K1 r^3, K1 = k3 / f^3 (1/m^2); positive is a pincushion.
-  Software that *adds* a correction to the image has the other sign.
+  them.
+- `radial3` k3, in metres: radial distortion. With r = f tan W it is K1 r^3, K1 = k3 / f^3 (1/m^2); positive is a
+  pincushion. Software that *adds* a correction to the image has the other sign.
 
-Angles in radians, lengths in metres. Leading axes of L and W are sets.
+**Fit.** `fit_interior_orientation` fits this model. Errors of a turntable are common to many points (eccentricity,
+graduation, the zero), so the noise has a full covariance. The paper weights all points equally; its estimates stay
+unbiased under such noise, but sigmas from the scatter of the residuals are wrong, because a common error is absorbed by
+the parameters. Here every sigma comes from the given covariance (sandwich). Generalised least squares, which has the
+smallest sigmas, serves for chi-square.
 
-From the frames and readings of a distortion test to interior orientation and distortion (paper 004, section 3).
+**Observability of p.** Over a narrow field tan^2 W is tiny: an error of 1 um at the edge of +-1.25 deg is 2 mm of p.
+The paper solves for p nevertheless (eq. 2) and remarks that p is about a pixel; `PointReport` states with numbers when
+p = 0 (eq. 3) is the better choice.
+
+**Line model.** A point of the line at y looks, from the camera's Z, at
+
+    tan theta = (y - y0) (1 + k1 (y - y0)^2) / f        (Brown, Photogramm. Eng. 37(8), 1971)
+
+and a test reads W = axis + theta, where `axis` is the reading of the camera's Z, counted from the zero of the test. To
+lowest order these are the terms above: k1 = -k3 / f^3 (the other sign: a pincushion, k3 > 0, images farther out than f
+tan W, so that positions have to be moved inward), y0 (1 + 3 k3 / f) = p (a shift of the distortion's centre is a tan^2
+term as well), axis = (y0 - c) / f. The f is that of the model with k3, the slope in the middle of the field, and not
+the balanced one of paper 004's eq. (3), the slope that leaves the smallest distortion: over a field of +- W they differ
+by about 0.6 k3 tan^2 W.
+
+**Reduction of a distortion test** (paper 004, section 3), with N points and S sets:
 
 1. `locate_spots`: energy centroids on the line CCD, L = (column - middle of the line) * pitch.
-2. `reduce_sets`: repeated sets to one (W, L) per point, gross errors out by Chauvenet's criterion.
-3. `Distortion.measure`: f, p and D = L - c - f tan W + p tan^2 W with a constant c beside eq. (2), which takes up the
-   error of the zero of W, and a smooth model of D. What the points scatter about that model beyond their noise is taken
-   as one more noise, the same at all points and independent from point to point: the subdivision error of the table
-   above all, whose period of arcseconds no calibration follows.
+2. `reduce_sets`: repeated sets to one (W, L) per point, gross errors rejected by Chauvenet's criterion.
+3. `Distortion.measure`: f, p and D = L - c - f tan W + p tan^2 W with a constant c beside eq. (2), which absorbs the
+   error of the zero of W, and a smooth model of D. The scatter of the points about that model beyond their noise is
+   treated as an additional noise, the same at all points and independent from point to point: mainly the subdivision
+   error of the table, whose period of arcseconds no calibration resolves.
 
-Metres and radians; N points, S sets.
+Angles are in radians, lengths in metres, k1 in 1/m^2. Leading axes of L and W are sets.
 """
 
 from __future__ import annotations
@@ -78,94 +72,110 @@ from analysis.spots.noise import NoiseModel
 from analysis.statistics import gain
 from analysis.turntable.dividing_error import CalibrationSeries
 
-# power of tan W and sign of each term
 _POWER = {"constant": (0, 1.0), "principal_distance": (1, 1.0), "principal_point": (2, -1.0), "radial3": (3, 1.0)}
+"""Power of tan W and sign of each term."""
 TERMS = tuple(_POWER)
-# Line cameras see a few degrees; beyond this an angle is rather in degrees than in radians.
+"""Names of the terms."""
 _WIDEST = np.pi / 4
-# Determinant of (2) relative to its first product; one part in 1e9 leaves six digits of the sums' rounding.
+"""Largest plausible angle, in radians: line cameras see a few degrees, and larger values are probably in degrees."""
 _SINGULAR = 1e-9
+"""Smallest determinant of (2) relative to its first product; one part in 1e9 leaves six correct digits."""
 
 
 class OrientationError(MeasurementError, ValueError):
-    """The readings do not determine what is asked for; the message says what to change."""
+    """Readings that do not determine the requested quantities; the message says what to change."""
 
 
 def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
-    """L and W as float64 arrays of one shape (..., N), checked.
+    """Return validated L and W as float64 arrays of the same shape (..., N).
 
-    Raises OrientationError for sizes that differ, no points, values that are not finite, angles beyond 45 deg.
+    Raises
+    ------
+    OrientationError
+        Sizes differ, there are no points, values are not finite, or angles exceed 45 deg.
     """
-    where, turned = np.asarray(position, dtype=np.float64), np.asarray(angle, dtype=np.float64)
-    if where.ndim == 0 or turned.ndim == 0 or where.shape[-1] != turned.shape[-1]:
+    positions, angles = np.asarray(position, dtype=np.float64), np.asarray(angle, dtype=np.float64)
+    if positions.ndim == 0 or angles.ndim == 0 or positions.shape[-1] != angles.shape[-1]:
         raise OrientationError(
-            f"interior orientation: {where.shape} spot positions and {turned.shape} angles; give one angle per spot"
+            f"interior orientation: {positions.shape} spot positions and {angles.shape} angles; give one angle per spot"
         )
     try:
-        where, turned = np.broadcast_arrays(where, turned)
+        positions, angles = np.broadcast_arrays(positions, angles)
     except ValueError as error:
         raise OrientationError(
-            f"interior orientation: sets of spot positions {where.shape} and angles {turned.shape} do not match"
+            f"interior orientation: sets of spot positions {positions.shape} and angles {angles.shape} do not match"
         ) from error
-    if where.size == 0:
+    if positions.size == 0:
         raise OrientationError("interior orientation: no points; give at least one angle with its spot position")
-    for name, values in (("spot position", where), ("angle", turned)):
+    for name, values in (("spot position", positions), ("angle", angles)):
         bad = np.argwhere(~np.isfinite(values))
         if bad.size:
             place = ", ".join(str(k) for k in bad[0])
             raise OrientationError(
-                f"interior orientation: {name} [{place}] is not finite ({len(bad)} in all); leave those points out"
+                f"interior orientation: {name} [{place}] is not finite ({len(bad)} in all); exclude those points"
             )
-    widest = float(np.max(np.abs(turned)))
+    widest = float(np.max(np.abs(angles)))
     if widest > _WIDEST:
         raise OrientationError(
             f"interior orientation: an angle of {np.rad2deg(widest):.6g} deg ({widest:.6g} rad) is beyond 45 deg;"
             " give radians, counted from the direction that images to the centre of the line"
         )
-    return where, turned
+    return positions, angles
 
 
 def distortion(
     position: ArrayLike, angle: ArrayLike, principal_distance: ArrayLike, principal_point: ArrayLike = 0.0
 ) -> Array:
-    """Distortion (..., N), m, of each point: paper 004, eq. (1).
-
-    Raises OrientationError for bad readings.
+    """Return the distortion (..., N) of each point, in metres: paper 004, eq. (1).
 
     Parameters
     ----------
-    position : ArrayLike
-        (..., N), m.
-    angle : ArrayLike
-        (..., N), rad.
-    principal_distance : ArrayLike
-        (...) m, one per set.
-    principal_point : ArrayLike
-        likewise.
+    position : (..., N) array_like
+        Image positions, in metres.
+    angle : (..., N) array_like
+        Angles, in radians.
+    principal_distance : (...) array_like
+        Principal distance of each set, in metres.
+    principal_point : (...) array_like
+        Principal point of each set, in metres.
+
+    Raises
+    ------
+    OrientationError
+        The readings are invalid.
     """
-    where, turned = readings(position, angle)
-    t = np.tan(turned)
+    positions, angles = readings(position, angle)
+    t = np.tan(angles)
     f = np.asarray(principal_distance, dtype=np.float64)[..., None]
     p = np.asarray(principal_point, dtype=np.float64)[..., None]
-    return np.asarray(where - f * t + p * t**2)
+    return np.asarray(positions - f * t + p * t**2)
 
 
 def principal_distance_and_point(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
-    """Principal distance f and point p, each (...), m: paper 004, eq. (2).
+    """Return principal distance f and principal point p, each (...), in metres: paper 004, eq. (2).
 
-    position, angle: (..., N) m, rad, at least two different angles other than zero in each set.
-    Raises OrientationError for bad or too few readings and for angles that count against the positions.
+    Parameters
+    ----------
+    position : (..., N) array_like
+        Image positions, in metres.
+    angle : (..., N) array_like
+        Angles, in radians, at least two different ones other than zero in each set.
+
+    Raises
+    ------
+    OrientationError
+        The readings are invalid or too few, or angles and positions count in opposite senses.
     """
-    where, turned = readings(position, angle)
-    if where.shape[-1] < 2:
+    positions, angles = readings(position, angle)
+    if positions.shape[-1] < 2:
         raise OrientationError("interior orientation: 1 angle for the 2 unknowns f and p; measure at more angles")
-    t = np.tan(turned)
+    t = np.tan(angles)
     t2, t3, t4 = np.sum(t**2, axis=-1), np.sum(t**3, axis=-1), np.sum(t**4, axis=-1)
-    lt, lt2 = np.sum(where * t, axis=-1), np.sum(where * t**2, axis=-1)
+    lt, lt2 = np.sum(positions * t, axis=-1), np.sum(positions * t**2, axis=-1)
     determinant = t3**2 - t2 * t4
     if np.any(np.abs(determinant) <= _SINGULAR * t2 * t4):
         raise OrientationError(
-            "interior orientation: f and p cannot be separated, for the angles are (nearly) all the same or zero;"
+            "interior orientation: f and p cannot be separated, because the angles are (nearly) all the same or zero;"
             " turn the turntable between the readings"
         )
     f = (lt2 * t3 - lt * t4) / determinant
@@ -175,64 +185,84 @@ def principal_distance_and_point(position: ArrayLike, angle: ArrayLike) -> tuple
 
 
 def principal_distance(position: ArrayLike, angle: ArrayLike) -> Array:
-    """Balanced principal distance f (...), m, which leaves the smallest distortion with p = 0: paper 004, eq. (3).
+    """Return the balanced principal distance f (...), in metres: paper 004, eq. (3).
 
-    position, angle: (..., N) m, rad. Raises OrientationError for bad readings, angles that are all zero, and angles
-    that count against the positions.
+    It leaves the smallest distortion with p = 0.
+
+    Parameters
+    ----------
+    position : (..., N) array_like
+        Image positions, in metres.
+    angle : (..., N) array_like
+        Angles, in radians.
+
+    Raises
+    ------
+    OrientationError
+        The readings are invalid, all angles are zero, or angles and positions count in opposite senses.
     """
-    where, turned = readings(position, angle)
-    t = np.tan(turned)
+    positions, angles = readings(position, angle)
+    t = np.tan(angles)
     t2 = np.sum(t**2, axis=-1)
     if np.any(t2 == 0):
-        raise OrientationError("interior orientation: all angles are zero and say nothing of f; turn the turntable")
-    f = np.sum(where * t, axis=-1) / t2
+        raise OrientationError("interior orientation: all angles are zero and do not determine f; turn the turntable")
+    f = np.sum(positions * t, axis=-1) / t2
     _same_sense(f)
     return np.asarray(f)
 
 
 def principal_point(position: ArrayLike, angle: ArrayLike, principal_distance: ArrayLike) -> Array:
-    """Principal point p (...), m, for a known f (...), m: paper 004, eq. (4).
-
-    Raises OrientationError for bad readings and angles that are all zero.
+    """Return the principal point p (...) for a known principal distance f (...), in metres: paper 004, eq. (4).
 
     Parameters
     ----------
-    position : ArrayLike
-        (..., N), m.
-    angle : ArrayLike
-        (..., N), rad.
-    principal_distance : ArrayLike
-        (...), m, one per set.
+    position : (..., N) array_like
+        Image positions, in metres.
+    angle : (..., N) array_like
+        Angles, in radians.
+    principal_distance : (...) array_like
+        Principal distance of each set, in metres.
+
+    Raises
+    ------
+    OrientationError
+        The readings are invalid, or all angles are zero.
     """
-    where, turned = readings(position, angle)
-    t = np.tan(turned)
+    positions, angles = readings(position, angle)
+    t = np.tan(angles)
     t4 = np.sum(t**4, axis=-1)
     if np.any(t4 == 0):
-        raise OrientationError("interior orientation: all angles are zero and say nothing of p; turn the turntable")
+        raise OrientationError("interior orientation: all angles are zero and do not determine p; turn the turntable")
     f = np.asarray(principal_distance, dtype=np.float64)
-    return np.asarray((f * np.sum(t**3, axis=-1) - np.sum(where * t**2, axis=-1)) / t4)
+    return np.asarray((f * np.sum(t**3, axis=-1) - np.sum(positions * t**2, axis=-1)) / t4)
 
 
 def design(angle: ArrayLike, terms: Sequence[str]) -> Array:
-    """dL/d(term) (..., P) at angles (...), rad. Raises OrientationError for unknown or repeated terms."""
+    """Return the derivatives dL/d(term) (..., P) at angles (...), in radians.
+
+    Raises
+    ------
+    OrientationError
+        A term is unknown or repeated.
+    """
     unknown = [term for term in terms if term not in _POWER]
     if unknown or len(set(terms)) != len(terms):
-        raise OrientationError(f"interior orientation: terms must be different ones of {TERMS}, found {tuple(terms)}")
+        raise OrientationError(f"interior orientation: terms must be distinct and out of {TERMS}, found {tuple(terms)}")
     t = np.tan(np.asarray(angle, dtype=np.float64))
     return np.stack([sign * t**power for power, sign in (_POWER[term] for term in terms)], axis=-1)
 
 
 def slope(angle: ArrayLike, terms: Sequence[str], values: ArrayLike) -> Array:
-    """dL/dW (...), m/rad, of the model with these terms and values (P,) at angles (...), rad.
+    """Return dL/dW (...), in m/rad, of the model with these terms and values at angles (...).
 
     Parameters
     ----------
-    angle : ArrayLike
-        (...), rad.
-    terms : Sequence[str]
+    angle : (...) array_like
+        Angles, in radians.
+    terms : sequence of str
         Names out of `TERMS`.
-    values : ArrayLike
-        Of the terms, (P,), m.
+    values : (P,) array_like
+        Values of the terms, in metres.
     """
     t = np.tan(np.asarray(angle, dtype=np.float64))
     powers = [_POWER[term] for term in terms]
@@ -241,6 +271,7 @@ def slope(angle: ArrayLike, terms: Sequence[str], values: ArrayLike) -> Array:
 
 
 def _same_sense(f: Array) -> None:
+    """Raise OrientationError for a negative principal distance: angles and positions count in opposite senses."""
     if np.any(f <= 0):
         raise OrientationError(
             f"interior orientation: the principal distance comes out as {float(np.min(f)):.6g} m; angles and spot"
@@ -248,22 +279,23 @@ def _same_sense(f: Array) -> None:
         )
 
 
-# With columns of length one, the worst combination of terms has this many times the sigma of the best. Five terms over
-# half a field have 270; f and a constant reach 1000 when the angles lie within 1 % of each other.
 _WORST_CONDITION = 1e3
+"""Largest condition number of columns of unit length: the ratio of the sigmas of the worst and the best combination of
+terms. Five terms over half a field have 270; f and a constant reach 1000 when the angles lie within 1 % of each other.
+"""
 
 
 def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> None:
-    """OrientationError, naming the terms that take part in the worst combination, where angles do not separate them.
+    """Raise OrientationError, naming the terms of the worst combination, if the angles do not separate the terms.
 
     Parameters
     ----------
-    columns : Array
-        Of the design, (N, P).
-    names : tuple[str, ...]
-        Of the terms.
-    angle : Array
-        (N,), rad.
+    columns : (N, P) ndarray
+        Columns of the design.
+    names : tuple of str
+        Names of the terms.
+    angle : (N,) ndarray
+        Angles, in radians.
     """
     length = np.linalg.norm(columns, axis=0)
     _, values, vt = np.linalg.svd(columns / np.where(length > 0, length, 1.0))
@@ -277,23 +309,26 @@ def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> No
     raise OrientationError(
         f"interior orientation: angles from {low:.6g} to {high:.6g} deg{side}, cannot separate {', '.join(mixed)}"
         f" (condition number {condition:.2g}); measure at more angles over both halves of the"
-        " field, or leave a term out"
+        " field, or omit a term"
     )
 
 
 def _noise_matrix(given: ArrayLike, count: int, name: str) -> Array:
-    """Covariance (N, N) from a covariance (N, N) or sigmas (N,) or ().
-
-    Raises OrientationError, with the given name, for another shape, values that are not finite, negative sigmas.
+    """Return a covariance (N, N) from a covariance (N, N) or from sigmas (N,) or ().
 
     Parameters
     ----------
-    given : ArrayLike
+    given : array_like
         Covariance (N, N), or sigmas (N,) or ().
     count : int
-        N.
+        Number of points, N.
     name : str
-        Of what it is the noise, for messages.
+        Name of the noisy quantity, for messages.
+
+    Raises
+    ------
+    OrientationError
+        The shape is wrong, a value is not finite, or a sigma is negative.
     """
     noise = np.asarray(given, dtype=np.float64)
     if not np.all(np.isfinite(noise)):
@@ -312,13 +347,16 @@ def _noise_matrix(given: ArrayLike, count: int, name: str) -> Array:
 
 
 def _noise_root(noise: Array) -> Array:
-    """Cholesky factor of a covariance (N, N): solve(root, x) has unit covariance.
+    """Return the Cholesky factor of a covariance (N, N): solve(root, x) has unit covariance.
 
-    Raises OrientationError when the covariance is not positive definite.
+    Raises
+    ------
+    OrientationError
+        The covariance is not positive definite.
     """
     sigma = np.sqrt(np.maximum(np.diagonal(noise), 0.0))
     least = np.min(np.linalg.eigvalsh(noise / np.outer(sigma, sigma))) if np.all(sigma > 0) else 0.0
-    # eigenvalues below the rounding of a matrix of this size are not known to be positive
+    # eigenvalues below the rounding error of the matrix are not significantly positive
     if least <= 1e-14 * len(noise):
         raise OrientationError(
             "interior orientation: the noise is zero or fully common in some combination of points (its covariance is"
@@ -327,25 +365,22 @@ def _noise_root(noise: Array) -> Array:
     return np.asarray(np.linalg.cholesky(noise))
 
 
-# Significance in sigmas: false alarm 0.3 %.
 _SIGNIFICANT = 3.0
+"""Significance of a principal point, in sigmas: false-alarm rate 0.3 %."""
 POINT_TOLERANCE = 10e-6
-"""Sigma up to which the principal point counts as observable, metres: about a pixel, the size that paper 004 expects of
-it.
-"""
+"""Largest sigma, in metres, of an observable principal point: about a pixel, the size that paper 004 expects of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointReport:
-    """What the test can say of the principal point p.
+    """Observability of the principal point p in a test.
 
     Attributes
     ----------
     observable : bool
-        Whether the sigma of p, or of the p that could have been fitted beside the other terms, is no larger than
-        `POINT_TOLERANCE`.
+        True if the sigma of p, or of a p fitted in addition to the other terms, is at most `POINT_TOLERANCE`.
     statement : str
-        This in a sentence, with numbers.
+        Sentence that states this with numbers.
     """
 
     observable: bool
@@ -353,27 +388,27 @@ class PointReport:
 
 
 def _point_report(names: tuple[str, ...], values: Array, angle: Array, noise: Array) -> PointReport:
-    """What a fit of these terms says of p, or would say with p beside them.
+    """Return the observability of p from a fit of these terms, or of a fit with p added.
 
     Parameters
     ----------
-    names : tuple[str, ...]
-        Of P terms.
-    values : Array
-        Of the terms, (P,), m.
-    angle : Array
-        (N,) rad.
-    noise : Array
-        (N, N) m^2.
+    names : tuple of str
+        Names of P terms.
+    values : (P,) ndarray
+        Values of the terms, in metres.
+    angle : (N,) ndarray
+        Angles, in radians.
+    noise : (N, N) ndarray
+        Covariance of the positions, in m^2.
     """
     fitted = "principal_point" in names
-    asked = names if fitted else (*names, "principal_point")
-    k = asked.index("principal_point")
-    columns = design(angle, asked)
+    names_with_point = names if fitted else (*names, "principal_point")
+    k = names_with_point.index("principal_point")
+    columns = design(angle, names_with_point)
     try:
-        if len(columns) < len(asked):
+        if len(columns) < len(names_with_point):
             raise OrientationError("interior orientation: no point is left for p")
-        _check_separable(columns, asked, angle)
+        _check_separable(columns, names_with_point, angle)
         row = gain(columns)[k]
         sigma = float(np.sqrt(row @ noise @ row))
     except OrientationError:
@@ -384,45 +419,65 @@ def _point_report(names: tuple[str, ...], values: Array, angle: Array, noise: Ar
     typical = float(np.median(np.sqrt(np.diagonal(noise))))
     observable, significant = sigma <= POINT_TOLERANCE, abs(value) > _SIGNIFICANT * sigma
     low, high = np.rad2deg(np.min(angle)), np.rad2deg(np.max(angle))
-    even = abs(low + high) < 0.01 * (high - low)
-    field = f"+-{0.5 * (high - low):.4g} deg" if even else f"{low:.4g} to {high:.4g} deg"
-    same = "A decentring distortion would be the same tan^2 term."
+    symmetric = abs(low + high) < 0.01 * (high - low)
+    field = f"+-{0.5 * (high - low):.4g} deg" if symmetric else f"{low:.4g} to {high:.4g} deg"
+    caveat = "A decentring distortion would give the same tan^2 term."
     size = f"p = {1e3 * value:.2g} +- {1e3 * sigma:.2g} mm"
     effect = (
-        f"one sigma of it moves the edge of the field by {1e6 * edge:.2g} um against {1e6 * typical:.2g} um of noise"
+        f"one sigma moves the edge of the field by {1e6 * edge:.2g} um, compared with {1e6 * typical:.2g} um of noise"
     )
     if not fitted:
         if np.isfinite(sigma):
-            able = "observable" if observable else "not observable"
-            text = f"p is taken as zero; fitted, it would be known to +- {1e3 * sigma:.2g} mm: {able} over {field}."
+            verdict = "observable" if observable else "not observable"
+            text = f"p is fixed at zero; if fitted, its sigma would be {1e3 * sigma:.2g} mm: {verdict} over {field}."
         else:
-            text = f"p is taken as zero; the angles, {field}, could not separate it from the other terms."
+            text = f"p is fixed at zero; the angles, {field}, do not separate it from the other terms."
     elif observable:
-        text = f"{size}: observable over {field}" + (". " if significant else ", and not different from zero. ") + same
+        text = (
+            f"{size}: observable over {field}"
+            + (". " if significant else ", and not significantly different from zero. ")
+            + caveat
+        )
     elif significant:
         text = (
-            f"{size}: a tan^2 term is there, but as a place of the principal point it is not observable over {field} to"
-            f" {1e6 * POINT_TOLERANCE:.3g} um. {same}"
+            f"{size}: the tan^2 term is significant, but as a principal point it is not observable over {field} to"
+            f" {1e6 * POINT_TOLERANCE:.3g} um. {caveat}"
         )
     else:
-        text = f"{size}: not observable over {field}; {effect}; take p = 0 (eq. 3). {same}"
+        text = f"{size}: not observable over {field}; {effect}; take p = 0 (eq. 3). {caveat}"
     return PointReport(observable, text)
 
 
-# A principal distance with a larger relative sigma is no result; the angles are then nearly constant.
 _WORST_DISTANCE = 0.1
+"""Largest relative sigma of a principal distance; with a larger one the angles are nearly constant."""
 
 
 @dataclass(frozen=True, eq=False)
 class InteriorOrientation:
-    """Result of a fit over N points with P terms.
+    """Fit over N points with P terms.
 
-    terms: names as in `analysis.orientation.interior.TERMS`. values: (P,) m. covariance: (P, P) m^2.
-    angle, position: (N,) rad, m, as measured. noise: (N, N) m^2, of positions and angles together.
-    residual: (N,) m, position - model.
-    chi_square: least sum of squares in the metric of the noise; it has degrees_of_freedom = N - P when model and noise
-    are right.
-    point: about the principal point.
+    Attributes
+    ----------
+    terms : (P,) tuple of str
+        Names of the terms, out of `TERMS`.
+    values : (P,) ndarray
+        Values of the terms, in metres.
+    covariance : (P, P) ndarray
+        Covariance of the values, in m^2.
+    angle : (N,) ndarray
+        Measured angles, in radians.
+    position : (N,) ndarray
+        Measured image positions, in metres.
+    noise : (N, N) ndarray
+        Covariance of positions and angles together, as positions, in m^2.
+    residual : (N,) ndarray
+        Position minus model, in metres.
+    chi_square : float
+        Least sum of squares in the metric of the noise.
+    degrees_of_freedom : int
+        Degrees of freedom of the chi-square, N - P.
+    point : PointReport
+        Observability of the principal point.
     """
 
     terms: tuple[str, ...]
@@ -437,30 +492,30 @@ class InteriorOrientation:
     point: PointReport
 
     def value(self, term: str) -> float:
-        """Metres; zero for a term that was not fitted."""
+        """Return the value of a term, in metres; zero for a term that was not fitted."""
         return float(self.values[self.terms.index(term)]) if term in self.terms else 0.0
 
     def sigma(self, term: str) -> float:
-        """Metres; zero for a term that was not fitted."""
+        """Return the standard deviation of a term, in metres; zero for a term that was not fitted."""
         k = self.terms.index(term) if term in self.terms else None
         return 0.0 if k is None else float(np.sqrt(self.covariance[k, k]))
 
     @property
     def correlation(self) -> Array:
-        """(P, P), in the order of the terms."""
+        """Correlation matrix (P, P), in the order of the terms."""
         sigma = np.sqrt(np.diagonal(self.covariance))
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
     @property
     def residual_covariance(self) -> Array:
-        """(N, N), m^2, of rank N - P."""
+        """Covariance (N, N) of the residuals, in m^2, of rank N - P."""
         columns = design(self.angle, self.terms)
         left = np.eye(len(self.angle)) - columns @ gain(columns)
         return np.asarray(left @ self.noise @ left.T)
 
     @property
     def probability(self) -> float:
-        """Chance of a chi-square at least this large if model and noise are right; nan without degrees of freedom."""
+        """p-value of the chi-square; NaN without degrees of freedom."""
         return float(stats.chi2.sf(self.chi_square, self.degrees_of_freedom)) if self.degrees_of_freedom else np.nan
 
 
@@ -529,14 +584,14 @@ def fit_interior_orientation(
     >>> round(fit.sigma("principal_distance"), 7), fit.degrees_of_freedom
     (9.1e-06, 38)
     """
-    where, turned = readings(position, angle)
+    positions, angles = readings(position, angle)
     names = tuple(terms)
-    if where.ndim != 1:
-        raise OrientationError(f"interior orientation: readings must be (N,), found {where.shape}; fit set by set")
+    if positions.ndim != 1:
+        raise OrientationError(f"interior orientation: readings must be (N,), found {positions.shape}; fit set by set")
     if "principal_distance" not in names:
         raise OrientationError("interior orientation: principal_distance must be among the terms")
-    columns = design(turned, names)
-    distinct = len(np.unique(turned))
+    columns = design(angles, names)
+    distinct = len(np.unique(angles))
     if distinct == 1:
         raise OrientationError("interior orientation: all angles are the same; turn the turntable between the readings")
     if distinct < len(names):
@@ -544,13 +599,13 @@ def fit_interior_orientation(
             f"interior orientation: {distinct} different angles for {len(names)} unknowns ({', '.join(names)}); measure"
             " at more angles or fit fewer terms"
         )
-    _check_separable(columns, names, turned)
+    _check_separable(columns, names, angles)
     solve = gain(columns)
-    values = solve @ where
-    noise = _noise_matrix(covariance, len(where), "covariance")
+    values = solve @ positions
+    noise = _noise_matrix(covariance, len(positions), "covariance")
     if angle_covariance is not None:
-        rate = slope(turned, names, values)
-        noise = noise + rate[:, None] * _noise_matrix(angle_covariance, len(where), "angle_covariance") * rate
+        rate = slope(angles, names, values)
+        noise = noise + rate[:, None] * _noise_matrix(angle_covariance, len(positions), "angle_covariance") * rate
     root = _noise_root(noise)
     best = gain(columns, root)
     spread = solve @ noise @ solve.T
@@ -558,7 +613,7 @@ def fit_interior_orientation(
     f, sigma = float(values[k]), float(np.sqrt(spread[k, k]))
     if sigma > _WORST_DISTANCE * abs(f):
         raise OrientationError(
-            f"interior orientation: f = {f:.3g} +- {sigma:.2g} m; the angles span only {np.ptp(turned):.3g} rad, too"
+            f"interior orientation: f = {f:.3g} +- {sigma:.2g} m; the angles span only {np.ptp(angles):.3g} rad, too"
             " little for their noise; turn the turntable over the whole field"
         )
     if f < 0:
@@ -570,31 +625,32 @@ def fit_interior_orientation(
         terms=names,
         values=values,
         covariance=spread,
-        angle=turned,
-        position=where,
+        angle=angles,
+        position=positions,
         noise=noise,
-        residual=where - columns @ values,
-        chi_square=float(np.sum(np.linalg.solve(root, where - columns @ (best @ where)) ** 2)),
-        degrees_of_freedom=len(where) - len(names),
-        point=_point_report(names, values, turned, noise),
+        residual=positions - columns @ values,
+        chi_square=float(np.sum(np.linalg.solve(root, positions - columns @ (best @ positions)) ** 2)),
+        degrees_of_freedom=len(positions) - len(names),
+        point=_point_report(names, values, angles, noise),
     )
 
 
 LINE_TERMS = ("axis", "principal_distance", "principal_point", "k1")
-"""Names of the unknowns; the last three are keys of a payload's line."""
+"""Names of the unknowns of the line model; the last three are keys of a payload's line."""
 _STEPS = 20
+"""Largest number of Gauss-Newton steps."""
 
 
 @dataclass(frozen=True, eq=False)
 class LineOrientation:
-    """Fit of `LINE_TERMS`.
+    """Fit of the line model, `LINE_TERMS`.
 
     Attributes
     ----------
-    values : Array
-        (4,), rad, m, m, 1/m^2.
-    covariance : Array
-        (4, 4) in these units.
+    values : (4,) ndarray
+        Values, in rad, m, m, 1/m^2.
+    covariance : (4, 4) ndarray
+        Covariance, in these units.
     """
 
     values: Array
@@ -602,42 +658,44 @@ class LineOrientation:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of the values, (4,)."""
+        """Standard deviations (4,) of the values."""
         return np.sqrt(np.diagonal(self.covariance))
 
 
 def _model(values: Array, position: Array) -> tuple[Array, Array, Array]:
-    """W (N,), its derivatives by the values (N, 4), and dL/dW (N,)."""
+    """Return W (N,), its derivatives with respect to the values (N, 4), and dL/dW (N,)."""
     axis, f, point, k1 = values
     u = position - point
     tangent = u * (1.0 + k1 * u**2) / f
-    turn = 1.0 / (1.0 + tangent**2)
-    steep = (1.0 + 3.0 * k1 * u**2) / f * turn
-    columns = np.stack([np.ones_like(u), -tangent / f * turn, -steep, u**3 / f * turn], axis=-1)
-    return np.asarray(axis + np.arctan(tangent)), columns, np.asarray(1.0 / steep)
+    derivative = 1.0 / (1.0 + tangent**2)
+    slope_of_angle = (1.0 + 3.0 * k1 * u**2) / f * derivative
+    columns = np.stack([np.ones_like(u), -tangent / f * derivative, -slope_of_angle, u**3 / f * derivative], axis=-1)
+    return np.asarray(axis + np.arctan(tangent)), columns, np.asarray(1.0 / slope_of_angle)
 
 
 def line_orientation(fit: InteriorOrientation) -> LineOrientation:
-    """Convert an interior orientation to principal distance, principal point and k1 of a line, by least squares in the
-    image at the same points with equal weights.
+    """Convert an interior orientation to principal distance, principal point and k1 of a line.
+
+    It is a least-squares fit in the image at the same points with equal weights.
 
     Parameters
     ----------
     fit : InteriorOrientation
-        With constant, principal_distance, principal_point and radial3 and no other terms, which it starts from.
+        Fit of constant, principal_distance, principal_point and radial3 and no other terms, which serve as start
+        values.
 
     Raises
     ------
     OrientationError
-        Other terms, or no convergence.
+        The fit has other terms, or the iteration does not converge.
     """
     if set(fit.terms) != {"constant", "principal_distance", "principal_point", "radial3"}:
-        raise OrientationError(f"interior orientation: no line's orientation follows from the terms {fit.terms}")
+        raise OrientationError(f"interior orientation: the terms {fit.terms} do not determine the line model")
     c, f, p, k3 = (fit.value(name) for name in ("constant", "principal_distance", "principal_point", "radial3"))
     point = p / (1.0 + 3.0 * k3 / f)
     values = np.array([(point - c) / f, f, point, -k3 / f**3])
     for _ in range(_STEPS):
-        with np.errstate(all="ignore"):  # steps of a camera that is none may end anywhere
+        with np.errstate(all="ignore"):  # steps from degenerate values may overflow
             angle, columns, rate = _model(values, fit.position)
             weighted = columns * rate[:, None]
         if not np.all(np.isfinite(weighted)):
@@ -652,9 +710,9 @@ def line_orientation(fit: InteriorOrientation) -> LineOrientation:
 
 
 CALIBRATED = ("constant", "principal_distance", "principal_point")
-"""What distortion is counted from: eq. (2) with a constant."""
+"""Terms to which distortion refers: eq. (2) with a constant."""
 SMOOTH = (*CALIBRATED, "radial3")
-"""The model whose residual tells how well the points fit a smooth curve."""
+"""Terms of the smooth model, whose residual measures the scatter of the points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -663,14 +721,14 @@ class Spots:
 
     Attributes
     ----------
-    position : Array
-        L, (N, S), metres.
-    temporal : Array
-        Sigma by noise that is new in each frame, (N, S), metres.
-    fixed : Array
-        Sigma by differences of the line's columns, which stay while the spot does, (N, S), metres.
-    row : Array
-        Of the spot in its image, (N, S), pixels.
+    position : (N, S) ndarray
+        Positions L, in metres.
+    temporal : (N, S) ndarray
+        Sigma from noise that is independent in each frame, in metres.
+    fixed : (N, S) ndarray
+        Sigma from differences of the line's columns, constant while the spot does not move, in metres.
+    row : (N, S) ndarray
+        Row of the spot in its image, in pixels.
     """
 
     position: Array
@@ -688,29 +746,30 @@ def locate_spots(
     radius: float,
     offset: ArrayLike = 0.0,
 ) -> Spots:
-    """Energy centroids.
+    """Locate spots on the line by energy centroids.
 
     Parameters
     ----------
-    frames : NDArray[np.uint16]
-        (N, S, frames, H, W).
-    column : ArrayLike
-        Of the line, where each image begins, (N, S).
+    frames : (N, S, frames, H, W) ndarray of uint16
+        Frames of N points in S sets.
+    column : (N, S) array_like
+        Column of the line at which each image begins.
     middle : float
         Column of the line's middle, where L = 0.
     pitch : float
-        metres.
+        Pixel pitch, in metres.
     noise : NoiseModel
-        Of one frame; its pattern is one of columns: every row of a TDI line is collected by the same pixels.
+        Noise of one frame; its fixed pattern is constant along columns, because every row of a TDI line is collected by
+        the same pixels.
     radius : float
-        Of the centroid's window, pixels.
-    offset : ArrayLike
-        Energy centroid minus chief ray by the camera's design, (N,), metres; taken off.
+        Radius of the centroid's window, in pixels.
+    offset : float or (N,) array_like
+        Energy centroid minus chief ray by the camera's design, in metres, which is subtracted.
 
     Raises
     ------
     SpotError
-        a spot is saturated, absent, or too near the edge of its image.
+        A spot is saturated, absent, or too near the edge of its image.
     """
     count, sets, number = frames.shape[:3]
     spots = energy_centroid(mean_frames(frames).reshape(count * sets, *frames.shape[3:]), number, noise, radius)
@@ -720,9 +779,9 @@ def locate_spots(
     gain = np.sum(np.sum(influence * spots.light_dn, axis=1) ** 2, axis=-1) * noise.prnu**2
     dark = np.sum(np.sum(influence, axis=1) ** 2, axis=-1) * noise.dsnu_variance_dn2
     shape = count, sets
-    place = (np.asarray(column) + spots.column.reshape(shape) - middle) * pitch
+    line_position = (np.asarray(column) + spots.column.reshape(shape) - middle) * pitch
     return Spots(
-        position=place - np.broadcast_to(np.asarray(offset, np.float64), (count,))[:, None],
+        position=line_position - np.broadcast_to(np.asarray(offset, np.float64), (count,))[:, None],
         temporal=pitch * np.sqrt(spots.temporal_covariance[:, 1, 1]).reshape(shape),
         fixed=pitch * np.sqrt(gain + dark).reshape(shape),
         row=spots.row.reshape(shape),
@@ -735,12 +794,12 @@ class PointMeans:
 
     Attributes
     ----------
-    keep : NDArray[np.bool_]
-        Exposures that Chauvenet's criterion keeps, (N, S).
+    keep : (N, S) ndarray of bool
+        Exposures that Chauvenet's criterion keeps.
     scatter : float
-        Sigma of one exposure by the scatter between the sets, or as given if there is one set only, metres.
-    sigma : Array
-        Of the mean of each point, without what is common to all sets, (N,), metres.
+        Sigma of one exposure from the scatter between the sets, in metres, or as specified if there is only one set.
+    sigma : (N,) ndarray
+        Sigma of the mean of each point, without errors common to all sets, in metres.
     """
 
     keep: NDArray[np.bool_]
@@ -748,51 +807,55 @@ class PointMeans:
     sigma: Array
 
     def mean(self, values: Array) -> Array:
-        """Mean over the sets that are kept, (N, S) to (N,)."""
+        """Return the mean over the sets that are kept, (N, S) to (N,)."""
         return np.asarray(np.mean(values, axis=1, where=self.keep))
 
 
 def reduce_sets(
     angle: Array, spots: Spots, principal_distance: float, single: float, present: NDArray[np.bool_] | None = None
 ) -> PointMeans:
-    """Find gross errors among the sets and the noise of the means.
+    """Detect gross errors among the sets and estimate the noise of the means.
 
     In each set, L - f tan W of a point differs from its mean over the sets by the repeatability of the table and by
-    noise, whose sizes the sets themselves tell.
+    noise, both estimated from the sets themselves.
 
     Parameters
     ----------
-    angle : Array
-        W, (N, S), radians, by the readings.
+    angle : (N, S) ndarray
+        Angles W from the readings, in radians.
     spots : Spots
-        As located.
+        Located spots.
     principal_distance : float
-        About, metres.
+        Approximate principal distance, in metres.
     single : float
-        Sigma of one exposure, metres, for a test of one set.
-    present : NDArray[np.bool_] | None
-        Which exposures there are, (N, S), where sets lack points; the others hold any finite numbers. None for all.
+        Sigma of one exposure, in metres, for a test with one set.
+    present : (N, S) ndarray of bool, optional
+        True for exposures that exist, if sets lack points; the others may hold any finite numbers. All by default.
     """
-    rest = spots.position - principal_distance * np.tan(angle)
-    # what does not average out while the spot stays on its pixels
+    deviation = spots.position - principal_distance * np.tan(angle)
+    # errors that do not average out while the spot stays on the same pixels
     fixed = np.sqrt(np.mean(spots.fixed**2, axis=1, where=True if present is None else present))
-    count, sets = rest.shape
+    count, sets = deviation.shape
     if sets < 2:
-        own = np.hypot(single, spots.temporal[:, 0])
-        return PointMeans(np.ones(rest.shape, bool), float(np.sqrt(np.mean(own**2))), np.hypot(own, fixed))
-    # the comparison of the table with the camera is a calibration series, if one forgets its units
-    series = CalibrationSeries(np.arange(count, dtype=float), rest, present=present)
+        single_sigma = np.hypot(single, spots.temporal[:, 0])
+        return PointMeans(
+            np.ones(deviation.shape, bool), float(np.sqrt(np.mean(single_sigma**2))), np.hypot(single_sigma, fixed)
+        )
+    # the comparison of the table with the camera has the form of a calibration series, in other units
+    series = CalibrationSeries(np.arange(count, dtype=float), deviation, present=present)
     return PointMeans(series.keep, series.repeatability, np.hypot(series.noise_sigma, fixed))
 
 
 def _white(fitted: Callable[[float], InteriorOrientation]) -> float:
-    """White noise beside the stated one that brings chi-square to its expectation, metres; zero if it is there already.
+    """Return the additional white noise, in metres, that brings chi-square to its expectation.
 
-    The estimator of Paule and Mandel (J. Res. Natl. Bur. Stand. 87, 377 (1982)). Chi-square falls steadily with the
-    noise.
+    The result is zero if chi-square does not exceed its expectation.
+
+    It is the estimator of Paule and Mandel (J. Res. Natl. Bur. Stand. 87, 377 (1982)). Chi-square decreases steadily
+    with the noise.
     """
-    bare = fitted(0.0)
-    if bare.degrees_of_freedom == 0 or bare.chi_square <= bare.degrees_of_freedom:
+    unscaled = fitted(0.0)
+    if unscaled.degrees_of_freedom == 0 or unscaled.chi_square <= unscaled.degrees_of_freedom:
         return 0.0
 
     def beyond(size: float) -> float:
@@ -800,8 +863,8 @@ def _white(fitted: Callable[[float], InteriorOrientation]) -> float:
         return fit.chi_square - fit.degrees_of_freedom
 
     # white noise of sigma s alone leaves chi-square <= sum(residual^2) / s^2, which is N - P at the upper end
-    most = float(np.sqrt(np.sum(bare.residual**2) / bare.degrees_of_freedom))
-    return float(brentq(beyond, 0.0, most, xtol=1e-11))
+    upper = float(np.sqrt(np.sum(unscaled.residual**2) / unscaled.degrees_of_freedom))
+    return float(brentq(beyond, 0.0, upper, xtol=1e-11))
 
 
 @dataclass(frozen=True, eq=False)
@@ -810,18 +873,18 @@ class Distortion:
 
     Attributes
     ----------
-    angle : Array
-        W of each exposure, (N, S), radians.
-    position : Array
-        L, (N, S), metres.
+    angle : (N, S) ndarray
+        Angle W of each exposure, in radians.
+    position : (N, S) ndarray
+        Position L, in metres.
     means : PointMeans
-        How sets were reduced.
+        Reduction of the sets.
     fit : InteriorOrientation
-        Of the calibrated terms; its residual is the distortion D of the mean of the sets, (N,), metres.
+        Fit of the calibrated terms; its residual is the distortion D of the mean of the sets, (N,), in metres.
     smooth : InteriorOrientation
-        The same with radial distortion; its residual is what is not smooth.
+        The fit with radial distortion added; its residual is the part that is not smooth.
     white : float
-        Sigma of each point's position beyond the noise that was stated, metres; it is in the noise of both fits.
+        Additional sigma of each point's position, in metres, which the noise of both fits includes.
     """
 
     angle: Array
@@ -835,30 +898,30 @@ class Distortion:
     def measure(
         cls, angle: Array, spots: Spots, means: PointMeans, angle_covariance: ArrayLike | None = None
     ) -> Distortion:
-        """Fit.
+        """Fit interior orientation and distortion.
 
         Parameters
         ----------
-        angle : Array
-            (N, S), radians.
+        angle : (N, S) ndarray
+            Angles, in radians.
         spots : Spots
-            As located.
+            Located spots.
         means : PointMeans
-            How sets are reduced.
-        angle_covariance : ArrayLike | None
-            Of the mean angles, (N, N), rad^2: what is common to all sets of a point, without what is independent from
-            point to point.
+            Reduction of the sets.
+        angle_covariance : (N, N) array_like, optional
+            Covariance of the mean angles, in rad^2: errors common to all sets of a point, without those that are
+            independent from point to point.
 
         Raises
         ------
         OrientationError
-            Fewer points than unknowns, or angles that do not determine them.
+            There are fewer points than unknowns, or the angles do not determine them.
         """
-        where, turned = means.mean(spots.position), means.mean(angle)
+        positions, angles = means.mean(spots.position), means.mean(angle)
 
         def fitted(terms: tuple[str, ...], white: float) -> InteriorOrientation:
             sigma = np.hypot(means.sigma, white)
-            return fit_interior_orientation(where, turned, sigma, terms, angle_covariance=angle_covariance)
+            return fit_interior_orientation(positions, angles, sigma, terms, angle_covariance=angle_covariance)
 
         white = _white(lambda size: fitted(SMOOTH, size))
         fit, smooth = fitted(CALIBRATED, white), fitted(SMOOTH, white)
@@ -866,23 +929,24 @@ class Distortion:
 
     @property
     def distortion(self) -> Array:
-        """D, (N,), metres."""
+        """Distortion D (N,), in metres."""
         return self.fit.residual
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation of D, (N,), metres."""
+        """Standard deviation (N,) of D, in metres."""
         return np.sqrt(np.maximum(np.diagonal(self.fit.residual_covariance), 0.0))
 
     @property
     def zero(self) -> float:
-        """Angle at which the line's middle is imaged, by the constant, radians."""
+        """Angle at which the line's middle is imaged, from the constant, in radians."""
         return -self.fit.value("constant") / self.fit.value("principal_distance")
 
     @property
     def rms_over_sets(self) -> Array:
-        """RMS of each point's distortion over the sets that are kept, (N,), metres, every set fitted by itself: what
-        Table 2 of paper 004 is called.
+        """RMS (N,) of each point's distortion over the kept sets, each fitted by itself, in metres.
+
+        The values are named after Table 2 of paper 004.
         """
         out = np.full(self.position.shape, np.nan)
         for s, keep in enumerate(self.means.keep.T):

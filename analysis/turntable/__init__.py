@@ -1,1 +1,1 @@
-"""Dividing error of a turntable: repeats, outliers, fits, compensation (paper 004)."""
+"""Dividing error of a turntable: repeated comparisons, outliers, fits and compensation (paper 004)."""

@@ -1,8 +1,10 @@
-"""The back-propagation network of paper 004 (section 3.3) as a fit of a curve: one angle in, one hidden layer of tanh,
-one value out; trained on standardised points with weight decay, several times from random starts, and averaged.
+"""Back-propagation network of paper 004 (section 3.3) as a curve fit with one hidden layer of tanh.
 
-It has more weights than there are points. The decay makes the solution definite and leaves some 25 effective
-parameters. A training that does not converge is left out and counted.
+One angle goes in, one value comes out.
+
+It is trained on standardised points with weight decay, several times from random starts, and averaged. It has more
+weights than there are points; the decay makes the solution unique and leaves some 25 effective parameters. A
+training that does not converge is excluded and counted.
 """
 
 from __future__ import annotations
@@ -23,47 +25,47 @@ DECAY, GAIN = 1e-2, 5.0
 Chosen on simulated turntables, seeds 0 to 3 of a model like that of scenes/lab/turntable.yaml.
 """
 FLATTEST = 0.1
-"""Least curvature of the network's loss, in units of the decay, that its linearisation believes. Between 0.1 and 1 the
-propagated sigma changes by 6% and agrees with the scatter of networks trained on fresh noise.
+"""Smallest curvature of the network's loss, in units of the decay, that its linearisation uses. Between 0.1 and 1 the
+propagated sigma changes by 6 % and agrees with the scatter of networks trained on fresh noise.
 """
 MOST_ITERATIONS, TOLERANCE = 8000, 1e-4
 
 
 class NotConvergedError(MeasurementError, RuntimeError):
-    """No training of the network came to a minimum."""
+    """Network of which no training converged."""
 
 
 def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], Curve, Curve]:
-    """Train; points (N,) each, checked by the caller.
+    """Train the network on points (N,) that the caller has checked.
 
     Parameters
     ----------
-    x : Array
-        angles.
-    y : Array
-        values.
-    s : Array
-        Their standard deviations.
+    x : (N,) ndarray
+        Angles, in radians.
+    y : (N,) ndarray
+        Values.
+    s : (N,) ndarray
+        Standard deviations of the values.
     seed : int
-        Of the random starts.
+        Seed of the random starts.
 
     Returns
     -------
-    tuple[dict[str, float], Curve, Curve]
-        Settings, curve (M,) -> (M,), and its derivative with respect to the values, (M,) -> (M, N).
+    tuple of (dict of str to float, callable, callable)
+        Settings, the curve, (M,) to (M,), and its derivatives with respect to the values, (M,) to (M, N).
 
     Raises
     ------
     NotConvergedError
-        No training came to a minimum.
+        No training converged.
     """
-    # a second for the import, and only this fit needs it
+    # imported here because the import takes a second and only this fit needs it
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.neural_network import MLPRegressor
 
     hidden = min(HIDDEN, (len(x) - 1) // 2)
     middle, scale = float(np.mean(x)), GAIN / float(np.std(x))
-    mean, spread = float(np.mean(y)), float(np.std(y)) or 1.0
+    mean, scale_of_values = float(np.mean(y)), float(np.std(y)) or 1.0
     weight = s**-2 / np.mean(s**-2)
     nets: list[Any] = []
     for state in np.random.SeedSequence(seed).generate_state(RESTARTS):
@@ -78,24 +80,26 @@ def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], 
             random_state=int(state),
         )
         with warnings.catch_warnings():
-            # a training that stops early is left out, and counted in the settings
+            # a training that does not converge is excluded, and counted in the settings
             warnings.simplefilter("error", ConvergenceWarning)
             try:
-                nets.append(net.fit(scale * (x[:, None] - middle), (y - mean) / spread, sample_weight=weight))
+                nets.append(net.fit(scale * (x[:, None] - middle), (y - mean) / scale_of_values, sample_weight=weight))
             except ConvergenceWarning:
                 continue
     if not nets:
         raise NotConvergedError(
-            f"network: none of {RESTARTS} trainings came to a minimum in {MOST_ITERATIONS} iterations; check the "
-            "values for gross errors, or take another fit"
+            f"network: none of {RESTARTS} trainings converged in {MOST_ITERATIONS} iterations; check the "
+            "values for gross errors, or choose another fit"
         )
 
     def curve(a: Array) -> Array:
-        return mean + spread * np.mean([net.predict(scale * (a[:, None] - middle)) for net in nets], axis=0)
+        """Return the mean prediction of the networks at angles."""
+        return mean + scale_of_values * np.mean([net.predict(scale * (a[:, None] - middle)) for net in nets], axis=0)
 
-    solves = [response(net, scale * (x - middle), (y - mean) / spread, weight) for net in nets]
+    solves = [response(net, scale * (x - middle), (y - mean) / scale_of_values, weight) for net in nets]
 
     def derivative(a: Array) -> Array:
+        """Return the derivatives of the predictions at angles with respect to the training values."""
         at = scale * (a - middle)
         return np.asarray(np.mean([gradient(net, at) @ solve for net, solve in zip(nets, solves, strict=True)], axis=0))
 
@@ -103,9 +107,14 @@ def network(x: Array, y: Array, s: Array, seed: int) -> tuple[dict[str, float], 
 
 
 def gradient(net: Any, x: Array) -> Array:
-    """Derivative (M, 3 H + 1) of the output c + v . tanh(w x + b), at standardised angles, by (w, b, v, c).
+    """Return the derivatives (M, 3 H + 1) of the output c + v . tanh(w x + b) with respect to (w, b, v, c).
 
-    net: scikit-learn's, with one hidden layer of H; only `coefs_` and `intercepts_` are used.
+    Parameters
+    ----------
+    net : MLPRegressor
+        Network of scikit-learn with one hidden layer of H; only `coefs_` and `intercepts_` are used.
+    x : (M,) ndarray
+        Standardised angles.
     """
     w, b, v = net.coefs_[0][0], net.intercepts_[0], net.coefs_[1][:, 0]
     t = np.tanh(np.outer(x, w) + b)
@@ -114,44 +123,46 @@ def gradient(net: Any, x: Array) -> Array:
 
 
 def response(net: Any, x: Array, y: Array, weight: Array) -> Array:
-    """Derivative (3 H + 1, N) of the trained weights with respect to the values, by the implicit function theorem at
-    the minimum of 1/2 sum weight (net - y)^2 + DECAY/2 (|w|^2 + |v|^2).
+    """Return the derivatives (3 H + 1, N) of the trained weights with respect to the training values.
+
+    They follow from the implicit function theorem at the minimum of 1/2 sum weight (net - y)^2 + DECAY/2 (|w|^2 +
+    |v|^2).
 
     Parameters
     ----------
-    net : Any
-        Trained, as for `gradient`.
-    x : Array
-        Inputs of the net, (N,).
-    y : Array
-        Values that it was trained with, (N,).
-    weight : Array
-        Of the values, (N,).
+    net : MLPRegressor
+        Trained network, as for `gradient`.
+    x : (N,) ndarray
+        Inputs of the network.
+    y : (N,) ndarray
+        Training values.
+    weight : (N,) ndarray
+        Weights of the values.
     """
     w, b, v, c = net.coefs_[0][0], net.intercepts_[0], net.coefs_[1][:, 0], net.intercepts_[1][0]
     n = len(w)
     t = np.tanh(np.outer(x, w) + b)
-    bend = 1.0 - t**2
+    slopes = 1.0 - t**2
     jacobian = gradient(net, x)
     residual = weight * (c + t @ v - y)
     hessian = jacobian.T @ (weight[:, None] * jacobian)
-    # what the residuals add: second derivatives of the output, within one hidden unit only
-    once, twice = residual @ (bend * x[:, None]), residual @ bend
-    curved = -2.0 * v * t * bend
+    # contribution of the residuals: second derivatives of the output, nonzero within one hidden unit only
+    by_input, by_bias = residual @ (slopes * x[:, None]), residual @ slopes
+    second = -2.0 * v * t * slopes
     i = np.arange(n)
     for row, column, term in (
-        (0, 0, residual @ (curved * x[:, None] ** 2)),
-        (0, n, residual @ (curved * x[:, None])),
-        (n, n, residual @ curved),
-        (0, 2 * n, once),
-        (n, 2 * n, twice),
+        (0, 0, residual @ (second * x[:, None] ** 2)),
+        (0, n, residual @ (second * x[:, None])),
+        (n, n, residual @ second),
+        (0, 2 * n, by_input),
+        (n, 2 * n, by_bias),
     ):
         hessian[row + i, column + i] += term
         if row != column:
             hessian[column + i, row + i] += term
     hessian[i, i] += DECAY
     hessian[2 * n + i, 2 * n + i] += DECAY
-    # Trainings stop a little short of the minimum, where flat directions may still curve the wrong way; none can be
-    # flatter than a part of the decay, or the response would be too large by any amount.
+    # Trainings stop slightly before the minimum, where flat directions may have negative curvature; a lower bound
+    # relative to the decay keeps the response from becoming arbitrarily large.
     level, direction = np.linalg.eigh(hessian)
     return (direction / np.maximum(level, FLATTEST * DECAY)) @ (direction.T @ (jacobian.T * weight))

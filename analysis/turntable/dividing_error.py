@@ -1,4 +1,4 @@
-"""Dividing error of a turntable from repeated comparisons with a reference: outliers, curve fits, and compensation.
+"""Dividing error of a turntable from comparisons with a reference: outliers, curve fits, compensation.
 
 Sign, everywhere: **dividing error = reading - true angle**, e(R) = R - phi. A corrected angle is R - e(R).
 
@@ -6,7 +6,8 @@ The table is stopped at a set of readings; at each of them a reference (indexed 
 true angle, so that every comparison gives e(R) + the error of the reference at that position + noise. The comparisons
 are repeated (paper 004, section 3.3).
 
-1. `CalibrationSeries`: gross errors are rejected by Chauvenet's criterion; mean, RMS of the repeats before and after, sigma.
+1. `CalibrationSeries`: gross errors are rejected by Chauvenet's criterion; mean, RMS of the repeats before and after,
+   sigma.
 2. `choose`: five fits, of which the one with the smallest cross-validation error is chosen.
 3. `DividingCompensation`: corrects readings and gives the covariance of the corrected angles.
 
@@ -29,8 +30,8 @@ most 0.081 / sqrt(10) = 0.026 arcsec, less than 0.037, and with it some 0.037 / 
 - `piecewise_linear`: straight lines through the points.
 - `polynomial`: weighted least squares in Chebyshev polynomials; the order by leave-one-out.
 - `cubic_spline`: natural cubic smoothing spline, the smoothing by leave-one-out; without smoothing it interpolates.
-- `fourier`: weighted least squares in a Fourier series whose fundamental period is longer than the range, since an arc is
-  not a full circle and the curve's ends need not meet; period and order by leave-one-out.
+- `fourier`: weighted least squares in a Fourier series whose fundamental period is longer than the range, since an arc
+  is not a full circle and the curve's ends need not meet; period and order by leave-one-out.
 - `network`: the paper's back-propagation network: one hidden layer of tanh, standardised, with weight decay; mean of
   several trainings from random starts.
 
@@ -109,16 +110,15 @@ class AngleFit:
         UndeterminedError
             An angle lies outside the range of the points.
         """
-        at = np.asarray(angle, np.float64)
-        return self.curve(self._inside(at).ravel()).reshape(at.shape)
+        angles = np.asarray(angle, np.float64)
+        return self.curve(self._inside(angles).ravel()).reshape(angles.shape)
 
     def weights(self, angle: ArrayLike) -> Array:
         """Return the derivatives (M, N) of the predictions at angles (M,) with respect to the points' values."""
         return self.derivative(self._inside(np.atleast_1d(np.asarray(angle, np.float64))))
 
     def covariance(self, angle: ArrayLike, other: ArrayLike | None = None) -> Array:
-        """Return the covariance of the predictions at angles (M,) and (L,), or (M, M), from the points' independent
-        sigmas.
+        """Return the covariance of the predictions at angles (M,) and (L,), or (M, M), from the points' sigmas.
 
         It includes the noise alone, not the error of the fitted form; see `DividingCompensation.covariance`.
         """
@@ -132,12 +132,11 @@ class AngleFit:
         return float(np.trace(self.weights(self.angle)))
 
     def step_at(self, angle: ArrayLike) -> Array:
-        """Return the distance of the two points between which each angle lies, in the shape of the angles, in radians.
-        """
-        at = np.asarray(angle, np.float64)
+        """Return the distance of the two points around each angle, in the shape of the angles, in radians."""
+        angles = np.asarray(angle, np.float64)
         steps = np.diff(self.angle)
         # a point belongs to the smaller of its two steps
-        below, above = (np.searchsorted(self.angle, at + side, side="right") for side in (-SLACK, SLACK))
+        below, above = (np.searchsorted(self.angle, angles + side, side="right") for side in (-SLACK, SLACK))
         return np.asarray(np.minimum(*(steps[np.clip(k, 1, len(steps)) - 1] for k in (below, above))))
 
     def _inside(self, angle: Array) -> Array:
@@ -146,7 +145,7 @@ class AngleFit:
         slack = 1e-9 * (high - low)
         if not np.all((angle >= low - slack) & (angle <= high + slack)):
             raise UndeterminedError(
-                f"{self.name}: {np.degrees(np.min(angle)):.4f} to {np.degrees(np.max(angle)):.4f} deg asked for, but "
+                f"{self.name}: {np.degrees(np.min(angle)):.4f} to {np.degrees(np.max(angle)):.4f} deg requested, but "
                 f"calibrated from {np.degrees(low):.4f} to {np.degrees(high):.4f} deg; calibrate the whole range of use"
             )
         return angle
@@ -255,7 +254,7 @@ def fit_dividing_error(
     0.043
     """
     if method not in FITS:
-        raise ValueError(f"no fit is called {method!r}; there are {', '.join(FITS)}")
+        raise ValueError(f"there is no fit {method!r}; known are {', '.join(FITS)}")
     x, y, s = _points(method, angle, value, sigma)
     settings, curve, derivative = FITS[method](x, y, s, seed)
     return AngleFit(method, x, y, s, settings, curve, derivative)
@@ -299,21 +298,21 @@ def cross_validate(
     x, y, s = _points(name, angle, value, sigma)
     if not 2 <= folds:
         raise ValueError(f"cross-validation: {folds} folds; take 2 or more")
-    left = angles_left(len(x), folds)
-    if left < fewest(name) or len(x) < 3:
+    remaining_count = angles_left(len(x), folds)
+    if remaining_count < fewest(name) or len(x) < 3:
         raise ValueError(
-            f"{name}: cross-validation leaves {left} of {len(x)} angles, but at least {fewest(name)} are needed "
-            "and one to leave out; calibrate more, take more folds, or another fit"
+            f"{name}: cross-validation leaves {remaining_count} of {len(x)} angles, but at least {fewest(name)} are "
+            "needed and one to exclude; calibrate more angles, use more folds, or choose another fit"
         )
     inner = np.arange(1, len(x) - 1)
     residual, variance = np.empty(len(x)), np.empty(len(x))
     for k in range(min(folds, len(inner))):
-        out = inner[k::folds]
-        rest = np.setdiff1d(np.arange(len(x)), out)
-        part = fit_dividing_error(x[rest], y[rest], s[rest], name, seed)
-        weights = part.weights(x[out])
-        residual[out] = y[out] - part(x[out])
-        variance[out] = s[out] ** 2 + (weights**2) @ s[rest] ** 2
+        excluded = inner[k::folds]
+        remaining = np.setdiff1d(np.arange(len(x)), excluded)
+        fit = fit_dividing_error(x[remaining], y[remaining], s[remaining], name, seed)
+        weights = fit.weights(x[excluded])
+        residual[excluded] = y[excluded] - fit(x[excluded])
+        variance[excluded] = s[excluded] ** 2 + (weights**2) @ s[remaining] ** 2
     return CrossValidation(name, x[inner], residual[inner], variance[inner])
 
 
@@ -326,7 +325,7 @@ def _points(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> 
     """Return validated angles, values and sigmas as arrays (N,)."""
     x, y = np.asarray(angle, np.float64), np.asarray(value, np.float64)
     if x.ndim != 1 or y.shape != x.shape:
-        raise ValueError(f"{name}: angles and values must be (N,) alike, found {x.shape} and {y.shape}")
+        raise ValueError(f"{name}: angles and values must be (N,) and of equal shape, found {x.shape} and {y.shape}")
     s = np.broadcast_to(np.asarray(sigma, np.float64), x.shape)
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y)) and np.all(np.isfinite(s)) and np.all(s > 0.0)):
         raise ValueError(f"{name}: angles and values must be finite and sigmas greater than zero")
@@ -337,13 +336,13 @@ def _points(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> 
     need = fewest(name) if name in FITS else 0
     if len(x) < need:
         raise UndeterminedError(
-            f"{name}: {len(x)} angles, but at least {need} are needed; calibrate more, or take another fit"
+            f"{name}: {len(x)} angles, but at least {need} are needed; calibrate more angles, or choose another fit"
         )
     return x, y, np.array(s)
 
 
-# A fit: points, seed -> settings, curve, derivative
-_Made = tuple[dict[str, float], Curve, Curve]
+# Result of a fit: settings, curve, derivative
+_FitResult = tuple[dict[str, float], Curve, Curve]
 
 
 def _linear(basis: Curve, solve: Array, value: Array) -> tuple[Curve, Curve]:
@@ -364,8 +363,9 @@ def _left_out(hat: Array, value: Array) -> float:
     return float(np.mean(((value - hat @ value)[1:-1] / free) ** 2))
 
 
-def _piecewise_linear(x: Array, y: Array, s: Array, seed: int) -> _Made:
+def _piecewise_linear(x: Array, y: Array, s: Array, seed: int) -> _FitResult:
     """Fit straight lines through the points."""
+
     def hats(a: Array) -> Array:
         return np.stack([np.interp(a, x, unit) for unit in np.eye(len(x))], axis=-1)
 
@@ -377,7 +377,7 @@ def _least_squares(design: Array, s: Array) -> Array:
     return np.linalg.pinv(design / s[:, None], rcond=1e-10) / s
 
 
-def _polynomial(x: Array, y: Array, s: Array, seed: int) -> _Made:
+def _polynomial(x: Array, y: Array, s: Array, seed: int) -> _FitResult:
     """Fit Chebyshev polynomials of the order with the smallest leave-one-out error."""
     middle, half = 0.5 * (x[0] + x[-1]), 0.5 * (x[-1] - x[0])
     best: tuple[float, int, Array] = (np.inf, 0, np.empty(0))
@@ -395,7 +395,7 @@ def _chebyshev(middle: float, half: float, order: int) -> Curve:
     return lambda a: np.asarray(np.polynomial.chebyshev.chebvander((a - middle) / half, order), np.float64)
 
 
-def _fourier(x: Array, y: Array, s: Array, seed: int) -> _Made:
+def _fourier(x: Array, y: Array, s: Array, seed: int) -> _FitResult:
     """Fit a Fourier series of the period and order with the smallest leave-one-out error."""
     best: tuple[float, int, float, Array] = (np.inf, 0, 0.0, np.empty(0))
     for period in PERIODS:
@@ -411,6 +411,7 @@ def _fourier(x: Array, y: Array, s: Array, seed: int) -> _Made:
 
 def _harmonics(first: float, period: float, order: int) -> Curve:
     """Return the basis of a constant and of cosines and sines of a fundamental period."""
+
     def basis(a: Array) -> Array:
         phase = 2.0 * np.pi / period * np.outer(a - first, np.arange(1, order + 1))
         return np.concatenate([np.ones((len(a), 1)), np.cos(phase), np.sin(phase)], axis=-1)
@@ -418,7 +419,7 @@ def _harmonics(first: float, period: float, order: int) -> Curve:
     return basis
 
 
-def _cubic_spline(x: Array, y: Array, s: Array, seed: int) -> _Made:
+def _cubic_spline(x: Array, y: Array, s: Array, seed: int) -> _FitResult:
     """Fit a natural cubic smoothing spline with the smallest leave-one-out error.
 
     Green and Silverman, Nonparametric Regression (1994), section 2.3: g = (W + a Q R^-1 Q^T)^-1 W y at the points, and
@@ -439,13 +440,13 @@ def _cubic_spline(x: Array, y: Array, s: Array, seed: int) -> _Made:
         hat = np.linalg.solve(np.diag(w) + smoothing * rough, np.diag(w))
         best = min(best, (_left_out(hat, y), smoothing, hat), key=lambda b: b[0])
     smoothing, hat = best[1:]
-    if smoothing == SMOOTHINGS[1]:  # the least one is best: none at all
+    if smoothing == SMOOTHINGS[1]:  # the smallest is best: interpolate without smoothing
         smoothing, hat = 0.0, np.eye(n)
     unit = CubicSpline(x, np.eye(n), bc_type="natural")
     return {"smoothing": float(smoothing)}, *_linear(unit, hat, y)
 
 
-FITS: Mapping[str, Callable[[Array, Array, Array, int], _Made]] = {
+FITS: Mapping[str, Callable[[Array, Array, Array, int], _FitResult]] = {
     "piecewise_linear": _piecewise_linear,
     "polynomial": _polynomial,
     "cubic_spline": _cubic_spline,
@@ -497,13 +498,13 @@ def chauvenet(readings: ArrayLike, present: NDArray[np.bool_] | None = None) -> 
     """
     x = np.asarray(readings, np.float64)
     if not np.all(np.isfinite(x)):
-        raise ValueError("Chauvenet's criterion: readings must be finite; leave failed readings out")
+        raise ValueError("Chauvenet's criterion: readings must be finite; exclude failed readings")
     keep = np.ones(x.shape, bool) if present is None else np.array(present, bool)
     x = np.where(keep, x, 0.0)
     count = keep.sum(-1, keepdims=True)
     deviation = np.abs(x - np.mean(x, -1, keepdims=True, where=keep))
     s = np.sqrt(np.sum(deviation**2, -1, keepdims=True, where=keep) / np.maximum(count - 1, 1))
-    # the comparison without a division: equal readings have s = 0 and stay
+    # comparison without division: equal readings have s = 0 and are kept
     gross = (deviation > limit(count) * s) & (count >= FEWEST)
     # deviations of rounding size are not gross errors
     gross &= deviation > 8.0 * np.finfo(float).eps * np.max(np.abs(x), -1, keepdims=True)
@@ -546,9 +547,7 @@ def normal_reduction(n: int | NDArray[np.int64]) -> float:
 
 
 def _left(n: int) -> tuple[float, float]:
-    """Return the expected sum of squares, in sigma^2, and degrees of freedom that the criterion leaves of n normal
-    readings.
-    """
+    """Return the expected sum of squares (sigma^2) and degrees of freedom after the criterion for n readings."""
     if n < FEWEST:
         return float(max(n - 1, 1)), float(max(n - 1, 1))
     square = float(beta.sf(_scaled(n), 1.5, 0.5 * (n - 2)))
@@ -597,7 +596,9 @@ class CalibrationSeries:
         if np.any(np.diff(x) <= 0.0):
             raise ValueError("calibration: angles must increase; sort them, and put repeats of one angle in one row")
         if y.shape[1] < 2:
-            raise ValueError("calibration: one repeat only; its noise cannot be told. Take 2 or more, 5 to reject any")
+            raise ValueError(
+                "calibration: one repeat does not determine the noise; use 2 or more, and 5 to reject outliers"
+            )
         if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y)) and self.reference_sigma >= 0.0):
             raise ValueError("calibration: angles and comparisons must be finite and reference_sigma not negative")
         if self.present is not None and (self.present.shape != y.shape or np.min(self.present.sum(axis=1)) < 2):
@@ -626,7 +627,7 @@ class CalibrationSeries:
         return self.comparisons.shape[1]
 
     @property
-    def gone(self) -> NDArray[np.bool_]:
+    def excluded_comparisons(self) -> NDArray[np.bool_]:
         """Mask (N, repeats) of the comparisons that Chauvenet's criterion rejects."""
         return self.taken & ~self.keep
 
@@ -638,7 +639,7 @@ class CalibrationSeries:
     @property
     def rejected(self) -> int:
         """Number of rejected comparisons."""
-        return int(np.sum(self.gone))
+        return int(np.sum(self.excluded_comparisons))
 
     @cached_property
     def mean(self) -> Array:
@@ -654,8 +655,7 @@ class CalibrationSeries:
 
     @cached_property
     def rms_after(self) -> Array:
-        """RMS (N,) of the kept repeats about their mean, divisor n - 1, in radians: of single readings, not of means.
-        """
+        """RMS (N,) of the kept repeats about their mean, divisor n - 1, in radians; of readings, not of means."""
         return np.asarray(np.std(self.comparisons, axis=1, ddof=1, where=self.keep))
 
     @property
@@ -712,8 +712,9 @@ class CalibrationSeries:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviation (N,) of each mean as a measure of the dividing error, in radians, from scatter and
-        reference.
+        """Standard deviation (N,) of each mean as a measure of the dividing error, in radians.
+
+        It includes the scatter and the reference.
 
         It is at least the rounding of the angles, which remains in a series without noise.
         """
@@ -793,18 +794,20 @@ def choose(
     ValueError
         There are fewer angles than a fit needs, or no fit succeeded.
     """
-    say = progress or (lambda text: None)
+    report = progress or (lambda text: None)
     trials: dict[str, Trial] = {}
     failed: dict[str, str] = {}
     for name in names:
-        say(f"fit and cross-validate: {name.replace('_', ' ')}")
+        report(f"fit and cross-validate: {name.replace('_', ' ')}")
         points = series.angle, series.mean, series.sigma
         try:
             trials[name] = Trial(fit_dividing_error(*points, name, seed), cross_validate(name, *points, seed, folds))
         except NotConvergedError as error:
             failed[name] = str(error)
     if not trials:
-        raise UndeterminedError(f"no fit of the dividing error succeeded: {'; '.join(failed.values()) or 'none asked'}")
+        raise UndeterminedError(
+            f"no fit of the dividing error succeeded: {'; '.join(failed.values()) or 'none requested'}"
+        )
     return Choice(trials, failed, min(trials, key=lambda name: trials[name].validation.rms))
 
 
@@ -816,10 +819,10 @@ class DividingCompensation:
     four parts:
 
     - the noise of the calibration points, propagated: A diag(sigma^2) A^T with A = `fit.weights`;
-    - `common`^2 everywhere: a constant, for example if all calibration points lie at one phase of the grating's signal; it
-      cancels in differences of angles;
-    - `smooth`^2 times `step_kernel`: the error of the fit between its points, correlated over one step. It grows with the
-      step of the calibration around the reading as the fit's error does (`GAP_ORDER`);
+    - `common`^2 everywhere: a constant, for example if all calibration points lie at one phase of the grating's signal;
+      it cancels in differences of angles;
+    - `smooth`^2 times `step_kernel`: the error of the fit between its points, correlated over one step. It grows with
+      the step of the calibration around the reading as the fit's error does (`GAP_ORDER`);
     - `white`^2 on the diagonal: independent errors from reading to reading, such as the subdivision error, whose period
       (arcseconds) is far below the distances of readings in use.
 
@@ -925,8 +928,9 @@ def covered(angle: Array, reading: ArrayLike) -> NDArray[np.bool_]:
 
 
 def step_kernel(first: Array, second: Array, step: float) -> Array:
-    """Return the correlation (M, L) of the misfit at readings (M,) and (L,), which falls linearly to zero over one
-    step.
+    """Return the correlation (M, L) of the misfit at two sets of readings, zero beyond one step.
+
+    It falls linearly from 1 to 0 over one step.
 
     It is an assumption, not a measurement: the error between two points says little about that between the next two.
     The triangle is a valid correlation (its Fourier transform is not negative).
@@ -948,12 +952,12 @@ def compensate(
 ) -> DividingCompensation:
     """Return the compensation of a chosen fit, with its misfit estimated from residuals beyond their noise.
 
-    - `smooth` comes from the cross-validation on the calibration points. Cross-validation bridges gaps of two steps and the
-      compensation gaps of one, so that for the local fits, whose error falls as h^p, the error is divided by 2^p (p = 2
+    - `smooth` comes from the cross-validation on the calibration points. Cross-validation bridges gaps of two steps and
+      the compensation gaps of one, so that for the local fits, whose error falls as h^p, it is divided by 2^p (p = 2
       for lines, 4 for the spline, 0 for the others).
     - `common` is the mean of the residuals at held-out angles beyond its noise.
-    - `white` is their mean square beyond noise, common and smooth misfit. Calibration points do not show the subdivision
-      error if their step is a whole number of signal periods; held-out angles must lie at other phases.
+    - `white` is their mean square beyond noise, common and smooth misfit. Calibration points do not show the
+      subdivision error if their step is a whole number of signal periods; held-out angles must lie at other phases.
 
     Without held-out angles common and white are zero, and the smooth part keeps its full excess.
 

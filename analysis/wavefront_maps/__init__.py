@@ -1,1 +1,1 @@
-"""Files of measured wavefronts as maps and Zernike coefficients, how they are oriented, and fits over any pupil."""
+"""Files of measured wavefronts as maps and Zernike coefficients, their orientation, and fits over any pupil."""

@@ -1,16 +1,14 @@
-"""Files of measured wavefronts, recognised by what is in them and not by their names.
+"""Readers of measured wavefronts and surfaces, recognised by the content of the file and not by its name.
 
-Maps in text files: interferograms of CODE V, Grid Sag of Zemax, and plain tables of numbers.
+- MetroPro's binary .dat and Mx's .datx (HDF5) of Zygo. Fringes become metres by the factor of the MetroPro Reference
+  Guide (page 12-6): wavelength times interferometric scale factor times obliquity factor.
+- Interferograms of CODE V, Grid Sag of Zemax, and plain tables of numbers, which are text files. Lines that begin with
+  ``!`` are comments of CODE V and Zemax, lines that begin with ``#`` those of a plain table, where they state the
+  meaning of the numbers.
+- FITS images.
 
-All three list the rows from the top of the picture down; they are turned over here. Lines that begin with ``!`` are
-comments of CODE V and Zemax, lines that begin with ``#`` those of a plain table, where they say what the numbers are.
-
-Interferograms of Zygo: MetroPro's binary .dat and Mx's .datx, which is HDF5.
-
-Fringes become metres by the factor of the MetroPro Reference Guide (page 12-6): wavelength times interferometric scale
-factor times obliquity factor. Rows are stored from the top of the picture down and are turned over here.
-
-A measured wavefront or surface as a map of metres, the error of files that hold none, and their units.
+All but FITS store the rows from the top of the picture down; they are flipped here. The result is a map in metres
+(`WavefrontMap`).
 """
 
 from __future__ import annotations
@@ -31,8 +29,9 @@ from analysis.arrays import Array, MeasurementError
 from analysis.images.image_file import FITS_MAGIC, ImageError, ImageFile, fits_cards
 
 WAVES = "waves"
-"""The unit that needs a wavelength."""
+"""Unit that needs a wavelength."""
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12}
+"""Metres in each unit of length."""
 _NAMES = {
     **{name: name for name in _LENGTHS},
     "micron": "um",
@@ -45,42 +44,42 @@ _NAMES = {
         for end in ("", "s")
     },
 }
-"""Names of units in files, in small letters, to those used here."""
+"""Unit by its name in files, in lower case."""
 
 
 class MapError(MeasurementError, ValueError):
-    """A file that cannot be read as a wavefront, or a map from which a number cannot be had; the message says what to
-    change.
+    """File that cannot be read as a wavefront, or map that does not determine a result.
+
+    The message says what to change.
     """
 
 
 @dataclass(frozen=True, eq=False)
 class WavefrontMap:
-    """A wavefront or a surface on a grid of square pixels.
+    """Wavefront or surface on a grid of square pixels.
 
-    Rows and columns are those of a right-handed frame in which the program that wrote the file draws it: x grows with
-    the column to the right, y with the row upwards, so that row 0 is the lowest one.
+    Rows and columns are those of the right-handed frame in which the program that wrote the file displays it: x grows
+    with the column to the right, y with the row upwards, so that row 0 is the lowest one.
 
     Attributes
     ----------
-    values : Array
-        (rows, columns), optical path difference or height in metres with the sign of the file, NaN where nothing was
-        measured.
+    values : (rows, columns) ndarray
+        Optical path difference or height in metres, with the sign of the file; NaN where nothing was measured.
     spacing : float
-        Of the pixels, metres; NaN where the file does not say.
-    wavelength : float | None
-        Metres; None where the file does not say.
-    what : str | None
-        ``wavefront`` or ``surface`` where the file says; None otherwise.
+        Pixel spacing, in metres; NaN if the file does not state it.
+    wavelength : float or None
+        Wavelength, in metres; None if the file does not state it.
+    what : str or None
+        ``wavefront`` or ``surface``; None if the file does not state it.
     scale_factor : float
-        Waves per fringe by which the file's program multiplied (0.5 for light that meets the surface twice); it is in
-        ``values``.
+        Interferometric scale factor in waves per fringe (0.5 for light that meets the surface twice), which ``values``
+        include.
     obliquity : float
-        Factor of oblique light, likewise.
+        Obliquity factor, which ``values`` include.
     kind : str
-        Of the file, as in ``Zygo MetroPro``.
-    notes : tuple[str, ...]
-        What a reader should know of how the file was understood, whole sentences.
+        Kind of the file, such as ``Zygo MetroPro``.
+    notes : tuple of str
+        Sentences on the assumptions made in reading the file.
     """
 
     values: Array
@@ -94,72 +93,72 @@ class WavefrontMap:
 
     @property
     def lit(self) -> NDArray[np.bool_]:
-        """Where something was measured, (rows, columns)."""
+        """Mask (rows, columns) of the measured pixels."""
         return np.isfinite(self.values)
 
 
 def unit_named(path: Path, text: str) -> str:
-    """The unit that a file or a user means: ``m``, ``mm``, ``um``, ``nm``, ``pm``, ``cm`` or ``waves``.
+    """Return the unit of a text: ``m``, ``mm``, ``um``, ``nm``, ``pm``, ``cm`` or ``waves``.
 
     Parameters
     ----------
     path : Path
-        Of the file, for the message.
+        File, for the message.
     text : str
-        Its name.
+        Name of the unit.
 
     Raises
     ------
     MapError
-        No such unit.
+        The unit is unknown.
     """
-    # both letters that stand for micro
+    # accept both letters that mean micro
     name = text.strip().strip("'\"").lower().replace("\N{MICRO SIGN}", "u").replace("\N{GREEK SMALL LETTER MU}", "u")
     if name not in _NAMES:
-        raise MapError(f"{path}: there is no unit {text.strip()[:40]!r}; m, mm, um, nm and waves are known")
+        raise MapError(f"{path}: unknown unit {text.strip()[:40]!r}; m, mm, um, nm and waves are known")
     return _NAMES[name]
 
 
 def metres_per(path: Path, unit: str, wavelength: float | None) -> float:
-    """Metres in one unit.
+    """Return the number of metres in one unit.
 
     Parameters
     ----------
     path : Path
-        Of the file, for the message.
+        File, for the message.
     unit : str
-        As ``unit_named`` gives it.
-    wavelength : float | None
-        Metres, None where it is not known.
+        Unit as returned by ``unit_named``.
+    wavelength : float or None
+        Wavelength, in metres; None if unknown.
 
     Raises
     ------
     MapError
-        Waves of an unknown wavelength.
+        The unit is waves, and the wavelength is unknown.
     """
     if unit != WAVES:
         return _LENGTHS[unit]
     if wavelength is None:
-        raise MapError(f"{path} is in waves and does not say of which wavelength: state the wavelength")
+        raise MapError(f"{path} is in waves and does not state the wavelength: specify the wavelength")
     return wavelength
 
 
 def length_from(path: Path, text: str, key: str) -> float:
-    """A positive length with its unit, as in ``632.8 nm``, in metres.
+    """Return a positive length with its unit, such as ``632.8 nm``, in metres.
 
     Parameters
     ----------
     path : Path
-        Of the file, for the message.
+        File, for the message.
     text : str
         Number and unit.
     key : str
-        What it is the length of, for the message.
+        Name of the length, for the message.
 
     Raises
     ------
     MapError
-        Another text, or not a positive length.
+        The text is not a positive length with a unit.
     """
     number, _, unit = text.strip().partition(" ")
     try:
@@ -175,67 +174,72 @@ def length_from(path: Path, text: str, key: str) -> float:
 
 
 def agreed(path: Path, key: str, stated: float | None, found: float | None) -> float | None:
-    """The one value where file and user both give one.
+    """Return the value from file or user; raise MapError if both state different ones.
 
     Parameters
     ----------
     path : Path
-        Of the file, for the message.
+        File, for the message.
     key : str
-        Of the value, for the message.
-    stated : float | None
-        By the user, in SI units.
-    found : float | None
-        In the file.
+        Name of the value, for the message.
+    stated : float or None
+        Value specified by the user, SI units.
+    found : float or None
+        Value in the file.
 
     Raises
     ------
     MapError
-        They differ by more than a millionth.
+        The values differ by more than a millionth.
     """
     if stated is None or found is None:
         return found if stated is None else stated
     if abs(stated - found) > 1e-6 * abs(found):
-        raise MapError(f"{path} says {key} {found:.8g} m, stated is {stated:.8g} m: take the statement away")
+        raise MapError(f"{path} states {key} {found:.8g} m, but {stated:.8g} m is specified: remove the specification")
     return found
 
 
 MOST_BYTES = 100_000_000
+"""Largest size of a text file that is read, in bytes."""
 MOST_POINTS = 20_000_000
+"""Largest number of points of a map."""
 _ZEMAX_UNITS = {0: 1e-3, 1: 1e-2, 2: 25.4e-3, 3: 1.0}
-"""Unit flag of a Grid Sag file -> metres."""
+"""Metres for each unit flag of a Grid Sag file."""
 _CODEV_NO_DATA = -32768
+"""Count that marks missing data in CODE V files without NDA."""
 _CODEV_DATA = ("WFR", "SUR", "FIL")
 _CODEV_KEY = re.compile(r"\b(GRD|ZFR|ZRN)\s+\d+", re.IGNORECASE)
 _STATEMENT = re.compile(r"#\s*([\w ]+?)\s*[:=]\s*(.*)")
 _WHAT = ("wavefront", "surface")
 
 Line = tuple[int, str]
-"""Number in the file, from 1, and text."""
+"""Line number in the file, from 1, and text."""
 
 
 def text_of(path: Path) -> str:
-    """The text of a file in UTF-8, UTF-16 with its mark, or Latin-1.
+    """Return the text of a file in UTF-8, UTF-16 with byte order mark, or Latin-1.
 
     Parameters
     ----------
     path : Path
-        Of the file.
+        File to read.
 
     Raises
     ------
     MapError
-        Too large, or no text.
+        The file is too large, or is not a text file.
     """
     size = path.stat().st_size
     if size > MOST_BYTES:
-        raise MapError(f"{path} has {size * 1e-6:.0f} MB, more than {MOST_BYTES * 1e-6:.0f}: save a smaller map")
+        raise MapError(
+            f"{path} has {size * 1e-6:.0f} MB, at most {MOST_BYTES * 1e-6:.0f} MB are read: save a smaller map"
+        )
     data = path.read_bytes()
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return data.decode("utf-16", "replace")
     if b"\0" in data:
         raise MapError(
-            f"{path} is no file of a wavefront that is known: MetroPro .dat, .datx, CODE V INT, Zemax Grid Sag, FITS"
+            f"{path} is not a wavefront file of a known format: MetroPro .dat, .datx, CODE V INT, Zemax Grid Sag, FITS"
             " and text tables are read"
         )
     try:
@@ -245,78 +249,78 @@ def text_of(path: Path) -> str:
 
 
 def lines_of(text: str, comment: str) -> list[Line]:
-    """Lines that say something, with their numbers.
+    """Return the non-empty lines that are not comments, with their numbers.
 
     Parameters
     ----------
     text : str
-        Of the file.
+        Text of the file.
     comment : str
-        How lines begin that are left out.
+        Start of a comment line.
     """
     numbered = enumerate(text.splitlines(), 1)
     return [(n, s) for n, s in ((n, line.strip()) for n, line in numbered) if s and not s.startswith(comment)]
 
 
 def is_codev(lines: list[Line]) -> bool:
-    """Whether one of the first lines, which may be titles, says that a grid or Zernike terms follow.
+    """Return True if one of the first lines, after possible titles, announces a grid or Zernike terms of CODE V.
 
     Parameters
     ----------
-    lines : list[Line]
-        Without comments.
+    lines : list of (int, str)
+        Lines of the file without comments.
     """
     return any(_CODEV_KEY.match(text) for _, text in lines[:4])
 
 
 def is_zemax(lines: list[Line]) -> bool:
-    """Whether the first line has the five or seven numbers of a Grid Sag file, two sizes before all.
+    """Return True if the first line has the five or seven numbers of a Grid Sag file, two sizes first.
 
     Parameters
     ----------
-    lines : list[Line]
-        Without comments.
+    lines : list of (int, str)
+        Lines of the file without comments.
     """
     first = lines[0][1].split() if lines else []
-    if len(first) not in (5, 7) or not all(re.fullmatch(r"[0-9]{1,9}", one) for one in first[:2]):
+    if len(first) not in (5, 7) or not all(re.fullmatch(r"[0-9]{1,9}", word) for word in first[:2]):
         return False
-    # a plain table of so many columns goes on with as many, and has not just so many rows as two of its numbers say
+    # a plain table has as many columns in the second line, and a number of rows unrelated to its first two numbers
     like_a_table = len(lines) > 1 and len(lines[1][1].split()) == len(first)
     return not like_a_table or len(lines) == int(first[0]) * int(first[1]) + 1
 
 
 def _numbers(path: Path, lines: Iterable[Line], split: str = r"\s+") -> tuple[Array, list[int]]:
-    """All numbers of lines in a row, and how many each line has. Raises MapError at the first text that is none."""
-    out, widths = array("d"), []
+    """Return all numbers of lines in a row and the number of each line; raise MapError at text that is not a number."""
+    numbers, widths = array("d"), []
     for number, text in lines:
         words = re.split(split, text.strip(" \t,;"))
-        for one in words:
+        for word in words:
             try:
-                # Python reads 1_000 as a number, no other program does
-                out.append(float(one.replace("_", "?")))
+                # reject 1_000, which only Python reads as a number
+                numbers.append(float(word.replace("_", "?")))
             except ValueError:
-                raise MapError(f"{path}, line {number}: {one[:40]!r} is no number") from None
+                raise MapError(f"{path}, line {number}: {word[:40]!r} is not a number") from None
         widths.append(len(words))
-    return np.array(out), widths
+    return np.array(numbers), widths
 
 
 def read_codev(path: Path, lines: list[Line]) -> WavefrontMap:
-    """An interferogram of CODE V with a grid: whole numbers of which SSZ make one wave of WVL micrometres.
+    """Read a CODE V interferogram with a grid: integers of which SSZ make one wave of WVL micrometres.
 
     Parameters
     ----------
     path : Path
-        Of the file.
-    lines : list[Line]
-        Of it, without comments.
+        File to read, for messages.
+    lines : list of (int, str)
+        Lines of the file without comments.
 
     Raises
     ------
     MapError
-        Zernike terms, transmissions, a header that is not understood, or another number of points.
+        The file holds Zernike terms or transmissions, the header is not understood, or the number of points is wrong.
     """
-    place = next(k for k, (_, text) in enumerate(lines) if _CODEV_KEY.match(text))
-    number, header = lines[place]
+    header_index = next(k for k, (_, text) in enumerate(lines) if _CODEV_KEY.match(text))
+    number, header = lines[header_index]
     where = f"{path}, line {number}"
     words = header.upper().split()
     sizes: list[int] = []
@@ -325,39 +329,43 @@ def read_codev(path: Path, lines: list[Line]) -> WavefrontMap:
     while words:
         word = words.pop(0)
         if word in ("ZFR", "ZRN"):
-            raise MapError(f"{where}: the file holds Zernike terms ({word}), no grid: write them as a table of terms")
-        wanted = 2 if word == "GRD" else 1 if word in ("WVL", "SSZ", "NDA", "XSC") else 0
-        if not wanted and word not in (*_CODEV_DATA, "NNB"):
+            raise MapError(
+                f"{where}: the file holds Zernike terms ({word}), not a grid: write them as a table of terms"
+            )
+        needed = 2 if word == "GRD" else 1 if word in ("WVL", "SSZ", "NDA", "XSC") else 0
+        if not needed and word not in (*_CODEV_DATA, "NNB"):
             raise MapError(f"{where}: {word[:40]!r} is not understood; GRD, WFR, SUR, WVL, SSZ, NDA, XSC, NNB are")
-        taken, words = words[:wanted], words[wanted:]
+        arguments, words = words[:needed], words[needed:]
         try:
-            found = [float(one) for one in taken]
+            numbers = [float(number_text) for number_text in arguments]
         except ValueError:
-            found = []
-        if len(found) < wanted or not all(map(math.isfinite, found)):
-            raise MapError(f"{where}: {wanted} number(s) are needed after {word}, found {' '.join(taken)[:40]!r}")
+            numbers = []
+        if len(numbers) < needed or not all(map(math.isfinite, numbers)):
+            raise MapError(f"{where}: {needed} number(s) are needed after {word}, found {' '.join(arguments)[:40]!r}")
         if word == "GRD":
-            sizes = [int(one) if one == int(one) else 0 for one in found]
+            sizes = [int(number_text) if number_text == int(number_text) else 0 for number_text in numbers]
         elif word in _CODEV_DATA:
             kind = word
-        elif wanted:
-            values[word] = found[0]
+        elif needed:
+            values[word] = numbers[0]
     if kind == "FIL":
-        raise MapError(f"{where}: the file holds transmissions (FIL), no wavefront: give one with WFR or SUR")
+        raise MapError(f"{where}: the file holds transmissions (FIL), not a wavefront: use a file with WFR or SUR")
     if not kind:
-        raise MapError(f"{where} says neither WFR (wavefront) nor SUR (surface)")
+        raise MapError(f"{where} states neither WFR (wavefront) nor SUR (surface)")
     for key, meaning in (("WVL", "the wavelength in micrometres"), ("SSZ", "the number of counts in a wave")):
         if not values.get(key, 0.0) > 0.0:
             raise MapError(f"{where}: {key}, {meaning}, is missing or not positive")
     if abs(values.get("XSC", 1.0) - 1.0) > 1e-6:
         raise MapError(f"{where}: its pixels are not square (XSC {values['XSC']:g}): resample the map to square ones")
     columns, rows = _grid(where, sizes)
-    counts, _ = _numbers(path, lines[place + 1 :])
+    counts, _ = _numbers(path, lines[header_index + 1 :])
     _check_points(path, counts, len(counts), rows, columns)
     counts = counts.reshape(rows, columns)
     no_data = values.get("NDA", _CODEV_NO_DATA)
     metres = values["WVL"] * 1e-6 / values["SSZ"]
-    notes = () if "NDA" in values else (f"NDA is not stated; {_CODEV_NO_DATA} was taken for no data, as CODE V does.",)
+    notes = (
+        () if "NDA" in values else (f"NDA is not stated; {_CODEV_NO_DATA} was used for missing data, as in CODE V.",)
+    )
     return WavefrontMap(
         values=np.where(counts == no_data, np.nan, counts * metres)[::-1],
         spacing=math.nan,
@@ -369,21 +377,23 @@ def read_codev(path: Path, lines: list[Line]) -> WavefrontMap:
 
 
 def read_zemax(path: Path, lines: list[Line]) -> WavefrontMap:
-    """A Grid Sag file of Zemax: sizes, steps and unit in its first line, then a line a point, sag before its slopes.
+    """Read a Zemax Grid Sag file.
 
-    A Grid Phase file looks the same and holds radians; it cannot be told from one of sags.
+    The first line holds sizes, steps and unit; then there is a line per point, sag before its slopes.
+
+    A Grid Phase file has the same form and holds radians; it cannot be distinguished from one of sags.
 
     Parameters
     ----------
     path : Path
-        Of the file.
-    lines : list[Line]
-        Of it, without comments.
+        File to read, for messages.
+    lines : list of (int, str)
+        Lines of the file without comments.
 
     Raises
     ------
     MapError
-        a header or points that are not of this form.
+        Header or points do not have this form.
     """
     where = f"{path}, line {lines[0][0]}"
     nx, ny, step_x, step_y, flag, *shift = _numbers(path, [lines[0]])[0]
@@ -394,7 +404,7 @@ def read_zemax(path: Path, lines: list[Line]) -> WavefrontMap:
     step_x, step_y = abs(step_x), abs(step_y)
     if not (0.0 < step_x < math.inf and abs(step_x - step_y) <= 1e-6 * step_x):
         raise MapError(
-            f"{where}: steps {step_x:g} and {step_y:g} are no square pixels: resample the map to square ones"
+            f"{where}: steps {step_x:g} and {step_y:g} are not square pixels: resample the map to square ones"
         )
     points, widths = _numbers(path, lines[1:])
     if len(set(widths)) != 1 or widths[0] not in (1, 4, 5):
@@ -403,33 +413,33 @@ def read_zemax(path: Path, lines: list[Line]) -> WavefrontMap:
     table = points.reshape(rows * columns, widths[0])
     measured = table[:, 4] == 0.0 if table.shape[1] == 5 else np.ones(len(table), bool)
     values = np.where(measured, table[:, 0] * unit, np.nan).reshape(rows, columns)[::-1]
-    notes = ["Read as sag. A Grid Phase file looks alike and would hold radians."]
+    notes = ["Read as sag. A Grid Phase file has the same form but holds radians."]
     if any(shift):
         notes.append("The shift of the grid that the file states (xdec, ydec) is not used.")
     return WavefrontMap(values, step_x * unit, None, "surface", kind="Zemax Grid Sag", notes=tuple(notes))
 
 
 def read_table(path: Path, text: str, wavelength: float | None) -> WavefrontMap:
-    """A plain table of numbers, separated by commas, semicolons or blanks, ``nan`` where nothing was measured.
+    """Read a plain table of numbers, separated by commas, semicolons or blanks, with ``nan`` for missing points.
 
-    Lines ``# unit: nm``, ``# spacing: 0.1 mm``, ``# wavelength: 632.8 nm`` and ``# what: surface`` before it say what
-    it holds; the unit is needed.
+    Lines ``# unit: nm``, ``# spacing: 0.1 mm``, ``# wavelength: 632.8 nm`` and ``# what: surface`` before it state its
+    meaning; the unit is required.
 
     Parameters
     ----------
     path : Path
-        Of the file.
+        File to read, for messages.
     text : str
-        Of it.
-    wavelength : float | None
-        Metres, where the file does not say.
+        Text of the file.
+    wavelength : float or None
+        Wavelength, in metres, if the file does not state it.
 
     Raises
     ------
     MapError
-        No table, no unit, or a statement that contradicts the file.
+        The file holds no table or no unit, or the wavelength contradicts the file.
     """
-    found = statements(path, text, ("unit", "spacing", "wavelength", "what"))
+    stated = statements(path, text, ("unit", "spacing", "wavelength", "what"))
     lines = lines_of(text, "#")
     if not lines:
         raise MapError(f"{path} holds no numbers")
@@ -444,87 +454,95 @@ def read_table(path: Path, text: str, wavelength: float | None) -> WavefrontMap:
         path,
         "wavelength",
         wavelength,
-        length_from(path, found["wavelength"], "wavelength") if "wavelength" in found else None,
+        length_from(path, stated["wavelength"], "wavelength") if "wavelength" in stated else None,
     )
-    named = unit_written(path, found.get("unit"), "a line '# unit: nm' before the numbers")
-    what = found.get("what")
+    unit = unit_written(path, stated.get("unit"), "a line '# unit: nm' before the numbers")
+    what = stated.get("what")
     if what is not None and what not in _WHAT:
         raise MapError(f"{path}: what is {what[:40]!r}; wavefront and surface are known")
-    spacing = length_from(path, found["spacing"], "spacing") if "spacing" in found else math.nan
-    return WavefrontMap(table[::-1] * metres_per(path, named, wavelength), spacing, wavelength, what, kind="text table")
+    spacing = length_from(path, stated["spacing"], "spacing") if "spacing" in stated else math.nan
+    return WavefrontMap(table[::-1] * metres_per(path, unit, wavelength), spacing, wavelength, what, kind="text table")
 
 
 def statements(path: Path, text: str, keys: tuple[str, ...]) -> dict[str, str]:
-    """What lines ``# key: value`` of a table say; other comments may stand beside them.
+    """Return the values of lines ``# key: value`` of a table; other comments are ignored.
 
     Parameters
     ----------
     path : Path
-        Of the file, for messages.
+        File, for messages.
     text : str
-        Of it.
-    keys : tuple[str, ...]
-        That mean something.
+        Text of the file.
+    keys : tuple of str
+        Known keys.
 
     Raises
     ------
     MapError
-        a key that is stated twice.
+        A key occurs twice.
     """
-    out: dict[str, str] = {}
+    values: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
         match = _STATEMENT.fullmatch(line.strip())
         if match is None or (key := match[1].lower()) not in keys:
             continue
-        if key in out:
-            raise MapError(f"{path}, line {number}: {key} is stated a second time")
-        out[key] = match[2].strip()
-    return out
+        if key in values:
+            raise MapError(f"{path}, line {number}: {key} is stated twice")
+        values[key] = match[2].strip()
+    return values
 
 
 def unit_written(path: Path, found: str | None, remedy: str) -> str:
-    """Return the unit that a file gives.
+    """Return the unit that a file states.
 
     Parameters
     ----------
     path : Path
-        Of the file, for messages.
-    found : str | None
-        In the file.
+        File, for messages.
+    found : str or None
+        Unit in the file.
     remedy : str
-        How the file could say it, for the message.
+        How the file could state it, for the message.
 
     Raises
     ------
     MapError
-        None, or one that is not known.
+        The unit is missing or unknown.
     """
     if found is None:
-        raise MapError(f"{path} does not say its unit: add {remedy}")
+        raise MapError(f"{path} does not state its unit: add {remedy}")
     return unit_named(path, found)
 
 
 def _grid(where: str, sizes: list[int]) -> tuple[int, int]:
+    """Return the two sizes of a grid; raise MapError if they are out of range."""
     if len(sizes) != 2 or min(sizes) < 2 or math.prod(sizes) > MOST_POINTS:
         raise MapError(f"{where}: a grid of {' x '.join(map(str, sizes))} points; 2 to {MOST_POINTS} in all are read")
     return sizes[0], sizes[1]
 
 
 def _check_points(path: Path, numbers: Array, count: int, rows: int, columns: int) -> None:
+    """Raise MapError for a wrong number of points or a point that is not finite."""
     if count != rows * columns:
-        raise MapError(f"{path} has {count} points, its header says {columns} x {rows}: it is cut off or added to")
+        raise MapError(
+            f"{path} has {count} points, but its header states {columns} x {rows}: it is truncated or extended"
+        )
     if not np.isfinite(numbers).all():
         raise MapError(f"{path}: a point is not a finite number; files mark points without data in another way")
 
 
 METROPRO_MAGIC = b"\x88\x1b\x03"
+"""First bytes of MetroPro files, before the byte of the header format."""
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+"""First bytes of HDF5 files."""
 _HEADERS = {0x6F: 834, 0x70: 834, 0x71: 4096}
-"""Last byte of the magic number -> smallest size of the header of that format."""
+"""Smallest header size in bytes for each header format, the last byte of the magic number."""
 _STEPS = {0: 4096, 1: 32768, 2: 131072}
-"""Phase resolution of the header -> counts per fringe."""
+"""Counts per fringe for each phase resolution of the header."""
 _INVALID = 2147483640
+"""Count from which a point of a Zygo file is invalid."""
 _LARGEST_WAVELENGTH = 1e-3
+"""Largest plausible wavelength, in metres."""
 _FIELDS = {
     "header_size": (">I", 6),
     "frame_width": (">H", 52),
@@ -540,32 +558,32 @@ _FIELDS = {
     "sign": (">H", 232),
     "codev_type": (">H", 298),
 }
-"""What is used of the header: form and place."""
+"""Format and byte offset of the header fields that are used."""
 
 
 def is_metropro(start: bytes) -> bool:
-    """Whether a file that starts so is MetroPro's."""
+    """Return True if the first bytes of a file are MetroPro's."""
     return start[:3] == METROPRO_MAGIC and start[3:4] != b"" and start[3] in _HEADERS
 
 
 def read_metropro(path: Path) -> WavefrontMap:
-    """A file of MetroPro, of any of its three header formats.
+    """Read a MetroPro file with any of its three header formats.
 
-    A short file is not filled up with zeros, which would be measured values.
+    A truncated file is rejected, not filled up with zeros, which would be measured values.
 
     Parameters
     ----------
     path : Path
-        Of the file.
+        File to read.
 
     Raises
     ------
     MapError
-        No phase in it, a header that cannot be, or a file that is cut off.
+        The file holds no phase, its header is invalid, or it is truncated.
     """
     data = path.read_bytes()
     if len(data) < _HEADERS[data[3]]:
-        raise MapError(f"{path} is cut off in its header: copy it again from the interferometer")
+        raise MapError(f"{path} is truncated in its header: copy it again from the interferometer")
     head: dict[str, Any] = {key: struct.unpack_from(form, data, place)[0] for key, (form, place) in _FIELDS.items()}
     rows, columns = head["height"], head["width"]
     if not rows or not columns:
@@ -580,13 +598,13 @@ def read_metropro(path: Path) -> WavefrontMap:
     if rows * columns > MOST_POINTS:
         raise MapError(f"{path} has {rows} x {columns} points, more than {MOST_POINTS}: save a smaller part of it")
     start = head["header_size"] + 2 * head["frame_width"] * head["frame_height"] * head["frames"]
-    one = head["header_size"] + 2 * head["frame_width"] * head["frame_height"]
-    # some programs count no frame and write one
-    start = one if not head["frames"] and len(data) >= one + 4 * rows * columns else start
+    single_frame_start = head["header_size"] + 2 * head["frame_width"] * head["frame_height"]
+    # some programs write a frame although their frame count is zero
+    start = single_frame_start if not head["frames"] and len(data) >= single_frame_start + 4 * rows * columns else start
     if len(data) < start + 4 * rows * columns or head["header_size"] < _HEADERS[data[3]]:
         raise MapError(
-            f"{path} is cut off or damaged: its header wants {rows} x {columns} points from byte {start} on, the file"
-            f" has {len(data)} bytes; copy it again"
+            f"{path} is truncated or damaged: its header states {rows} x {columns} points from byte {start} on, the"
+            f" file has {len(data)} bytes; copy it again"
         )
     counts = np.frombuffer(data, ">i4", rows * columns, start).reshape(rows, columns)[::-1]
     metres = head["wavelength"] * head["scale_factor"] * head["obliquity"] / _STEPS[head["resolution"]]
@@ -611,45 +629,47 @@ def read_metropro(path: Path) -> WavefrontMap:
 
 
 def _of_scale(scale: float) -> str:
+    """Return the note on the interferometric scale factor."""
     return f"The interferometric scale factor of the file, {scale:.6g} waves per fringe, is in the values."
 
 
 def read_datx(path: Path, wavelength: float | None = None) -> WavefrontMap:
-    """A file of Mx, in its present layout (``Data/Surface``) or its first one (``Measurement/Surface``).
+    """Read an Mx file, in its present layout (``Data/Surface``) or its first one (``Measurement/Surface``).
 
     Parameters
     ----------
     path : Path
-        Of the file.
-    wavelength : float | None
-        Metres, where the file does not say.
+        File to read.
+    wavelength : float, optional
+        Wavelength, in metres, if the file does not state it.
 
     Raises
     ------
     MapError
-        HDF5 of another kind, or damaged.
+        The file is HDF5 of another kind, or damaged.
     """
     try:
         return _datx(path, wavelength)
     except MapError:
         raise
-    # what the library finds wrong with a spoilt file cannot be foreseen, nor is it said in words for a user
+    # the errors of the library for a damaged file are neither documented nor meant for users
     except Exception as error:
         raise MapError(f"{path} cannot be read as a .datx file: it is damaged; copy it again") from error
 
 
-def _datx(path: Path, stated: float | None) -> WavefrontMap:
+def _datx(path: Path, specified: float | None) -> WavefrontMap:
+    """Read an Mx file without handling the errors of the HDF5 library."""
     # imported for such a file only
     import h5py
 
     with h5py.File(path, "r") as file:
-        found = list(_surfaces(file))
-        if not found:
-            raise MapError(f"{path} is HDF5, but no .datx file of Zygo: it has neither Data/Surface nor Measurement")
-        surface = found[0]
+        surfaces = list(_surfaces(file))
+        if not surfaces:
+            raise MapError(f"{path} is HDF5, but not a .datx file of Zygo: it has neither Data/Surface nor Measurement")
+        surface = surfaces[0]
         shape = surface.shape
         if len(shape) != 2 or 0 in shape or surface.dtype.kind not in "iuf":
-            raise MapError(f"{path}: its surface is no map of numbers (shape {shape}, type {surface.dtype})")
+            raise MapError(f"{path}: its surface is not a map of numbers (shape {shape}, type {surface.dtype})")
         if math.prod(shape) > MOST_POINTS:
             raise MapError(f"{path} has {shape[0]} x {shape[1]} points, more than {MOST_POINTS}: save a part of it")
         if surface.external is not None or surface.is_virtual:
@@ -664,40 +684,40 @@ def _datx(path: Path, stated: float | None) -> WavefrontMap:
         wave = _number(keys, "Wavelength", math.nan)
         spacing = _spacing(surface)
     usable = math.isfinite(wave) and 0.0 < wave < _LARGEST_WAVELENGTH
-    wavelength = wave if usable else stated
+    wavelength = wave if usable else specified
     if not isinstance(unit, str) or not unit:
-        raise MapError(f"{path} does not say the unit of its surface; save it from Mx in fringes or nanometres")
+        raise MapError(f"{path} does not state the unit of its surface; save it from Mx in fringes or nanometres")
     if unit.lower() == "fringes":
         if not (math.isfinite(scale) and scale > 0.0 and math.isfinite(obliquity) and obliquity > 0.0):
             raise MapError(f"{path} is in fringes and has no usable interferometric scale factor or obliquity factor")
         if wavelength is None:
-            raise MapError(f"{path} is in fringes and does not say of which wavelength: state the wavelength")
+            raise MapError(f"{path} is in fringes and does not state the wavelength: specify the wavelength")
         values = stored * obliquity * scale * wavelength
         notes = [_of_scale(scale)]
     else:
         values = stored * metres_per(path, unit_named(path, unit), wavelength)
         scale = obliquity = 1.0
         notes = [f"The file is in {unit}; no scale factor was applied."]
-    if len(found) > 1:
-        notes.append(f"The file has {len(found)} surfaces, of which the first was read.")
+    if len(surfaces) > 1:
+        notes.append(f"The file has {len(surfaces)} surfaces, of which the first was read.")
     return WavefrontMap(values, spacing, wavelength, None, scale, obliquity, "Zygo datx", tuple(notes))
 
 
 def _surfaces(file: Any) -> Iterator[Any]:
-    """Data sets of surfaces, in the order of their names."""
+    """Yield the data sets of surfaces, in the order of their names."""
     import h5py
 
     for name in ("Data/Surface", "Measurement/Surface"):
-        place = _held(file, name)
-        if isinstance(place, h5py.Dataset):
-            yield place
-        elif isinstance(place, h5py.Group):
-            held = (_held(place, key) for key in sorted(place))
-            yield from (one for one in held if isinstance(one, h5py.Dataset))
+        node = _member(file, name)
+        if isinstance(node, h5py.Dataset):
+            yield node
+        elif isinstance(node, h5py.Group):
+            members = (_member(node, key) for key in sorted(node))
+            yield from (member for member in members if isinstance(member, h5py.Dataset))
 
 
-def _held(place: Any, name: str) -> Any:
-    """Return the group or data set of a name, None for none; links lead to other places, and are refused unfollowed.
+def _member(node: Any, name: str) -> Any:
+    """Return the group or data set of a name, None for none; links are refused without following them.
 
     Raises
     ------
@@ -707,43 +727,44 @@ def _held(place: Any, name: str) -> Any:
     import h5py
 
     for part in name.split("/"):
-        if not isinstance(place, h5py.Group):
+        if not isinstance(node, h5py.Group):
             return None
-        if isinstance(place.get(part, getlink=True), h5py.ExternalLink | h5py.SoftLink):
+        if isinstance(node.get(part, getlink=True), h5py.ExternalLink | h5py.SoftLink):
             raise MapError(
-                f"{place.file.filename}: {part} is a link to another place; save it as one file, without links"
+                f"{node.file.filename}: {part} is a link to another place; save it as one file, without links"
             )
-        place = place.get(part)
-    return place
+        node = node.get(part)
+    return node
 
 
 def _attributes(file: Any, surface: Any) -> dict[str, Any]:
-    """Scalars and texts among the attributes of the surface and, where these lack one, of the measurement."""
+    """Return scalar and text attributes of the surface and, where missing there, of the measurement."""
     import h5py
 
-    general = _held(file, "Measurement/Attributes")
-    out: dict[str, Any] = {}
+    general = _member(file, "Measurement/Attributes")
+    attributes: dict[str, Any] = {}
     for holder in (general, surface):
         if isinstance(holder, h5py.Group | h5py.Dataset):
             for key, value in holder.attrs.items():
                 first = np.asarray(value).reshape(-1)[:1]
                 if first.size and first.dtype.kind in "OSUiuf":
-                    one = first[0]
-                    out[key] = one.decode("utf-8", "replace") if isinstance(one, bytes) else one
-    # names of the first layout
+                    scalar = first[0]
+                    attributes[key] = scalar.decode("utf-8", "replace") if isinstance(scalar, bytes) else scalar
+    # attribute names of the first layout
     for old, new in (("Interf Scale Factor", "Interferometric Scale Factor"), ("Obliquity", "Obliquity Factor")):
-        if old in out:
-            out.setdefault(new, out[old])
-    return out
+        if old in attributes:
+            attributes.setdefault(new, attributes[old])
+    return attributes
 
 
 def _number(keys: dict[str, Any], key: str, otherwise: float) -> float:
+    """Return a numeric attribute, or a default if it is missing or a text."""
     value = keys.get(key, otherwise)
     return otherwise if isinstance(value, str) else float(value)
 
 
 def _spacing(surface: Any) -> float:
-    """Metres per pixel by the converter of x: category, unit, and parameters, the second of which it is."""
+    """Return metres per pixel from the converter of x: category, unit, and parameters, of which it is the second."""
     try:
         category, _, parameters = surface.attrs["X Converter"][0]
         spacing = float(parameters[1])
@@ -754,53 +775,58 @@ def _spacing(surface: Any) -> float:
 
 
 _PUPIL_SCALE = ("PUPLSCAL", "PIXELSCL", "PIXSCALE")
-"""Keys of FITS files of pupils with metres per pixel, as POPPY writes and reads them."""
+"""FITS keys with metres per pixel of pupils, as POPPY writes and reads them."""
 _LARGEST_PIXEL, _LARGEST = 1.0, 10.0
 """Metres; beyond them a unit is wrong or a file is damaged."""
 
 
 def read_map(path: Path, *, wavelength: float | None = None) -> WavefrontMap:
-    """The map in a file of MetroPro, Mx, CODE V, Zemax, FITS, or in a text table.
+    """Read a map from a file of MetroPro, Mx, CODE V, Zemax, FITS, or from a text table.
 
     Parameters
     ----------
     path : Path
-        Of the file.
-    wavelength : float | None
-        Metres, for files in waves that do not say it.
+        File to read.
+    wavelength : float, optional
+        Wavelength, in metres, for files in waves that do not state it.
 
     Raises
     ------
     MapError
-        a file that is not read, with what is wrong and what to do.
+        The file cannot be read; the message gives the reason and the remedy.
     """
     path = Path(path)
     if path.is_dir():
         raise MapError(f"{path} is a folder, not a file of a wavefront")
     if not path.exists():
         raise MapError(f"there is no file {path}")
-    if not path.is_file():  # it could be endless, or block
+    if not path.is_file():  # reading it could block or never end
         raise MapError(f"{path} is a device, a pipe or a socket, not a file of a wavefront")
     try:
         with path.open("rb") as file:
             start = file.read(16)
-        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is told below
-            found = _read(path, start, wavelength)
+        with np.errstate(over="ignore", invalid="ignore"):  # checked below
+            wavefront_map = _read(path, start, wavelength)
     except OSError as error:
         raise MapError(f"{path} cannot be read: {error.strerror or 'input/output error'}") from error
-    largest = np.max(np.abs(found.values), where=~np.isnan(found.values), initial=0.0)
+    largest = np.max(np.abs(wavefront_map.values), where=~np.isnan(wavefront_map.values), initial=0.0)
     if largest > _LARGEST:
         raise MapError(
-            f"{path} holds values of up to {largest:.3g} m, which no wavefront has: check its unit and scale"
+            f"{path} holds values of up to {largest:.3g} m, which is too large for a wavefront: check its unit"
         )
-    if not np.isfinite(found.values).any():
-        raise MapError(f"{path} holds no measured point: all of its {found.values.size} points are without data")
-    agreed(path, "wavelength", wavelength, found.wavelength)
-    # a stated wavelength also counts where it was not needed
-    return found if found.wavelength is not None or wavelength is None else replace(found, wavelength=wavelength)
+    if not np.isfinite(wavefront_map.values).any():
+        raise MapError(f"{path} holds no measured point: all {wavefront_map.values.size} points are missing")
+    agreed(path, "wavelength", wavelength, wavefront_map.wavelength)
+    # keep a specified wavelength also if the file did not need it
+    return (
+        wavefront_map
+        if wavefront_map.wavelength is not None or wavelength is None
+        else replace(wavefront_map, wavelength=wavelength)
+    )
 
 
 def _read(path: Path, start: bytes, wavelength: float | None) -> WavefrontMap:
+    """Read a map with the reader that matches the first bytes of the file."""
     if start.startswith(FITS_MAGIC):
         return _fits(path, wavelength)
     if not start:
@@ -817,7 +843,7 @@ def _read(path: Path, start: bytes, wavelength: float | None) -> WavefrontMap:
 
 
 def _fits(path: Path, wavelength: float | None) -> WavefrontMap:
-    """An image of a FITS file; row 0 of it, which FITS viewers draw lowest, is that of the map."""
+    """Read an image of a FITS file; row 0, which FITS viewers display lowest, is row 0 of the map."""
     try:
         image = ImageFile.open(path, choose="")
         if len(image.header.pages) != 1:
@@ -827,10 +853,10 @@ def _fits(path: Path, wavelength: float | None) -> WavefrontMap:
     except ImageError as error:
         raise MapError(str(error)) from error
     written = header.get("BUNIT")
-    named = unit_written(path, str(written) if written else None, "the key BUNIT")
+    unit = unit_written(path, str(written) if written else None, "the key BUNIT")
     scale = next((float(header[key]) for key in _PUPIL_SCALE if isinstance(header.get(key), int | float)), math.nan)
     in_metres = "arc" not in str(header.get("PIXUNIT", "meter")).lower() and 0.0 < scale < _LARGEST_PIXEL
-    metres = metres_per(path, named, wavelength)
+    metres = metres_per(path, unit, wavelength)
     values = np.asarray(values, dtype=np.float64) * metres
     return WavefrontMap(
         values=values,

@@ -1,10 +1,11 @@
-"""Zernike terms of a map over any lit area of a pupil.
+"""Orientation of a measured wavefront, and Zernike fits of a map over an illuminated area of any shape.
 
-Terms are made orthonormal over the pixels that are lit, in Noll's order: over a ring these are Mahajan's annular terms
-up to the pixels, over a cut pupil their like. Coefficients of the circle's terms follow from them; where light is
-missing they share among them what looks alike there.
+**Fit.** Terms are made orthonormal over the illuminated pixels, in Noll's order: over a ring these are Mahajan's
+annular terms up to the pixels, and the equivalent over a vignetted pupil. Coefficients of the circular terms follow
+from them; where light is missing, terms that look alike there share the measured aberration.
 
-Which way round a measured wavefront is: flips, quarter turns and sign, and which of these the data allow.
+**Orientation.** Flips, rotations by 90 degrees and the sign of a measured wavefront, and which of these agree with
+predicted coefficients.
 """
 
 from __future__ import annotations
@@ -33,22 +34,23 @@ _ORIENTATION_NAMES = {
     (True, 2): "mirrored x",
     (True, 3): "mirrored antidiagonal",
 }
+"""Name of each orientation, by (mirrored, quarter turns)."""
 _COSINE = (1, 0, -1, 0)
-"""Of multiples of a quarter turn."""
+"""Cosine of multiples of 90 degrees."""
 
 
 @dataclass(frozen=True)
 class Orientation:
-    """What has to be done to a map so that it lies as its user's pupil does: a mirror, then turns, and a sign.
+    """Operation that brings a map into the orientation of the user's pupil: a mirror, then rotations, and a sign.
 
     Attributes
     ----------
     mirrored : bool
-        Whether y is turned into -y first.
+        True if y is reversed first.
     quarter_turns : int
-        By 90 degrees each, from x to y, 0 to 3.
+        Number of rotations by 90 degrees, from x to y, 0 to 3.
     sign : int
-        +1 or -1, by which the values are multiplied.
+        Factor of the values, +1 or -1.
     """
 
     mirrored: bool = False
@@ -61,19 +63,19 @@ class Orientation:
 
     @classmethod
     def named(cls, name: str, sign: int = 1) -> Orientation:
-        """The orientation with a name.
+        """Return the orientation with a name.
 
         Parameters
         ----------
         name : str
-            One of ``ORIENTATIONS``, such as ``turned 90``.
+            Name of one of ``ORIENTATIONS``, such as ``turned 90``.
         sign : int
             +1 or -1.
 
         Raises
         ------
         MapError
-            No such name.
+            The name is unknown.
         """
         for key, known in _ORIENTATION_NAMES.items():
             if known == name.strip().lower():
@@ -87,13 +89,13 @@ class Orientation:
 
     @property
     def matrix(self) -> NDArray[np.int_]:
-        """Where a point (x, y) of the map comes to lie, (2, 2): a feature at p is at ``matrix @ p``."""
+        """Matrix (2, 2) that maps points: a feature at p moves to ``matrix @ p``."""
         c, s = _COSINE[self.quarter_turns], _COSINE[(self.quarter_turns + 3) % 4]
         return np.array([[c, -s], [s, c]]) @ np.diag([1, -1 if self.mirrored else 1])
 
     @property
     def inverse(self) -> Orientation:
-        """What takes it back: a mirror is its own inverse."""
+        """Inverse operation; a mirror is its own inverse."""
         turns = self.quarter_turns if self.mirrored else -self.quarter_turns % 4
         return Orientation(self.mirrored, turns, self.sign)
 
@@ -101,97 +103,97 @@ class Orientation:
         return self.name if self.sign > 0 else f"{self.name}, sign inverted"
 
     def values(self, values: Array) -> Array:
-        """A map's values as they lie after it.
+        """Return the values of a map after the operation.
 
         Parameters
         ----------
-        values : Array
-            (rows, columns), y growing with the row.
+        values : (rows, columns) ndarray
+            Values, y growing with the row.
         """
         flipped = values[::-1] if self.mirrored else values
         # rows grow upwards: what NumPy calls clockwise is from x to y
         return self.sign * np.rot90(flipped, -self.quarter_turns)
 
     def apply(self, measured: WavefrontMap) -> WavefrontMap:
-        """A map as it lies after it.
+        """Return a map after the operation.
 
         Parameters
         ----------
         measured : WavefrontMap
-            As the file has it.
+            Map with the orientation of the file.
         """
         return replace(measured, values=self.values(measured.values))
 
-    def of_terms(self, terms: Sequence[int]) -> Array:
-        """What it makes of Zernike coefficients: (Z, Z) with entries 0, 1 and -1.
+    def term_matrix(self, terms: Sequence[int]) -> Array:
+        """Return the (Z, Z) matrix, with entries 0, 1 and -1, that transforms Zernike coefficients.
 
         Parameters
         ----------
-        terms : Sequence[int]
-            Indices of Noll, (Z,), with both the cosine and the sine term of every one that turns.
+        terms : sequence of int
+            Noll's indices, (Z,), with both the cosine and the sine term of every azimuthal order.
 
         Raises
         ------
         MapError
-            a term without its partner, into which it turns.
+            A term lacks its partner, into which it rotates.
         """
-        place = {int(index): k for k, index in enumerate(terms)}
-        orders = {noll_to_nm(index): k for index, k in place.items()}
-        out = np.zeros((len(place), len(place)))
+        positions = {int(index): k for k, index in enumerate(terms)}
+        orders = {noll_to_nm(index): k for index, k in positions.items()}
+        matrix = np.zeros((len(positions), len(positions)))
         for (n, m), k in orders.items():
-            # the angle at which the old map is looked up is s (angle - turn)
+            # the original map is evaluated at the angle s (angle - rotation)
             c, s = _COSINE[abs(m) * self.quarter_turns % 4], _COSINE[(abs(m) * self.quarter_turns + 3) % 4]
-            kept, turned = (-c if self.mirrored and m < 0 else c), (-s if self.mirrored and m < 0 else s)
-            out[k, k] = kept
-            if turned:
+            unchanged, rotated = (-c if self.mirrored and m < 0 else c), (-s if self.mirrored and m < 0 else s)
+            matrix[k, k] = unchanged
+            if rotated:
                 partner = orders.get((n, -m))
                 if partner is None:
                     raise MapError(
-                        f"Z{next(j for j, p in place.items() if p == k)} turns into a term that was not fitted: take"
-                        " both the cosine and the sine term of every order"
+                        f"Z{next(j for j, p in positions.items() if p == k)} rotates into a term that was not fitted:"
+                        " fit both the cosine and the sine term of every order"
                     )
-                out[partner, k] = turned if m > 0 else -turned
-        return self.sign * out
+                matrix[partner, k] = rotated if m > 0 else -rotated
+        return self.sign * matrix
 
     def coefficients(self, coefficients: Array, terms: Sequence[int]) -> Array:
-        """Zernike coefficients as they are after it, exactly.
+        """Return Zernike coefficients after the operation, exactly.
 
         Parameters
         ----------
-        coefficients : Array
-            (..., Z).
-        terms : Sequence[int]
-            Indices of Noll, (Z,).
+        coefficients : (..., Z) ndarray
+            Coefficients before the operation.
+        terms : sequence of int
+            Noll's indices, (Z,).
         """
-        return np.asarray(coefficients) @ self.of_terms(terms).T
+        return np.asarray(coefficients) @ self.term_matrix(terms).T
 
 
 ORIENTATIONS = tuple(Orientation(*key) for key in _ORIENTATION_NAMES)
-"""All eight, with the sign of the file."""
-READINGS = tuple(Orientation(o.mirrored, o.quarter_turns, sign) for sign in (1, -1) for o in ORIENTATIONS)
-"""All sixteen with their signs."""
+"""All eight orientations with the sign of the file."""
+SIGNED_ORIENTATIONS = tuple(Orientation(o.mirrored, o.quarter_turns, sign) for sign in (1, -1) for o in ORIENTATIONS)
+"""All sixteen orientations with both signs."""
 
 
 @dataclass(frozen=True, eq=False)
-class ReadingEvidence:
-    """What measured coefficients say of the ways in which they may be read.
+class OrientationEvidence:
+    """Agreement of measured coefficients with a prediction for each of K possible orientations.
 
     Attributes
     ----------
-    readings : tuple[Orientation, ...]
-        The best one first, (K,).
-    chi_square : Array
-        Of each against the prediction, (K,).
-    log_evidence : Array
-        Logarithm of the probability density of the measured coefficients under each, (K,).
+    readings : tuple of Orientation
+        Orientations, the best one first.
+    chi_square : (K,) ndarray
+        Chi-square of each against the prediction.
+    log_evidence : (K,) ndarray
+        Logarithm of the probability density of the measured coefficients under each.
     degrees : int
-        Of freedom of each chi-square.
-    chance : Array
-        Of a larger chi-square if the reading is right, (K,).
-    allowed : tuple[Orientation, ...]
-        Those that the data do not reject at the false-alarm rate.
-    together : tuple[Orientation, ...]
-        Those that cannot be told from the best one, which is among them.
+        Degrees of freedom of each chi-square.
+    chance : (K,) ndarray
+        p-value of each chi-square.
+    allowed : tuple of Orientation
+        Orientations that the data do not reject at the false-alarm rate.
+    together : tuple of Orientation
+        Orientations that the data do not distinguish from the best one, including it.
     """
 
     readings: tuple[Orientation, ...]
@@ -200,43 +202,44 @@ class ReadingEvidence:
     degrees: int
     chance: Array
     allowed: tuple[Orientation, ...]
-    together: tuple[Orientation, ...]
+    indistinguishable: tuple[Orientation, ...]
 
     @property
     def found(self) -> Orientation | None:
-        """The reading, where the data allow it and tell it from all others; None otherwise."""
-        return self.readings[0] if len(self.together) == 1 and self.readings[0] in self.allowed else None
+        """Best orientation, if the data allow it and distinguish it from all others; None otherwise."""
+        return self.readings[0] if len(self.indistinguishable) == 1 and self.readings[0] in self.allowed else None
 
 
 _ODDS = 100.0
-"""Readings less than so many times as probable as the best one are not told from it."""
+"""Odds of the best orientation from which another one is distinguished from it."""
 
 
-def tellable(
+def orientation_evidence(
     measured: Array, expected: Array, covariance: Array, terms: Sequence[int], *, false_alarm: float = 0.01
-) -> ReadingEvidence:
-    """Which readings of measured coefficients agree with a prediction.
+) -> OrientationEvidence:
+    """Test which orientations of measured coefficients agree with a prediction.
 
-    One reading holds for all fields. The covariance is that of prediction and noise together, for coefficients in the
-    frame of the prediction; noise that is equal in both terms of each pair is the same in every reading.
+    The orientation is the same for all fields. The covariance is that of prediction and noise together, for
+    coefficients in the frame of the prediction; noise that is equal in both terms of each pair is the same in every
+    orientation.
 
     Parameters
     ----------
-    measured : Array
-        Coefficients as the files have them, (F, Z), metres.
-    expected : Array
-        Coefficients that are predicted, (F, Z), metres.
-    covariance : Array
-        Of measured minus expected, (F*Z, F*Z), square metres, fields before terms.
-    terms : Sequence[int]
-        Indices of Noll, (Z,); leave out what the measurement leaves free, such as piston and tilt.
+    measured : (F, Z) ndarray
+        Coefficients in the orientation of the files, in metres.
+    expected : (F, Z) ndarray
+        Predicted coefficients, in metres.
+    covariance : (F*Z, F*Z) ndarray
+        Covariance of measured minus expected, in m^2, fields before terms.
+    terms : sequence of int
+        Noll's indices, (Z,), without those that the measurement does not determine, such as piston and tilt.
     false_alarm : float
-        Probability with which the right reading may be rejected.
+        Probability of rejecting the right orientation.
 
     Raises
     ------
     UndeterminedError
-        a covariance that is none, or numbers that are not finite.
+        The covariance is not positive definite, or a number is not finite.
     """
     size = np.size(expected)
     if not (np.isfinite(measured).all() and np.isfinite(expected).all() and np.isfinite(covariance).all()):
@@ -245,41 +248,49 @@ def tellable(
         root = np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError as error:
         raise UndeterminedError(
-            "the covariance of measured minus predicted coefficients has no positive determinant: add the noise of the"
+            "the covariance of measured minus predicted coefficients is not positive definite: add the noise of the"
             " measurement to it"
         ) from error
-    rest = np.stack([(one.coefficients(measured, terms) - expected).ravel() for one in READINGS], axis=-1)
-    chi_square = np.sum(np.linalg.solve(root, rest) ** 2, axis=0)
+    residual = np.stack(
+        [(orientation.coefficients(measured, terms) - expected).ravel() for orientation in SIGNED_ORIENTATIONS], axis=-1
+    )
+    chi_square = np.sum(np.linalg.solve(root, residual) ** 2, axis=0)
     constant = np.sum(np.log(np.diag(root))) + 0.5 * size * math.log(2.0 * math.pi)
-    # a stable sort: of readings that are exactly alike the first in the list is named first
+    # stable sort: of orientations with equal chi-square the first in the list comes first
     ranks = np.argsort(chi_square, kind="stable")
-    ranked = tuple(READINGS[k] for k in ranks)
+    ranked = tuple(SIGNED_ORIENTATIONS[k] for k in ranks)
     chi_square = chi_square[ranks]
     chance = np.asarray(chance_beyond(chi_square, size))
     limit = 2.0 * math.log(_ODDS)
-    return ReadingEvidence(
+    return OrientationEvidence(
         readings=ranked,
         chi_square=chi_square,
         log_evidence=-0.5 * chi_square - constant,
         degrees=size,
         chance=chance,
-        allowed=tuple(one for one, p in zip(ranked, chance, strict=True) if p >= false_alarm),
-        together=tuple(one for one, c in zip(ranked, chi_square, strict=True) if c - chi_square[0] < limit),
+        allowed=tuple(orientation for orientation, p in zip(ranked, chance, strict=True) if p >= false_alarm),
+        indistinguishable=tuple(
+            orientation for orientation, c in zip(ranked, chi_square, strict=True) if c - chi_square[0] < limit
+        ),
     )
 
 
-HELD = 1e-6
-"""Share of a term that has to be left beside those before it; below it the light does not tell them apart."""
+LEAST_INDEPENDENCE = 1e-6
+"""Smallest share of a term that is independent of the terms before it; below it the illuminated pixels do not separate
+them.
+"""
 _CHUNK = 50_000
-"""Pixels at a time, so that large maps take little memory."""
+"""Number of pixels processed at a time, which limits the memory for large maps."""
 _TRIES, _NEAR, _STEP = 400, 1.5, 0.75
 """Circles through three points of the edge that are tried; pixels from one of them within which a point is on it, at
 first and when it is refined: a step lies within half a pixel of the edge.
 """
 _SPECK = 0.02
-"""Of the largest connected lit area; smaller ones lie outside the pupil, or do not matter."""
+"""Smallest area of a connected illuminated region, relative to the largest; smaller ones lie outside the pupil, or are
+negligible.
+"""
 _ROUND_SHARE = 0.5
-"""Of the full angle in which the edge of a pupil has to be seen."""
+"""Smallest share of the full angle over which the edge of a pupil must be visible."""
 
 
 @dataclass(frozen=True)
@@ -315,14 +326,14 @@ class Pupil:
             raise MapError(f"a pupil at {self.x:g}, {self.y:g} with radius {self.radius:g} pixels: radii are positive")
 
     def unit(self, columns: Array, rows: Array) -> tuple[Array, Array]:
-        """Coordinates on the unit disk.
+        """Return coordinates on the unit disk.
 
         Parameters
         ----------
-        columns : Array
-            Of points, any shape.
-        rows : Array
-            likewise.
+        columns : ndarray
+            Columns of points, any shape.
+        rows : ndarray
+            Rows of points, the same shape.
         """
         return (columns - self.x) / self.radius, (rows - self.y) / self.radius
 
@@ -333,10 +344,10 @@ class MapFit:
 
     Attributes
     ----------
-    coefficients : Array
-        Of the circle's terms, metres rms over the full disk each, (Z,).
-    parts : Array
-        Of the terms that are orthonormal over the light, metres rms over it each, (Z,).
+    coefficients : (Z,) ndarray
+        Coefficients of the circular terms, in metres RMS over the full disk.
+    parts : (Z,) ndarray
+        Coefficients of terms that are orthonormal over the illuminated pixels, in metres RMS over these.
     """
 
     coefficients: Array
@@ -375,38 +386,40 @@ def find_pupil(values: ArrayLike) -> Pupil:
     >>> round(pupil.x, 1), round(pupil.y, 1), round(pupil.radius, 1)
     (57.0, 60.0, 47.9)
     """
-    light = np.isfinite(_checked_map(values))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(light.astype(np.uint8), connectivity=8)
+    measured = np.isfinite(_checked_map(values))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(measured.astype(np.uint8), connectivity=8)
     if count < 2:
-        raise UndeterminedError("the map has no lit pixel")
+        raise UndeterminedError("the map has no measured pixel")
     area = stats[:, cv2.CC_STAT_AREA]
-    # spiders part the light of a pupil; specks of it are none
+    # spiders divide the pupil into several regions; small specks do not belong to it
     kept_labels = np.flatnonzero((area >= _SPECK * area[1:].max()) & (np.arange(count) > 0))
     lit = np.isin(labels, kept_labels)
-    # steps from dark to lit between two pixels; a map that ends in the light shows no edge there
+    # edges between unmeasured and measured pixels; the border of the map is not an edge of the pupil
     points = np.concatenate([_ends(lit), _ends(lit.T)[:, ::-1]])
     rng = np.random.default_rng(0)
-    best, most = (0.0, 0.0, 0.0), -1
+    best, best_count = (0.0, 0.0, 0.0), -1
     for _ in range(_TRIES if len(points) >= 8 else 0):
         circle = _circle(points[rng.choice(len(points), 3, replace=False)])
-        near = int(np.count_nonzero(_off(points, circle) < _NEAR)) if circle[2] < 4.0 * max(lit.shape) else -1
-        if near > most:
-            best, most = circle, near
-    for near_by in (_NEAR, _NEAR, _STEP, _STEP, _STEP) if most >= 8 else ():
-        kept = points[_off(points, best) < near_by]
-        best = _circle(kept if len(kept) >= 8 else points[_off(points, best) < _NEAR])
-    kept = points[_off(points, best) < _NEAR]
-    angles = np.arctan2(kept[:, 1] - best[1], kept[:, 0] - best[0])
-    seen = len(np.unique(np.floor(angles / (2.0 * np.pi) * 36.0))) / 36.0
-    if most < 8 or seen < _ROUND_SHARE:
+        count_on_circle = (
+            int(np.count_nonzero(_off(points, circle) < _NEAR)) if circle[2] < 4.0 * max(lit.shape) else -1
+        )
+        if count_on_circle > best_count:
+            best, best_count = circle, count_on_circle
+    for tolerance in (_NEAR, _NEAR, _STEP, _STEP, _STEP) if best_count >= 8 else ():
+        edge_points = points[_off(points, best) < tolerance]
+        best = _circle(edge_points if len(edge_points) >= 8 else points[_off(points, best) < _NEAR])
+    edge_points = points[_off(points, best) < _NEAR]
+    angles = np.arctan2(edge_points[:, 1] - best[1], edge_points[:, 0] - best[0])
+    visible_share = len(np.unique(np.floor(angles / (2.0 * np.pi) * 36.0))) / 36.0
+    if best_count < 8 or visible_share < _ROUND_SHARE:
         raise UndeterminedError(
-            "the lit area has no round edge from which centre and radius of the pupil follow: state them in pixels"
+            "the measured area has no round edge that determines centre and radius of the pupil: specify them in pixels"
         )
     return Pupil(float(best[0]), float(best[1]), float(best[2]))
 
 
 def _ends(lit: NDArray[np.bool_]) -> Array:
-    """First and last steps of each row of a mask, (column, row), where they lie inside the map."""
+    """Return the first and last steps of each row of a mask inside the map, as (column, row)."""
     rows = np.flatnonzero(lit.any(axis=1))
     first, last = lit[rows].argmax(axis=1), lit.shape[1] - 1 - lit[rows, ::-1].argmax(axis=1)
     left, right = np.stack([first - 0.5, rows], axis=1), np.stack([last + 0.5, rows], axis=1)
@@ -414,17 +427,18 @@ def _ends(lit: NDArray[np.bool_]) -> Array:
 
 
 def _circle(points: Array) -> tuple[float, float, float]:
-    """Column and row of the centre and radius of the circle nearest to points (N, 2)."""
+    """Return column and row of the centre, and radius, of the circle that fits points (N, 2) best."""
     middle = points.mean(axis=0)
-    moved = points - middle
-    found, *_ = np.linalg.lstsq(
-        np.column_stack([2.0 * moved, np.ones(len(moved))]), np.sum(moved**2, axis=1), rcond=None
+    offset = points - middle
+    solution, *_ = np.linalg.lstsq(
+        np.column_stack([2.0 * offset, np.ones(len(offset))]), np.sum(offset**2, axis=1), rcond=None
     )
-    square = found[2] + found[0] ** 2 + found[1] ** 2
-    return float(found[0] + middle[0]), float(found[1] + middle[1]), math.sqrt(max(square, 1e-12))
+    square = solution[2] + solution[0] ** 2 + solution[1] ** 2
+    return float(solution[0] + middle[0]), float(solution[1] + middle[1]), math.sqrt(max(square, 1e-12))
 
 
 def _off(points: Array, circle: tuple[float, float, float]) -> Array:
+    """Return the distances of points (N, 2) from a circle, in pixels."""
     return np.abs(np.hypot(points[:, 0] - circle[0], points[:, 1] - circle[1]) - circle[2])
 
 
@@ -483,11 +497,11 @@ def fit_wavefront_map(values: ArrayLike, terms: Sequence[int], pupil: Pupil | No
     count, size = len(rows), len(terms)
     if count <= size:
         raise UndeterminedError(
-            f"{count} lit pixels lie within the pupil at column {pupil.x:.1f}, row {pupil.y:.1f} of radius"
-            f" {pupil.radius:.1f}; {size} terms need more: state where the pupil lies, or take fewer terms"
+            f"{count} measured pixels lie within the pupil at column {pupil.x:.1f}, row {pupil.y:.1f} of radius"
+            f" {pupil.radius:.1f}; {size} terms need more: specify the pupil, or fit fewer terms"
         )
     lit_values = measured[rows, columns]
-    # by chunks, each with the triangle of those before it: the triangle of all, with the parts as its last column
+    # QR by chunks, each stacked below the triangle of those before; the last column holds the orthonormal coefficients
     triangle = np.zeros((0, size + 1))
     for part in _chunks(count):
         basis = circle_terms(terms, x[part], y[part])
@@ -495,17 +509,17 @@ def fit_wavefront_map(values: ArrayLike, terms: Sequence[int], pupil: Pupil | No
         triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, both]), mode="r"))
     sign = np.where(np.diag(triangle)[:size] < 0.0, -1.0, 1.0)
     factor, parts = triangle[:size, :size] * sign[:, None], triangle[:size, size] * sign
-    left = np.diag(factor) / np.maximum(np.linalg.norm(factor, axis=0), HELD)
-    if (left < HELD).any():
+    independent = np.diag(factor) / np.maximum(np.linalg.norm(factor, axis=0), LEAST_INDEPENDENCE)
+    if (independent < LEAST_INDEPENDENCE).any():
         raise UndeterminedError(
-            f"over the lit part of the pupil, Z{terms[int(np.argmax(left < HELD))]} cannot be told from the terms"
-            " before it: take fewer terms, or state where the pupil lies"
+            f"over the measured part of the pupil, Z{terms[int(np.argmax(independent < LEAST_INDEPENDENCE))]} cannot be"
+            " separated from the terms before it: fit fewer terms, or specify the pupil"
         )
     return MapFit(np.asarray(np.linalg.solve(factor, parts), dtype=np.float64), parts)
 
 
 def _checked_map(values: ArrayLike) -> Array:
-    """Return a map as float64. Raise MapError if it is not a plane of real numbers."""
+    """Return a map as float64; raise MapError if it is not a plane of real numbers."""
     plane = np.asarray(values)
     if plane.ndim != 2 or plane.dtype.kind not in "iuf":
         raise MapError(
@@ -515,4 +529,5 @@ def _checked_map(values: ArrayLike) -> Array:
 
 
 def _chunks(count: int) -> Iterator[slice]:
+    """Yield slices of at most `_CHUNK` elements."""
     return (slice(k, k + _CHUNK) for k in range(0, count, _CHUNK))

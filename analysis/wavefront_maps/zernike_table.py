@@ -1,15 +1,12 @@
-"""Tables of Zernike coefficients in the orders and units of other programs, read as Noll's of unit rms in metres.
+"""Zernike terms in Noll's order, orders of other programs, and tables of coefficients in metres.
 
-A table is CSV text of one of two forms. A long one has a column with indices and one with coefficients; a wide one has
-a row for each field and a column for each term, ``Z4``, ``Z5``..., beside columns with other texts, which are kept.
-Lines ``# order: fringe``, ``# normalised: peak``, ``# unit: waves`` and ``# wavelength: 632.8 nm`` say what they mean;
-a unit may also stand in the head of the columns, as in ``Z4 [nm]``.
+**Terms.** Angles run from the columns' direction x to the rows' direction y. Noll's terms have unit RMS over the disk
+(Noll, J. Opt. Soc. Am. 66, 207, 1976).
 
-Zernike terms of circles and rings in Noll's order, the orders of other programs, and terms made orthonormal over any
-light.
-
-Angles run from the columns' direction x to the rows' direction y. Terms of Noll have unit rms over the disk (Noll,
-J. Opt. Soc. Am. 66, 207, 1976); those of a ring unit rms over it (Mahajan, J. Opt. Soc. Am. 71, 75, 1981).
+**Tables** are CSV text of one of two forms. A long one has a column with indices and one with coefficients; a wide one
+has a row for each field and a column for each term, ``Z4``, ``Z5``..., and possibly other text columns, which are kept.
+Lines ``# order: fringe``, ``# normalised: peak``, ``# unit: waves`` and ``# wavelength: 632.8 nm`` state the meaning of
+the coefficients; the unit may also be in the head of the columns, as in ``Z4 [nm]``.
 """
 
 from __future__ import annotations
@@ -31,25 +28,26 @@ from analysis.arrays import Array
 from analysis.wavefront_maps import map_files
 
 HIGHEST_ORDER = 30
-"""Radial order of the last supported terms."""
+"""Highest radial order of the supported terms."""
 MOST_TERMS = (HIGHEST_ORDER + 1) * (HIGHEST_ORDER + 2) // 2
+"""Number of supported terms."""
 LAST_FRINGE = 37
-"""The last Fringe term: spherical aberration of the twelfth order, which the rule would count as the 49th."""
+"""Last Fringe index: spherical aberration of the twelfth order, which the general rule would count as the 49th term."""
 
 
 def noll_to_nm(index: int) -> tuple[int, int]:
-    """Radial order n and azimuthal order m, positive of cosine terms and negative of sine terms.
+    """Return radial order n and azimuthal order m, positive for cosine terms and negative for sine terms.
 
     Parameters
     ----------
     index : int
-        Of Noll, 1 for piston.
+        Noll's index, 1 for piston.
     """
     if not 1 <= index <= MOST_TERMS:
         raise ValueError(f"Noll's terms 1 to {MOST_TERMS} are known, not {index}")
     n = (isqrt(8 * index - 7) - 1) // 2
-    place = index - n * (n + 1) // 2 - 1
-    m = 2 * ((place + 1) // 2) if n % 2 == 0 else 2 * (place // 2) + 1
+    position = index - n * (n + 1) // 2 - 1
+    m = 2 * ((position + 1) // 2) if n % 2 == 0 else 2 * (position // 2) + 1
     return n, m if index % 2 == 0 else -m
 
 
@@ -158,11 +156,11 @@ def ansi_to_nm(index: int) -> tuple[int, int]:
 
 
 ORDERS = {"noll": noll_to_nm, "fringe": fringe_to_nm, "ansi": ansi_to_nm}
-"""Names of orders -> from the index to n and m."""
+"""Functions from the index of each order of terms to n and m."""
 
 
 def edge_value(n: int, m: int) -> float:
-    """What a term of unit rms reaches at the edge, where a term of unit peak reaches 1.
+    """Return the largest value at the edge of a term of unit RMS, where a term of unit peak reaches 1.
 
     Parameters
     ----------
@@ -175,16 +173,16 @@ def edge_value(n: int, m: int) -> float:
 
 
 def circle_terms(terms: Any, x: Any, y: Any) -> Array:
-    """Terms of unit rms over the disk at points, as columns (N, Z).
+    """Return the values of terms of unit RMS over the disk at points, as columns (N, Z).
 
     Parameters
     ----------
-    terms : Any
-        Indices of Noll, (Z,).
-    x : Any
-        On the unit disk, (N,).
-    y : Any
-        likewise.
+    terms : sequence of int
+        Noll's indices, (Z,).
+    x : (N,) array_like
+        x on the unit disk.
+    y : (N,) array_like
+        y on the unit disk.
     """
     point, square = np.asarray(x) + 1j * np.asarray(y), np.square(x) + np.square(y)
     columns = np.empty((*point.shape, len(terms)))
@@ -193,16 +191,17 @@ def circle_terms(terms: Any, x: Any, y: Any) -> Array:
         order = abs(m)
         if order not in powers:
             powers[order] = point**order
-        turning = powers[order].imag if m < 0 else powers[order].real
-        # the radial polynomial, without the power of the radius that stands in the turning part
+        azimuthal = powers[order].imag if m < 0 else powers[order].real
+        # radial polynomial without the power of the radius, which the azimuthal part includes
         radial = eval_jacobi((n - order) // 2, 0, order, 2.0 * square - 1.0)
-        np.multiply(edge_value(n, m) * radial, turning, out=columns[..., k])
+        np.multiply(edge_value(n, m) * radial, azimuthal, out=columns[..., k])
     return columns
 
 
 ORDER_NAMES = {"noll": "noll", "fringe": "fringe", "ansi": "ansi", "osa": "ansi", "osa/ansi": "ansi"}
+"""Names of orders in files, and the orders that they mean."""
 NORMALISATIONS = {"rms": True, "peak": False}
-"""Whether terms have unit rms over the disk; those of unit peak reach 1 at the edge."""
+"""Normalisations: True for unit RMS over the disk, False for unit peak, terms that reach 1 at the edge."""
 _INDEX = ("index", "j", "term")
 _COEFFICIENT = ("coefficient", "value", "c")
 _TERM = re.compile(r"[zZ]\s?_?(\d{1,4})")
@@ -213,20 +212,20 @@ _MOST_CHARACTERS = 10_000_000
 
 @dataclass(frozen=True, eq=False)
 class ZernikeTable:
-    """Coefficients of one or more wavefronts.
+    """Coefficients of F wavefronts.
 
     Attributes
     ----------
-    terms : tuple[int, ...]
-        Noll's indices, ascending, (Z,).
-    coefficients : Array
-        Metres of terms of unit rms over the disk, (F, Z); the file's sign.
-    others : Mapping[str, tuple[str, ...]]
-        Other columns of a wide table, name -> texts, (F,) each.
-    wavelength : float | None
-        Metres, None where neither file nor user says.
-    notes : tuple[str, ...]
-        How the table was understood, whole sentences.
+    terms : (Z,) tuple of int
+        Noll's indices, ascending.
+    coefficients : (F, Z) ndarray
+        Coefficients of terms of unit RMS over the disk, in metres, with the file's sign.
+    others : mapping of str to tuple of str
+        Other columns of a wide table, (F,) texts each, by name.
+    wavelength : float or None
+        Wavelength, in metres; None if neither file nor user states it.
+    notes : tuple of str
+        Sentences on how the table was understood.
     """
 
     terms: tuple[int, ...]
@@ -237,19 +236,19 @@ class ZernikeTable:
 
 
 def read_zernikes(path: Path, *, wavelength: float | None = None) -> ZernikeTable:
-    """Coefficients of a table.
+    """Read the coefficients of a table.
 
     Parameters
     ----------
     path : Path
-        Of the file.
-    wavelength : float | None
-        Metres, where the file does not say.
+        File to read.
+    wavelength : float, optional
+        Wavelength, in metres, if the file does not state it.
 
     Raises
     ------
     MapError
-        No such table, a meaning that is missing or stated in two ways, with what to write.
+        There is no such table, or its meaning is missing or contradictory; the message says what to write.
     """
     path = Path(path)
     if not path.is_file():
@@ -260,17 +259,19 @@ def read_zernikes(path: Path, *, wavelength: float | None = None) -> ZernikeTabl
         raise map_files.MapError(f"{path} cannot be read: {error.strerror or 'input/output error'}") from error
     if len(text) > _MOST_CHARACTERS:
         raise map_files.MapError(f"{path} is too long for a table of Zernike coefficients: {len(text)} characters")
-    said = map_files.statements(path, text, ("order", "normalised", "unit", "wavelength"))
-    order = _one(path, "order", said.get("order"), ORDER_NAMES)
-    scaled = _one(path, "normalised", said.get("normalised"), NORMALISATIONS)
-    found = map_files.length_from(path, said["wavelength"], "wavelength") if "wavelength" in said else None
-    wavelength = map_files.agreed(path, "wavelength", wavelength, found)
+    statements = map_files.statements(path, text, ("order", "normalised", "unit", "wavelength"))
+    order = _keyword(path, "order", statements.get("order"), ORDER_NAMES)
+    scaled = _keyword(path, "normalised", statements.get("normalised"), NORMALISATIONS)
+    stated_wavelength = (
+        map_files.length_from(path, statements["wavelength"], "wavelength") if "wavelength" in statements else None
+    )
+    wavelength = map_files.agreed(path, "wavelength", wavelength, stated_wavelength)
     indices, table, others, in_head = _table(path, text)
-    written = {one for one in (said.get("unit"), *in_head) if one}
-    if len(written) > 1:
-        raise map_files.MapError(f"{path} states more than one unit: {', '.join(sorted(written))[:60]}")
-    named = map_files.unit_written(path, written.pop() if written else None, "a line '# unit: nm'")
-    metres = map_files.metres_per(path, named, wavelength)
+    units = {text_unit for text_unit in (statements.get("unit"), *in_head) if text_unit}
+    if len(units) > 1:
+        raise map_files.MapError(f"{path} states more than one unit: {', '.join(sorted(units))[:60]}")
+    unit = map_files.unit_written(path, units.pop() if units else None, "a line '# unit: nm'")
+    metres = map_files.metres_per(path, unit, wavelength)
     terms, scales = [], []
     for index in indices:
         try:
@@ -281,8 +282,8 @@ def read_zernikes(path: Path, *, wavelength: float | None = None) -> ZernikeTabl
         scales.append(metres if scaled else metres / edge_value(n, m))
     sequence = np.argsort(terms)
     if len(set(terms)) != len(terms):
-        twice = next(index for index in indices if indices.count(index) > 1)
-        raise map_files.MapError(f"{path} has term {twice} more than once")
+        repeated = next(index for index in indices if indices.count(index) > 1)
+        raise map_files.MapError(f"{path} has term {repeated} more than once")
     coefficients = table * np.array(scales)
     if not np.isfinite(coefficients).all():
         raise map_files.MapError(f"{path}: a coefficient is not a finite number")
@@ -292,15 +293,15 @@ def read_zernikes(path: Path, *, wavelength: float | None = None) -> ZernikeTabl
         coefficients=coefficients[:, sequence],
         others=others,
         wavelength=wavelength,
-        notes=(f"{len(terms)} terms in the order {order}, of {size}, in {named}.",),
+        notes=(f"{len(terms)} terms in the order {order}, of {size}, in {unit}.",),
     )
 
 
-def _one(path: Path, key: str, found: str | None, known: Mapping[str, Any]) -> Any:
-    """What a file says of a key, by its name here."""
+def _keyword(path: Path, key: str, found: str | None, known: Mapping[str, Any]) -> Any:
+    """Return the value of a key in a file, translated to its meaning here."""
     if found is None:
         raise map_files.MapError(
-            f"{path} does not say its {key}: add a line '# {key}: {next(iter(known))}' ({', '.join(known)})"
+            f"{path} does not state its {key}: add a line '# {key}: {next(iter(known))}' ({', '.join(known)})"
         )
     if found.strip().lower() not in known:
         raise map_files.MapError(f"{path}: {key} is {found[:40]!r}; {', '.join(known)} are known")
@@ -308,15 +309,15 @@ def _one(path: Path, key: str, found: str | None, known: Mapping[str, Any]) -> A
 
 
 def _table(path: Path, text: str) -> tuple[list[int], Array, dict[str, tuple[str, ...]], set[str | None]]:
-    """Indices (Z,), coefficients (F, Z), other columns, and the units in the heads of the coefficients."""
+    """Return indices (Z,), coefficients (F, Z), other columns, and the units in the heads of the coefficients."""
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"]
     if not lines:
         raise map_files.MapError(f"{path} holds no table")
-    delimiter = next((one for one in _DELIMITERS if one in lines[0][1]), ",")
+    delimiter = next((candidate for candidate in _DELIMITERS if candidate in lines[0][1]), ",")
     try:
         rows = [(n, [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]) for n, line in lines]
     except csv.Error as error:
-        raise map_files.MapError(f"{path} is no table: {error}") from error
+        raise map_files.MapError(f"{path} is not a table: {error}") from error
     matches = [_HEAD.fullmatch(cell) for cell in rows[0][1]]
     heads = [(m[1].strip(), m[2]) if m else ("", None) for m in matches]
     body = rows[1:]
@@ -343,17 +344,19 @@ def _table(path: Path, text: str) -> tuple[list[int], Array, dict[str, tuple[str
 
 
 def _whole(path: Path, line: int, cell: str) -> int:
+    """Return the index of a term in a cell."""
     match = _TERM.fullmatch(cell) or re.fullmatch(r"([0-9]{1,4})", cell)
     if match is None:
-        raise map_files.MapError(f"{path}, line {line}: {cell[:40]!r} is no index of a term")
+        raise map_files.MapError(f"{path}, line {line}: {cell[:40]!r} is not the index of a term")
     return int(match[1])
 
 
 def _real(path: Path, line: int, cell: str) -> float:
+    """Return the coefficient in a cell."""
     try:
         value = float(cell.replace("_", "?"))
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise map_files.MapError(f"{path}, line {line}: {cell[:40]!r} is no coefficient")
+        raise map_files.MapError(f"{path}, line {line}: {cell[:40]!r} is not a coefficient")
     return value

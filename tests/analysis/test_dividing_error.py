@@ -160,7 +160,7 @@ def test_covariance_of_two_sets_of_readings() -> None:
     [
         (np.full(5, 1.7), np.zeros((5, 3)), "all 5 angles are the same; step the table"),
         ([1.0, 3.0, 2.0], np.zeros((3, 3)), "must increase"),
-        ([1.0, 2.0, 3.0], np.zeros((3, 1)), "one repeat only"),
+        ([1.0, 2.0, 3.0], np.zeros((3, 1)), "one repeat does not determine the noise"),
         ([1.0, 2.0, 3.0], np.zeros((2, 3)), "found"),
         ([1.0, 2.0, 3.0], np.full((3, 3), np.inf), "finite"),
     ],

@@ -118,11 +118,11 @@ def test_principal_point_over_a_narrow_field():
     assert found.sigma("principal_point") == pytest.approx(expected, rel=1e-9)
     point = found.point
     assert not point.observable
-    for part in ("not observable over +-1.25 deg", "take p = 0", "eq. 3", "0.44 um against 1 um", "decentring"):
+    for part in ("not observable over +-1.25 deg", "take p = 0", "eq. 3", "0.44 um, compared with 1 um", "decentring"):
         assert part in point.statement
     # not fitted: the same, said of the p that could have been
     without = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance")).point
-    assert f"p is taken as zero; fitted, it would be known to +- {1e3 * expected:.2g} mm" in without.statement
+    assert f"p is fixed at zero; if fitted, its sigma would be {1e3 * expected:.2g} mm" in without.statement
     assert "not observable" in without.statement
 
 
@@ -172,8 +172,8 @@ WITH_NAN = np.where(np.arange(55) == 7, np.nan, GF7)
         ({"position": -line_image(GF7)}, "opposite senses, change the sign"),
         ({"position": np.tile(GF7, (2, 1))}, "fit set by set"),
         ({"terms": ("constant",)}, "principal_distance must be among"),
-        ({"terms": ("principal_distance", "radial7")}, "terms must be different ones of"),
-        ({"terms": ("principal_distance", "principal_distance")}, "terms must be different ones of"),
+        ({"terms": ("principal_distance", "radial7")}, "terms must be distinct and out of"),
+        ({"terms": ("principal_distance", "principal_distance")}, "terms must be distinct and out of"),
         ({"covariance": np.zeros(55)}, "not positive definite.*add the sigmas"),
         ({"covariance": np.ones((55, 55))}, "not positive definite"),
         ({"covariance": np.ones(54)}, r"need \(55, 55\), or 55 sigmas"),

@@ -44,7 +44,7 @@ from analysis.orbit.forward_intersection import (
     intersect_pair,
 )
 from analysis.orbit.image_correction import image_correction
-from analysis.orbit.jitter import JitterError, Observations, periodogram, fit_spline
+from analysis.orbit.jitter import JitterError, Observations, fit_spline, periodogram
 from analysis.orientation.interior import OrientationError, fit_interior_orientation, line_orientation
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import FramesError
@@ -240,7 +240,7 @@ def test_edges_and_angles():
     angle = np.linspace(-0.02, 0.02, 20)
     three = ("constant", "principal_distance", "principal_point")
     found = fit_interior_orientation(np.tan(angle), angle, 1e-6, three)
-    refuses(OrientationError, "no line's orientation follows from the terms", line_orientation, found)
+    refuses(OrientationError, "do not determine the line model", line_orientation, found)
     wide = 15.0 * angle
     for bent in (-50.0, 500.0):
         found = fit_interior_orientation(5.5 * np.tan(wide) + bent * np.tan(wide) ** 3, wide, 1e-6, (*three, "radial3"))

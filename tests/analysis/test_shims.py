@@ -155,7 +155,7 @@ def test_errors_say_what_to_change():
     plan = shim_plan(RigidMotion.of([5 * ARCMIN, 0, 0], [0, 0, 0]), make_mount(count=4), now)
     assert plan.thickness.min() == pytest.approx(0, abs=1e-9)
     holes = make_mount().holes
-    refuses(ShimError, "2 holes cannot hold a plane", Mount.of, holes[:2], [0, 0, 1], MM, STEP)
+    refuses(ShimError, "2 holes do not fix a plane", Mount.of, holes[:2], [0, 0, 1], MM, STEP)
     refuses(ShimError, "on one line", Mount.of, np.outer(np.arange(4), [0.01, 0.1, 0]), [0, 0, 1], MM, STEP)
     with pytest.raises(ShimError, match="seen along the normal"):
         Mount.of([[0, 0, 0], [0, 0.1, 0], [0, 0.05, 0.05]], [0, 0, 1], MM, STEP)

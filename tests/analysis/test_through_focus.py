@@ -181,7 +181,7 @@ def test_other_faults():
     [
         ({"sigma": 0.0}, "sigma must be positive"),
         ({"position": np.zeros(4)}, "same Z points"),
-        ({"sigma": np.ones((2, 3))}, "do not fit"),
+        ({"sigma": np.ones((2, 3))}, "do not match"),
         ({"value": np.ones((2, 9))}, r"must be \(Z,\)"),
     ],
 )

@@ -168,9 +168,9 @@ def test_fits_says_its_unit(tmp_path):
     write.fits_map(path, WAVE, "microns")
     np.testing.assert_allclose(read_map(path).values, WAVE * 1e3, rtol=1e-15, atol=0)
     write.fits_map(path, WAVE, None)
-    refuses(MapError, "does not say its unit", read_map, path)
+    refuses(MapError, "does not state its unit", read_map, path)
     write.fits_map(path, WAVE, "waves")
-    refuses(MapError, "of which wavelength", read_map, path)
+    refuses(MapError, "does not state the wavelength", read_map, path)
     found = read_map(path, wavelength=5e-7)
     np.testing.assert_allclose(found.values, WAVE * 500.0, rtol=1e-14, atol=0)
     assert found.wavelength == 5e-7
@@ -216,24 +216,24 @@ BAD = {
     "size": (lambda p: p.write_text("t\nGRD 2 0 SUR SSZ 2 WVL 1\n1 2 3 4\n"), "grid of 2 x 0"),
     "short": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 2 WVL 1\n1 2 3\n"), "has 3 points"),
     "zernikes": (lambda p: p.write_text("t\nZFR 2 SUR SSZ 2 WVL 1\n1 2\n"), "Zernike terms"),
-    "huge": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 1e-300 WVL 1e20\n1 2 3 4\n"), "inf m, which no wavefront has"),
+    "huge": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 1e-300 WVL 1e20\n1 2 3 4\n"), "inf m, which is too large for a wavefront"),
     "unit of a table": (lambda p: write.table(p, WAVE, "# unit: m\n"), "check its unit"),
-    "letters": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 2 WVL 1\n1 2\n3 o\n"), "line 4: 'o' is no number"),
-    "steps": (lambda p: p.write_text("5 5 1 2 0 0 0\n" + "1 0 0 0 0\n" * 25), "no square pixels"),
+    "letters": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 2 WVL 1\n1 2\n3 o\n"), "line 4: 'o' is not a number"),
+    "steps": (lambda p: p.write_text("5 5 1 2 0 0 0\n" + "1 0 0 0 0\n" * 25), "not square pixels"),
     "flag": (lambda p: p.write_text("5 5 1 1 7 0 0\n" + "1 0 0 0 0\n" * 25), "unit flag 7"),
     "points": (lambda p: p.write_text("5 5 1 1 0 0 0\n" + "1 0 0 0 0\n" * 24), "has 24 points"),
     "phase": (lambda p: write.metropro(p, np.zeros((0, 0))), "no phase map"),
     "scale": (lambda p: write.metropro(p, WAVE, scale=0.0), "scale factor 0"),
     "dark": (lambda p: write.metropro(p, WAVE * np.nan), "no measured point"),
-    "cut": (lambda p: (write.metropro(p, WAVE), p.write_bytes(p.read_bytes()[:-9])), "cut off"),
-    "other hdf5": (lambda p: h5py.File(p, "w").close(), "no .datx file"),
-    "no unit": (lambda p: write.datx(p, WAVE, Unit=None), "does not say the unit"),
+    "cut": (lambda p: (write.metropro(p, WAVE), p.write_bytes(p.read_bytes()[:-9])), "truncated"),
+    "other hdf5": (lambda p: h5py.File(p, "w").close(), "not a .datx file"),
+    "no unit": (lambda p: write.datx(p, WAVE, Unit=None), "does not state the unit"),
     "no factor": (lambda p: write.datx(p, WAVE, **{"Interferometric Scale Factor": None}), "no usable"),
-    "table unit": (lambda p: write.table(p, WAVE, ""), "does not say its unit"),
-    "furlongs": (lambda p: write.table(p, WAVE, "# unit: furlong\n"), "no unit 'furlong'"),
-    "twice": (lambda p: write.table(p, WAVE, "# unit: nm\n# unit: nm\n"), "line 2: unit is stated a second time"),
+    "table unit": (lambda p: write.table(p, WAVE, ""), "does not state its unit"),
+    "furlongs": (lambda p: write.table(p, WAVE, "# unit: furlong\n"), "unknown unit 'furlong'"),
+    "twice": (lambda p: write.table(p, WAVE, "# unit: nm\n# unit: nm\n"), "line 2: unit is stated twice"),
     "ragged": (lambda p: p.write_text("# unit: nm\n1 2\n1 2\n1 2 3\n"), "line 4: a map has"),
-    "binary": (lambda p: p.write_bytes(b"\0\1\2"), "no file of a wavefront that is known"),
+    "binary": (lambda p: p.write_bytes(b"\0\1\2"), "not a wavefront file of a known format"),
     "empty": (lambda p: p.write_bytes(b""), "is empty"),
     "folder": (lambda p: p.mkdir(), "is a folder"),
     "nothing": (lambda p: None, "there is no file"),
@@ -244,7 +244,7 @@ BAD = {
     "too many": (lambda p: unstored(p, 70_000), "70000 x 70000 points, more than"),
     "2 m": (lambda p: patched(p, 168, b"\x40\0\0\0"), "its header has wavelength 2 m"),
     "size of the phase": (lambda p: patched(p, 68, b"\xff\xff\xff\xff"), "65535 x 65535 points, more than"),
-    "line": (lambda p: write.datx(p, WAVE.ravel()), "is no map of numbers"),
+    "line": (lambda p: write.datx(p, WAVE.ravel()), "is not a map of numbers"),
 }
 
 
@@ -276,7 +276,7 @@ def test_statements_that_are_not_needed_are_refused(tmp_path):
     path = tmp_path / "a.dat"
     write.metropro(path, WAVE)
     refuses(MapError, "cannot be read: Input/output error", read_map, "/proc/self/mem")
-    refuses(MapError, "says wavelength", read_map, path, wavelength=5e-7)
+    refuses(MapError, "states wavelength", read_map, path, wavelength=5e-7)
 
 
 @pytest.mark.parametrize("kind", [*write.WRITERS, "zernikes"])

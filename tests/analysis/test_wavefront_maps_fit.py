@@ -12,12 +12,12 @@ from analysis.arrays import UndeterminedError
 from analysis.wavefront_maps.map_files import MapError, WavefrontMap
 from analysis.wavefront_maps.pupil_fit import (
     ORIENTATIONS,
-    READINGS,
+    SIGNED_ORIENTATIONS,
     Orientation,
     Pupil,
     find_pupil,
     fit_wavefront_map,
-    tellable,
+    orientation_evidence,
 )
 from analysis.wavefront_maps.zernike_table import circle_terms
 from tests.analysis.refusals import refuses
@@ -62,10 +62,10 @@ def test_the_pupil_is_found_by_its_light(light):
 
 def test_light_without_a_round_edge_needs_a_stated_pupil():
     values = np.full((60, 60), np.nan)
-    refuses(UndeterminedError, "no lit pixel", find_pupil, values)
+    refuses(UndeterminedError, "no measured pixel", find_pupil, values)
     values[10:50, 10:30] = 0.0
-    refuses(UndeterminedError, "state them in pixels", find_pupil, values)
-    with pytest.raises(UndeterminedError, match="state them in pixels"):
+    refuses(UndeterminedError, "specify them in pixels", find_pupil, values)
+    with pytest.raises(UndeterminedError, match="specify them in pixels"):
         find_pupil(np.zeros((20, 20)))  # steps at the end of a map are no edge
     refuses(MapError, "radii are positive", Pupil, 1.0, 2.0, 0.0)
 
@@ -88,9 +88,9 @@ def test_coefficients_come_back_exactly(light):
 def test_terms_that_the_light_does_not_tell_apart():
     x, y = disk(100, 50.0, 50.0, 45.0)
     values = np.where((np.abs(y) < 1e-9) & (np.abs(x) <= 1.0), 0.0, np.nan)
-    with pytest.raises(UndeterminedError, match="Z3 cannot be told from the terms before it"):
+    with pytest.raises(UndeterminedError, match="Z3 cannot be separated from the terms before it"):
         fit_wavefront_map(values, range(1, 5), Pupil(50.0, 50.0, 45.0))
-    with pytest.raises(UndeterminedError, match="0 lit pixels lie within the pupil"):
+    with pytest.raises(UndeterminedError, match="0 measured pixels lie within the pupil"):
         fit_wavefront_map(values, range(1, 5), Pupil(500.0, 50.0, 45.0))
     refuses(MapError, "ascending order", fit_wavefront_map, values, [1, 4, 2], Pupil(50.0, 50.0, 45.0))
 
@@ -110,8 +110,8 @@ def map_by(coefficients: np.ndarray, rows: int = 41, columns: int = 41) -> Wavef
 
 def test_there_are_eight_and_sixteen():
     assert len({one.matrix.tobytes() for one in ORIENTATIONS}) == len(ORIENTATIONS) == 8
-    assert len(set(READINGS)) == len({str(one) for one in READINGS}) == 16
-    assert [Orientation.named(one.name, one.sign) for one in READINGS] == list(READINGS)
+    assert len(set(SIGNED_ORIENTATIONS)) == len({str(one) for one in SIGNED_ORIENTATIONS}) == 16
+    assert [Orientation.named(one.name, one.sign) for one in SIGNED_ORIENTATIONS] == list(SIGNED_ORIENTATIONS)
     refuses(MapError, "turned 270", Orientation.named, "turned 45")
     refuses(ValueError, "quarter turns", Orientation, quarter_turns=4)
 
@@ -125,7 +125,7 @@ def test_what_the_names_mean(name, point):
     assert tuple(Orientation.named(name).matrix @ (1, 2)) == point
 
 
-@pytest.mark.parametrize("reading", READINGS, ids=str)
+@pytest.mark.parametrize("reading", SIGNED_ORIENTATIONS, ids=str)
 def test_maps_and_coefficients_turn_alike(reading):
     coefficients = np.random.default_rng(0).normal(size=36)
     before = map_by(coefficients)
@@ -138,7 +138,7 @@ def test_maps_and_coefficients_turn_alike(reading):
     found, *_ = np.linalg.lstsq(circle_terms(TERMS, x, y), after.values[after.lit], rcond=None)
     np.testing.assert_allclose(found, reading.coefficients(coefficients, TERMS), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(reading.inverse.apply(after).values, before.values)
-    turning = reading.of_terms(TERMS)
+    turning = reading.term_matrix(TERMS)
     np.testing.assert_array_equal(turning @ turning.T, np.eye(36))
 
 
@@ -151,8 +151,8 @@ def test_a_map_that_is_no_square_turns_into_another():
 
 
 def test_terms_without_their_partners():
-    assert Orientation.named("turned 180").of_terms([4, 7]).tolist() == [[1, 0], [0, -1]]
-    refuses(MapError, "Z7 turns into a term that was not fitted", Orientation.named("turned 90").of_terms, [4, 7])
+    assert Orientation.named("turned 180").term_matrix([4, 7]).tolist() == [[1, 0], [0, -1]]
+    refuses(MapError, "Z7 rotates into a term that was not fitted", Orientation.named("turned 90").term_matrix, [4, 7])
 
 
 FIELDS, USED = 5, tuple(range(4, 12))
@@ -167,14 +167,14 @@ def camera(noise: float, coma: float, seed: int = 3) -> tuple[np.ndarray, np.nda
     return expected, unknown @ unknown.T + noise**2 * np.eye(FIELDS * len(USED))
 
 
-@pytest.mark.parametrize("truth", READINGS, ids=str)
+@pytest.mark.parametrize("truth", SIGNED_ORIENTATIONS, ids=str)
 def test_the_reading_of_half_a_micron_of_coma_is_found(truth):
     expected, covariance = camera(5e-9, 0.5e-6)
-    rng = np.random.default_rng(READINGS.index(truth))
+    rng = np.random.default_rng(SIGNED_ORIENTATIONS.index(truth))
     right = expected + rng.multivariate_normal(np.zeros(expected.size), covariance).reshape(expected.shape)
     # what the file holds: the reading is what turns it back
-    measured = right.reshape(FIELDS, -1) @ truth.of_terms(USED)
-    found = tellable(measured, expected, covariance, USED)
+    measured = right.reshape(FIELDS, -1) @ truth.term_matrix(USED)
+    found = orientation_evidence(measured, expected, covariance, USED)
     assert found.found == truth
     assert found.allowed[0] == truth
     assert found.readings[0] == truth
@@ -186,10 +186,10 @@ def test_readings_that_look_alike_are_named_together():
     """Coma along x alone: what mirrors y changes nothing."""
     expected = np.zeros((1, len(USED)))
     expected[0, USED.index(8)] = 0.5e-6
-    found = tellable(expected, expected, (5e-9) ** 2 * np.eye(len(USED)), USED)
+    found = orientation_evidence(expected, expected, (5e-9) ** 2 * np.eye(len(USED)), USED)
     assert found.found is None
     # an inverted coma along x is one that is mirrored in x
-    assert {str(one) for one in found.together} == {
+    assert {str(one) for one in found.indistinguishable} == {
         "as it is",
         "mirrored y",
         "turned 180, sign inverted",
@@ -203,7 +203,7 @@ def test_the_right_reading_is_rejected_as_often_as_stated():
     rng = np.random.default_rng(8)
     draws = rng.multivariate_normal(expected.ravel(), covariance, 400).reshape(400, *expected.shape)
     rejected = sum(
-        ORIENTATIONS[0] not in tellable(one, expected, covariance, USED, false_alarm=0.1).allowed for one in draws
+        ORIENTATIONS[0] not in orientation_evidence(one, expected, covariance, USED, false_alarm=0.1).allowed for one in draws
     )
     # 400 draws of a chance of 0.1: three binomial sigmas
     assert 40 - 18 <= rejected <= 40 + 18
@@ -212,12 +212,12 @@ def test_the_right_reading_is_rejected_as_often_as_stated():
 def test_no_reading_is_allowed_of_another_camera():
     expected, covariance = camera(5e-9, 0.5e-6)
     other, _ = camera(5e-9, -0.9e-6, seed=4)
-    found = tellable(other * 3.0, expected, covariance, USED)
+    found = orientation_evidence(other * 3.0, expected, covariance, USED)
     assert found.allowed == ()
     assert found.found is None
 
 
 def test_a_covariance_that_is_none():
     expected, covariance = camera(5e-9, 0.5e-6)
-    refuses(UndeterminedError, "add the noise", tellable, expected, expected, 0.0 * covariance, USED)
-    refuses(UndeterminedError, "not finite", tellable, expected * np.nan, expected, covariance, USED)
+    refuses(UndeterminedError, "add the noise", orientation_evidence, expected, expected, 0.0 * covariance, USED)
+    refuses(UndeterminedError, "not finite", orientation_evidence, expected * np.nan, expected, covariance, USED)

@@ -127,10 +127,10 @@ def test_the_unit_in_the_head_of_a_column(tmp_path):
 
 SAID = "# order: noll\n# normalised: rms\n# unit: nm\n"
 BAD = {
-    "order": ("# unit: nm\n# normalised: rms\nZ4\n1\n", "does not say its order: add a line '# order: noll'"),
-    "size": ("# unit: nm\n# order: noll\nZ4\n1\n", "does not say its normalised"),
-    "unit": ("# order: noll\n# normalised: rms\nZ4\n1\n", "does not say its unit"),
-    "waves": ("# order: noll\n# normalised: rms\n# unit: waves\nZ4\n1\n", "of which wavelength"),
+    "order": ("# unit: nm\n# normalised: rms\nZ4\n1\n", "does not state its order: add a line '# order: noll'"),
+    "size": ("# unit: nm\n# order: noll\nZ4\n1\n", "does not state its normalised"),
+    "unit": ("# order: noll\n# normalised: rms\nZ4\n1\n", "does not state its unit"),
+    "waves": ("# order: noll\n# normalised: rms\n# unit: waves\nZ4\n1\n", "does not state the wavelength"),
     "unknown": (
         "# order: zemax\n# normalised: rms\n# unit: nm\nZ4\n1\n",
         "order is 'zemax'; noll, fringe, ansi, osa, osa/ansi are",
@@ -138,9 +138,9 @@ BAD = {
     "two units": (SAID + "Z4 [um]\n1\n", "more than one unit"),
     "head": (SAID + "a,b\n1,2\n", "line 4: the head names neither terms"),
     "cells": (SAID + "Z4,Z5\n1,2\n1\n", "line 6: 1 cells, the head of the table has 2"),
-    "text": (SAID + "Z4,Z5\n1,x\n", "line 5: 'x' is no coefficient"),
-    "infinite": (SAID + "Z4,Z5\n1,1e400\n", "line 5: '1e400' is no coefficient"),
-    "index": (SAID + "index,value\nfour,1\n", "line 5: 'four' is no index"),
+    "text": (SAID + "Z4,Z5\n1,x\n", "line 5: 'x' is not a coefficient"),
+    "infinite": (SAID + "Z4,Z5\n1,1e400\n", "line 5: '1e400' is not a coefficient"),
+    "index": (SAID + "index,value\nfour,1\n", "line 5: 'four' is not the index"),
     "twice": (SAID + "index,value\n4,1\n4,2\n", "has term 4 more than once"),
     "zero": (SAID + "Z0\n1\n", "Noll's terms 1 to 496 are known, not 0"),
     "rows": (SAID + "Z4\n", "no row below"),
@@ -148,7 +148,7 @@ BAD = {
     "wavelength": (SAID + "# wavelength: 632.8\nZ4\n1\n", "a positive length with its unit is needed"),
     "waves long": (SAID + "# wavelength: 2 waves\nZ4\n1\n", "a length is needed: 632.8 nm"),
     "huge": (SAID.replace("nm", "waves") + "# wavelength: 1000 m\nZ4\n1e308\n", "coefficient is not a finite number"),
-    "cell": (SAID + "Z4\n" + "1" * 140_000, "is no table: field larger than field limit"),
+    "cell": (SAID + "Z4\n" + "1" * 140_000, "is not a table: field larger than field limit"),
     "long": (SAID + "Z4\n" + "1\n" * 5_100_000, "is too long for a table"),
 }
 
@@ -168,10 +168,10 @@ def test_tables_without_a_meaning_are_refused(tmp_path, case):
 def test_statements_that_contradict_the_table(tmp_path):
     path = tmp_path / "z.csv"
     path.write_text(text_of("fringe", "peak", "nm", "long"))
-    refuses(MapError, "take the statement away", read_zernikes, path, wavelength=5e-7)
+    refuses(MapError, "remove the specification", read_zernikes, path, wavelength=5e-7)
     refuses(MapError, "there is no file", read_zernikes, Path(tmp_path / "other.csv"))
     refuses(MapError, "is no file", read_zernikes, tmp_path)
     refuses(MapError, "cannot be read: Input/output error", read_zernikes, "/proc/self/mem")
     with path.open("wb") as file:
         file.truncate(101_000_000)
-    refuses(MapError, "101 MB, more than 100: save a smaller map", read_zernikes, path)
+    refuses(MapError, "101 MB, at most 100 MB are read: save a smaller map", read_zernikes, path)

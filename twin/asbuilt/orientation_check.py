@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from analysis.arrays import UndeterminedError
-from analysis.wavefront_maps.pupil_fit import Orientation, ReadingEvidence, tellable
+from analysis.wavefront_maps.pupil_fit import Orientation, OrientationEvidence, orientation_evidence
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import Backend
 from scenes.specs.asbuilt import AsBuiltSetup
@@ -46,14 +46,14 @@ class OrientationCheck:
     setup: AsBuiltSetup
     names: tuple[str, ...]
     stated: Orientation
-    evidence: ReadingEvidence
+    evidence: OrientationEvidence
 
     @property
     def code(self) -> int:
         """Exit code: 0 where the stated reading is not excluded."""
         if not self.evidence.allowed:
             return NONE
-        return 0 if self.stated in self.evidence.together else ANOTHER
+        return 0 if self.stated in self.evidence.indistinguishable else ANOTHER
 
 
 def run_check(
@@ -112,7 +112,7 @@ def run_check(
         known = np.where(np.isinf(sigmas), FREE_FOCUS, sigmas)
         covariance[rows, rows] += kind.covariance() + (columns * known**2) @ columns.T
     try:
-        evidence = tellable(np.concatenate(data), mean.reshape(-1, len(terms)), covariance, terms)
+        evidence = orientation_evidence(np.concatenate(data), mean.reshape(-1, len(terms)), covariance, terms)
     except UndeterminedError as error:
         raise test.error(str(error), ("measurements",)) from error
     advance("readings", 1, 1)
@@ -146,7 +146,7 @@ def _readings(check: OrientationCheck) -> list[dict[str, Any]]:
             "chance": float(found.chance[k]),
             "log_evidence": float(found.log_evidence[k]),
             "allowed": one in found.allowed,
-            "like_the_best": one in found.together,
+            "like_the_best": one in found.indistinguishable,
         }
         for k, one in enumerate(found.readings)
     ]
@@ -172,7 +172,7 @@ def check_report(check: OrientationCheck) -> Report:
             float(found.chi_square[k]),
             float(found.chance[k]),
             "yes" if one in found.allowed else "no",
-            "yes" if one in found.together else "no",
+            "yes" if one in found.indistinguishable else "no",
             "stated" if one == check.stated else "",
         ]
         for k, one in enumerate(found.readings)
@@ -200,9 +200,9 @@ def _words(check: OrientationCheck) -> list[str]:
     if found.found is not None:
         same = "as stated" if best == stated else f"and not {_text(stated)}, as stated"
         return [f"The wavefronts lie {_text(best)}, {same}"]
-    others = ", ".join(_text(one) for one in found.together[1:])
+    others = ", ".join(_text(one) for one in found.indistinguishable[1:])
     head = f"The data do not tell {_text(best)} from {others}"
-    if stated in found.together:
+    if stated in found.indistinguishable:
         return [head, f"The stated reading, {_text(stated)}, is among them"]
     return [head, f"The stated reading, {_text(stated)}, is excluded"]
 

@@ -398,8 +398,8 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
         (distortion_run.REJECTED, "rejected_readings", "Readings"),
         (turntable_run.REJECTED, "rejected_comparisons", "Comparisons of the turntable"),
     ):
-        if gone := data.get(key):
-            artefacts.append(rejected_table(record, f"distortion-{key.replace('_', '-')}", what, gone))
+        if rejected := data.get(key):
+            artefacts.append(rejected_table(record, f"distortion-{key.replace('_', '-')}", what, rejected))
     folded = len([one for one in artefacts if one.name.startswith("distortion-rejected")])
     return Section("Noise, and what was rejected", tuple(text), tuple(artefacts), folded)
 

@@ -54,8 +54,8 @@ def comparison_figure(run: TurntableRun) -> Figure:
     figure = svg.new_figure(5.2)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
     top.plot(places[keep], off[keep], ".", color=svg.BLUE, ms=3.5, label=f"kept, {np.sum(keep)}")
-    gone = series.gone
-    top.plot(places[gone], off[gone], "x", color=svg.VERMILION, ms=5.5, label=f"rejected, {series.rejected}")
+    rejected = series.excluded_comparisons
+    top.plot(places[rejected], off[rejected], "x", color=svg.VERMILION, ms=5.5, label=f"rejected, {series.rejected}")
     top.set(title="Comparisons, minus the mean of those kept at their angle", ylabel="arcsec")
     top.margins(y=0.18)
     top.legend(loc="upper right", ncols=2)
@@ -231,10 +231,10 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
             )
         )
     artefacts += [_ranking(result), _left(run, result), _chi_square(result)]
-    gone = result.get("rejected_readings")
-    if gone:
-        artefacts.append(rejected_table(turntable_run.REJECTED, "turntable-rejected", "Comparisons", gone))
-    return Section("Fits of the dividing error", tuple(text), tuple(artefacts), folded=1 if gone else 0)
+    rejected = result.get("rejected_readings")
+    if rejected:
+        artefacts.append(rejected_table(turntable_run.REJECTED, "turntable-rejected", "Comparisons", rejected))
+    return Section("Fits of the dividing error", tuple(text), tuple(artefacts), folded=1 if rejected else 0)
 
 
 def rejected_table(record: Record[Any], name: str, what: str, rows: Sequence[Mapping[str, Any]]) -> Table:

@@ -430,9 +430,9 @@ DATA_FILE: Record[DataFile] = Record(
 REJECTED: Record[Comparisons] = Record(
     "A comparison that Chauvenet's criterion takes out, and where it stands.",
     Quantity("file", lambda c: [c.file.file] * c.series.rejected, "path of its table"),
-    Quantity("line", lambda c: c.lines[c.series.gone], "line in this file"),
-    Quantity("reading_deg", lambda c: c.series.angle[np.nonzero(c.series.gone)[0]], "reading", decimals=6),
-    Quantity("from_mean_arcsec", lambda c: c.series.from_mean[c.series.gone], "minus the mean", "from the mean", 3),
+    Quantity("line", lambda c: c.lines[c.series.excluded_comparisons], "line in this file"),
+    Quantity("reading_deg", lambda c: c.series.angle[np.nonzero(c.series.excluded_comparisons)[0]], "reading", decimals=6),
+    Quantity("from_mean_arcsec", lambda c: c.series.from_mean[c.series.excluded_comparisons], "minus the mean", "from the mean", 3),
 )
 FIT: Record[tuple[TurntableRun, str]] = Record(
     "One fit of the dividing error; the source is the run and the fit's name.",

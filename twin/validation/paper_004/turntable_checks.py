@@ -95,11 +95,11 @@ def _criterion(context: Context, series: Sequence[CalibrationSeries]) -> CheckRe
     """Where the rule begins to reject, from the readings that it kept and rejected."""
     readings, keep = (np.concatenate([getattr(s, name) for s in series]) for name in ("comparisons", "keep"))
     size = np.abs(readings - readings.mean(axis=1, keepdims=True)) / readings.std(axis=1, ddof=1, keepdims=True)
-    kept, gone = float(np.max(size[keep])), float(np.min(size[~keep]))
+    kept, rejected = float(np.max(size[keep])), float(np.min(size[~keep]))
     # half a reading is expected beyond it, two-sided
     wanted = brentq(lambda x: REPEATS * erfc(x / np.sqrt(2.0)) - 0.5, 0.1, 5.0)
-    facts: dict[str, Any] = {"series": series, "size": size, "kept": kept, "gone": gone}
-    return context.row("004.turntable.criterion", 0.5 * (kept + gone), None, wanted, **facts)
+    facts: dict[str, Any] = {"series": series, "size": size, "kept": kept, "gone": rejected}
+    return context.row("004.turntable.criterion", 0.5 * (kept + rejected), None, wanted, **facts)
 
 
 def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
