@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scipy.ndimage import fourier_shift, gaussian_filter
 import analysis
 
 FUNCTIONS = [name for name in analysis.__all__ if not isinstance(getattr(analysis, name), type)]
+DOCS = Path(__file__).resolve().parent.parent / "docs"
 NOISE = analysis.NoiseModel()
 DRIFT = analysis.Disturbances.of([[1.0]], [[1.0]], [analysis.TimeLaw(drift_s=10.0)])
 
@@ -20,6 +22,12 @@ def test_the_documented_arguments_are_those_of_the_function(name: str) -> None:
     text = inspect.getdoc(function).partition("Parameters\n----------\n")[2].partition("\n\nReturns\n")[0]
     documented = [each for line in re.findall(r"^([\w, ]+) : ", text, re.M) for each in line.split(", ")]
     assert sorted(documented) == sorted(inspect.signature(function).parameters)
+
+
+def test_the_pages_list_every_name() -> None:
+    for page in ("library_analysis.md", "site/pages/reference/analysis.md"):
+        text = (DOCS / page).read_text("utf-8")
+        assert [name for name in analysis.__all__ if not re.search(rf"`{name}`|analysis\.{name}$", text, re.M)] == []
 
 
 @pytest.mark.oracle
