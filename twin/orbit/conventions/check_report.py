@@ -46,9 +46,7 @@ READING: Record[CheckedReading] = Record(
     ),
     Quantity("why_impossible", lambda of: of[1].why or None, "reason why they cannot"),
     Quantity("rms_m", _of_fit(lambda fit: fit.rms), "root mean square residual in plan", "rms", 1),
-    Quantity(
-        "rms_px", _of_fit(lambda fit: fit.rms_pixels), "root mean square residual along the lines' own axes", "rms", 1
-    ),
+    Quantity("rms_px", _of_fit(lambda fit: fit.rms_pixels), "rms residual along the lines' own axes", "rms", 1),
     Quantity("chi_square", _of_fit(lambda fit: fit.chi_square), "of the residuals under their covariance"),
     Quantity("degrees_of_freedom", _of_fit(lambda fit: fit.freedom), "number of residuals"),
     Quantity(
@@ -69,9 +67,7 @@ VALUE_TEST: Record[ValueTest] = Record(
         "minus twice the log of the likelihood over that of the best reading",
     ),
     Quantity("displacement_m", lambda one: one.moved, "root mean square displacement of the points on the ground"),
-    Quantity(
-        "why_impossible", lambda one: one.why or None, "reason why the points cannot have been imaged under this value"
-    ),
+    Quantity("why_impossible", lambda one: one.why or None, "reason why the value is impossible"),
 )
 CONVENTION: Record[tuple[ValueTest, ...]] = Record(
     "A convention: its stated and its best value, and whether the points determine it.",
@@ -124,25 +120,15 @@ def _best(run: Check) -> dict[str, Any]:
 
 CHECK: Record[Check] = Record(
     "check.json. Conventions under which a pass explains its ground points.",
-    Quantity(
-        "result", lambda run: run.verdict, "confirmed (the stated conventions), another (other conventions fit) or none"
-    ),
-    Quantity(
-        "best", lambda run: dict(run.best.changes), "conventions of the best reading that differ from the stated ones"
-    ),
-    Quantity(
-        "equally_likely",
-        lambda run: [dict(one) for one in run.equally_likely],
-        "changes of other readings that are equally likely",
-    ),
+    Quantity("result", lambda run: run.verdict, "confirmed (as stated), another (others fit) or none"),
+    Quantity("best", lambda run: dict(run.best.changes), "changed conventions of the best reading"),
+    Quantity("equally_likely", lambda run: [dict(one) for one in run.equally_likely], "equally likely readings"),
     Quantity("reading", _best, "every convention of the best reading"),
     Quantity("readings_tried", lambda run: run.count, "number of readings that were tried"),
     Quantity("decided_by_cost", lambda run: DECIDED, "difference of cost from which two readings are separated"),
     Quantity("factor_of_variance", lambda run: run.factor, "factor by which the variances are too small"),
     Quantity(
-        "ground_accuracy_m",
-        lambda run: run.readings.ground.accuracy,
-        "stated accuracy of the transformation to the ITRS",
+        "ground_accuracy_m", lambda run: run.readings.ground.accuracy, "accuracy of the transformation to the ITRS"
     ),
     Quantity(
         "image_points",
@@ -152,9 +138,7 @@ CHECK: Record[Check] = Record(
     Quantity("gross_errors", lambda run: run.wrong, "rejected points of each line"),
     Quantity("conventions", lambda run: run.answers, "tests of each convention", record=CONVENTION),
     Quantity("ranking", lambda run: [(run, one) for one in run.tried], "readings, the likeliest first", record=READING),
-    Quantity(
-        "places", lambda run: [(run, one) for one in run.places], "ground positions of the first points", record=PLACE
-    ),
+    Quantity("places", lambda run: [(run, one) for one in run.places], "ground positions", record=PLACE),
 )
 
 
@@ -209,7 +193,7 @@ def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
 
 def _undetermined(answers: tuple[ValueTest, ...]) -> bool:
     """Return whether more than one value of a convention is possible."""
-    return sum(candidate.possible for candidate in answers) > 1
+    return sum(test.possible for test in answers) > 1
 
 
 def _metres(value: float) -> str:
@@ -219,21 +203,19 @@ def _metres(value: float) -> str:
 
 def _lead(run: Check) -> tuple[str, ...]:
     """Return sentences on wrong and undetermined conventions."""
-    lines = [f"Equally likely: {changes_text(alternative)}." for alternative in run.equally_likely]
+    lines = [f"Equally likely: {changes_text(changes)}." for changes in run.equally_likely]
     for name, answers in run.answers.items():
         convention = TESTED_CONVENTIONS[name]
-        stated = next(alternative for alternative in answers if alternative.stated)
-        best = next(alternative for alternative in answers if alternative.best)
+        stated = next(test for test in answers if test.stated)
+        best = next(test for test in answers if test.best)
         if run.verdict == "another" and not stated.possible:
-            lines.append(
-                f"{convention.title}: {convention.text(best.value)} instead of {convention.text(stated.value)}."
-            )
+            lines.append(f"{convention.title}: {convention.text(best.value)}, not {convention.text(stated.value)}.")
         elif _undetermined(answers):
-            others = [alternative for alternative in answers if alternative.possible and not alternative.best]
-            moved = max(alternative.moved or 0.0 for alternative in others)
-            texts = ", ".join(convention.text(alternative.value) for alternative in (best, *others))
+            others = [test for test in answers if test.possible and not test.best]
+            moved = max(test.moved or 0.0 for test in others)
+            texts = ", ".join(convention.text(test.value) for test in (best, *others))
             lines.append(
-                f"{convention.title}: {texts} fit equally; they differ by {_metres(moved)}, within the uncertainty."
+                f"{convention.title}: {texts} fit equally; they differ by {_metres(moved)}, within uncertainty."
             )
     return tuple(lines)
 
@@ -246,10 +228,7 @@ def _facts(run: Check) -> tuple[tuple[str, str], ...]:
         ("Image points", ", ".join(f"{name} {len(raw.line)}" for name, raw in images.items())),
         ("Uncertainty of the attitude", f"{np.degrees(size.attitude) * 3600.0:.4g} arcsec about each axis"),
         ("Uncertainty of the orbit", f"{size.position:.4g} m"),
-        (
-            "Uncertainty of the lines",
-            f"{size.interior:.4g} px in position, {1e6 * size.scale:.4g} ppm in principal distance",
-        ),
+        ("Uncertainty of the lines", f"{size.interior:.4g} px, {1e6 * size.scale:.4g} ppm in principal distance"),
         ("Uncertainty of the line times", f"{1e3 * size.time:.4g} ms"),
     )
 
@@ -287,20 +266,11 @@ def _conventions(run: Check) -> Section:
     rows: list[tuple[Cell, ...]] = []
     for name, answers in run.answers.items():
         convention = TESTED_CONVENTIONS[name]
-        for candidate in answers:
-            verdict = (
-                "best" if candidate.best else "not excluded" if candidate.possible else candidate.why or "excluded"
-            )
-            cost = max(candidate.excess, 0.0) if np.isfinite(candidate.excess) else None
+        for test in answers:
+            verdict = "best" if test.best else "not excluded" if test.possible else test.why or "excluded"
+            cost = max(test.excess, 0.0) if np.isfinite(test.excess) else None
             rows.append(
-                (
-                    convention.title,
-                    convention.text(candidate.value),
-                    "yes" if candidate.stated else "",
-                    candidate.moved,
-                    cost,
-                    verdict,
-                )
+                (convention.title, convention.text(test.value), "yes" if test.stated else "", test.moved, cost, verdict)
             )
     text = (
         "Each convention by itself, the others as in the best reading. A value is not excluded if it moves the points "

@@ -190,9 +190,7 @@ def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: 
     for name in dict.fromkeys(names.tolist()):
         rows = np.flatnonzero(names == name)
         if len(rows) < 2:
-            raise table.error(
-                int(rows[0]), "line", f"one line of {name} does not define a line time", None, "two or more"
-            )
+            raise table.error(int(rows[0]), "line", f"one line of {name} gives no line time", None, "two or more")
         line, times = table["line"][rows], clock.taken(rows)
         step = np.diff(times.day) * 86400.0 + np.diff(times.second)
         for what, rise in (("line", np.diff(line)), ("time", step)):

@@ -77,7 +77,7 @@ class Jitter:
         seed : SeedSequence
             Seed of random phases and of bands. Each line and each band has its own stream.
         """
-        if not spec.stated:
+        if not spec.present:
             return None
         streams, terms = seed.spawn(len(spec.lines) + len(spec.bands)), []
         for line, generator in zip(spec.lines, streams, strict=False):

@@ -153,7 +153,7 @@ def predicted(image: LineFrame, points: np.ndarray) -> np.ndarray:
     return np.stack([line - image.window.first_line, pixel - image.window.first_pixel], axis=-1)
 
 
-def inside_frame(image: LineFrame, place: np.ndarray, border: float) -> np.ndarray:
+def in_frame(image: LineFrame, place: np.ndarray, border: float) -> np.ndarray:
     """Return which positions (..., 2) lie in a frame at least `border` pixels from its border; False for NaN."""
     last = np.array(image.frame.shape) - 1.0 - border
     return np.asarray(np.all((place >= border) & (place <= last), axis=-1))
@@ -324,7 +324,7 @@ class MatchedLine:
         return self.place + np.array(self.first)
 
     @property
-    def median_displacement(self) -> np.ndarray:
+    def median_shift(self) -> np.ndarray:
         """Median displacement from predicted to measured of the accepted, lines and pixels, (2,)."""
         return np.asarray(np.median((self.place - self.predicted)[self.accepted], axis=0))
 
@@ -493,9 +493,7 @@ def tie_points(
     image = patch.images[source]
     place = distinct_points(image.frame, spec.tie, spacing=max(0.5 * spec.template, 1.0), border=border)
     ground = _ground_of_looks(patch, image, heights, place, control.lines[source] if control else None)
-    seen = [
-        inside_frame(other, predicted(other, ground), border) for other in patch.images.values() if other is not image
-    ]
+    seen = [in_frame(other, predicted(other, ground), border) for other in patch.images.values() if other is not image]
     good = np.all([np.isfinite(ground).all(axis=1), *seen], axis=0)
     place, ground = place[good], ground[good]
     if not len(place):
@@ -549,11 +547,11 @@ def _distinct_map(
     row, column = np.meshgrid(*sides, indexing="ij")
     east, north = photo.east_north(row.ravel(), column.ravel())
     ground = patch.frame.itrs(east, north, heights(east, north))
-    seen = np.all([inside_frame(im, predicted(im, ground), border) for im in patch.images.values()], axis=0).reshape(
+    seen = np.all([in_frame(im, predicted(im, ground), border) for im in patch.images.values()], axis=0).reshape(
         row.shape
     )
     if not seen.any():
-        raise PointsError(f"no place of the orthophoto is seen by every line {border} pixels from the frames' borders")
+        raise PointsError(f"no point of the orthophoto is seen by every line {border} pixels from the frames' borders")
     scale = float(np.mean([np.mean(im.sample) for im in patch.images.values()])) / photo.spacing
     (top, bottom), (left, right) = ((int(v.min()), int(v.max())) for v in np.nonzero(seen))
     inside = seen[top : bottom + 1, left : right + 1]
@@ -565,10 +563,10 @@ def _distinct_map(
     share = max(float(mask.mean()), 0.05)
     place = distinct_points(grey, int(np.ceil(count / share)), spacing=max(0.5 * spec.template * scale, 1.0), border=0)
     if not len(place):
-        raise PointsError("the orthophoto has no distinct places where every line sees it")
+        raise PointsError("the orthophoto has no distinct points that every line sees")
     found_east, found_north = photo.east_north(place[:, 0] + top * _MASK, place[:, 1] + left * _MASK)
     ground = patch.frame.itrs(found_east, found_north, heights(found_east, found_north))
-    good = np.all([inside_frame(im, predicted(im, ground), border) for im in patch.images.values()], axis=0)
+    good = np.all([in_frame(im, predicted(im, ground), border) for im in patch.images.values()], axis=0)
     return found_east[good][:count], found_north[good][:count]
 
 
@@ -615,7 +613,7 @@ def _matched(
     degree = _degree(int(good.sum()))
     if degree is None:
         raise PointsError(f"{name}: too few matches for a consensus: {match.text}")
-    place = np.where(good[:, None], match.place, np.nan)
+    place = np.where(good[:, None], match.position, np.nan)
     agreed = consensus(
         at,
         place,
@@ -632,7 +630,7 @@ def _matched(
     status[good & ~agreed.accepted] = CONSENSUS
     return MatchedLine(
         at,
-        match.place,
+        match.position,
         match.covariance,
         match.correlation,
         status,

@@ -208,7 +208,7 @@ def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> No
     axes.imshow(image.frame, cmap="gray", vmin=low, vmax=high, extent=ends, interpolation="antialiased", alpha=0.75)
     at, to = line.predicted + np.array(line.first), line.image
     # Adding zero removes a minus before zero.
-    middle = np.round(line.median_displacement, 1) + 0.0
+    middle = np.round(line.median_shift, 1) + 0.0
     rest = to - at - middle
     good, against = line.accepted, line.status == CONSENSUS
     longest = float(np.quantile(np.linalg.norm(rest[good], axis=1), 0.95))

@@ -160,10 +160,7 @@ def _images(run: Simulation) -> Section:
         "correction.",
     )
     figure = PngFigure(
-        "lines",
-        "Images of the lines",
-        "Each image is stretched between its 0.5 % and 99.5 % grey values.",
-        _images_png(run),
+        "lines", "Images of the lines", "Each image between its 0.5 % and 99.5 % grey values.", _images_png(run)
     )
     caption = "Lines are counted from the start of the orbit data, pixels from the first of the line."
     keys = ("first_line", "first_pixel", "mean_dn", "smallest_dn", "largest_dn", "saturated_pixels")
@@ -185,10 +182,7 @@ def _control(run: Simulation) -> Section:
         f"shift of [{spec.shift[0]:g}, {spec.shift[1]:g}] m and a smooth part of {spec.sigma:g} m.",
     )
     figure = PngFigure(
-        "control",
-        "Control",
-        "Coordinates east and north of the patch's middle; rows of the files run south.",
-        _control_png(run),
+        "control", "Control", "East and north of the patch's middle; rows of the files run south.", _control_png(run)
     )
     return Section("Orthophoto and elevation model", text, (figure,))
 
@@ -279,11 +273,7 @@ def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
     test, camera = setup.test, setup.camera
     terrain, light = test.ground.terrain, test.ground.light
     relief = "original relief" if terrain.relief is None else f"relief {format_quantity(terrain.relief, LENGTH)} rms"
-    kind = (
-        "Jacksboro fault, 3 arc seconds, shifted"
-        if terrain.kind == "real"
-        else f"fractal, exponent {terrain.exponent:g}"
-    )
+    kind = "Jacksboro fault, 3 arcsec, shifted" if terrain.kind == "real" else f"fractal, exponent {terrain.exponent:g}"
     sun = f"elevation {format_quantity(light.elevation, ANGLE)}, azimuth {format_quantity(light.azimuth, ANGLE)}"
     bias = ", ".join(format_quantity(v, ANGLE) for v in test.errors.star_tracker.bias)
     return (

@@ -246,15 +246,9 @@ LINE: Record[LineImage] = Record(
     Quantity("first_pixel", lambda image: image.window.first_pixel, "first pixel of the window on the line"),
     Quantity("lines", lambda image: image.window.lines, "number of lines"),
     Quantity("pixels", lambda image: image.window.pixels, "number of pixels"),
+    Quantity("first_line_time_s", lambda image: _line_time(image, 0), "mid-exposure of the first line, from the epoch"),
     Quantity(
-        "first_line_time_s",
-        lambda image: _line_time(image, 0),
-        "middle of the exposure of the first line, from the epoch",
-    ),
-    Quantity(
-        "last_line_time_s",
-        lambda image: _line_time(image, image.window.lines - 1),
-        "middle of the exposure of the last line",
+        "last_line_time_s", lambda image: _line_time(image, image.window.lines - 1), "mid-exposure of the last line"
     ),
     Quantity("line_time_s", lambda image: image.measured.line_time, "time from one line to the next"),
     Quantity("mean_dn", lambda image: image.frame.mean(), "mean grey value", "mean [DN]"),
@@ -264,23 +258,11 @@ LINE: Record[LineImage] = Record(
     Quantity("saturated_pixels", lambda image: image.saturated, "number of saturated pixels"),
     Quantity("sample_along_line_m", lambda image: image.sample[0], "distance of neighbouring pixels on the ground"),
     Quantity("sample_along_track_m", lambda image: image.sample[1], "distance of neighbouring lines on the ground"),
-    Quantity(
-        "mtf_nyquist_along_line",
-        lambda image: image.nyquist[0],
-        "modulation transfer at half a cycle per pixel",
-        "MTF line",
-    ),
-    Quantity(
-        "mtf_nyquist_along_track",
-        lambda image: image.nyquist[1],
-        "modulation transfer at half a cycle per line",
-        "MTF track",
-    ),
+    Quantity("mtf_nyquist_along_line", lambda image: image.nyquist[0], "MTF at half a cycle per pixel", "MTF line"),
+    Quantity("mtf_nyquist_along_track", lambda image: image.nyquist[1], "MTF at half a cycle per line", "MTF track"),
     Quantity("advance_px_per_line", lambda image: image.motion.advance, "motion of the image across the line"),
     Quantity("drift_px_per_line", lambda image: image.motion.drift, "motion of the image along the line"),
-    Quantity(
-        "geometry_error_px", lambda image: image.error, "largest error of positions that the renderer interpolates"
-    ),
+    Quantity("geometry_error_px", lambda image: image.error, "largest error of interpolated positions"),
 )
 
 
@@ -308,34 +290,18 @@ GEOREFERENCE: Record[Raster] = Record(
     Quantity("latitude_per_row_deg", lambda raster: _per_pixel(raster)[1], "step from one row to the next, negative"),
 )
 MATCHED: Record[MatchedLine] = Record(
-    "Points of one kind in one line. Displacements from the predicted positions, and sigmas of the fit, are medians of "
+    "Points of one kind in one line. Shifts, measured minus predicted, and sigmas of the fit, are medians of "
     "the accepted points.",
     Quantity("found", lambda line: np.isfinite(line.place[:, 0]).sum(), "points for which the fit gave a position"),
     Quantity("matched", lambda line: line.matched.sum(), "of these, points that passed the thresholds of the matching"),
     Quantity("accepted", lambda line: line.accepted.sum(), "of these, points that agree with their neighbours"),
-    Quantity(
-        "rejected_by_consensus",
-        lambda line: (line.status == CONSENSUS).sum(),
-        "points that contradict their neighbours",
-    ),
+    Quantity("rejected_by_consensus", lambda line: (line.status == CONSENSUS).sum(), "contradicted by neighbours"),
     Quantity("not_accepted", lambda line: line.rejections, "number of points by reason, the most frequent first"),
-    Quantity(
-        "displacement_lines_px",
-        lambda line: line.median_displacement[0],
-        "measured minus predicted along track",
-        "moved, track",
-    ),
-    Quantity(
-        "displacement_pixels_px",
-        lambda line: line.median_displacement[1],
-        "measured minus predicted along line",
-        "moved, line",
-    ),
+    Quantity("displacement_lines_px", lambda line: line.median_shift[0], "shift along the track", "shift, track"),
+    Quantity("displacement_pixels_px", lambda line: line.median_shift[1], "shift along the line", "shift, line"),
     Quantity("displacement_lines_px_sigma", lambda line: line.median_sigma[0], "1 sigma along track", "σ track"),
     Quantity("displacement_pixels_px_sigma", lambda line: line.median_sigma[1], "1 sigma along line", "σ line"),
-    Quantity(
-        "consensus_scatter_px", lambda line: line.scatter, "scatter of the displacements beyond their covariances"
-    ),
+    Quantity("consensus_scatter_px", lambda line: line.scatter, "scatter of the shifts beyond their covariances"),
 )
 POINTS: Record[MatchedPoints] = Record(
     "Points of one kind; for ties without the line in which they are chosen.",
@@ -350,13 +316,9 @@ SIMULATE: Record[Simulation] = Record(
     Quantity("longitude_deg", lambda run: run.place[0], "longitude of the patch's middle"),
     Quantity("latitude_deg", lambda run: run.place[1], "latitude of the patch's middle"),
     Quantity("lines", lambda run: run.patch.images, "image of each line", record=LINE),
-    Quantity(
-        "orthophoto", lambda run: run.patch.control.orthophoto, "georeference of the orthophoto", record=GEOREFERENCE
-    ),
+    Quantity("orthophoto", lambda run: run.patch.control.orthophoto, "orthophoto", record=GEOREFERENCE),
     Quantity("dem", lambda run: run.patch.control.dem, "georeference of the elevation model", record=GEOREFERENCE),
-    Quantity(
-        "points", lambda run: run.points and run.points.sorts, "points measured in the images, by kind", record=POINTS
-    ),
+    Quantity("points", lambda run: run.points and run.points.sorts, "measured points by kind", record=POINTS),
 )
 
 
@@ -474,21 +436,13 @@ TRUTH: Record[Simulation] = Record(
         record=TRUE_POINTS,
     ),
     Quantity("camera", lambda run: described("camera", camera_data(run.truth)), "true camera"),
-    Quantity(
-        "trajectory",
-        lambda run: described("trajectory", trajectory_data(run, run.trajectory)),
-        "true orbit and attitude",
-    ),
+    Quantity("trajectory", lambda run: described("trajectory", trajectory_data(run, run.trajectory)), "true path"),
     Quantity(
         "ground_points",
         lambda run: {name: _true_grid(run.patch, name) for name in run.patch.images},
         "true ground positions of a grid of each line's image",
     ),
-    Quantity(
-        "control_error",
-        lambda run: _control_error(run.patch),
-        "error in plan of the control at a grid of the orthophoto",
-    ),
+    Quantity("control_error", lambda run: _control_error(run.patch), "error in plan at a grid of the orthophoto"),
 )
 
 

@@ -29,7 +29,7 @@ def _verdict(run: Match) -> tuple[str, tuple[str, ...]]:
     role = run.measurements.ground.role
     counts = [f"{int(np.sum(role == name))} {name}" for name in ("control", "check", "tie") if np.any(role == name)]
     displacements = [
-        (float(np.linalg.norm(line.median_displacement)), name)
+        (float(np.linalg.norm(line.median_shift)), name)
         for group in run.points.sorts.values()
         for name, line in group.lines.items()
         if group.kind == "map" and line.accepted.any()
@@ -71,9 +71,7 @@ def _measured(run: Match) -> Section:
 def _images(run: Match) -> Section:
     """Return the report section on the images."""
     rows = {name: IMAGE(image) for name, image in run.ground.images.items()}
-    caption = (
-        "Lines are counted from the first in the table of times, pixels from the one that looks farthest to the right."
-    )
+    caption = "Lines count from the first in the table of times, pixels from the one that looks farthest to the right."
     return Section("Images", (), (IMAGE.table("windows", "Images", caption, rows, label="line", digits=4),))
 
 
@@ -82,10 +80,8 @@ def _warnings(run: Match) -> tuple[str, ...]:
     texts, reach = [], run.setup.test.points.reach
     for group in run.points.sorts.values():
         for name, line in group.lines.items():
-            if group.kind == "map" and line.accepted.any() and np.max(np.abs(line.median_displacement)) > _FAR * reach:
-                texts.append(
-                    f"points of {name} lie near the limit of the search; a larger `points.reach` may find more"
-                )
+            if group.kind == "map" and line.accepted.any() and np.max(np.abs(line.median_shift)) > _FAR * reach:
+                texts.append(f"points of {name} lie near the search limit; a larger `points.reach` may find more")
     if run.accuracy is None or run.accuracy < 0.0:
         texts.append("the accuracy of the datum transformation of the maps to WGS 84 is not stated by its authority")
     elif run.accuracy > 0.1:

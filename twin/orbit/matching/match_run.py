@@ -121,9 +121,7 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
     photo = UserMap.open(spec.orthophoto, folder)
     dem = UserMap.open(spec.dem, folder, heights=True)
     sensors = {name: _sensor(spec, name, cameras[name], path, times[name], light) for name in spec.images}
-    images = {
-        name: _image(image_spec, name, sensors[name], folder, len(sensors)) for name, image_spec in spec.images.items()
-    }
+    images = {name: _image(file, name, sensors[name], folder, len(sensors)) for name, file in spec.images.items()}
     limits = dem.limits()
     frame, ends = _extent(spec, images, limits)
     maps = Maps(photo.part(frame, ends), dem.part(frame, ends, heights=True))
@@ -221,9 +219,7 @@ def _read_image(path: Path, spec: LineImageFileSpec, count: int) -> np.ndarray:
         require_memory(Lowered(spec, key, rows, unit, lambda n: n * columns * count * _PIXEL, 32))
         values = np.asarray(source.read(spec.band, window=Part(column, row, columns, rows)))
     if values.dtype.kind not in "uif":
-        raise InputError(
-            Issue("values that are not grey values", file, found=str(values.dtype), allowed="real numbers")
-        )
+        raise InputError(Issue("not grey values", file, found=str(values.dtype), allowed="real numbers"))
     if not np.all(np.isfinite(values)):
         raise InputError(Issue("grey values that are not finite", file, allowed="images without gaps, or a `window:`"))
     return values if values.dtype == np.uint16 else values.astype(np.float32)
@@ -289,14 +285,8 @@ def _used(points: MatchedPoints) -> np.ndarray:
 
 IMAGE: Record[LineFrame] = Record(
     "A line's image: the part that was matched, and its sample distances on the ground.",
-    Quantity(
-        "first_line", lambda image: image.window.first_line, "first line, counted from the first in the table of times"
-    ),
-    Quantity(
-        "first_pixel",
-        lambda image: image.window.first_pixel,
-        "first pixel, counted from the one that looks farthest to the right",
-    ),
+    Quantity("first_line", lambda image: image.window.first_line, "first line, from the first in the table of times"),
+    Quantity("first_pixel", lambda image: image.window.first_pixel, "first pixel, counted from the right"),
     Quantity("lines", lambda image: image.window.lines, "number of lines"),
     Quantity("pixels", lambda image: image.window.pixels, "number of pixels"),
     Quantity("sample_along_line_m", lambda image: image.sample[0], "distance of neighbouring pixels on the ground"),
@@ -322,11 +312,7 @@ MATCH: Record[Match] = Record(
     Quantity("images", lambda run: run.ground.images, "image of each line", record=IMAGE),
     Quantity("orthophoto", lambda run: run.ground.control.orthophoto, "part of the orthophoto", record=MAP),
     Quantity("dem", lambda run: run.ground.control.dem, "part of the elevation model", record=MAP),
-    Quantity(
-        "map_accuracy_m",
-        lambda run: run.accuracy,
-        "accuracy of the maps' transformation to WGS 84, as its authority states it",
-    ),
+    Quantity("map_accuracy_m", lambda run: run.accuracy, "accuracy of the maps' transformation to WGS 84"),
     Quantity(
         "control_points",
         lambda run: np.sum(run.measurements.ground.role == "control"),

@@ -229,9 +229,7 @@ def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
     short = next((k for k, row in enumerate(cells) if len(row) != len(cells[0])), None)
     if short is not None:
         found = f"{len(cells[short])} columns"
-        raise InputError(
-            Issue("a row with a different number of columns", file, lines[short], (), found, f"{len(cells[0])} columns")
-        )
+        raise InputError(Issue("wrong number of columns", file, lines[short], (), found, f"{len(cells[0])} columns"))
     heads = ("MJD", "x", "y", "UT1-UTC", "dX", "dY")
     table = numbers(file, [[row[k] for k in columns] for row in cells], lines, heads)
     late = table[:, 0] >= FIRST_DAY

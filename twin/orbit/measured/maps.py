@@ -138,9 +138,7 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
         raise InputError(Issue("no such band", file, None, ("band",), str(band), f"1 to {count}"))
     dtype = dtypes[band - 1]
     if np.dtype(dtype).kind not in "uif":
-        raise InputError(
-            Issue("values that are not grey values or heights", file, None, (), str(dtype), "real numbers")
-        )
+        raise InputError(Issue("not grey values or heights", file, None, (), str(dtype), "real numbers"))
     if affine.is_identity or affine.determinant == 0.0:
         found = "ground control points only" if ground else "no georeference"
         raise InputError(Issue("a raster without georeference", file, None, (), found, "a GeoTIFF with a geotransform"))
@@ -151,13 +149,9 @@ def open_raster(path: str | Path, band: int = 1, crs: str | None = None) -> GeoR
     try:
         system = pyproj.CRS.from_wkt(text) if text is not None else pyproj.CRS(str(crs))
         if text is not None and crs is not None and not system.to_2d().equals(pyproj.CRS(crs).to_2d(), True):
-            raise InputError(
-                Issue("the file has another coordinate reference system", file, None, ("crs",), str(crs), system.name)
-            )
+            raise InputError(Issue("the file has another system", file, None, ("crs",), str(crs), system.name))
     except pyproj.exceptions.CRSError:
-        raise InputError(
-            Issue("a coordinate reference system that PROJ does not know", file, None, ("crs",), crs, "EPSG:32650, ...")
-        ) from None
+        raise InputError(Issue("a system unknown to PROJ", file, None, ("crs",), crs, "EPSG:32650, ...")) from None
     a, b, c, d, e, f = affine[:6]
     middle = (a, b, c + 0.5 * (a + b), d, e, f + 0.5 * (d + e))
     return GeoRaster(file, system, middle, shape, band, str(dtype))
@@ -217,9 +211,7 @@ class Geoid:
         raster = open_raster(path)
         if not raster.crs.is_geographic:
             name = raster.crs.name
-            raise InputError(
-                Issue("a geoid grid in another system", str(path), None, (), name, "longitude and latitude")
-            )
+            raise InputError(Issue("a geoid in another system", str(path), None, (), name, "longitude and latitude"))
         return cls(raster)
 
     @cached_property
@@ -227,9 +219,7 @@ class Geoid:
         values, valid = self.raster.read()
         if np.any(np.abs(values[valid]) > 150.0):
             found = f"{np.max(np.abs(values[valid])):g}"
-            raise InputError(
-                Issue("values are not heights of a geoid", self.raster.file, None, (), found, "metres, within 150 m")
-            )
+            raise InputError(Issue("not heights of a geoid", self.raster.file, None, (), found, "metres, within 150 m"))
         known = np.where(valid, values, np.nan).astype(np.float64)
         # Append the first column to a whole circle, otherwise repeat the last one, which then has no weight.
         return np.pad(known, ((0, 0), (0, 1)), mode="wrap" if self._whole_turn else "edge")

@@ -214,9 +214,7 @@ def _line_times_of(
         rows = rows[np.argsort(table["line"][rows], kind="stable")]
         line, time = table["line"][rows], table["time"][rows]
         if len(rows) < 2:
-            raise table.error(
-                int(rows[0]), "line", f"one line of {name} does not define a line time", allowed="two or more"
-            )
+            raise table.error(int(rows[0]), "line", f"one line of {name} gives no line time", allowed="two or more")
         for row in rows[1:][np.diff(line) == 0.0][:1]:
             raise table.error(int(row), "line", f"this line of {name} occurs twice", f"{table['line'][row]:g}")
         for row in rows[1:][np.diff(time) <= 0.0][:1]:
@@ -539,7 +537,7 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     for k in np.flatnonzero((radius < _LEAST_RADIUS) | (radius > _MOST_RADIUS))[:1]:
         found = f"{radius[k] / 1e3:.6g} km from the Earth's centre"
         allowed = f"{_LEAST_RADIUS / 1e3:g} to {_MOST_RADIUS / 1e3:g} km; is the unit in the head right?"
-        raise orbit.error(int(order[k]), "x", "not a position of a satellite", found, allowed)
+        raise orbit.error(int(order[k]), "x", "not a satellite position", found, allowed)
     _check_jumps(orbit, order, time, place)
     speed = None
     given = [name for name in ("vx", "vy", "vz") if name in orbit]

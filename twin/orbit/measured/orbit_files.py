@@ -160,7 +160,7 @@ def require_orbit(file: str, position: np.ndarray, lines: list[int]) -> None:
     for row in np.flatnonzero((radius < 6.3e6) | (radius > 1e8))[:1]:
         found = f"{radius[row] / 1e3:.6g} km from the Earth's centre"
         raise InputError(
-            Issue("not a position of a satellite", file, lines[row], (), found, "6300 km to 100 000 km; units?")
+            Issue("not a satellite position", file, lines[row], (), found, "6300 km to 100 000 km; units?")
         )
 
 

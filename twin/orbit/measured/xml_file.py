@@ -59,11 +59,7 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
     uneven = next((k for k, row in enumerate(cells) if len(row) != width), None)
     if uneven is not None:
         found = f"{len(cells[uneven])} numbers"
-        raise InputError(
-            Issue(
-                "a row with a different number of columns", file, lines[uneven], found=found, allowed=", ".join(heads)
-            )
-        )
+        raise InputError(Issue("wrong number of columns", file, lines[uneven], found=found, allowed=", ".join(heads)))
     try:
         values = np.array([list(map(float, row)) for row in cells], dtype=np.float64).reshape(len(cells), width)
     except ValueError:
