@@ -35,10 +35,10 @@ from scenes.specs.disturbances import (
     DisturbancesSpec,
     JointSpec,
     TimeLawSpec,
-    component_named,
+    component_parts,
     written_sigma,
 )
-from scenes.specs.motion_text import node_named
+from scenes.specs.motion_text import find_node
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
@@ -379,9 +379,9 @@ def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath, wrong: Problem) -
     changes = resolved.job.disturbances
     own = changes.causes.get(cause) if changes is not None else None
     at: KeyPath = ("disturbances", "causes", cause)
-    if own is not None and (not key or key[0] in own.given):
+    if own is not None and (not key or key[0] in own.set_keys):
         return resolved.job.issue(wrong, (*at, *key))
-    if own is not None and "bodies" in own.given:
+    if own is not None and "bodies" in own.set_keys:
         text = f"{key[0]} of {cause}: {wrong.problem}"
         return resolved.job.issue(Problem(text, wrong.found, wrong.allowed, wrong.suggestion), (*at, "bodies"))
     assert resolved.disturbances is not None
@@ -463,10 +463,10 @@ def _of_joint(
     issues: list[Issue] = []
     said: dict[tuple[str, str, int], str] = {}
     for name, sigma in joint.components.items():
-        node, kind, what, about = component_named(name)
+        node, kind, what, about = component_parts(name)
         axis = noll(what) if kind == "figure" else max(AXES.find(what), 0) if what else 0
         try:
-            path = node_named(node, instrument.nodes)
+            path = find_node(node, instrument.nodes)
             info = instrument.nodes[path]
             can = _possible(info, path in glass)
             if _NEEDS.get(kind, kind) not in can:

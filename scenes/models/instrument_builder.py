@@ -44,7 +44,7 @@ from scenes.models.obstruction import check_beams, check_clearance, check_solids
 from scenes.specs.baffle import Plate
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE, CENTRAL_PRISM, Channel, InstrumentSpec
-from scenes.specs.perturbation import NodeInfo, in_full, perturbation_issues
+from scenes.specs.perturbation import NodeInfo, perturbation_issues, with_full_paths
 from scenes.yaml.errors import InputError, Issue, KeyPath, unknown
 from scenes.yaml.spec import Spec
 
@@ -71,7 +71,7 @@ def as_built(drawn: Instrument) -> Instrument:
     stated = drawn.spec.as_built
     if not stated:
         return drawn
-    named = in_full(stated, drawn.nodes, lambda problem, name: stated[name].issue(problem))
+    named = with_full_paths(stated, drawn.nodes, lambda problem, name: stated[name].issue(problem))
     issues = [issue for path, what in named.items() for issue in perturbation_issues(what, drawn.nodes, path, what, ())]
     if issues:
         raise InputError(*issues)

@@ -361,7 +361,7 @@ class MeasuredFinishes:
             out.setdefault(kind, {})["bsdf"] = {
                 "incidence_deg": np.degrees(angles).tolist(),
                 "total_scatter": [scatter.table.total(float(angle)) for angle in angles],
-                "total_scatter_stated": list(scatter.stated),
+                "total_scatter_stated": list(scatter.tis),
                 "not_reciprocal_rms": None if np.isnan(rms) else rms,
             }
         for kind, coating in self.coatings.items():
@@ -401,7 +401,7 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
     changed: dict[str, Finish] = {}
     scatter: dict[str, MeasuredScatter] = {}
     coatings: dict[str, CoatingTable] = {}
-    for kind, spec in stray.finishes.given.items():
+    for kind, spec in stray.finishes.by_kind.items():
         key = ("render", "stray", "finishes", kind)
         base = built_in.board if kind == "black" else getattr(built_in, kind)
         if spec.coating is not None:

@@ -60,7 +60,7 @@ class ReadingsSpec(Spec):
     after: Name | None = None
 
     @property
-    def given(self) -> bool:
+    def has_data(self) -> bool:
         """True if the file holds the data or refers to a file of data."""
         raise NotImplementedError
 
@@ -127,7 +127,7 @@ class WavefrontReadingsSpec(ReadingsSpec):
         return range(noll(self.terms[0]), noll(self.terms[1]) + 1)
 
     @property
-    def given(self) -> bool:
+    def has_data(self) -> bool:
         """True if the measurement refers to files."""
         return self.zernikes is not None or self.maps is not None
 
@@ -164,7 +164,7 @@ class FocusReadingsSpec(ReadingsSpec):
         return self
 
     @property
-    def given(self) -> bool:
+    def has_data(self) -> bool:
         """True if there are values."""
         return self.values is not None or self.file is not None
 
@@ -201,7 +201,7 @@ class MtfReadingsSpec(ReadingsSpec):
         return self
 
     @property
-    def given(self) -> bool:
+    def has_data(self) -> bool:
         """True if there are values."""
         return self.along_line is not None
 
@@ -233,7 +233,7 @@ class DistortionReadingsSpec(ReadingsSpec):
         return self
 
     @property
-    def given(self) -> bool:
+    def has_data(self) -> bool:
         """True if the measurement refers to a file."""
         return self.file is not None
 
@@ -257,7 +257,7 @@ class SpotReadingsSpec(ReadingsSpec):
     state: Literal["before", "after"] = "before"
 
     @property
-    def given(self) -> bool:
+    def has_data(self) -> bool:
         """True if the measurement refers to a file."""
         return self.file is not None
 
@@ -312,7 +312,7 @@ class SightReadingsSpec(ReadingsSpec):
         return tuple(name for name in names if getattr(self, f"sigma_{name}") is not None)
 
     @property
-    def given(self) -> bool:
+    def has_data(self) -> bool:
         """True if there are values."""
         return getattr(self, self.measured[0]) is not None
 
@@ -343,7 +343,7 @@ class TemperatureReadingsSpec(ReadingsSpec):
         return self
 
     @property
-    def given(self) -> bool:
+    def has_data(self) -> bool:
         """True if there are values."""
         return self.values is not None
 
@@ -378,7 +378,7 @@ class PositionReadingsSpec(ReadingsSpec):
         return self
 
     @property
-    def given(self) -> bool:
+    def has_data(self) -> bool:
         """True if there are values."""
         return self.values is not None
 
@@ -423,13 +423,13 @@ class MeasurementsSpec(Spec):
     @model_validator(mode="after")
     def _names_once(self) -> MeasurementsSpec:
         kinds: dict[str, str] = {}
-        for kind, name, _ in self.every():
+        for kind, name, _ in self.named():
             if name in kinds:
                 raise Problem("two measurements have one name", name, "a different name for each", within=(kind, name))
             kinds[name] = kind
         return self
 
-    def every(self) -> Iterator[tuple[str, str, ReadingsSpec]]:
+    def named(self) -> Iterator[tuple[str, str, ReadingsSpec]]:
         """Iterate over kind, name and content of each measurement."""
         for kind in type(self).model_fields:
             for name, measurement in getattr(self, kind).items():
@@ -540,16 +540,16 @@ class AsBuiltSpec(Spec):
 
     @model_validator(mode="after")
     def _belongs_together(self) -> AsBuiltSpec:
-        if not any(True for _ in self.measurements.every()):
+        if not any(True for _ in self.measurements.named()):
             kinds = names_text(MeasurementsSpec.model_fields)
             raise Problem("nothing was measured", None, f"at least one measurement: {kinds}", within=("measurements",))
-        for kind, name, measurement in self.measurements.every():
+        for kind, name, measurement in self.measurements.named():
             where = ("measurements", kind, name)
             if measurement.after is not None and measurement.after not in self.moves:
                 raise unknown_within("no such move", measurement.after, self.moves, (*where, "after"))
-            if self.simulate is None and not measurement.given:
+            if self.simulate is None and not measurement.has_data:
                 raise Problem("no data", name, "values or files, or `simulate: {}` to draw them", within=where)
-            if self.simulate is not None and measurement.given:
+            if self.simulate is not None and measurement.has_data:
                 raise Problem("both data and `simulate`", name, "one of them", within=where)
         for name, move in self.moves.items():
             for actuator, amount in move.by.items():

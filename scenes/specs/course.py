@@ -129,7 +129,7 @@ class MotionCourse(Spec):
     pivot: Name = DEFAULT_PIVOT
 
     @property
-    def given(self) -> Mapping[str, tuple[Any, ...] | None]:
+    def series(self) -> Mapping[str, tuple[Any, ...] | None]:
         """Name of a quantity -> its values, one for each time."""
         return {"rotate": self.rotate, "shift": self.shift, "scale": self.scale}
 
@@ -196,7 +196,7 @@ class CourseSpec(Spec):
         for path, heat in self.temperature.items():
             self._one_for_each_time(("temperature", path), {"change": heat.change, "gradient": heat.gradient})
         for path, moves in self.motion.items():
-            self._one_for_each_time(("motion", path), moves.given)
+            self._one_for_each_time(("motion", path), moves.series)
         if self.detail is not None and index_of_value(self.detail, self.times) is None:
             raise no_such_time(self.detail, self.times, "one of times").below("detail")
         return self
@@ -206,7 +206,7 @@ class CourseSpec(Spec):
             if getattr(self, name):
                 raise Problem("given in the table already", name, "the table, or what it has, not both", within=(name,))
         for path, moves in self.motion.items():
-            for name, values in moves.given.items():
+            for name, values in moves.series.items():
                 if values is not None:
                     raise Problem("given in the table already", name, "pivot", within=("motion", path, name))
         return self

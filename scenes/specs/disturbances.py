@@ -50,7 +50,7 @@ def _something(value: Any) -> Any:
     return value
 
 
-STATED = BeforeValidator(_something)
+NOT_EMPTY = BeforeValidator(_something)
 """Validator of an optional key that must not be empty: an empty standard deviation is a forgotten one."""
 ShiftSigma = Annotated[tuple[float, float, float], Vector(_spread(units.LENGTH, "10 mm"), alike=True)]
 RotateSigma = Annotated[tuple[float, float, float], Vector(_spread(units.ANGLE, "1 deg"), alike=True)]
@@ -207,7 +207,7 @@ class CorrelationSpec(Spec):
     """
 
     between: Annotated[tuple[Annotated[str, Field(strict=True)], ...], Field(min_length=2)]
-    correlation: Annotated[Correlation | None, STATED] = None
+    correlation: Annotated[Correlation | None, NOT_EMPTY] = None
     matrix: tuple[tuple[Correlation, ...], ...] | None = None
 
     @model_validator(mode="after")
@@ -241,7 +241,7 @@ MOST_JOINT_BYTES = 4 << 20
 _AXES = ("x", "y", "z")
 
 
-def component_named(text: str) -> tuple[str, str, str, str]:
+def component_parts(text: str) -> tuple[str, str, str, str]:
     """Return the parts of a component's name: node, kind, axis or term, and pivot; missing parts are empty.
 
     Parameters
@@ -282,7 +282,7 @@ _PURE: Mapping[str, float] = {"conic": 1.0, "index": 0.1}
 
 def _sigma_of(name: str, value: Any) -> float:
     """Return the standard deviation of a component in the SI unit; raise `Problem` for another value."""
-    kind = component_named(name)[1]
+    kind = component_parts(name)[1]
     if kind not in _PURE:
         return _SPREADS[kind].parse(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value <= _PURE[kind]:
@@ -301,7 +301,7 @@ def _components(value: Any) -> Any:
     for name, sigma in value.items():
         try:
             out[name] = _sigma_of(str(name), sigma)
-            parts = component_named(name)[:3]
+            parts = component_parts(name)[:3]
             if parts in names:
                 raise Problem("a component is named twice", shown(name), f"once; it is also named {names[parts]}")
             names[parts] = name
@@ -320,7 +320,7 @@ def written_sigma(name: str, sigma: float) -> str | float:
     sigma : float
         Standard deviation in the SI unit.
     """
-    kind = component_named(name)[1]
+    kind = component_parts(name)[1]
     return sigma if kind in _PURE else _SPREADS[kind].format(sigma)
 
 
@@ -426,26 +426,26 @@ class JointSpec(Spec):
         return out
 
 
-class _CauseWords(Spec):
+class _CauseKeys(Spec):
     """Keys of a cause, all optional."""
 
-    bodies: Annotated[BodyPatterns | None, STATED] = None
-    shift: Annotated[ShiftSigma | None, STATED] = None
-    rotate: Annotated[RotateSigma | None, STATED] = None
-    scale: Annotated[ScaleSigma | None, STATED] = None
-    figure: Annotated[FigureSigmas | None, STATED] = None
-    radius: Annotated[RadiusSigma | None, STATED] = None
-    conic: Annotated[ConicSigma | None, STATED] = None
-    temperature: Annotated[TemperatureSigmaSpec | None, STATED] = None
-    index_gradient: Annotated[IndexSigma | None, STATED] = None
-    pivot: Annotated[Name | None, STATED] = None
-    together: Annotated[Correlation | None, STATED] = None
-    correlations: Annotated[tuple[CorrelationSpec, ...] | None, STATED] = None
-    time: Annotated[TimeLaw | None, STATED] = None
-    reason: Annotated[Reason | None, STATED] = None
+    bodies: Annotated[BodyPatterns | None, NOT_EMPTY] = None
+    shift: Annotated[ShiftSigma | None, NOT_EMPTY] = None
+    rotate: Annotated[RotateSigma | None, NOT_EMPTY] = None
+    scale: Annotated[ScaleSigma | None, NOT_EMPTY] = None
+    figure: Annotated[FigureSigmas | None, NOT_EMPTY] = None
+    radius: Annotated[RadiusSigma | None, NOT_EMPTY] = None
+    conic: Annotated[ConicSigma | None, NOT_EMPTY] = None
+    temperature: Annotated[TemperatureSigmaSpec | None, NOT_EMPTY] = None
+    index_gradient: Annotated[IndexSigma | None, NOT_EMPTY] = None
+    pivot: Annotated[Name | None, NOT_EMPTY] = None
+    together: Annotated[Correlation | None, NOT_EMPTY] = None
+    correlations: Annotated[tuple[CorrelationSpec, ...] | None, NOT_EMPTY] = None
+    time: Annotated[TimeLaw | None, NOT_EMPTY] = None
+    reason: Annotated[Reason | None, NOT_EMPTY] = None
 
 
-class CauseSpec(_CauseWords):
+class CauseSpec(_CauseKeys):
     """Cause of change: its bodies, and the standard deviation of each component of their motions.
 
     Components are independent unless `together` or `correlations` say otherwise.
@@ -495,7 +495,7 @@ class CauseSpec(_CauseWords):
         return self
 
 
-class CauseChangeSpec(_CauseWords):
+class CauseChangeSpec(_CauseKeys):
     """Change by a job of a cause in the disturbances file, key by key.
 
     A cause that the file does not have needs all keys that a cause needs.
@@ -509,16 +509,16 @@ class CauseChangeSpec(_CauseWords):
     """
 
     @property
-    def given(self) -> Mapping[str, Any]:
+    def set_keys(self) -> Mapping[str, Any]:
         """Keys that the job sets, with their values."""
         return {name: getattr(self, name) for name in self.model_fields_set if getattr(self, name) is not None}
 
-    def made_to(self, cause: CauseSpec) -> CauseSpec:
+    def apply_to(self, cause: CauseSpec) -> CauseSpec:
         """Return the cause with this change.
 
         Other keys stay unchanged; figures are merged term by term, and temperatures number by number.
         """
-        update = dict(self.given)
+        update = dict(self.set_keys)
         if self.figure is not None and cause.figure is not None:
             update["figure"] = FrozenMap({**cause.figure, **self.figure})
         if self.temperature is not None and cause.temperature is not None:
@@ -585,16 +585,16 @@ class DisturbancesSpec(TitledSpec):
                 text = "the components of `joint` cannot be changed as a cause"
                 raise changes.error(text, ("causes", name), allowed="another file of disturbances")
             if name in causes:
-                causes[name] = change.made_to(causes[name])
+                causes[name] = change.apply_to(causes[name])
                 continue
-            missing = [key for key in ("bodies", "reason") if key not in change.given]
-            if missing or not any(key in change.given for key in MOVES):
+            missing = [key for key in ("bodies", "reason") if key not in change.set_keys]
+            if missing or not any(key in change.set_keys for key in MOVES):
                 new = f"a new one with bodies, a reason and one of {names_text(MOVES)}"
                 allowed = f"a change of {names_text(self.causes)}; or {new}"
                 problem = unknown(f"no such cause in {self.name}", name, self.causes, allowed=allowed)
                 raise changes.error(problem, ("causes", name))
             # the parts are already validated; validating again would require quantities as text
-            causes[name] = CauseSpec.model_construct(**change.given)
+            causes[name] = CauseSpec.model_construct(**change.set_keys)
         if not causes and self.joint is None:
             raise changes.error("no cause is left", ("without",), allowed="`disturbances: none` for none at all")
         return self.model_copy(update={"causes": FrozenMap(causes)})

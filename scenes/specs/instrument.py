@@ -151,14 +151,14 @@ def _check_faces(errors: Mapping[str, tuple[float, float]], reflector: Reflector
             raise unknown("no such face", name, reflector.faces, ("angle_errors", name))
 
 
-def check_made(made_of: str, reflector: Reflector) -> None:
+def check_made(from_design: str, reflector: Reflector) -> None:
     """Raise `Problem` for a material that a reflector cannot be made of."""
     names = GLASSES if reflector.transparent else MATERIALS
-    if made_of not in names:
+    if from_design not in names:
         what = "no such glass" if reflector.transparent else "no such material"
-        if made_of in MATERIALS:
+        if from_design in MATERIALS:
             what += ": this kind transmits light and must be made of glass"
-        raise unknown(what, made_of, names, ("material",))
+        raise unknown(what, from_design, names, ("material",))
 
 
 class Prism180Spec(Spec):
@@ -691,7 +691,7 @@ class AsBuiltInstrumentSpec(TitledSpec):
     as_built: AsBuilt = Field(default_factory=FrozenMap)
     disturbances: Ref | None = None
 
-    def made_of(self, design: InstrumentSpec, disturbances: str | None = None) -> InstrumentSpec:
+    def from_design(self, design: InstrumentSpec, disturbances: str | None = None) -> InstrumentSpec:
         """Return this instrument, made from its design.
 
         Parameters

@@ -18,10 +18,10 @@ from scenes.specs.perturbation import (
     IN_WORDS,
     NodeInfo,
     PlainPerturbationSpec,
-    in_full,
     no_such_node,
     not_allowed,
     perturbation_issues,
+    with_full_paths,
 )
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.named import Named
@@ -340,7 +340,7 @@ def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
         A node does not exist, has no such pivot or does not allow an action; one issue for each fault, with the nearest
         valid name.
     """
-    perturb = in_full(job.perturb, nodes, lambda problem, name: job.issue(problem, ("perturb", name)))
+    perturb = with_full_paths(job.perturb, nodes, lambda problem, name: job.issue(problem, ("perturb", name)))
     if perturb != job.perturb:
         job = job.model_copy(update={"perturb": perturb})
     issues = [
@@ -366,7 +366,7 @@ def _course_issues(course: CourseSpec, nodes: Mapping[str, NodeInfo]) -> list[Is
     for path, moves in course.motion.items():
         # a quantity that the course has counts at every time, even where it is zero
         does: dict[str, Any] = {
-            name: 1.0 if name == "scale" else (1.0, 1.0, 1.0) for name, v in moves.given.items() if v is not None
+            name: 1.0 if name == "scale" else (1.0, 1.0, 1.0) for name, v in moves.series.items() if v is not None
         }
         whole = PerturbationSpec.model_construct(**does, pivot=moves.pivot)
         issues += perturbation_issues(course, nodes, path, whole, ("motion", path))

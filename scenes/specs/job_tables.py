@@ -300,9 +300,9 @@ class FinishesSpec(Spec):
 
     @model_validator(mode="after")
     def _allowed(self) -> "FinishesSpec":
-        if not self.given:
+        if not self.by_kind:
             raise Problem("no finish", "no keys", names_text(ALLOWS))
-        for kind, spec in self.given.items():
+        for kind, spec in self.by_kind.items():
             named = [what for what in FinishSpec.model_fields if getattr(spec, what) is not None]
             wrong = next((what for what in named if what not in ALLOWS[kind]), None)
             if wrong is not None:
@@ -311,19 +311,21 @@ class FinishesSpec(Spec):
         return self
 
     @property
-    def given(self) -> dict[str, FinishSpec]:
+    def by_kind(self) -> dict[str, FinishSpec]:
         """Kind of surface -> finish, for kinds with a finish."""
         return {kind: spec for kind in ALLOWS if (spec := getattr(self, kind)) is not None}
 
     @property
     def tables(self) -> dict[tuple[str, str], FinishTableSpec]:
         """Kind of surface and property -> table."""
-        both = ((kind, what, getattr(spec, what)) for kind, spec in self.given.items() for what in ("bsdf", "coating"))
+        both = (
+            (kind, what, getattr(spec, what)) for kind, spec in self.by_kind.items() for what in ("bsdf", "coating")
+        )
         return {(kind, what): table for kind, what, table in both if table is not None}
 
     def with_tables(self, tables: Mapping[tuple[str, str], FinishTableSpec]) -> "FinishesSpec":
         """Return the finishes with other tables, given as (kind of surface, property) -> table."""
-        changed = dict(self.given)
+        changed = dict(self.by_kind)
         for (kind, what), table in tables.items():
             changed[kind] = changed[kind].model_copy(update={what: table})
         return self.model_copy(update=dict(changed))

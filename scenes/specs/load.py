@@ -58,7 +58,7 @@ def _instrument_file(reference: str | Path, owner: Spec | None, key: KeyPath) ->
     """Return the file of an instrument or, as an instrument without a monitor, of a camera."""
     alone = str(reference) not in library_names(INSTRUMENTS) and str(reference) in library_names(CAMERAS)
     folder = CAMERAS if alone and not isinstance(reference, Inline) else INSTRUMENTS
-    return referred(folder, reference, owner, key, (CAMERAS,))
+    return read_reference(folder, reference, owner, key, (CAMERAS,))
 
 
 def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
@@ -98,9 +98,9 @@ def load_instrument(reference: str | Path, owner: Spec | None = None, key: KeyPa
         return _as_built(validate(AsBuiltInstrumentSpec, text))
     instrument = validate(InstrumentSpec, text)
     for name, mounted in instrument.cameras.items():
-        referred(CAMERAS, mounted.camera, instrument, ("cameras", name, "camera"))
+        read_reference(CAMERAS, mounted.camera, instrument, ("cameras", name, "camera"))
     if instrument.monitor is not None:
-        referred(DETECTORS, instrument.monitor.area_ccd.detector, instrument, AREA_CCD)
+        read_reference(DETECTORS, instrument.monitor.area_ccd.detector, instrument, AREA_CCD)
     return instrument
 
 
@@ -113,8 +113,8 @@ def _as_built(spec: AsBuiltInstrumentSpec) -> InstrumentSpec:
         raise spec.error(problem, (DESIGN,), found=spec.design, allowed=allowed)
     disturbances = spec.disturbances
     if disturbances is not None and disturbances != NONE:
-        disturbances = placed(DISTURBANCES, disturbances, spec, ("disturbances",))
-    return spec.made_of(load_instrument(spec.design, spec, (DESIGN,)), disturbances)
+        disturbances = portable_reference(DISTURBANCES, disturbances, spec, ("disturbances",))
+    return spec.from_design(load_instrument(spec.design, spec, (DESIGN,)), disturbances)
 
 
 def is_instrument(data: Any) -> bool:
@@ -177,7 +177,7 @@ def load_cameras(instrument: InstrumentSpec) -> FrozenMap[str, CameraSpec]:
 
 def load_camera(reference: str | Path, owner: Spec | None = None, key: KeyPath = ()) -> CameraSpec:
     """Read a camera; arguments and errors as in `load_instrument`."""
-    text = referred(CAMERAS, reference, owner, key)
+    text = read_reference(CAMERAS, reference, owner, key)
     if isinstance(text.data, dict) and DESIGN in text.data:
         problem = "an instrument as built is not a prescription of a camera"
         line, key_path = text.lines.get((*text.prefix, DESIGN)), (*text.prefix, DESIGN)
@@ -214,7 +214,7 @@ def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
         The camera is missing or invalid, the instrument has several cameras, or both files have deviations of one body.
     """
     key = ("camera",)
-    text = referred(CAMERAS, test.camera, test, key)
+    text = read_reference(CAMERAS, test.camera, test, key)
     if not (isinstance(text.data, dict) and DESIGN in text.data):
         return test, load_camera(test.camera, test, key)
     instrument = load_instrument(test.camera, test, key)
@@ -266,7 +266,7 @@ def load_named(
     InputError
         The file is missing or invalid, as in `load_instrument`.
     """
-    return validate(model, referred(folder, reference, owner, key))
+    return validate(model, read_reference(folder, reference, owner, key))
 
 
 def _names(folders: tuple[str, ...]) -> list[str]:
@@ -280,7 +280,7 @@ def _names_and_paths(folders: tuple[str, ...]) -> str:
     return f"{first}{others}, or the path of a .yaml file"
 
 
-def referred(
+def read_reference(
     folder: str, reference: str | Path, owner: Spec | None = None, key: KeyPath = (), others: tuple[str, ...] = ()
 ) -> YamlFile:
     """Return the content to which a reference leads; all names, paths and mappings are resolved here.
@@ -311,8 +311,8 @@ def referred(
 def find_named(
     folder: str, reference: str | Path, owner: Spec | None, key: KeyPath, others: tuple[str, ...] = ()
 ) -> Path:
-    """Return the file to which a name or a path leads; arguments and errors as in `referred`."""
-    path = place_of(folder, reference, owner)
+    """Return the file to which a name or a path leads; arguments and errors as in `read_reference`."""
+    path = reference_path(folder, reference, owner)
     folders = (folder, *others)
     if path is None:
         text = f"no such name in {' or '.join(folders)}"
@@ -324,8 +324,8 @@ def find_named(
     return path
 
 
-def placed(folder: str, reference: str, owner: Spec, key: KeyPath, others: tuple[str, ...] = ()) -> str:
-    """Return a reference that is valid from any folder; arguments and errors as in `referred`."""
+def portable_reference(folder: str, reference: str, owner: Spec, key: KeyPath, others: tuple[str, ...] = ()) -> str:
+    """Return a reference that is valid from any folder; arguments and errors as in `read_reference`."""
     if isinstance(reference, Inline):
         return reference.placed(owner.source, key)
     path = find_named(folder, reference, owner, key, others)
@@ -338,7 +338,7 @@ def is_path(name_or_path: str | Path) -> bool:
     return isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml"))
 
 
-def place_of(folder: str, reference: str | Path, owner: Spec | None) -> Path | None:
+def reference_path(folder: str, reference: str | Path, owner: Spec | None) -> Path | None:
     """Return the path of a reference: a library file that exists, or a path that may not; None for an unknown name."""
     text = str(reference)
     if is_path(reference):

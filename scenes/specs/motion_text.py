@@ -39,7 +39,7 @@ FORMS = (
 _ABOUT = "about"
 
 
-def meant(name: str, nodes: Iterable[str]) -> list[str]:
+def matching_nodes(name: str, nodes: Iterable[str]) -> list[str]:
     """Return the bodies to which a name may refer: the one with this path, else all whose paths end with it.
 
     Parameters
@@ -53,7 +53,7 @@ def meant(name: str, nodes: Iterable[str]) -> list[str]:
     return [name] if name in paths else [path for path in paths if path.endswith(f"/{name}")]
 
 
-def node_named(name: str, nodes: Iterable[str]) -> str:
+def find_node(name: str, nodes: Iterable[str]) -> str:
     """Return the path of the body to which a name refers.
 
     Parameters
@@ -69,7 +69,7 @@ def node_named(name: str, nodes: Iterable[str]) -> str:
     Problem
         The name fits no body, or several.
     """
-    matches = meant(name, nodes)
+    matches = matching_nodes(name, nodes)
     if len(matches) == 1:
         return matches[0]
     if matches:
@@ -89,7 +89,7 @@ def short_name(path: str, nodes: Iterable[str]) -> str:
     """
     parts, paths = path.split("/"), tuple(nodes)
     tails = ("/".join(parts[-count:]) for count in range(1, len(parts) + 1))
-    return next((tail for tail in tails if meant(tail, paths) == [path]), path)
+    return next((tail for tail in tails if matching_nodes(tail, paths) == [path]), path)
 
 
 def motion_of(text: str) -> tuple[str, str, str, str, str]:

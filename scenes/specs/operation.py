@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.disturbances import NONE, DisturbancesSpec
-from scenes.specs.load import DISTURBANCES, INSTRUMENTS, placed
+from scenes.specs.load import DISTURBANCES, INSTRUMENTS, portable_reference
 from scenes.specs.resolved import ResolvedJob, resolve_on
 from scenes.yaml.errors import Problem, names_text, nearest, shown, unknown
 from scenes.yaml.spec import Name, Number, Paths, Ref, Reference, Spec, Text, Whole, not_empty, short_for, validate
@@ -207,7 +207,7 @@ def resolve_operation(spec: OperationSpec) -> OperationSetup:
         if reference == NONE:
             problem, allowed = "a plan of operation needs disturbances", "the name of a file of disturbances"
             raise spec.error(problem, (key,), found=reference, allowed=allowed)
-        update[key] = placed(folder, reference, spec, (key,), others)
+        update[key] = portable_reference(folder, reference, spec, (key,), others)
     spec = spec.model_copy(update=update)
     setup = OperationSetup.model_construct(operation=spec, model=resolve_on(spec, spec.instrument, spec.disturbances))
     known = setup.disturbances.causes

@@ -22,7 +22,7 @@ from scenes.specs.course import (
     Term,
     noll,
 )
-from scenes.specs.motion_text import meant, node_named, perturbation_in_words
+from scenes.specs.motion_text import find_node, matching_nodes, perturbation_in_words
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.spec import ZERO_IS_NONE, Name, Paths, Spec
 from scenes.yaml.unit_fields import Quantity
@@ -156,7 +156,7 @@ BUILT = ("shift", "rotate", "pivot", "figure", "radius", "conic", "index")
 """Keys of a perturbation that describe a body as built."""
 
 
-def _standing(value: Mapping[str, PlainPerturbationSpec]) -> Mapping[str, PlainPerturbationSpec]:
+def _check_as_built(value: Mapping[str, PlainPerturbationSpec]) -> Mapping[str, PlainPerturbationSpec]:
     for path, what in value.items():
         if what.temperature is not None:
             problem = "a body as built has no temperature: its state is that at the instrument's temperature"
@@ -168,14 +168,14 @@ def _standing(value: Mapping[str, PlainPerturbationSpec]) -> Mapping[str, PlainP
     return value
 
 
-AsBuilt = Annotated[Paths[PlainPerturbationSpec], IN_WORDS, AfterValidator(_standing)]
+AsBuilt = Annotated[Paths[PlainPerturbationSpec], IN_WORDS, AfterValidator(_check_as_built)]
 """Node -> deviation of the built body from the design."""
 
 
 Perturbed = TypeVar("Perturbed", bound=PlainPerturbationSpec)
 
 
-def in_full(
+def with_full_paths(
     perturb: Mapping[str, Perturbed], nodes: Mapping[str, NodeInfo], issue: Callable[[Problem, str], Issue]
 ) -> FrozenMap[str, Perturbed]:
     """Return perturbations by the full paths of their nodes; unknown names stay unchanged.
@@ -198,7 +198,7 @@ def in_full(
     named: dict[str, str] = {}
     for name in perturb:
         try:
-            path = node_named(name, nodes) if meant(name, nodes) else name
+            path = find_node(name, nodes) if matching_nodes(name, nodes) else name
             if path in named.values():
                 raise Problem("this node is perturbed twice", shown(name), f"{path} once, under one name")
             named[name] = path
@@ -252,7 +252,7 @@ def not_allowed(owner: Spec, info: NodeInfo, action: str, key: KeyPath) -> Issue
     return owner.issue(f"this node does not allow {action}{why}", key, allowed=allowed)
 
 
-def in_words(perturb: Mapping[str, PlainPerturbationSpec]) -> str:
+def perturbation_text(perturb: Mapping[str, PlainPerturbationSpec]) -> str:
     """Return perturbations as readable text: ``base/gf7/M2 shift (0 um, 0 um, 20 um); ...``."""
     parts = []
     for path, what in perturb.items():

@@ -112,7 +112,7 @@ BASES: dict[str, Named] = {
 """
 
 
-def studied() -> tuple[str, ...]:
+def studied_commands() -> tuple[str, ...]:
     """Return the commands that a study can vary."""
     return (*BASES, *(name for name, procedure in PROCEDURES.items() if procedure.varied))
 

@@ -287,7 +287,7 @@ class ExperimentSetup(Spec, Generic[TestType]):
         InputError
             A file cannot be read or is not valid, or the files do not fit together.
         """
-        yaml = load.referred(cls.FOLDER, path)
+        yaml = load.read_reference(cls.FOLDER, path)
         if isinstance(yaml.data, dict) and "test" in yaml.data:
             return validate(cls, yaml).checked()
         model = cast(type[Spec], cls.model_fields["test"].annotation)
@@ -486,7 +486,7 @@ class CameraSetup(Spec):
         return self
 
     @property
-    def standing(self) -> tuple[InstrumentSpec, Mapping[str, CameraSpec], str]:
+    def mounted_instrument(self) -> tuple[InstrumentSpec, Mapping[str, CameraSpec], str]:
         """Instrument, its cameras and the name of this one in it; a camera alone forms an instrument."""
         if self.instrument is not None and self.mounted is not None:
             return self.instrument, self.cameras, self.mounted
@@ -496,7 +496,7 @@ class CameraSetup(Spec):
     @property
     def job(self) -> JobSpec:
         """Job that perturbs the camera's instrument."""
-        job = JobSpec.model_construct(instrument=self.standing[0].name, perturb=self.perturb)
+        job = JobSpec.model_construct(instrument=self.mounted_instrument[0].name, perturb=self.perturb)
         return job.with_source(self._source)
 
     def perturbed(self, words: Sequence[str]) -> CameraSetup:
@@ -514,7 +514,9 @@ class CameraSetup(Spec):
         """
         if not words:
             return self
-        job = validate(JobSpec, YamlFile("--perturb", {"instrument": self.standing[0].name, "perturb": [*words]}, {}))
+        job = validate(
+            JobSpec, YamlFile("--perturb", {"instrument": self.mounted_instrument[0].name, "perturb": [*words]}, {})
+        )
         return self.model_copy(update={"perturb": FrozenMap({**self.perturb, **job.perturb})})
 
     @property
@@ -551,7 +553,7 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
     text = str(file)
     place: Path | str = text if not load.is_path(text) and not is_file(Path(text)) else Path(text)
     folder = load.CAMERAS if text in load.library_names(load.CAMERAS) else load.INSTRUMENTS
-    yaml = load.referred(folder, place, others=(load.CAMERAS,))
+    yaml = load.read_reference(folder, place, others=(load.CAMERAS,))
     data = yaml.data if isinstance(yaml.data, dict) else {}
     if "mirrors" in data:
         return _alone(load.load_camera(place), text, name)

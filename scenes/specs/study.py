@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.extension_table import ExtensionTable
 from scenes.specs.motion_text import key_below, motion_of
-from scenes.specs.procedures import studied
+from scenes.specs.procedures import studied_commands
 from scenes.yaml.errors import KeyPath, Problem, key_text, shown, unknown
 from scenes.yaml.spec import (
     Flag,
@@ -484,7 +484,7 @@ class BaseSpec(Spec):
         the library.
     """
 
-    command: Annotated[str, OneOf(studied)]
+    command: Annotated[str, OneOf(studied_commands)]
     file: Reference
 
 
@@ -531,7 +531,7 @@ class ResponseSpec(Spec):
         return self.unit if self.unit is not None else unit_of(self.key)
 
     @property
-    def stated(self) -> dict[str, KeyPath]:
+    def sigma_keys(self) -> dict[str, KeyPath]:
         """Suffix of a column of the result -> key path of the standard deviation in it."""
         sigmas = {TOTAL: self.sigma, NOISE: self.noise}
         return {ending: key for ending, key in sigmas.items() if key is not None}
@@ -688,7 +688,7 @@ class StudySpec(TitledSpec):
 
     def _clash(self) -> str | None:
         """Return a name that two columns of the result would have, or None."""
-        sigmas = [f"{name}{ending}" for name, response in self.responses.items() for ending in response.stated]
+        sigmas = [f"{name}{ending}" for name, response in self.responses.items() for ending in response.sigma_keys]
         names = ["run", "failed", "message", "seed", *self.factors, *self.responses, *sigmas]
         return next((name for name in names if names.count(name) > 1), None)
 

@@ -70,12 +70,12 @@ class MeasuredScatter:
     ----------
     table : ScatterTable
         The BSDF.
-    stated : tuple[float, ...]
+    tis : tuple[float, ...]
         Total integrated scatter that the file states, for each of the table's angles of incidence.
     """
 
     table: ScatterTable
-    stated: tuple[float, ...]
+    tis: tuple[float, ...]
 
 
 class _Lines:

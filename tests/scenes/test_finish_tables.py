@@ -39,7 +39,7 @@ def put(place: Path, text: str) -> Path:
 @pytest.mark.second
 def test_a_bsdf_file(tmp_path) -> None:
     found = read_bsdf(put(tmp_path / "m.bsdf", bsdf_text()))
-    assert found.stated == (0.2, 0.2, 0.2)
+    assert found.tis == (0.2, 0.2, 0.2)
     np.testing.assert_allclose(np.degrees(found.table.incidence), [0, 30, 60])
     np.testing.assert_allclose(found.table.values, 0.2 / np.pi, rtol=1e-6)
     for degrees in (0.0, 45.0, 60.0):

@@ -324,7 +324,7 @@ def test_a_loop(tmp_path: Path) -> None:
 
 def test_a_monitored_orbit(tmp_path: Path) -> None:
     setup = orbit_setup.MonitorSetup.read(SCENES / ORBIT / "monitor.yaml")
-    assert (setup.pair, setup.test.step, setup.test.referred) == (("forward", "backward"), 300.0, 0)
+    assert (setup.pair, setup.test.step, setup.test.reference_index) == (("forward", "backward"), 300.0, 0)
     test = orbit_setup.MonitorSetup.read(write(tmp_path, good("monitor"))).test
     assert test.apply == ("d_alpha", "d_beta", "d_gamma", "d_f")
     assert test.compared == (300.0, 600.0, 1200.0)

@@ -17,7 +17,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.load import load_camera, load_instrument
-from scenes.specs.motion_text import node_named, perturbation_in_words
+from scenes.specs.motion_text import find_node, perturbation_in_words
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import resolve_camera, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem
@@ -83,13 +83,13 @@ NODES = dict.fromkeys(("base", "base/a", "base/a/M1", "base/b", "base/b/M1", "ba
 
 
 def test_short_names_mean_one_body() -> None:
-    assert node_named("M2", NODES) == "base/b/M2"
-    assert node_named("a/M1", NODES) == "base/a/M1"
+    assert find_node("M2", NODES) == "base/b/M2"
+    assert find_node("a/M1", NODES) == "base/a/M1"
     with pytest.raises(Problem, match="several nodes have this name") as several:
-        node_named("M1", NODES)
+        find_node("M1", NODES)
     assert several.value.allowed == "base/a/M1, base/b/M1"
     with pytest.raises(Problem, match="no such node"):
-        node_named("M7", NODES)
+        find_node("M7", NODES)
     named = checked_nodes(job(perturb={"M2": {"shift": "1 0 0 um"}, "a/M1": {"shift": "2 0 0 um"}}), NODES)
     assert list(named.perturb) == ["base/b/M2", "base/a/M1"]
     with pytest.raises(InputError, match="perturbed twice"):

@@ -203,7 +203,7 @@ def test_noise_is_as_large_as_its_sigma(noisy) -> None:
 @pytest.mark.second
 def test_the_noise_is_not_the_whole_error(stated) -> None:
     """The truth is missed by what the spots leave open, as the total sigma says."""
-    later = np.arange(5) != stated.spec.referred
+    later = np.arange(5) != stated.spec.reference_index
     assert np.all(stated.sigma_total[later] > 20.0 * stated.sigma[later])
     wrong = stated.cases["monitored"].camera
     assert rms(wrong) > 5.0 * rms(stated.sigma)

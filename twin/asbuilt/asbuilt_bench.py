@@ -81,7 +81,7 @@ class AsBuiltBench(Site):
         self.parameters = Parameters.of(self.test, stated, self.experiment.instrument, self.experiment.thermal)
         self._beams: dict[tuple[tuple[float, float], ...], VariedBeams] = {}
         self.kinds = self._kinds(self.test.measurements, "measurements")
-        self.afters = tuple(one.after for _, _, one in self.test.measurements.every())
+        self.afters = tuple(one.after for _, _, one in self.test.measurements.named())
         for name, merit in self.test.merits.items():
             if merit.kind in OF_MONITOR:
                 problem = "what a monitor knows rests on its own disturbances, not on how the instrument was assembled"
@@ -98,7 +98,7 @@ class AsBuiltBench(Site):
         return self.test.camera or names[0]
 
     def _kinds(self, measured: MeasurementsSpec, where: str) -> tuple[MeasuredKind, ...]:
-        return tuple(KINDS[kind](self, name, one, (where, kind, name)) for kind, name, one in measured.every())
+        return tuple(KINDS[kind](self, name, one, (where, kind, name)) for kind, name, one in measured.named())
 
     @cached_property
     def candidates(self) -> tuple[MeasuredKind, ...]:

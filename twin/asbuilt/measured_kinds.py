@@ -23,7 +23,7 @@ from optics.numerics.array_math import PhysicalError
 from optics.numerics.number_tree import FrozenMap
 from optics.raytrace.first_order import line_tangents
 from scenes.specs import asbuilt as specs
-from scenes.specs.motion_text import node_named
+from scenes.specs.motion_text import find_node
 from scenes.specs.tolerance import MeritSpec
 from scenes.yaml.errors import InputError, Problem
 from twin.asbuilt.wavefront_files import read_coefficients
@@ -548,7 +548,7 @@ def named_bodies(one: MeasuredKind) -> tuple[str, ...]:
     out = []
     for k, name in enumerate(one.spec.bodies):
         try:
-            out.append(node_named(name, nodes))
+            out.append(find_node(name, nodes))
         except Problem as problem:
             raise InputError(one.spec.issue(problem, ("bodies", k))) from None
     return tuple(out)

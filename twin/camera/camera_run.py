@@ -24,7 +24,7 @@ from scenes.models.job_state import job_state
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec, checked_nodes
-from scenes.specs.perturbation import in_words
+from scenes.specs.perturbation import perturbation_text
 from scenes.specs.resolved import CameraSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.camera import field_maps
@@ -106,7 +106,7 @@ class Perturbed:
     @property
     def words(self) -> str:
         """What was done: ``base/gf7/M2 shift (0, 0, 20) um``."""
-        return in_words(self.job.perturb) or "nothing"
+        return perturbation_text(self.job.perturb) or "nothing"
 
 
 @shows("camera.name", "errors [waves]", "worst")
@@ -241,7 +241,7 @@ def run_camera(
     quality, done = None, None
     state: State = {}
     if setup.instrument is not None or setup.perturb:
-        instrument_spec, cameras, mounted = setup.standing
+        instrument_spec, cameras, mounted = setup.mounted_instrument
         cameras = {name: camera if one == setup.camera else one for name, one in cameras.items()}
         instrument = build_instrument(instrument_spec, cameras, backend)
         optics = CameraOptics.within(instrument, mounted, backend)
@@ -372,7 +372,7 @@ _OF_THE_DRAWING = "First-order data are those of this state; layout and obscurat
 def built_text(run: CameraRun) -> str:
     """How the camera's instrument was built, empty for one as drawn."""
     instrument = run.setup.instrument
-    words = "" if instrument is None or not instrument.as_built else in_words(instrument.as_built)
+    words = "" if instrument is None or not instrument.as_built else perturbation_text(instrument.as_built)
     words = _LONG.sub(lambda number: f"{float(number.group()):.4g}", words)
     if not words:
         return ""

@@ -325,7 +325,7 @@ def finish_section(run: RenderRun) -> Section | None:
         rows: list[tuple[Cell, ...]] = []
         for kind, scatter in measured.scatter.items():
             rms = scatter.table.reciprocity()
-            for angle, stated in zip(scatter.table.incidence, scatter.stated, strict=True):
+            for angle, stated in zip(scatter.table.incidence, scatter.tis, strict=True):
                 total = scatter.table.total(float(angle))
                 unequal: Cell = "" if np.isnan(rms) else 100.0 * rms
                 rows.append((kind, float(np.degrees(angle)), 100.0 * total, 100.0 * stated, unequal))

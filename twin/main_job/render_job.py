@@ -21,7 +21,7 @@ from scenes.models.obstruction import find_obstructions, moved_into_beams
 from scenes.models.scenery import measured_finishes
 from scenes.specs.instrument import PRISM_180, as_built_of, prism_of
 from scenes.specs.job import checked_nodes
-from scenes.specs.perturbation import in_words
+from scenes.specs.perturbation import perturbation_text
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
 from twin.camera.first_order_data import obscuration, unstated_shadows
@@ -417,7 +417,7 @@ def _mounted_facets(experiment: MonitorExperiment) -> str:
         return smaller
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}
     stand = as_built_of(compose(instrument.as_built, turns, bodies))
-    return f"{smaller}; or facets turned as where they are mounted: {in_words({path: stand[path] for path in turns})}"
+    return f"{smaller}; or facets turned as where they are mounted: {perturbation_text({path: stand[path] for path in turns})}"
 
 
 def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotError, focus: SpotFocus) -> InputError:

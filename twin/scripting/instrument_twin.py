@@ -25,7 +25,7 @@ from scenes.specs.course import noll
 from scenes.specs.job import JobSpec, checked_nodes, with_tables
 from scenes.specs.load import INSTRUMENTS, find_disturbances, is_path, library_names
 from scenes.specs.load import load_camera as read_camera
-from scenes.specs.motion_text import AXES, meant, motion_of, node_named, perturbation_in_words
+from scenes.specs.motion_text import AXES, find_node, matching_nodes, motion_of, perturbation_in_words
 from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, unknown
@@ -240,7 +240,9 @@ class InstrumentTwin:
                 if not isinstance(one, str):
                     said |= dict(one)
             nodes = self._nodes
-            return {node_named(name, nodes) if meant(name, nodes) else name: what for name, what in said.items()}
+            return {
+                find_node(name, nodes) if matching_nodes(name, nodes) else name: what for name, what in said.items()
+            }
         except Problem as problem:
             raise InputError(problem.at("", key=("perturb",))) from None
 
@@ -320,7 +322,9 @@ class InstrumentTwin:
         second = as_frames(after, "after", keys, path.shape)
         stated = experiment.disturbances
         again = experiment.motion_models
-        recovery = recover_monitor(first, second[None], experiment.calibration, method, disturbances=stated, motions=again)
+        recovery = recover_monitor(
+            first, second[None], experiment.calibration, method, disturbances=stated, motions=again
+        )
         reading = MonitorReading(
             channels=tuple((channel.camera, channel.name) for channel in path.channels),
             cameras=experiment.cameras,
@@ -526,7 +530,7 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
     """
     try:
         name, kind, axis, amount, pivot = motion_of(text)
-        node = node_named(name, nodes)
+        node = find_node(name, nodes)
     except Problem as problem:
         raise InputError(problem.at("", key=("motions",))) from None
     if amount:

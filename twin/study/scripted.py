@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import xarray as xr
 
 from analysis.monitor import parameters
-from scenes.specs.motion_text import motion_of, node_named, put
+from scenes.specs.motion_text import find_node, motion_of, put
 from scenes.specs.resolved import ResolvedJob
 from scenes.specs.study import NOISE, TOTAL, StudySpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
@@ -229,7 +229,7 @@ def config_text(
     if not spreads:
         raise InputError(Issue("nothing varies", key=("vary",), allowed=_FORMS))
     resolved = instrument.perturbed(middle).resolved
-    paths = {node: node_named(node, resolved.job.perturb) for node in middle}
+    paths = {node: find_node(node, resolved.job.perturb) for node in middle}
     spreads = [Spread((paths[str(s.key[0])], *s.key[1:]), s.factor) for s in spreads]
     named = {"factors": {s.name: {"key": ["job", "perturb", *s.key], **s.factor} for s in spreads}}
     about = {

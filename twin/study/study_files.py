@@ -55,7 +55,7 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         key = f"{_path(response.key)}{minus}"
         about = {"units": response.units, ROLE: "response", "key": key, "long_name": f"response {name}, {key}"}
         data[name] = (RUN, result.values[:, r], about)
-        for ending, place in response.stated.items():
+        for ending, place in response.sigma_keys.items():
             about = {"units": response.units, ROLE: "sigma", "key": _path(place), "of": name}
             by = ", by noise alone" if ending == NOISE else ""
             about["long_name"] = f"standard deviation of {name}{by}"

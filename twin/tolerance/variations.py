@@ -22,7 +22,7 @@ from optics.thermal.heat import Temperature
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
-from scenes.specs.motion_text import AXES, node_named
+from scenes.specs.motion_text import AXES, find_node
 from scenes.specs.perturbation import PlainPerturbationSpec, perturbation_issues
 from scenes.specs.tolerance import CompensatorSpec, ToleranceSetup, ToleranceSpec, Varied
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
@@ -144,7 +144,7 @@ class _Maker:
     def _node(self, one: Varied, name: str, key: KeyPath) -> str:
         """Path of a body that allows the motion. Raises InputError."""
         try:
-            body = node_named(name, self.instrument.nodes)
+            body = find_node(name, self.instrument.nodes)
         except Problem as problem:
             raise self.test.error(problem, (*key, "motion" if name == one.parts[0] else "carrying")) from None
         _, kind, axis, _, pivot = one.parts

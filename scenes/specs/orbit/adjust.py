@@ -303,7 +303,7 @@ class MonitorRecordSpec(Spec):
     plan: Reference | None = None
 
 
-def one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None:
+def check_one_monitor(monitor: object, record: MonitorRecordSpec | None) -> None:
     """Raise `Problem` if both a monitor and a record of one are given."""
     if monitor is not None and record is not None:
         raise Problem("`monitor` and `monitor_record` are both given", None, "one of them", within=("monitor_record",))
@@ -394,7 +394,7 @@ class OrbitAdjustSpec(PayloadTestSpec):
         for name in self.changes:
             if name not in self.lines:
                 raise unknown("no such line among `lines`", name, self.lines, ("changes", name))
-        one_monitor(self.monitor, self.monitor_record)
+        check_one_monitor(self.monitor, self.monitor_record)
         trackers = tuple(dict.fromkeys(item.tracker for item in self.passes.values()))
         for k, angle in enumerate(self.angles):
             for j, name in enumerate(angle.between):
@@ -509,7 +509,7 @@ class MeasuredAdjustSpec(MeasuredTestSpec):
         for k, name in enumerate(self.components):
             if name not in groups:
                 raise unknown("no such group of variances", name, groups, ("components", k))
-        one_monitor(self.monitor, self.monitor_record)
+        check_one_monitor(self.monitor, self.monitor_record)
         if "monitor" in self.without and "monitor" not in self.sensors:
             raise Problem("there is no monitor to exclude", None, "a section `monitor:`", within=("without",))
         return self

@@ -79,7 +79,7 @@ class JitterSpec(Spec):
     bands: tuple[JitterBandSpec, ...] = Field(default=(), max_length=20)
 
     @property
-    def stated(self) -> bool:
+    def present(self) -> bool:
         """True if there is any jitter."""
         return any(any(line.amplitude) for line in self.lines) or any(any(band.level) for band in self.bands)
 

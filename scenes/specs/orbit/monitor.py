@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 from optics.numerics.array_math import index_of_value
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment, no_such_time
-from scenes.specs.disturbances import JobDisturbances, component_named
+from scenes.specs.disturbances import JobDisturbances, component_parts
 from scenes.specs.job import AnalysisSpec, JobSpec, PerturbationSpec, RenderSpec, checked_nodes
 from scenes.specs.orbit.angle import Relief, TerrainHeight, check_ends
 from scenes.specs.orbit.calibration import Count, FieldLength
@@ -95,7 +95,7 @@ class MotionSpec(Spec):
         return float(passed >= 0.0)
 
     @property
-    def furthest(self) -> PlainPerturbationSpec:
+    def full_motion(self) -> PlainPerturbationSpec:
         """Full motion as a perturbation."""
         return PlainPerturbationSpec.model_construct(rotate=self.rotate, shift=self.shift, pivot=self.pivot)
 
@@ -216,7 +216,7 @@ class CorrectionSpec(Spec):
     @property
     def motion(self) -> tuple[str, str, str, str]:
         """Node, kind, axis and pivot of the mechanism; empty for none."""
-        return ("", "", "", "") if self.mechanism is None else component_named(self.mechanism)
+        return ("", "", "", "") if self.mechanism is None else component_parts(self.mechanism)
 
     def kind_of(self, key: str) -> Kind:
         """Return the kind of quantity of ``step``, ``range`` or ``dead_band``."""
@@ -505,7 +505,7 @@ class OrbitMonitorSpec(TitledSpec):
         return tuple(self.step * n for n in range(1, count + 1) if count % n == 0)
 
     @property
-    def referred(self) -> int:
+    def reference_index(self) -> int:
         """Number of the reference time, counted from 0."""
         number = index_of_value(self.reference_time, self.times)
         assert number is not None
@@ -520,7 +520,7 @@ class OrbitMonitorSpec(TitledSpec):
     def measured(self, interval: float) -> list[int]:
         """Return the numbers of the measured times at this interval, counted from the reference to both sides."""
         steps = round(interval / self.step)
-        return [k for k in range(len(self.times)) if (k - self.referred) % steps == 0]
+        return [k for k in range(len(self.times)) if (k - self.reference_index) % steps == 0]
 
     @property
     def job(self) -> JobSpec:
@@ -544,7 +544,7 @@ class OrbitMonitorSpec(TitledSpec):
         issues = [
             issue
             for path, motion in self.motion.items()
-            for issue in perturbation_issues(self, nodes, path, motion.furthest, ("motion", path))
+            for issue in perturbation_issues(self, nodes, path, motion.full_motion, ("motion", path))
         ]
         if issues:
             raise InputError(*issues)

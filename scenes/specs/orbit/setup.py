@@ -76,13 +76,13 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
         """Return the payload, or the instrument with its cameras."""
         reference, key = test.camera, ("camera",)
         folders = (load.PAYLOADS, load.INSTRUMENTS)
-        known = next((folder for folder in folders if load.place_of(folder, reference, test) is not None), None)
+        known = next((folder for folder in folders if load.reference_path(folder, reference, test) is not None), None)
         if known is None and not isinstance(reference, Inline):
             payloads, instruments = (load.library_names(folder) for folder in folders)
             allowed = f"{names_text(payloads)}, an instrument ({names_text(instruments)}), or the path of a .yaml file"
             problem = "no such name in payloads or instruments"
             raise test.error(unknown(problem, reference, (*payloads, *instruments), allowed=allowed), key)
-        if not load.is_instrument(load.referred(known or load.PAYLOADS, reference, test, key).data):
+        if not load.is_instrument(load.read_reference(known or load.PAYLOADS, reference, test, key).data):
             return {"camera": load_three_line_camera(reference, test, key)}
         instrument = load.load_instrument(reference, test, key)
         return {"instrument": instrument, "cameras": load.load_cameras(instrument)}

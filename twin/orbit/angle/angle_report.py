@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from analysis.arrays import ARCSEC
 from analysis.orbit.planes import AXES
 from scenes.specs.orbit.setup import MeasuredAngleSetup
-from scenes.specs.perturbation import in_words
+from scenes.specs.perturbation import perturbation_text
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.framework import svg
 from twin.framework.artefact import FAR, Cell, SvgFigure, Table, fixed
@@ -149,7 +149,7 @@ def _facts(run: AngleRun) -> tuple[tuple[str, str], ...]:
                 f"{np.degrees(passing.latitude):.4g}° N {np.degrees(passing.longitude):.4g}° E, {orbit}"
             )
         particular = (
-            ("Changed since the laboratory", in_words(simulated.perturb) or "nothing"),
+            ("Changed since the laboratory", perturbation_text(simulated.perturb) or "nothing"),
             ("Orbit", orbit),
             ("Exposure", f"{simulated.time:g} s from the epoch"),
             ("Points", f"{strips.points} on each strip, pixels {strips.first:g} to {strips.last:g}"),

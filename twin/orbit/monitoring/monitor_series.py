@@ -263,7 +263,7 @@ class MonitorSeries:
             of_prisms = {p: f for p, f in job.fields(k).items() if "/monitor/" in p or p.startswith(CENTRAL_PRISM)}
             states.append(self.experiment.thermal.state(of_prisms, {}))
         shifts = self.clean(states).shifts
-        return np.asarray(shifts - shifts[self.spec.referred])
+        return np.asarray(shifts - shifts[self.spec.reference_index])
 
     def repeated(self, state: State, count: int, seed: int, number: int) -> Measured:
         """Measure the reference and one state ``count`` times, each time with another fixed pattern of the detectors.
@@ -389,7 +389,7 @@ class MonitorSeries:
     def _reference_spots(self, images: np.ndarray) -> MeasuredSpots:
         """Measure the spots of mean frames (1, C, rows, columns) at the reference."""
         experiment, centroid = self.experiment, self.spec.analysis.centroid
-        with self._reporting_spot_errors([self.spec.referred]), one_blas_thread():
+        with self._reporting_spot_errors([self.spec.reference_index]), one_blas_thread():
             return judged_spots(images[0], self.frames, experiment.calibration, centroid, cores())
 
     def _observed(

@@ -52,7 +52,7 @@ CAMERA: Record[tuple[MonitorRun, str]] = Record(
 )
 ANGLE: Record[MonitorRun] = Record(
     "Angle between the lines of sight at the reference, and its changes over the times.",
-    Quantity("reference_deg", lambda run: run.true_angle[run.spec.referred], "true angle at the reference"),
+    Quantity("reference_deg", lambda run: run.true_angle[run.spec.reference_index], "true angle at the reference"),
     Quantity("true_change_arcsec", lambda run: _unsigned(run.angle_change), "true change since the reference"),
     Quantity("monitored_change_arcsec", lambda run: _unsigned(run.angle.change_rad), "change by the monitor"),
     Quantity("monitored_change_arcsec_sigma", lambda run: _unsigned(run.angle.sigma_rad), "total sigma"),
@@ -190,7 +190,7 @@ CAUSE: Record[tuple[MonitorRun, Cause]] = Record(
 
 
 def _sensitivity(run: MonitorRun) -> dict[str, Array]:
-    return {name: run.slopes[name][run.spec.referred] / PER_SI for name in run.pair}
+    return {name: run.slopes[name][run.spec.reference_index] / PER_SI for name in run.pair}
 
 
 MONITOR: Record[MonitorRun] = Record(

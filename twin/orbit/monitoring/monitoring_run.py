@@ -314,7 +314,7 @@ class MonitorRun(PairFlight):
     @property
     def angle_change(self) -> np.ndarray:
         """True change (T,) of the intersection angle, in radians."""
-        return np.asarray(self.true_angle - self.true_angle[self.spec.referred])
+        return np.asarray(self.true_angle - self.true_angle[self.spec.reference_index])
 
     @property
     def sigma(self) -> np.ndarray:
@@ -370,7 +370,7 @@ class MonitorRun(PairFlight):
     @cached_property
     def conversion(self) -> Conversion:
         """Height change for an arcsecond, at the reference, where the calibrated cameras are the true ones."""
-        k = self.spec.referred
+        k = self.spec.reference_index
         view, traced = self.views[k], {}
         first, second = self.pair
         calm = point_errors(self.true_pair(k), view, exact_data=True)[:, 2].mean()
@@ -471,7 +471,10 @@ def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advanc
     spec.check_nodes(experiment.instrument.nodes)
     states = states_of(experiment, spec)
     advance("monitor", 1, parts)
-    reference, bodies = states[spec.referred], {body.path: body for body in experiment.instrument.assembly.tree.bodies}
+    reference, bodies = (
+        states[spec.reference_index],
+        {body.path: body for body in experiment.instrument.assembly.tree.bodies},
+    )
 
     def turned(camera: str) -> State:
         return compose(reference, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
@@ -480,12 +483,12 @@ def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advanc
     by_arcsec = {name: traced_pair(experiment, turned(name), pair)[name] for name in pair}
     advance("monitor", 2, parts)
     angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
-    worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
+    worst = int(np.argmax(np.abs(angle - angle[spec.reference_index])))
     # before the images, which take longer
     views = view_check_points(spec, pair, lines, ground_seed, advance)
     monitor = MonitorSeries(experiment, spec, reference, pair)
     noisy, clean = monitor.measured(states, number)
-    truth, distance = _changes(clean.truth, spec.referred)
+    truth, distance = _changes(clean.truth, spec.reference_index)
     used = noisy if spec.errors.switched_on and spec.errors.monitor else clean
     gains = monitor.gains(used, range(len(states)))
     advance("monitor", 3, parts)
@@ -502,7 +505,7 @@ def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advanc
         pair,
         np.array(spec.times),
         lines,
-        FrozenMap({n: calibrated_line(lines[spec.referred][n], axes[n], distance[n]) for n in pair}),
+        FrozenMap({n: calibrated_line(lines[spec.reference_index][n], axes[n], distance[n]) for n in pair}),
         views,
         setup,
         seed,
@@ -557,7 +560,9 @@ def _causes(
     """
     assert spec.course is not None
     named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]
-    states = [s for what, path in named for s in states_of(experiment, spec, (spec.referred, worst), (what, path))]
+    states = [
+        s for what, path in named for s in states_of(experiment, spec, (spec.reference_index, worst), (what, path))
+    ]
     measured = monitor.clean(states)
     truth, _ = _changes(measured.truth, 0)
     estimates = monitor.estimates_by_camera(gain, measured.shifts)

@@ -156,7 +156,7 @@ class StudyRuns:
         responses, sigmas = [], []
         for name, response in study.responses.items():
             unit = str(data[name].attrs.get("units", ""))
-            stated = {ending: data[f"{name}{ending}"].values.astype(np.float64) for ending in response.stated}
+            stated = {ending: data[f"{name}{ending}"].values.astype(np.float64) for ending in response.sigma_keys}
             responses.append(Response(name, unit, data[name].values.astype(np.float64), stated.get(NOISE)))
             own = [Response(f"{name}{ending}", unit, sigma, None, name) for ending, sigma in stated.items()]
             sigmas += [one for one in own if not one.constant]

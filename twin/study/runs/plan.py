@@ -483,7 +483,7 @@ def study_bytes(setup: StudySetup, runs: int) -> float:
         Of it.
     """
     responses = setup.study.responses.values()
-    columns = _KEPT + len(setup.study.factors) + sum(1 + len(one.stated) for one in responses)
+    columns = _KEPT + len(setup.study.factors) + sum(1 + len(one.sigma_keys) for one in responses)
     return STARTED + CELL * columns * runs
 
 

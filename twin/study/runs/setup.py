@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from optics.numerics.number_tree import FrozenMap
 from scenes.specs.job_tables import HEAT_KEYS
 from scenes.specs.load import find_named
-from scenes.specs.procedures import BASES, PROCEDURES, studied
+from scenes.specs.procedures import BASES, PROCEDURES, studied_commands
 from scenes.specs.study import FactorSpec, Scalar, StudySpec
 from scenes.yaml import yaml_file
 from scenes.yaml.csv_table import lines_of, table_text
@@ -362,7 +362,7 @@ def _job(command: str) -> BaseJob:
     if command in BASES:
         job: BaseJob = BASES[command]()
         return job
-    if command not in studied():
-        allowed = ", ".join(studied())
+    if command not in studied_commands():
+        allowed = ", ".join(studied_commands())
         raise InputError(Issue(f"this version of the twin cannot run {command!r} in a study", allowed=allowed))
     return ProcedureBase(PROCEDURES[command])
