@@ -1,12 +1,11 @@
-"""What a prescription is judged by: wavefront or spots over the field, and constraints; with exact derivatives.
+"""Merit function of a prescription: wavefront or spots over the field, and constraints, with exact derivatives.
 
-Obstruction is looked at in the plane of symmetry, onto which all rays are projected: every stretch of every beam keeps
-to that side of every other surface on which it passes in the prescription that the design starts from.
+Obstruction is evaluated in the plane of symmetry, onto which all rays are projected: every segment of every beam must
+stay on that side of every other surface on which it passes in the initial prescription.
 
-Rays through a prescription for its merit, with exact derivatives by everything that may vary.
-
-Every field's beam is a circle of the entrance pupil's diameter about the ray that meets the vertex of the stop. Where
-that chief ray starts follows from the implicit function theorem, all else from forward-mode AD through the trace.
+Every field's beam is a circle of the entrance pupil's diameter about the ray that meets the vertex of the stop. The
+derivatives of that chief ray's launch point follow from the implicit function theorem, all others from forward-mode AD
+through the trace.
 """
 
 from __future__ import annotations
@@ -25,19 +24,19 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, jvp, make_rays, trace
 
 LAUNCH_DISTANCE = 9.0
-"""How far before the prescription's origin beams start, metres: well before every mirror."""
+"""Distance of the beams' launch plane before the prescription's origin, metres: well before every mirror."""
 
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams that a prescription is evaluated by.
+    """Beams by which a prescription is evaluated.
 
     Attributes
     ----------
-    fields : np.ndarray
-        Angles x, y about the field bias, radians, (F, 2).
+    fields : (F, 2) ndarray
+        Field angles x, y about the field bias, radians.
     diameter : float
-        Of the entrance pupil, metres.
+        Diameter of the entrance pupil, metres.
     nodes : PupilNodes
         Quadrature over the pupil.
     rim : int
@@ -63,16 +62,16 @@ class DesignRays:
 
     Attributes
     ----------
-    position, direction : np.ndarray
-        On the image in its own frame, (F, N, 3).
-    path : np.ndarray
-        Optical path from the incoming wavefront through the prescription's origin, (F, N), metres.
-    points : np.ndarray
-        Launch points, hits on each surface and the image, prescription frame, (K + 1, F, N, 3).
-    d_position, d_direction, d_path, d_points : np.ndarray | None
-        Derivatives, (V, ...) each; None if not asked for.
-    d_bias : np.ndarray | None
-        Of the field bias, (V,).
+    position, direction : (F, N, 3) ndarray
+        Positions (metres) and directions on the image in its own frame.
+    path : (F, N) ndarray
+        Optical path from the incoming wavefront through the prescription's origin, metres.
+    points : (K + 1, F, N, 3) ndarray
+        Launch points, and intersections with each surface and the image, prescription frame, metres.
+    d_position, d_direction, d_path, d_points : ndarray, optional
+        Derivatives, (V, ...) each; None if not requested.
+    d_bias : (V,) ndarray, optional
+        Derivatives of the field bias.
     """
 
     position: np.ndarray
@@ -87,7 +86,7 @@ class DesignRays:
 
 
 def beam_axes(fields: np.ndarray, bias: complex) -> tuple[np.ndarray, np.ndarray]:
-    """Direction (F, 3) in which light of the fields travels, and two axes of its wavefront (F, 2, 3), the first near x.
+    """Return the directions (F, 3) of the fields' light, and two axes of the wavefronts (F, 2, 3), the first near x.
 
     ``bias`` may be complex, for a complex step.
     """
@@ -108,9 +107,9 @@ def trace_beams(
     Raises
     ------
     AimError
-        a chief ray does not reach the stop.
+        A chief ray does not reach the stop.
     BeamMissedError
-        a beam is lost.
+        A beam is lost.
     """
     assembly = prescription.assembly
     along, axes = beam_axes(beams.fields, prescription.field_bias)
@@ -118,8 +117,8 @@ def trace_beams(
     to_stop = assemble(assembly, ["to_stop"]).take(np.zeros(count, dtype=int))
     fan = RayFan(-LAUNCH_DISTANCE * along[:, None], along[:, None], axes[:, None], moves_position=True)
     chief = fan.at(aim(backend, to_stop, fan, np.zeros((1, 2)))[0])[0][:, 0]
-    reach = 0.5 * beams.diameter * beams.pupil
-    launch = chief[:, None] + np.einsum("nk,fkx->fnx", reach, axes)
+    offset = 0.5 * beams.diameter * beams.pupil
+    launch = chief[:, None] + np.einsum("nk,fkx->fnx", offset, axes)
     heading = np.broadcast_to(along[:, None], launch.shape)
     phase = np.einsum("fnx,fx->fn", launch, along)
 
@@ -129,7 +128,7 @@ def trace_beams(
     traced = trace(backend, imaging, make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3)), keep=keep)
     position, direction, path, valid = (a[0] for a in traced.numpy())
     if not valid.all():
-        raise BeamMissedError("a part of a beam misses a surface of the prescription")
+        raise BeamMissedError("some rays of a beam miss a surface of the prescription")
     hits = np.stack([traced.hit(i)[0] for i in keep])
     points = np.einsum("kij,knj->kni", imaging.world.rotation[0], hits) + imaging.world.translation[0][:, None]
     points = np.concatenate([launch[None], points.reshape(len(hits), *shape)])
@@ -145,29 +144,29 @@ def _differentiated(
     rays: DesignRays,
     chief: np.ndarray,
 ) -> DesignRays:
-    """The rays with their derivatives."""
+    """Return the rays with their derivatives."""
     along, axes = beam_axes(beams.fields, prescription.field_bias)
-    turned = beam_axes(beams.fields, prescription.field_bias + 1j * COMPLEX_STEP)
+    stepped = beam_axes(beams.fields, prescription.field_bias + 1j * COMPLEX_STEP)
     biased = np.array([v.quantity == BIAS for v in variables], dtype=float)
-    along_step, axes_step = (np.multiply.outer(biased, a.imag / COMPLEX_STEP) for a in turned)  # (V, F, ...)
+    along_step, axes_step = (np.multiply.outer(biased, a.imag / COMPLEX_STEP) for a in stepped)  # (V, F, ...)
     count, fields = len(variables), len(along)
 
     # the chief ray's start is c = -L d + a e1 + b e2 with a, b such that it meets the vertex of the stop
-    place = np.einsum("fx,fkx->fk", chief, axes)
-    fixed = -LAUNCH_DISTANCE * along_step + np.einsum("fk,vfkx->vfx", place, axes_step)
+    chief_offset = np.einsum("fx,fkx->fk", chief, axes)
+    fixed = -LAUNCH_DISTANCE * along_step + np.einsum("fk,vfkx->vfx", chief_offset, axes_step)
     single = assemble(prescription.assembly, ["to_stop"])
     twice = np.repeat(chief, 2, axis=0)[None], np.repeat(along, 2, axis=0)[None]
     slopes = jvp(backend, single, *twice, axes.reshape(1, -1, 3)).position[0, :, :2]
     slopes = np.swapaxes(slopes.reshape(fields, 2, 2), -1, -2)
     to_stop = prescription.tangents(variables, "to_stop")
-    every = np.broadcast_to(chief, (count, fields, 3)), np.broadcast_to(along, (count, fields, 3))
-    drift = jvp(backend, to_stop, *every, fixed, along_step).position[..., :2]
+    chief_rays = np.broadcast_to(chief, (count, fields, 3)), np.broadcast_to(along, (count, fields, 3))
+    drift = jvp(backend, to_stop, *chief_rays, fixed, along_step).position[..., :2]
     moved = -np.linalg.solve(np.broadcast_to(slopes, (count, fields, 2, 2)), drift[..., None])[..., 0]
     chief_step = fixed + np.einsum("vfk,fkx->vfx", moved, axes)
 
-    reach = 0.5 * beams.diameter * beams.pupil
+    offset = 0.5 * beams.diameter * beams.pupil
     launch = rays.points[0]
-    launch_step = chief_step[:, :, None] + np.einsum("nk,vfkx->vfnx", reach, axes_step)
+    launch_step = chief_step[:, :, None] + np.einsum("nk,vfkx->vfnx", offset, axes_step)
     shape = launch_step.shape
     heading = np.broadcast_to(along[:, None], launch.shape)
     heading_step = np.broadcast_to(along_step[:, :, None], shape)
@@ -208,22 +207,23 @@ class Operands:
     Attributes
     ----------
     wavelength : float
-        metres.
-    principal_distance : float | None
-        Along the line, f = sum(L tan W) / sum(tan^2 W) over the fields on it, metres; None: free.
-    envelope : float | None
-        Largest extent along z over all surfaces that light meets, image included, metres; None: free.
-    clearance : float | None
-        Least distance in y between a beam and the edge of a surface that it passes, metres; None: free.
+        Wavelength, metres.
+    principal_distance : float, optional
+        Required principal distance along the line, f = sum(L tan W) / sum(tan^2 W) over the fields on it, metres; None:
+        free.
+    envelope : float, optional
+        Largest allowed extent along z over all surfaces that light meets, image included, metres; None: free.
+    clearance : float, optional
+        Smallest allowed distance in y between a beam and the edge of a surface that it passes, metres; None: free.
     edge_margin : float
-        By how much surfaces are wider than the light on them, metres.
+        Width of surfaces beyond the beam footprints, metres.
     measure : str
         ``wavefront`` (rms waves, piston and tilt removed) or ``spot`` (rms about the mean, in units of the wavelength
         times the focal ratio).
     distortion : float
         Weight of the chief rays' departure from L = f tan W, residuals per relative departure; 0 for none.
-    anamorphism : float | None
-        Largest departure of f along the line from f across it, as a share of f across; None: free.
+    anamorphism : float, optional
+        Largest allowed difference of f along the line from f across it, relative to f across; None: free.
     """
 
     wavelength: float
@@ -238,33 +238,33 @@ class Operands:
 
 @dataclass(frozen=True)
 class Passage:
-    """A stretch of the beams that passes a surface: between points ``stretch`` and the next, on which side in y."""
+    """Segment of the beams that passes a surface: from point ``segment`` to the next, on the given side in y."""
 
-    stretch: int
+    segment: int
     surface: int
     side: float
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A prescription's merit.
+    """Merit and constraints of a prescription.
 
     Attributes
     ----------
-    residuals : np.ndarray
-        Their squares sum to the mean square error over the fields (waves^2), (P,).
-    errors : np.ndarray
-        Rms error per field in waves, (F,).
+    residuals : (P,) ndarray
+        Residuals whose squares sum to the mean square error over the fields (waves^2).
+    errors : (F,) ndarray
+        Rms error per field, waves.
     principal_distance : float
-        metres.
+        Principal distance along the line, metres.
     distance_across : float
-        The same across the line, of the fields in the plane of symmetry, metres.
-    extents : np.ndarray
-        Along z from the farthest point of one surface to that of another, for all pairs, (E,), metres.
-    clearances : np.ndarray
-        Of every passage, metres.
-    d_residuals, d_principal_distance, d_distance_across, d_extents, d_clearances : np.ndarray | None
-        Derivatives, variables first; None if not wanted.
+        Principal distance across the line, from the fields in the plane of symmetry, metres.
+    extents : (E,) ndarray
+        Extents along z from the farthest point of one surface to that of another, for all pairs, metres.
+    clearances : ndarray
+        Clearance of every passage, metres.
+    d_residuals, d_principal_distance, d_distance_across, d_extents, d_clearances : ndarray, optional
+        Derivatives, variables first; None if not requested.
     """
 
     residuals: np.ndarray
@@ -281,7 +281,7 @@ class Evaluation:
 
     @property
     def anamorphism(self) -> float:
-        """Principal distance along the line over that across it."""
+        """Ratio of the principal distance along the line to that across it."""
         return self.principal_distance / self.distance_across
 
     @property
@@ -292,18 +292,18 @@ class Evaluation:
 
 @dataclass(frozen=True, eq=False)
 class MeritFunction:
-    """The merit function of a prescription, and what its constraints ask for.
+    """Merit function of a prescription, with its constraints.
 
     Attributes
     ----------
     backend : Backend
-        Where to trace.
+        Backend of the trace.
     beams : Beams
-        The fields and pupils.
+        Fields and pupils.
     operands : Operands
-        What is asked for.
-    passages : tuple[Passage, ...]
-        Which beams pass which surfaces.
+        Targets and limits.
+    passages : tuple of Passage
+        Beams and the surfaces that they pass.
     """
 
     backend: Backend
@@ -313,25 +313,25 @@ class MeritFunction:
 
     @classmethod
     def of(cls, backend: Backend, start: Prescription, beams: Beams, operands: Operands) -> MeritFunction:
-        """A merit function that takes the sides on which beams pass surfaces from the prescription ``start``.
+        """Return a merit function whose beams must pass surfaces on the same sides as in the prescription ``start``.
 
         Raises
         ------
         ValueError
-            No field lies on the line (y = 0) beside its centre, or the measure is unknown.
+            No field lies on the line (y = 0) off its centre, or the measure is unknown.
         """
         if not _on_line(beams).any() or operands.measure not in ("wavefront", "spot"):
-            raise ValueError("a design needs fields on the line off its centre, and the measure wavefront or spot")
+            raise ValueError("a design needs fields on the line off its centre, and the measure 'wavefront' or 'spot'")
         points = trace_beams(backend, start, beams).points
         last, passages = len(points) - 1, []
-        for stretch in range(last):
+        for segment in range(last):
             for surface in range(1, last + 1):
-                if surface in (stretch, stretch + 1):
+                if surface in (segment, segment + 1):
                     continue
                 level = np.mean(points[surface, ..., 2])
-                y = _crossing(points[stretch], points[stretch + 1], level)[..., 0]
+                y = _crossing(points[segment], points[segment + 1], level)[..., 0]
                 side = float(np.sign(np.mean(y) - np.mean(points[surface, ..., 1])))
-                passages.append(Passage(stretch, surface, side))
+                passages.append(Passage(segment, surface, side))
         return cls(backend, beams, operands, tuple(passages))
 
     def evaluate(self, prescription: Prescription, variables: Sequence[Variable] | None = None) -> Evaluation:
@@ -340,7 +340,7 @@ class MeritFunction:
         Raises
         ------
         AimError, BeamMissedError
-            Light does not get through.
+            A beam does not pass the prescription.
         """
         rays = trace_beams(self.backend, prescription, self.beams, variables)
         residuals, d_residuals, errors = self._errors(rays)
@@ -361,31 +361,31 @@ class MeritFunction:
         return Evaluation(*values, d_residuals, d_distance, d_across, d_extents, slopes)
 
     def _errors(self, rays: DesignRays) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """Residuals (P,), their derivatives (V, P), and errors per field (F,) in waves."""
+        """Return residuals (P,), their derivatives (V, P), and errors per field (F,) in waves."""
         nodes = self.beams.nodes
-        own = slice(1, 1 + nodes.count)
+        pupil = slice(1, 1 + nodes.count)
         weight = np.sqrt(nodes.share / len(rays.path))
         differentiate = rays.d_path is not None
         if self.operands.measure == "spot":
             unit = self.operands.wavelength * self._focal_ratio
             project = np.eye(nodes.count) - nodes.share
-            value = (project @ rays.position[:, own, :2]) * weight[:, None] / unit
+            value = (project @ rays.position[:, pupil, :2]) * weight[:, None] / unit
             errors = np.sqrt(np.sum(value**2, axis=(1, 2)) * len(value))
             if not differentiate:
                 return value.ravel(), None, errors
             assert rays.d_position is not None
-            slope = (project @ rays.d_position[:, :, own, :2]) * weight[:, None] / unit
+            slope = (project @ rays.d_position[:, :, pupil, :2]) * weight[:, None] / unit
             return value.ravel(), slope.reshape(len(slope), -1), errors
         if self.operands.measure != "wavefront":
-            raise ValueError(f"a design has no measure {self.operands.measure!r}; there are wavefront and spot")
-        # eikonal about the chief ray's image; the exit pupil is taken as far away, which matters by offset^2 / (2 R):
+            raise ValueError(f"unknown measure {self.operands.measure!r}; choose wavefront or spot")
+        # eikonal about the chief ray's image; the exit pupil is assumed at infinity, an error of offset^2 / (2 R):
         # some 1e-12 m for spots of 1 um
-        offset = rays.position[:, own] - rays.position[:, :1]
-        eikonal = rays.path[:, own] - np.sum(rays.direction[:, own] * offset, axis=-1)
+        offset = rays.position[:, pupil] - rays.position[:, :1]
+        eikonal = rays.path[:, pupil] - np.sum(rays.direction[:, pupil] * offset, axis=-1)
         basis = np.stack([np.ones(nodes.count), nodes.x, nodes.y], axis=-1)
         weighted = basis * nodes.share[:, None]
         project = np.eye(nodes.count) - basis @ np.linalg.solve(basis.T @ weighted, weighted.T)
-        # the projection takes a metre of common path out; before that the mean, so that no digits are lost
+        # the projection removes the common path of metres; the chief ray's is subtracted first to keep all digits
         value = (eikonal - rays.path[:, :1]) @ project.T * weight / self.operands.wavelength
         errors = np.sqrt(np.sum(value**2, axis=1) * len(value))
         if not differentiate:
@@ -393,97 +393,111 @@ class MeritFunction:
         assert rays.d_position is not None
         assert rays.d_direction is not None
         assert rays.d_path is not None
-        d_offset = rays.d_position[:, :, own] - rays.d_position[:, :, :1]
-        slope = rays.d_path[:, :, own] - rays.d_path[:, :, :1]
-        slope = slope - np.sum(rays.d_direction[:, :, own] * offset + rays.direction[:, own] * d_offset, axis=-1)
+        d_offset = rays.d_position[:, :, pupil] - rays.d_position[:, :, :1]
+        slope = rays.d_path[:, :, pupil] - rays.d_path[:, :, :1]
+        slope = slope - np.sum(rays.d_direction[:, :, pupil] * offset + rays.direction[:, pupil] * d_offset, axis=-1)
         slope = slope @ project.T * weight / self.operands.wavelength
         return value.ravel(), slope.reshape(len(slope), -1), errors
 
     @property
     def _focal_ratio(self) -> float:
+        """Focal ratio for the unit of spots; 1 where the principal distance is free."""
         distance = self.operands.principal_distance
         return 1.0 if distance is None else distance / self.beams.diameter
 
     def _principal_distance(
         self, rays: DesignRays, prescription: Prescription
     ) -> tuple[float, np.ndarray | None, np.ndarray, np.ndarray | None]:
-        """Distance f (metres), its derivatives; relative departures of the line's fields from L = f tan W, theirs."""
+        """Return f along the line (metres) and the relative departures of its fields from L = f tan W.
+
+        Each is followed by its derivatives.
+
+        The order is f, its derivatives, the departures, their derivatives.
+        """
         line = _on_line(self.beams)
         # between (tan x, tan b, 1) and (0, tan b, 1): tan W = tan x cos b, as both have the same part across x
         tangent = np.tan(self.beams.fields[line, 0])
         bias = prescription.field_bias
         size = np.sum(tangent**2)
-        place = rays.position[line, 0, 0]
-        slope = float(place @ tangent / size)
+        position = rays.position[line, 0, 0]
+        slope = float(position @ tangent / size)
         sign = np.sign(slope)
         distance = abs(slope) / np.cos(bias)
-        departure = place / slope - tangent
+        departure = position / slope - tangent
         if rays.d_position is None:
             return distance, None, departure, None
-        d_place = rays.d_position[:, line, 0, 0]
-        d_slope = d_place @ tangent / size
+        d_position = rays.d_position[:, line, 0, 0]
+        d_slope = d_position @ tangent / size
         assert rays.d_bias is not None
         d_distance = sign * d_slope / np.cos(bias) + distance * np.tan(bias) * rays.d_bias
-        return distance, d_distance, departure, d_place / slope - np.outer(d_slope, place) / slope**2
+        return distance, d_distance, departure, d_position / slope - np.outer(d_slope, position) / slope**2
 
     def _distance_across(self, rays: DesignRays) -> tuple[float, np.ndarray | None]:
-        """Distance f across the line, f = sum(L tan W) / sum(tan^2 W) over the fields in the plane of symmetry beside
-        the line, L from the image of the field's centre (metres), and its derivatives; NaN where there are none.
+        """Return f across the line (metres) and its derivatives; NaN where there are no fields for it.
+
+        f = sum(L tan W) / sum(tan^2 W) over the fields in the plane of symmetry off the line, with L from the image of
+        the field's centre.
         """
         fields = self.beams.fields
-        beside = (fields[:, 0] == 0.0) & (fields[:, 1] != 0.0)
+        off_line = (fields[:, 0] == 0.0) & (fields[:, 1] != 0.0)
         centre = np.flatnonzero(np.all(fields == 0.0, axis=1))
-        if not beside.any() or not len(centre):
+        if not off_line.any() or not len(centre):
             return np.nan, None if rays.d_position is None else np.full(len(rays.d_position), np.nan)
-        tangent = np.tan(fields[beside, 1])
+        tangent = np.tan(fields[off_line, 1])
         weight = tangent / np.sum(tangent**2)
-        place = rays.position[beside, 0, 1] - rays.position[centre[0], 0, 1]
-        slope = float(place @ weight)
+        position = rays.position[off_line, 0, 1] - rays.position[centre[0], 0, 1]
+        slope = float(position @ weight)
         if rays.d_position is None:
             return abs(slope), None
-        d_place = rays.d_position[:, beside, 0, 1] - rays.d_position[:, centre, 0, 1]
-        return abs(slope), np.sign(slope) * (d_place @ weight)
+        d_position = rays.d_position[:, off_line, 0, 1] - rays.d_position[:, centre, 0, 1]
+        return abs(slope), np.sign(slope) * (d_position @ weight)
 
     def _clearance(self, rays: DesignRays, passage: Passage) -> tuple[float, np.ndarray]:
-        """Least distance in y between a stretch of the beams and a surface's edge, and its derivatives (V,)."""
+        """Return the smallest distance in y between a beam segment and a surface's edge, and its derivatives (V,)."""
         points = rays.points.reshape(len(rays.points), -1, 3)
         edge = int(np.argmax(passage.side * points[passage.surface, :, 1]))
-        start, end = points[passage.stretch], points[passage.stretch + 1]
-        y, share = np.moveaxis(_crossing(start, end, points[passage.surface, edge, 2]), -1, 0)
+        start, end = points[passage.segment], points[passage.segment + 1]
+        y, fraction = np.moveaxis(_crossing(start, end, points[passage.surface, edge, 2]), -1, 0)
         nearest = int(np.argmin(passage.side * y))
         value = passage.side * (y[nearest] - points[passage.surface, edge, 1]) - self.operands.edge_margin
         if rays.d_points is None:
             return value, np.empty(0)
         steps = rays.d_points.reshape(len(rays.d_points), len(points), -1, 3)
-        a, b = steps[:, passage.stretch, nearest], steps[:, passage.stretch + 1, nearest]
+        a, b = steps[:, passage.segment, nearest], steps[:, passage.segment + 1, nearest]
         e = steps[:, passage.surface, edge]
-        t, way = share[nearest], end[nearest] - start[nearest]
+        t, span = fraction[nearest], end[nearest] - start[nearest]
         d_t = np.zeros(len(steps))
         if 0.0 < t < 1.0:
-            d_t = (e[:, 2] - a[:, 2] - t * (b[:, 2] - a[:, 2])) / way[2]
-        return value, passage.side * (a[:, 1] + t * (b[:, 1] - a[:, 1]) + d_t * way[1] - e[:, 1])
+            d_t = (e[:, 2] - a[:, 2] - t * (b[:, 2] - a[:, 2])) / span[2]
+        return value, passage.side * (a[:, 1] + t * (b[:, 1] - a[:, 1]) + d_t * span[1] - e[:, 1])
 
 
 def _on_line(beams: Beams) -> np.ndarray:
-    """Which fields lie on the line, off its centre; (F,)."""
+    """Return the mask of fields that lie on the line, off its centre; (F,)."""
     return np.asarray((beams.fields[:, 1] == 0.0) & (beams.fields[:, 0] != 0.0))
 
 
 def _crossing(start: np.ndarray, end: np.ndarray, level: float) -> np.ndarray:
-    """Where stretches (..., 3) cross the plane z = level, or their nearer end: y, share of the way (..., 2)."""
-    way = end - start
-    share = np.clip((level - start[..., 2]) / way[..., 2], 0.0, 1.0)
-    return np.stack([start[..., 1] + share * way[..., 1], share], axis=-1)
+    """Return the intersection of segments (..., 3) with the plane z = level, or their nearer end, as (..., 2).
+
+    The two numbers are y and the fraction of the segment.
+    """
+    span = end - start
+    fraction = np.clip((level - start[..., 2]) / span[..., 2], 0.0, 1.0)
+    return np.stack([start[..., 1] + fraction * span[..., 1], fraction], axis=-1)
 
 
 def _extents(rays: DesignRays) -> tuple[np.ndarray, np.ndarray | None]:
-    """Extent along z from each surface to each other one, (E,), the largest is the envelope; derivatives (V, E)."""
+    """Return the extents along z from each surface to each other one, (E,), and their derivatives (V, E).
+
+    The largest extent is the envelope.
+    """
     z = rays.points[1:, ..., 2].reshape(len(rays.points) - 1, -1)
-    at = np.arange(len(z))
+    surfaces = np.arange(len(z))
     high, low = np.argmax(z, axis=1), np.argmin(z, axis=1)
     pairs = ~np.eye(len(z), dtype=bool)
-    extents = (z[at, high][:, None] - z[at, low])[pairs]
+    extents = (z[surfaces, high][:, None] - z[surfaces, low])[pairs]
     if rays.d_points is None:
         return extents, None
     steps = rays.d_points[:, 1:, ..., 2].reshape(len(rays.d_points), len(z), -1)
-    return extents, (steps[:, at, high][:, :, None] - steps[:, at, low][:, None])[:, pairs]
+    return extents, (steps[:, surfaces, high][:, :, None] - steps[:, surfaces, low][:, None])[:, pairs]

@@ -1,1 +1,1 @@
-"""Where things are and what shape they have: rigid bodies, surfaces, apertures, solids, polygons."""
+"""Geometry of an optical system: rigid bodies, surfaces, apertures, solids and polygons."""

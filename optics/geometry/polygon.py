@@ -41,9 +41,7 @@ def area_in_disk(polygons: np.ndarray) -> np.ndarray:
     side = end - start
     length = np.abs(side)
     unit = side / np.where(length > _COINCIDENT, length, 1.0)
-    along = (
-        np.conj(unit) * start
-    ).real  # position of the start along the side, from the foot of the centre's perpendicular
+    along = (np.conj(unit) * start).real  # from the foot of the centre's perpendicular on the side
     half = np.sqrt(np.maximum(1.0 - np.abs(start - along * unit) ** 2, 0.0))
     first, second = (start + (np.clip(position, along, along + length) - along) * unit for position in (-half, half))
     sectors = np.angle(np.conj(start) * first) + np.angle(np.conj(second) * end)
@@ -67,9 +65,7 @@ def covered(polygons: np.ndarray, points: np.ndarray, smallest: float = 0.0) -> 
     for k in range(polygons.shape[1]):
         corner = polygons[:, k]
         side = np.roll(corner, -1, axis=1) - corner
-        side[np.hypot(side[..., 0], side[..., 1]) <= _COINCIDENT] = (
-            0.0  # a side without length has a direction of rounding errors
-        )
+        side[np.hypot(side[..., 0], side[..., 1]) <= _COINCIDENT] = 0.0  # its direction would be rounding error
         within = np.repeat(full[:, k, None], len(points), axis=1)
         for v in range(corner.shape[1]):
             x, y = (points[:, i] - corner[:, v, i, None] for i in (0, 1))

@@ -307,7 +307,7 @@ class SolidMesh:
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """This mesh as a trimesh object, for measuring and drawing."""
+        """Triangle mesh as a trimesh object, for measuring and drawing."""
         import trimesh
 
         return trimesh.Trimesh(self.vertices, self.triangles, process=False)

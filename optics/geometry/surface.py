@@ -398,7 +398,10 @@ class Surface:
         return replace(self, figure=figure)
 
     def scaled(self, scale: float) -> Surface:
-        """Return the surface of a body scaled by a factor; the figure is not scaled, as in ``optics.raytrace.system``."""
+        """Return the surface of a body scaled by a factor.
+
+        The figure is not scaled, as in ``optics.raytrace.system``.
+        """
         even = tuple(a / scale ** (2 * n + 3) for n, a in enumerate(self.even))
         terms = tuple(scaled_term(term, scale) for term in self.terms)
         return replace(self, curvature=self.curvature / scale, even=even, terms=terms)

@@ -366,7 +366,10 @@ COMPLEX_STEP = 1e-40
 def _local_motions(
     bodies: Sequence[Body], states: Sequence[State], step: Sequence[tuple[str, str, int]] | None, dtype: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return rotation (B, S, 3, 3), translation (B, S, 3), scale and expansion (B, S) of motions in each body's frame."""
+    """Return the rotation, translation, scale and expansion of motions in each body's frame.
+
+    The shapes are (B, S, 3, 3), (B, S, 3), (B, S) and (B, S).
+    """
     size = len(bodies), len(states)
     rotate, shift = np.zeros((*size, 3), dtype), np.zeros((*size, 3), dtype)
     scale, expansion = np.ones(size, dtype), np.ones(size, dtype)

@@ -337,7 +337,7 @@ class _Edges:
 
 
 def _sinc_less_one(s: np.ndarray) -> np.ndarray:
-    """Return sin(s)/s - 1 for |s| <= 1, by its power series to s^18, which avoids the cancellation of the difference."""
+    """Return sin(s)/s - 1 for |s| <= 1, by its power series to s^18, which avoids cancellation."""
     square = s * s
     total = np.ones_like(s)
     for n in range(18, 3, -2):

@@ -29,9 +29,9 @@ zero beyond its last radial angle.
 
 Sampling of tables. For angles of incidence one degree apart the scattered power is summed over cells that are finer
 than the table's. A path takes one of the two angles next to its own, with probability proportional to its part of the
-interpolated power, then a ring of
-cells, a cell in it, and a position in the cell, uniform in solid angle. Directions that fall below the surface because
-of the difference from the path's own angle are reflected upward, so that all of TIS is scattered.
+interpolated power, then a ring of cells, a cell in it, and a position in the cell, uniform in solid angle. Directions
+that fall below the surface because of the difference from the path's own angle are reflected upward, so that all of TIS
+is scattered.
 
 Finishes. A ``Finish`` describes one side of a surface in the path tracer: Fresnel reflection, constant shares, measured
 coatings and scattering.
@@ -252,7 +252,7 @@ def _require_samplable(lobe: Lobe) -> Lobe:
     """Return the lobe; raise ValueError if its upper bound integrates to more than 1."""
     if lobe.share > 1.0:
         raise ValueError(
-            f"the scatter lobe is too strong to be sampled: its upper bound is {lobe.share:.4g} of the light, more than 1"
+            f"the scatter lobe is too strong to be sampled: its upper bound is {lobe.share:.4g} of the light (> 1)"
         )
     return lobe
 
@@ -387,7 +387,13 @@ class ScatterTable:
         return (1.0 - w) * self.values[k] + (w * self.values[k + 1] if w > 0.0 else 0.0)
 
     def total(self, incidence: float) -> float:
-        """Return the total integrated scatter at an angle of incidence in radians, as a fraction of the incident power."""
+        """Return the total integrated scatter as a fraction of the incident power.
+
+        Parameters
+        ----------
+        incidence : float
+            Angle of incidence, radians.
+        """
         return float(np.sum(self._power(incidence)))
 
     @cached_property
@@ -505,7 +511,10 @@ def _interpolated(table: np.ndarray, knots: int, cells: int, fraction: float) ->
 
 
 def _cumulative(power: np.ndarray) -> np.ndarray:
-    """Return cumulative shares along the last axis, (N, K + 1), from 0 to exactly 1; uniform where there is no power."""
+    """Return cumulative shares along the last axis, (N, K + 1), from 0 to exactly 1.
+
+    They are uniform where there is no power.
+    """
     total = np.sum(power, axis=-1, keepdims=True)
     even = np.where(total > 0.0, power, 1.0)
     sums = np.cumsum(even, axis=-1)
@@ -658,16 +667,14 @@ class Finish:
         if self.table is None:
             return
         if self.scatter is not None or self.transmission > 0.0:
-            raise ValueError(
-                "a scatter table replaces the lobe, and is allowed only on a surface that transmits no light"
-            )
+            raise ValueError("a scatter table replaces the lobe, on a surface that transmits no light")
         for k in range(STEPS if not self.scattered_only else 0):
             angle = 0.5 * np.pi * k / STEPS
             reflected = self.reflectance if self.coating is None else self.coating.at(angle, False)[0]
             if self.table.sampling.share[k] > reflected:
                 raise ValueError(
-                    f"at {np.degrees(angle):.0f} deg the table scatters {self.table.sampling.share[k]:.4g} of the light, "
-                    f"but only {reflected:.4g} is reflected"
+                    f"at {np.degrees(angle):.0f} deg the table scatters {self.table.sampling.share[k]:.4g} of the "
+                    f"light, but only {reflected:.4g} is reflected"
                 )
         if self.scattered_only and float(np.max(self.table.sampling.share)) + self.diffuse > 1.0:
             raise ValueError("the scattered and diffused light together exceed the incident light")
@@ -772,5 +779,8 @@ class CoatingTable:
         return reflected, float(np.interp(angle, self.angles, self.transmittance))
 
     def sampled(self, through: bool) -> np.ndarray:
-        """Return reflectance and transmittance from 0 to 90 degrees, (COATING_STEPS + 1, 2); ``through`` as for ``at``."""
+        """Return reflectance and transmittance from 0 to 90 degrees, (COATING_STEPS + 1, 2).
+
+        ``through`` is as for ``at``.
+        """
         return np.array([self.at(float(angle), through) for angle in np.linspace(0.0, 0.5 * np.pi, COATING_STEPS + 1)])

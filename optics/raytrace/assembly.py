@@ -88,9 +88,7 @@ class Element:
         """
         outer = self.outer_edge
         if outer is None and self.surface.zernike_figure is None:
-            raise ValueError(
-                f"element {self.name!r} needs an aperture to carry a figure: the aperture defines the disk"
-            )
+            raise ValueError(f"element {self.name!r} needs an aperture, which defines the disk of a figure")
         return self.surface.figure_disk(outer)
 
     def figured(self, motion: Motion) -> Surface:

@@ -139,9 +139,7 @@ def structure_of(elements: Sequence[Element]) -> Structure:
     """Return the common structure of nominal elements, the i-th ones of several chains."""
     grid = any(_known_figure(e) is not None and e.surface.grid_figure is not None for e in elements)
     apertures = [None if e.aperture is None else type(e.aperture.numbers()) for e in elements]
-    kinds = {
-        (e.interaction, e.surface.is_plane, aperture_kind) for e, aperture_kind in zip(elements, apertures, strict=True)
-    }
+    kinds = {(e.interaction, e.surface.is_plane, kind) for e, kind in zip(elements, apertures, strict=True)}
     if len(kinds) != 1:
         names = ", ".join(sorted(e.name for e in elements))
         raise ValueError(f"elements of different kinds cannot be batched: {names}")
@@ -160,9 +158,7 @@ def _known_figure(element: Element) -> Figure | None:
         case None | ZernikeFigure() | GridFigure() | SummedFigure() as figure:
             return figure
         case other:
-            raise ValueError(
-                f"element {element.name!r}: the trace does not support a figure of type {type(other).__name__}"
-            )
+            raise ValueError(f"element {element.name!r}: the trace supports no figure of type {type(other).__name__}")
 
 
 def local_numbers_of(

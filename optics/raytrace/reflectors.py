@@ -209,7 +209,10 @@ def prism_180(mount: Mount) -> ReflectorParts:
 
 
 def _beam_height(width: float) -> float:
-    """Return the height of the transferred beam above the window, metres; the returning beam clears the window's edge."""
+    """Return the height of the transferred beam above the window, metres.
+
+    It is so large that the returning beam clears the window's edge.
+    """
     return sqrt(2.0) * roof_offset(width) + sqrt(3.0) * 0.5 * width + EDGE_MARGIN
 
 

@@ -440,9 +440,7 @@ class _TracePlan:
         import drjit as dr
 
         p, d, path, valid = rays
-        d = d + dr.zeros(
-            self.backend.Float, dr.width(p)
-        )  # full width also if no element has changed a shared direction
+        d = d + dr.zeros(self.backend.Float, dr.width(p))  # gives a shared direction full width
         if pose is not None:
             to_world = pose.coordinates
             outside += [
@@ -525,12 +523,10 @@ class _TracePlan:
 
         def ray(place: Any) -> tuple[Any, ...]:
             index = first + place
-            ray_arrays = tuple(
-                array if dr.width(array) == 1 else dr.gather(type(array), array, index) for array in rays
-            )
+            mine = tuple(array if dr.width(array) == 1 else dr.gather(type(array), array, index) for array in rays)
             own_hits: list[Any] = []
             own_outside: list[Any] = []
-            end = self._along(leg, elements, grids, ray_arrays, own_hits)
+            end = self._along(leg, elements, grids, mine, own_hits)
             if leg.stop == len(self.structure):
                 end = self._at_end(end, pose, own_outside)
             for target, value in zip(arrays, (*end, *own_hits, *own_outside), strict=True):
@@ -597,7 +593,10 @@ def require_rays(valid: np.ndarray, what: str) -> None:
 
 
 def _full_width(backend: Backend, rays: Rays, count: int) -> tuple[Rays, Any]:
-    """Return rays of full width, and the number of rays per system as an array of width 1 (None for a single system)."""
+    """Return rays of full width, and the number of rays per system as an array of width 1.
+
+    The number is None for a single system.
+    """
     import drjit as dr
 
     if count == 1:
@@ -741,7 +740,10 @@ def _on_surface(p: Any, surface: SurfaceNumbers, table: Any) -> Any:
 
 
 def _on_sheet(level_and_gradient: tuple[Any, Any, Any, Any]) -> Any:
-    """Return whether a point with that level and gradient lies on the sheet; level / nz is its height to first order."""
+    """Return whether a point with that level and gradient lies on the sheet of the vertex.
+
+    The level divided by nz is the point's height to first order.
+    """
     import drjit as dr
 
     value, _, _, nz = level_and_gradient

@@ -318,7 +318,10 @@ def _series(
 
 
 def _overhang(parts: list[tuple[float, FiniteShape]], x: Grid, y: Grid) -> float:
-    """Return the largest distance of a shape's bounds beyond the window of pixel centres, metres; 0 if all lie inside."""
+    """Return the largest distance of a shape's bounds beyond the window of pixel centres, metres.
+
+    It is 0 if all lie inside.
+    """
     x0, x1, y0, y1 = np.array([shape.bounds for _, shape in parts]).T
     (left, right), (low, high) = x.points()[[0, -1]], y.points()[[0, -1]]
     beyond = (left - np.min(x0), np.max(x1) - right, low - np.min(y0), np.max(y1) - high)

@@ -1,4 +1,4 @@
-"""Linear temperature fields on bodies, and the motions that a free body of one material gives to what is mounted on it."""
+"""Linear temperature fields on bodies, and the motions that a free body gives to what is mounted on it."""
 
 from __future__ import annotations
 

@@ -154,13 +154,13 @@ class Finder:
             x = x + step if self._simplex else np.clip(x + step, -0.5, 1.5)
             if np.max(np.abs(step)) < 1e-12:
                 break
-        # a point far from a cell may have no reference coordinates; the end of the clipped iteration is then meaningless
+        # a point far from a cell may have no reference coordinates; the iteration's result is then meaningless
         failed = np.max(np.abs(step), axis=1, keepdims=True) > 1e-8
         return x if self._simplex else np.where(failed, np.inf, x)
 
 
 def rigid_modes(points: np.ndarray) -> np.ndarray:
-    """Return displacements of points (P, 3) by three unit shifts and three unit rotations about the origin, (6, 3 P)."""
+    """Return displacements of points (P, 3) by unit shifts and unit rotations about the origin, (6, 3 P)."""
     shifts = np.broadcast_to(np.eye(3)[:, None, :], (3, len(points), 3))
     turns = np.cross(np.eye(3)[:, None, :], points[None])
     return np.concatenate([shifts, turns]).reshape(6, -1)

@@ -1,1 +1,1 @@
-"""From rays to images: wavefronts, pupils with their shadows, diffraction, transfer functions."""
+"""Physical optics: wavefronts, pupils with shadows, diffraction images and transfer functions."""

@@ -8,19 +8,18 @@ and of eikonal L (the optical path to the wave's plane through P0). The field on
     U(x, y) = 1/lambda * sum_j w_j a_j exp(i k (L_j + u_j x + v_j y)),
 
 with w_j the pupil element. Because exp(ik(ux + vy)) factors, U on a grid of R x C pixels is the product of an (R x N)
-and an (N x C) matrix: no FFT grid, no padding, pixels wherever the detector has them (Soummer et al., Opt. Express
-15, 15935 (2007), here with arbitrary pupil nodes). Plancherel: with sum w_j |a_j|^2 = P over du dv the image
-integrates to P.
+and an (N x C) matrix: no FFT grid, no padding, pixels wherever the detector has them (Soummer et al., Opt. Express 15,
+15935 (2007), here with arbitrary pupil nodes). Plancherel: with sum w_j |a_j|^2 = P over du dv the image integrates to
+P.
 
-How few samples of a wave are enough: its values on an even grid from others that stand as far apart as its aperture
-allows.
+Sampling of the field. Along one detector axis the field of a beam is a sum of exp(i q x) with |q| no more than the half
+width of the beam's directions. On a whole interval such a function is determined by little more samples than its
+Nyquist number, if they extend somewhat beyond the ends of the interval (Slepian and Pollak, Bell Syst. Tech. J. 40, 43,
+1961; here by least squares over all q of the band). A spot that is well sampled by its pixels needs half or a third as
+many columns and rows as there are pixels.
 
-Along one detector axis the field of a beam is a sum of exp(i q x) with |q| no more than the half width of the beam's
-directions. Such a function is known on a whole stretch from little more samples than its Nyquist number, if they reach
-somewhat beyond the stretch's ends (Slepian and Pollak, Bell Syst. Tech. J. 40, 43, 1961; here by least squares over all
-q of the band). A spot that its pixels sample well needs half or a third as many columns and rows as there are pixels.
-
-What pixel area and an extended incoherent source do to a well-sampled image: a short exact filter.
+Pixel response. ``PixelResponse`` is a short exact filter for the pixel area and an extended incoherent source, applied
+to a well-sampled image.
 """
 
 from __future__ import annotations
@@ -36,39 +35,40 @@ from numpy.typing import ArrayLike
 from optics.numerics.array_math import PhysicalError
 from optics.numerics.backend import cores, one_blas_thread
 
-LONGEST = 256
-"""Points of a grid for which samples are worked out; longer ones are cut, since the work grows with the cube."""
+MAX_POINTS = 256
+"""Largest number of grid points for one set of samples; longer grids are divided, since the work grows with the cube.
+"""
 
 _BEYOND, _BEYOND_IF_LOOSE = 4.0, 3.0
-"""Nyquist distances by which samples reach beyond each end."""
+"""Extent of the samples beyond each end of the points, in Nyquist distances: for 2e-12 and for 1e-8 accuracy."""
 
 _TIGHT, _LOOSE = 2e-12, 1e-8
-"""Largest error of a wave of the band."""
+"""Largest error of a wave of the band, of amplitude 1."""
 
 _OVER = 1.35
 _MORE, _MORE_IF_LOOSE = 22, 14
-"""Number of samples that is tried first: so many times the Nyquist number, and so many more."""
+"""First number of samples that is tried: ``_OVER`` times the Nyquist number, plus ``_MORE`` (or for 1e-8 accuracy)."""
 
-_WIDER = 1.1
-"""Ladder of bands for which samples are worked out."""
+_BAND_RATIO = 1.1
+"""Ratio of successive bands for which samples are computed."""
 
-_WORTH = 0.8
-"""Share of the points from which it is as well to take them all."""
+_MAX_RATIO = 0.8
+"""Ratio of samples to points above which all points are used instead."""
 
-_STEEPEST = 2.5
-"""Largest band, radians from one point to the next; beyond it the points themselves are too few."""
+_MAX_BAND = 2.5
+"""Largest band, radians from one point to the next; beyond it the points undersample the field."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldSamples:
-    """Samples of a field along one axis, even and symmetric about the middle of the points.
+    """Samples of a field along one axis, evenly spaced and symmetric about the middle of the points.
 
     Attributes
     ----------
     step : float
-        Between two samples, in steps of the points.
-    weights : np.ndarray
-        Of the samples (an even number M) in each of the N points, (N, M).
+        Distance between two samples, in steps of the points.
+    weights : (N, M) ndarray
+        Weights of the samples (an even number M) in each of the N points.
     """
 
     step: float
@@ -81,38 +81,39 @@ class FieldSamples:
 
     @classmethod
     def of(cls, points: int, band: float, loose: bool) -> FieldSamples | None:
-        """Samples for a grid of points, or None where they would not be fewer than the points.
+        """Return samples for a grid of points, or None where they would not be fewer than the points.
 
         Parameters
         ----------
         points : int
-            N of the grid, at most ``LONGEST``.
+            Number N of grid points, at most ``MAX_POINTS``.
         band : float
             Largest |q|, radians from one point to the next.
         loose : bool
-            Right to 1e-8 of the sum of all waves' amplitudes, else to 2e-12.
+            True for an accuracy of 1e-8 of the sum of all waves' amplitudes; False for 2e-12.
         """
-        if not 0.0 < band < _STEEPEST:
+        if not 0.0 < band < _MAX_BAND:
             return None
-        rung = int(np.ceil(np.log(band) / np.log(_WIDER)))
+        rung = int(np.ceil(np.log(band) / np.log(_BAND_RATIO)))
         return _samples(points, rung, loose)
 
 
 @lru_cache(maxsize=64)
 def _samples(points: int, rung: int, loose: bool) -> FieldSamples | None:
-    band = _WIDER**rung
+    """Return ``FieldSamples`` for the band ``_BAND_RATIO**rung``."""
+    band = _BAND_RATIO**rung
     nyquist, beyond = np.pi / band, _BEYOND_IF_LOOSE if loose else _BEYOND
     first = _OVER * points / nyquist + (_MORE_IF_LOOSE if loose else _MORE)
-    reach = 0.5 * (points - 1) + beyond * min(nyquist, 0.25 * points)
-    for count in range(2 * int(np.ceil(0.5 * first)), int(_WORTH * points) + 1, 2):
-        step = 2.0 * reach / (count - 1)
+    extent = 0.5 * (points - 1) + beyond * min(nyquist, 0.25 * points)
+    for count in range(2 * int(np.ceil(0.5 * first)), int(_MAX_RATIO * points) + 1, 2):
+        step = 2.0 * extent / (count - 1)
         # even and odd functions of the band, dense at its ends
         nodes = (np.arange(2 * count) + 0.5) / (4 * count)
         known, wanted = _plane_waves(points, count, step, band * np.cos(np.pi * nodes))
         weights = np.linalg.lstsq(known, wanted, rcond=1e-15)[0]
         between = band * np.cos(np.pi * (np.arange(2 * count) / (4 * count)))
-        seen, true = _plane_waves(points, count, step, between)
-        if np.max(np.abs(seen @ weights - true)) <= (_LOOSE if loose else _TIGHT):
+        sampled, true = _plane_waves(points, count, step, between)
+        if np.max(np.abs(sampled @ weights - true)) <= (_LOOSE if loose else _TIGHT):
             weights = np.ascontiguousarray(weights.T)
             weights.setflags(write=False)
             return FieldSamples(step, weights)
@@ -120,7 +121,7 @@ def _samples(points: int, rung: int, loose: bool) -> FieldSamples | None:
 
 
 def _plane_waves(points: int, count: int, step: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cosines and sines of frequencies at the samples and at the points."""
+    """Return cosines and sines of frequencies q at the samples and at the points."""
     even = step * (np.arange(count) - 0.5 * (count - 1)), np.arange(points) - 0.5 * (points - 1)
     first, then = (np.concatenate([np.cos(q[:, None] * x), np.sin(q[:, None] * x)]) for x in even)
     return first, then
@@ -128,18 +129,18 @@ def _plane_waves(points: int, count: int, step: float, q: np.ndarray) -> tuple[n
 
 @dataclass(frozen=True, eq=False)
 class PupilField:
-    """Plane waves that make B images, N nodes each.
+    """Plane waves that form B images, N nodes each.
 
     Attributes
     ----------
-    u, v : np.ndarray
-        Direction cosines along the detector's x and y, (B, N).
-    eikonal : np.ndarray
-        Optical path to the plane wave through the image's origin, metres, (B, N), common piston removed.
-    amplitude : np.ndarray
-        a_j * w_j * du dv, such that the formula above holds with unit total power, (B, N); 0 = blocked.
+    u, v : (B, N) ndarray
+        Direction cosines along the detector's x and y.
+    eikonal : (B, N) ndarray
+        Optical path to the plane wave through the image's origin, metres, common piston removed.
+    amplitude : (B, N) ndarray
+        a_j * w_j * du dv, such that the module's formula holds with unit total power; 0 = blocked.
     wavelength : float
-        metres.
+        Wavelength, metres.
     """
 
     u: np.ndarray
@@ -149,11 +150,11 @@ class PupilField:
     wavelength: float
 
     def __getitem__(self, piece: slice) -> PupilField:
-        """Some of the images."""
+        """Return the field of some of the images."""
         return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
 
-    def in_lengths_of(self, size: np.ndarray) -> PupilField:
-        """Tell the images in coordinates x / size, y / size: those of pixels that have grown by ``size``, (B,).
+    def scaled_by(self, size: np.ndarray) -> PupilField:
+        """Return the field in coordinates x / size, y / size: those of pixels scaled by ``size``, (B,).
 
         Phases u x + v y stay, and so does the power: an image is then photons per area of the nominal pixels.
         """
@@ -170,14 +171,14 @@ class Grid:
     count: int
 
     def points(self) -> np.ndarray:
-        """All samples, (count,)."""
+        """Return all samples, (count,)."""
         return self.start + self.step * np.arange(self.count)
 
 
 def image(field: PupilField, x: Grid, y: Grid, single: bool = False) -> np.ndarray:
-    """Irradiance on the grid of columns x and rows y by the matrix Fourier transform.
+    """Return the irradiance on the grid of columns x and rows y by the matrix Fourier transform.
 
-    Where the pixels sample the field well, it is summed at fewer places and interpolated (``FieldSamples``).
+    Where the pixels sample the field well, it is summed at fewer points and interpolated (``FieldSamples``).
 
     Parameters
     ----------
@@ -188,45 +189,45 @@ def image(field: PupilField, x: Grid, y: Grid, single: bool = False) -> np.ndarr
     y : Grid
         Detector y of the R rows.
     single : bool
-        Right to some 1e-7 of the peak, as in single precision, for less time; else to 1e-12.
+        True for an accuracy of some 1e-7 of the peak, as in single precision, in less time; False for 1e-12.
 
     Returns
     -------
-    np.ndarray
-        Shape (B, R, C), 1/m^2 for unit power through the pupil.
+    (B, R, C) ndarray
+        Irradiance, 1/m^2 for unit power through the pupil.
     """
     k = 2.0 * np.pi / field.wavelength
     count = len(field.u)
     out = np.empty((count, y.count, x.count))
     centred, bands = _centred(field, k)
     parts = []
-    for columns, some in _pieces(x):
-        for rows, others in _pieces(y):
+    for columns, column_slice in _pieces(x):
+        for rows, row_slice in _pieces(y):
             samples = [
                 FieldSamples.of(grid.count, band * abs(grid.step), single)
                 for grid, band in zip((columns, rows), bands, strict=True)
             ]
-            parts.append((columns, rows, samples, out[:, others, some]))
+            parts.append((columns, rows, samples, out[:, row_slice, column_slice]))
 
-    # a few images use all cores, too
-    together = max(1, min(_AT_ONCE, count // cores()))
+    # small blocks, so that a few images use all cores
+    block_size = max(1, min(_BLOCK_IMAGES, count // cores()))
 
     def piece(start: int) -> None:
-        one = slice(start, start + together)
+        block = slice(start, start + block_size)
         for columns, rows, (across, down), part in parts:
             if across is None or down is None:
-                _irradiance(field[one], k, columns, rows, np.complex64 if single else np.complex128, part[one])
+                _irradiance(field[block], k, columns, rows, np.complex64 if single else np.complex128, part[block])
             else:
-                _from_samples(centred[one], k, (columns, across), (rows, down), part[one])
+                _from_samples(centred[block], k, (columns, across), (rows, down), part[block])
 
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
-        list(pool.map(piece, range(0, count, together)))
+        list(pool.map(piece, range(0, count, block_size)))
     return out
 
 
 def _pieces(grid: Grid) -> list[tuple[Grid, slice]]:
-    """A grid in stretches of at most ``LONGEST`` points of about one length."""
-    count = -(-grid.count // LONGEST)
+    """Return a grid divided into intervals of at most ``MAX_POINTS`` points, of nearly equal length."""
+    count = -(-grid.count // MAX_POINTS)
     ends = [grid.count * n // count for n in range(count + 1)]
     return [
         (Grid(grid.start + grid.step * first, grid.step, last - first), slice(first, last))
@@ -235,21 +236,22 @@ def _pieces(grid: Grid) -> list[tuple[Grid, slice]]:
 
 
 def _centred(field: PupilField, k: float) -> tuple[PupilField, tuple[float, float]]:
-    """The field without its common tilt, which its irradiance does not show, and the half widths of its directions
-    along x and y, radians per metre.
+    """Return the field without its common tilt, and the half-widths of its directions, radians per metre.
+
+    The common tilt does not affect the irradiance.
     """
-    turned, bands = [], []
+    centred, bands = [], []
     for cosine in (field.u, field.v):
         low, high = cosine.min(axis=1, keepdims=True), cosine.max(axis=1, keepdims=True)
-        turned.append(cosine - 0.5 * (low + high))
+        centred.append(cosine - 0.5 * (low + high))
         bands.append(0.5 * k * float(np.max(high - low)))
-    return replace(field, u=turned[0], v=turned[1]), (bands[0], bands[1])
+    return replace(field, u=centred[0], v=centred[1]), (bands[0], bands[1])
 
 
 def _from_samples(
     field: PupilField, k: float, across: tuple[Grid, FieldSamples], down: tuple[Grid, FieldSamples], out: np.ndarray
 ) -> None:
-    """Fill ``out`` (B, R, C) from samples of the field; rows of samples go together as in ``_irradiance``."""
+    """Fill ``out`` (B, R, C) from samples of the field; rows of samples are paired as in ``_irradiance``."""
     (x, columns), (y, rows) = across, down
     count, nodes = field.u.shape
     half = rows.count // 2
@@ -260,10 +262,10 @@ def _from_samples(
     start = middle[0] - 0.5 * (columns.count - 1) * step[0]
     product: np.ndarray = np.zeros((count, 2 * half, 2 * columns.count))
     for begin in range(0, nodes, _NODES):
-        some = slice(begin, begin + _NODES)
-        u, v = field.u[:, some], field.v[:, some]
-        factor = _phasor(k * (field.eikonal[:, some] + start * u + middle[1] * v))
-        factor *= field.amplitude[:, some]
+        block = slice(begin, begin + _NODES)
+        u, v = field.u[:, block], field.v[:, block]
+        factor = _phasor(k * (field.eikonal[:, block] + start * u + middle[1] * v))
+        factor *= field.amplitude[:, block]
         first = _phasor(0.5 * k * step[1] * v)
         left = _real_rows(first, first * first, half)
         product += left @ np.swapaxes(_real_rows(factor, _phasor(k * step[0] * u), columns.count), 1, 2)
@@ -278,8 +280,9 @@ def _from_samples(
 
 
 def _real_rows(first: np.ndarray, turn: np.ndarray, count: int) -> np.ndarray:
-    """Real parts, then imaginary ones, of first, first * turn, first * turn^2, ... of phasors (B, N): (B, 2 count, N),
-    by doubling as in ``_waves``.
+    """Return real, then imaginary parts of first * turn^n, n = 0 .. count - 1, of phasors (B, N): (B, 2 count, N).
+
+    The powers are built by doubling as in ``_waves``.
     """
     table = np.empty((len(first), count, first.shape[1]), np.complex128)
     table[:, 0] = first
@@ -293,7 +296,7 @@ def _real_rows(first: np.ndarray, turn: np.ndarray, count: int) -> np.ndarray:
 
 
 def _phasor(phase: np.ndarray) -> np.ndarray:
-    """exp(i phase)."""
+    """Return exp(i phase)."""
     out = np.empty(phase.shape, np.complex128)
     np.cos(phase, out=out.real)
     np.sin(phase, out=out.imag)
@@ -301,11 +304,11 @@ def _phasor(phase: np.ndarray) -> np.ndarray:
 
 
 def _irradiance(field: PupilField, k: float, x: Grid, y: Grid, kind: type, out: np.ndarray) -> None:
-    """Fill ``out`` (B, R, C).
+    """Fill ``out`` (B, R, C) with the irradiance.
 
-    Rows at equal distances d on both sides of the grid's middle share their waves: sum_j f_j exp(+-i q_j d) is
-    P +- i Q with P the sum of f_j cos(q_j d) and Q that of f_j sin(q_j d). So real tables of half of the rows do, and
-    a real matrix product of half of the work.
+    Rows at equal distances d on both sides of the grid's middle share their waves: sum_j f_j exp(+-i q_j d) is P +- i Q
+    with P the sum of f_j cos(q_j d) and Q that of f_j sin(q_j d). So real tables of half of the rows suffice, and a
+    real matrix product of half of the work.
     """
     count, nodes = field.u.shape
     half = (y.count + 1) // 2
@@ -314,36 +317,37 @@ def _irradiance(field: PupilField, k: float, x: Grid, y: Grid, kind: type, out: 
     factor = field.amplitude * np.exp(1j * k * (field.eikonal + middle * field.v))
     real = np.float32 if kind is np.complex64 else np.float64
     product: np.ndarray = np.zeros((count, 2 * half, 2 * x.count), real)
-    tables = max(1, _TABLES // (count * _SUMMED * (half + x.count))) * _SUMMED
+    tables = max(1, _TABLES // (count * _BLOCK_SUM * (half + x.count))) * _BLOCK_SUM
     for begin in range(0, nodes, tables):
-        some = slice(begin, begin + tables)
-        rows = _waves(k * field.v[:, some], Grid(first, y.step, half), 1.0, kind)
-        columns = _waves(k * field.u[:, some], x, factor[:, some], kind)
+        block = slice(begin, begin + tables)
+        rows = _waves(k * field.v[:, block], Grid(first, y.step, half), 1.0, kind)
+        columns = _waves(k * field.u[:, block], x, factor[:, block], kind)
         # a complex number is two real ones: (B, N, 2 half), its cosines and sines by turns, and (B, N, 2 C)
         left, right = np.swapaxes(rows.view(real), 1, 2), columns.view(real)
-        for start in range(0, left.shape[-1], _SUMMED):
-            product += left[..., start : start + _SUMMED] @ right[:, start : start + _SUMMED]
+        for start in range(0, left.shape[-1], _BLOCK_SUM):
+            product += left[..., start : start + _BLOCK_SUM] @ right[:, start : start + _BLOCK_SUM]
     terms: np.ndarray = product.view(kind).reshape(count, half, 2, x.count)
     even, odd = terms[:, :, 0], terms[:, :, 1]
     scale = 1.0 / field.wavelength**2
     for sign, part in ((1.0, out[:, y.count - half :]), (-1.0, out[:, half - 1 :: -1])):
-        one, two = even.real - sign * odd.imag, even.imag + sign * odd.real
-        np.multiply(one * one + two * two, scale, out=part)
+        real_part, imaginary_part = even.real - sign * odd.imag, even.imag + sign * odd.real
+        np.multiply(real_part * real_part + imaginary_part * imaginary_part, scale, out=part)
 
 
-def at_crossings(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Irradiance where a few columns of each image cross a few rows, (B, R, C): the sum of ``image``, term by term.
+def at_intersections(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the irradiance at the intersections of a few columns and rows of each image, (B, R, C).
 
-    Phases are worked out in double, waves in single precision: right to some 1e-6 of the peak.
+    It is the sum of ``image``, term by term. Phases are computed in double, waves in single precision: accurate to some
+    1e-6 of the peak.
 
     Parameters
     ----------
     field : PupilField
         B pupils.
-    x : np.ndarray
-        Of the columns, (B, C), metres.
-    y : np.ndarray
-        Of the rows, (B, R), metres.
+    x : (B, C) ndarray
+        Positions of the columns, metres.
+    y : (B, R) ndarray
+        Positions of the rows, metres.
     """
     turns = 1.0 / field.wavelength
 
@@ -358,22 +362,26 @@ def at_crossings(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.asarray((wave.real.astype(np.float64) ** 2 + wave.imag.astype(np.float64) ** 2) / field.wavelength**2)
 
 
-_AT_ONCE = 2
-"""Images whose wave tables are worked on together: they should stay in the processor's cache."""
+_BLOCK_IMAGES = 2
+"""Number of images whose wave tables are processed together: the tables should stay in the processor's cache."""
 
 _TABLES = 1 << 21
-"""Numbers in the wave tables of some nodes, which are made and summed before the next: memory does not grow with the
-nodes. Sums have the same order whatever it is."""
+"""Size of the wave tables of a block of nodes: memory does not grow with the number of nodes.
+
+The order of the sums does not depend on it.
+"""
 
 _NODES = 4096
-"""Nodes whose waves are made and summed before the next, where the field is sampled."""
+"""Number of nodes per block where the field is sampled."""
 
-_SUMMED = 160
-"""Nodes summed in one go: sums of sums lose less by rounding than one long sum, which matters in single precision."""
+_BLOCK_SUM = 160
+"""Number of nodes per partial sum: sums of sums have less rounding error than one long sum, in single precision above
+all.
+"""
 
 
 def _waves(frequency: np.ndarray, grid: Grid, factor: np.ndarray | float, kind: type) -> np.ndarray:
-    """Factor * exp(i frequency * point) for frequencies (..., N) on a grid, (..., N, count).
+    """Return factor * exp(i frequency * point) for frequencies (..., N) on a grid, (..., N, count).
 
     Built by doubling: exp(i q (p + m step)) = exp(i q p) exp(i q m step), with m = 1, 2, 4, ... from one phasor that is
     squared in double precision. Each sample is a product of at most log2(count) + 1 phasors.
@@ -435,21 +443,21 @@ def airy(radius: ArrayLike, wavelength: float, f_number: float, obscuration: flo
 
 
 FIT_ERROR = 1e-6
-"""Largest error of the matched transfer function; kernels grow until they reach it."""
+"""Largest error of the matched transfer function; the kernel is enlarged until it is reached."""
 
 MAX_REACH = 10
-"""Pixels to which a kernel may reach: enough for three quarters of what pixels can sample."""
+"""Largest half-width of a kernel, in pixels: enough for three quarters of what pixels can sample."""
 
 
 class UnsampledImageError(PhysicalError, ValueError):
-    """An image is too fine for its pixels, or the source's image too wide for the filter.
+    """An image is too fine for its pixels, or the source's image too large for the filter.
 
     Attributes
     ----------
-    remedy
-        What would do.
-    of_source
-        Whether that is a smaller source.
+    remedy : str
+        What to change.
+    of_source : bool
+        True when the remedy is a smaller source.
     """
 
     def __init__(self, text: str, remedy: str, of_source: bool) -> None:
@@ -462,26 +470,26 @@ class UnsampledImageError(PhysicalError, ValueError):
 class PixelResponse:
     """Filter that turns irradiance at pixel centres into the mean over the pixel, convolved with a disk source.
 
-    A diffraction image holds no frequency above its optical cut-off. Below it, the transfer function of pixel and
-    disk is matched by a small symmetric kernel, so that no oversampling is needed; above half the sampling frequency
-    it is not possible and the fit says so.
+    A diffraction image contains no frequency above its optical cut-off. Below it, the transfer function of pixel and
+    disk is matched by a small symmetric kernel, so that no oversampling is needed. Above half the sampling frequency
+    this is impossible, and the fit raises an error.
 
     Attributes
     ----------
-    kernel : np.ndarray
-        (2 reach + 1, 2 reach + 1).
+    kernel : (2 reach + 1, 2 reach + 1) ndarray
+        Filter kernel.
     """
 
     kernel: np.ndarray
 
     @property
     def reach(self) -> int:
-        """Pixels by which the filter shrinks an image on every side."""
+        """Number of pixels by which the filter shrinks an image on every side."""
         return self.kernel.shape[0] // 2
 
     @classmethod
     def fit(cls, pitch: float, disk: float, cutoff: float) -> PixelResponse:
-        """Fit the kernel.
+        """Fit the kernel to a pixel and a source.
 
         Parameters
         ----------
@@ -495,12 +503,12 @@ class PixelResponse:
         Raises
         ------
         UnsampledImageError
-            The image is not well enough sampled by the pixels.
+            The pixels do not sample the image well enough.
         """
         limit = cutoff * pitch  # cycles per pixel
         if limit > 0.45:
             raise UnsampledImageError(
-                f"the image has up to {limit:.2f} cycles per pixel, and its pixels sample 0.45",
+                f"the image has up to {limit:.2f} cycles per pixel, but its pixels can sample only 0.45",
                 "smaller pixels, a longer focal length, a longer wavelength or a narrower beam",
                 of_source=False,
             )
@@ -515,15 +523,15 @@ class PixelResponse:
                 kernel.setflags(write=False)
                 return cls(kernel)
         raise UnsampledImageError(
-            f"pixels and a source of {disk / pitch:.3g} pixels cannot be followed to better than {error:.1g} of the "
+            f"the response of pixels and a source of {disk / pitch:.3g} pixels is accurate only to {error:.1g} of the "
             f"peak in an image of up to {limit:.2f} cycles per pixel",
             "a smaller source or smaller pixels",
             of_source=disk > pitch,
         )
 
     def apply(self, images: np.ndarray) -> np.ndarray:
-        """Filter images (B, R, C); returns (B, R - 2 reach, C - 2 reach)."""
-        # messages about files of designs wait for this module
+        """Return the filtered images, (B, R - 2 reach, C - 2 reach), of images (B, R, C)."""
+        # imported late, since commands that only check files import this module
         import cv2
 
         r = self.reach
@@ -538,7 +546,7 @@ class PixelResponse:
 
 
 def _symmetric_kernel(fx: np.ndarray, fy: np.ndarray, wanted: np.ndarray, reach: int) -> tuple[np.ndarray, float]:
-    """Least-squares kernel of eightfold symmetry with a given transfer function, and its largest error."""
+    """Return the least-squares kernel of eightfold symmetry with a given transfer function, and its largest error."""
     orbits = []
     for i in range(reach + 1):
         for j in range(i + 1):
@@ -554,7 +562,8 @@ def _symmetric_kernel(fx: np.ndarray, fy: np.ndarray, wanted: np.ndarray, reach:
 
 
 def _jinc(z: np.ndarray) -> np.ndarray:
-    # messages about files of designs wait for this module, and scipy takes a tenth of a second
+    """Return 2 J1(z)/z, 1 at z = 0."""
+    # imported late, since commands that only check files import this module
     from scipy.special import j1
 
     safe = np.where(z == 0.0, 1.0, z)

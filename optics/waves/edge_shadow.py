@@ -5,8 +5,9 @@ are a smooth function of the stop's coordinates, as long as edges block no ray i
 polynomials and inverted at the corners of the edge's outline. The blocked part of the stop is then a set of convex
 polygons, which ``optics.waves.pupil_shadow`` subtracts from the pupil exactly.
 
-``IlluminatedStop`` is a quadrature over the illuminated part of a stop. A smooth integrand is integrated over the whole disk by
-Gauss' rule, and each shadow is subtracted by a rule of its own that ends at its sides. So edges leave no raster.
+``IlluminatedStop`` is a quadrature over the illuminated part of a stop. A smooth integrand is integrated over the whole
+disk by Gauss' rule, and each shadow is subtracted by a rule of its own that ends at its sides. So edges leave no
+raster.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ MOST_PIECES = 160
 """Largest number of pieces of a shadow: the time of a transfer function grows with the square of their number."""
 
 _WINDOW, _WINDOW_SIDES = 1.2, 16
-"""Radius and number of sides of the polygon about the unit disk to which outlines are clipped before their projection."""
+"""Radius and number of sides of the polygon about the unit disk to which outlines are clipped before projection."""
 
 _STEPS, _CLOSE = 12, 1e-9
 """Largest number of Newton steps for a corner, and tolerance of its position in radii of the stop."""
@@ -74,9 +75,7 @@ class StopOutlines:
 
     def take(self, images: np.ndarray | slice) -> StopOutlines:
         """Return the outlines of the images of the given indices."""
-        return StopOutlines(
-            tuple(polygons[images] for polygons in self.clear), tuple(polygons[images] for polygons in self.blocked)
-        )
+        return StopOutlines(tuple(p[images] for p in self.clear), tuple(p[images] for p in self.blocked))
 
     def shadows(self, count: int, further: Sequence[np.ndarray] = ()) -> np.ndarray:
         """Return the shadows of edges and of other bodies in ``count`` pupils.
@@ -156,8 +155,8 @@ def converged_shadows(
         if change < COARSE_SHARE:
             return pieces, change / 3.0
     raise UnphysicalError(
-        f"the shadow of round edges changes by {change:.2g} of the pupil between polygons of {more[-1]} sides and of half "
-        "as many: edges nearly coincide"
+        f"the shadow of round edges changes by {change:.2g} of the pupil between polygons of {more[-1]} sides and "
+        "of half as many: edges nearly coincide"
     )
 
 
@@ -256,8 +255,8 @@ def outlines_on_stop(
         worst = worst_miss(terms)
     if not worst < WORST_FIT:
         raise UnphysicalError(
-            f"polynomials of degree {DEGREE} miss the rays on a surface with edges by {worst:.2g} of the beam's size (at "
-            f"most {WORST_FIT:g}): its shadow in the pupil cannot be computed"
+            f"polynomials of degree {DEGREE} miss the rays on a surface with edges by {worst:.2g} of the beam's size "
+            f"(at most {WORST_FIT:g}): its shadow in the pupil cannot be computed"
         )
     clear, blocked = [], []
     for edge in edges:

@@ -79,8 +79,8 @@ def path_to_sphere(
     offset = position - origin
     along = np.sum(direction * offset, axis=-1)
     # path back to the sphere minus the radius, written so that nothing cancels and an infinite radius is allowed
-    bend = along**2 - np.sum(offset**2, axis=-1)
-    back = along if np.isinf(radius) else along + bend / (radius + np.sign(radius) * np.sqrt(radius**2 + bend))
+    term = along**2 - np.sum(offset**2, axis=-1)
+    back = along if np.isinf(radius) else along + term / (radius + np.sign(radius) * np.sqrt(radius**2 + term))
     return np.asarray(path - back)
 
 
@@ -157,10 +157,10 @@ def orthonormal_parts(
     (last,) ndarray
         Contributions, in the unit of ``difference``, with the signs of the terms.
     """
-    lit = weight > 0.0
-    root = np.sqrt(weight[lit] / np.sum(weight))
-    q, r = np.linalg.qr(zernike.basis(last, x[lit], y[lit]) * root[:, None])
-    return np.asarray(np.sign(np.diag(r)) * (q.T @ (difference[lit] * root)))
+    bright = weight > 0.0
+    root = np.sqrt(weight[bright] / np.sum(weight))
+    q, r = np.linalg.qr(zernike.basis(last, x[bright], y[bright]) * root[:, None])
+    return np.asarray(np.sign(np.diag(r)) * (q.T @ (difference[bright] * root)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,28 +217,28 @@ def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.nd
     basis = zernike.basis(last, x, y)
 
     def orthonormal(count: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        own = basis[:, :count]
+        terms = basis[:, :count]
         try:
-            root = np.linalg.cholesky(own.T @ (share[:, None] * own))
+            root = np.linalg.cholesky(terms.T @ (share[:, None] * terms))
         except np.linalg.LinAlgError as error:
             raise UnphysicalError(
                 f"{count} Zernike terms are not independent over the light that comes through"
             ) from error
-        parts = np.linalg.solve(root, own.T @ (share * values))
+        parts = np.linalg.solve(root, terms.T @ (share * values))
         return parts, np.linalg.solve(root.T, parts)
 
     _, level = orthonormal(3, difference)
     flat = difference - basis[:, :3] @ level
     parts, coefficients = orthonormal(last, flat)
     square = float(share @ flat**2)
-    left = float(share @ (flat - basis @ coefficients) ** 2)
+    residual = float(share @ (flat - basis @ coefficients) ** 2)
     phasor = share @ np.exp(2j * np.pi * flat)
     return PartFit(
         level,
         coefficients,
         parts,
         float(np.sqrt(max(square, 0.0))),
-        float(np.sqrt(max(left, 0.0))),
+        float(np.sqrt(max(residual, 0.0))),
         float(abs(phasor) ** 2),
     )
 
@@ -294,9 +294,9 @@ def aim_collimated(
     axes = transverse_axes(along, across)
     fan = RayFan(origin, along, axes, moves_position=True)
     middle, slope = aim(backend, to_stop, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
-    way = "bnij,pj->bpi" if target.ndim == 2 else "bnij,bpj->bpi"
-    near = middle + np.einsum(way, np.linalg.inv(slope), target)
-    q, _ = aim(backend, to_stop, fan, target, near, slope, AIM_TOLERANCE)
+    subscripts = "bnij,pj->bpi" if target.ndim == 2 else "bnij,bpj->bpi"
+    initial = middle + np.einsum(subscripts, np.linalg.inv(slope), target)
+    q, _ = aim(backend, to_stop, fan, target, initial, slope, AIM_TOLERANCE)
     return fan.at(q)[0], axes[:, 0]
 
 
@@ -376,15 +376,15 @@ def imaging_rays(
     twice, heading = (np.repeat(array, 2, axis=1) for array in (launched, heading))
     moves = np.broadcast_to(axes[:, None], (*launched.shape[:2], 2, 3)).reshape(twice.shape)
     out = jvp(backend, systems, twice, heading, moves, keep=(stop_index,))
-    hit, turn = (
+    hit, step = (
         np.swapaxes(step[..., :2].reshape(*launched.shape[:2], 2, 2), -1, -2)
         for step in (out.hits[stop_index], out.direction)
     )
-    place, leaving, path, valid = (array[:, ::2] for array in out.traced.numpy())
+    position, leaving, path, valid = (array[:, ::2] for array in out.traced.numpy())
     require_rays(valid, "the imaging path")
     launch_area = (to_stop.size[:, None] * stop.radius) ** 2 * nodes.weight / np.abs(np.linalg.det(hit))
-    amplitude = np.sqrt(np.abs(np.linalg.det(turn)) / np.sum(launch_area, axis=-1, keepdims=True)) * launch_area * valid
-    return ImagingRays(place, leaving, path, amplitude, launched, launch_area, axes)
+    amplitude = np.sqrt(np.abs(np.linalg.det(step)) / np.sum(launch_area, axis=-1, keepdims=True)) * launch_area * valid
+    return ImagingRays(position, leaving, path, amplitude, launched, launch_area, axes)
 
 
 def pupil_field(

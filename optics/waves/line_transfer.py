@@ -33,7 +33,7 @@ from optics.numerics.quadrature import PupilNodes, gauss, nodes_for
 from optics.waves.edge_shadow import StopOutlines
 from optics.waves.optical_transfer import WORST_TRANSFER
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import EVENLY, PupilFunction
+from optics.waves.pupil_stack import EVEN_WEIGHT, PupilFunction
 from optics.waves.pupil_terms import polynomials, products, smooth_terms
 
 RIM_SIDES = 2048
@@ -47,7 +47,7 @@ LINE_SIDES = 192
 LINES = (400, 720, 1440, 3240)
 """Numbers of lines across the pupil, tried in this order until the error is small enough."""
 
-SETTLED = 1e-4
+CONVERGED = 1e-4
 """Change of a transfer function from a third of the lines below which there are enough: the error is then a tenth of
 it.
 """
@@ -55,7 +55,7 @@ it.
 FEW_OUTLINES = 2
 """Largest number of outlines, besides the pupil's own edge, for which the smallest number of lines is tried."""
 
-_LEAST = 9
+_MIN_LINES = 9
 """Smallest number of lines between two positions where outlines begin or end."""
 
 _CORNER = 0.3
@@ -72,7 +72,7 @@ _TURNS = 0.2
 Near the cut-off there are few cells without an edge.
 """
 
-_AT_ONCE = 2**14
+_BLOCK_NODES = 2**14
 """Number of nodes processed in one block: some arrays of 200 kB that stay in the cache."""
 
 _APART = 1e-6
@@ -85,7 +85,7 @@ little beyond the pupil.
 
 
 @dataclass(frozen=True, eq=False)
-class CutPupil:
+class VignettedPupil:
     """Exit pupil vignetted by edges.
 
     Attributes
@@ -122,14 +122,14 @@ class LineTransfer:
     error: float
 
 
-def cut_pupils(
+def vignetted_pupils(
     pupils: Sequence[PupilFunction],
     u: np.ndarray,
     v: np.ndarray,
     nodes: PupilNodes,
     outlines: StopOutlines,
-    lit: np.ndarray,
-) -> tuple[CutPupil, ...]:
+    bright: np.ndarray,
+) -> tuple[VignettedPupil, ...]:
     """Return the pupils with the outlines of edges in them.
 
     Parameters
@@ -142,29 +142,29 @@ def cut_pupils(
         Nodes of the stop.
     outlines : StopOutlines
         Outlines of the edges on the stop's unit disk, for B images.
-    lit : (B, N) ndarray of bool
+    bright : (B, N) ndarray of bool
         Mask of the illuminated nodes; only these determine the positions of the edges.
     """
     degree = pupils[0].eikonal_terms.shape[-1] - 1
     on_stop = products(nodes.x, nodes.y, degree)
-    terms = smooth_terms(on_stop, nodes.weight, lit, np.stack([u, v], axis=-1), EVENLY).swapaxes(1, 2)
-    each: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []) for _ in pupils]
-    for which, kind in enumerate((outlines.clear, outlines.blocked)):
+    terms = smooth_terms(on_stop, nodes.weight, bright, np.stack([u, v], axis=-1), EVEN_WEIGHT).swapaxes(1, 2)
+    edges: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []) for _ in pupils]
+    for group, kind in enumerate((outlines.clear, outlines.blocked)):
         for polygons in kind:
             full = area(polygons) > SMALLEST
-            # where no rays are followed, polynomials of high degree run away beyond the rim, and p is nearly the stop's
+            # beyond the rim there are no rays and polynomials of high degree diverge; p is nearly the stop's coordinate
             within = polygons / np.maximum(np.hypot(polygons[..., 0], polygons[..., 1]), 1.0)[..., None]
             cosines = products(within[..., 0], within[..., 1], degree) @ np.swapaxes(terms, 1, 2)
             for k, pupil in enumerate(pupils):
                 if full[k]:
-                    place = np.linalg.solve(pupil.axes, (cosines[k] - pupil.centre).T) + (polygons[k] - within[k]).T
-                    each[k][which].append(_sensed(place[0] + 1j * place[1]))
-                elif which == 0:
-                    raise UnphysicalError(f"an edge leaves no light in the pupil of image {k}")
-    return tuple(CutPupil(pupil, tuple(c), tuple(b)) for pupil, (c, b) in zip(pupils, each, strict=True))
+                    position = np.linalg.solve(pupil.axes, (cosines[k] - pupil.centre).T) + (polygons[k] - within[k]).T
+                    edges[k][group].append(_counterclockwise(position[0] + 1j * position[1]))
+                elif group == 0:
+                    raise UnphysicalError(f"an edge blocks all light in the pupil of image {k}")
+    return tuple(VignettedPupil(pupil, tuple(c), tuple(b)) for pupil, (c, b) in zip(pupils, edges, strict=True))
 
 
-def lit_at(cut: CutPupil, points: np.ndarray) -> np.ndarray:
+def unvignetted_at(cut: VignettedPupil, points: np.ndarray) -> np.ndarray:
     """Return the mask of points p, complex (N,), that no edge except the pupil's own blocks."""
     out = np.ones(len(points), bool)
     for polygons, clear in ((cut.clear, True), (cut.blocked, False)):
@@ -175,7 +175,7 @@ def lit_at(cut: CutPupil, points: np.ndarray) -> np.ndarray:
 
 
 def line_transfers(
-    cut: Sequence[CutPupil],
+    cut: Sequence[VignettedPupil],
     wavelengths: Sequence[float],
     directions: np.ndarray,
     step: float,
@@ -186,7 +186,7 @@ def line_transfers(
 
     Parameters
     ----------
-    cut : sequence of CutPupil
+    cut : sequence of VignettedPupil
         Pupils of B images.
     wavelengths : sequence of float
         Wavelength of each image, metres.
@@ -210,27 +210,27 @@ def line_transfers(
     UnphysicalError
         Even with the largest number of lines the result differs from that of a third of them.
     """
-    tasks = [(one, wave, way) for one, wave in zip(cut, wavelengths, strict=True) for way in np.asarray(directions)]
+    tasks = [(p, wave, unit) for p, wave in zip(cut, wavelengths, strict=True) for unit in np.asarray(directions)]
 
-    def told(task: tuple[CutPupil, float, np.ndarray]) -> LineTransfer:
-        one, wave, way = task
-        return _line_transfer(one, wave, way, step, count, lines)
+    def computed(task: tuple[VignettedPupil, float, np.ndarray]) -> LineTransfer:
+        pupil, wave, direction = task
+        return _line_transfer(pupil, wave, direction, step, count, lines)
 
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
-        found = list(pool.map(told, tasks))
-    each = len(directions)
-    return [found[k : k + each] for k in range(0, len(found), each)]
+        transfers = list(pool.map(computed, tasks))
+    per_image = len(directions)
+    return [transfers[k : k + per_image] for k in range(0, len(transfers), per_image)]
 
 
 def _line_transfer(
-    cut: CutPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int]
+    cut: VignettedPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int]
 ) -> LineTransfer:
     """Return ``line_transfers`` of one image along one direction."""
-    way = complex(cut.pupil.normalised(*direction))
-    pitch, turn = wavelength * step * abs(way), way / abs(way)
-    every = int(np.ceil(pitch / _LONGEST_CELL))
-    pitch, count = pitch / every, (count - 1) * every + 1
-    tables, outlines = _turned_tables(cut.pupil, turn), _turned(cut, turn)
+    shift = complex(cut.pupil.normalised(*direction))
+    pitch, unit = wavelength * step * abs(shift), shift / abs(shift)
+    cells_per_step = int(np.ceil(pitch / _LONGEST_CELL))
+    pitch, count = pitch / cells_per_step, (count - 1) * cells_per_step + 1
+    tables, outlines = _rotated_tables(cut.pupil, unit), _rotated(cut, unit)
     wave, error = 2.0 * np.pi / wavelength, np.inf
     nodes = _first_nodes(pitch, wave * pitch * _steepest(tables[0]))
     many = len(cut.clear) + len(cut.blocked) > FEW_OUTLINES
@@ -239,32 +239,32 @@ def _line_transfer(
         fine = _autocorrelation(rows, tables, wave, pitch, count, nodes)
         coarse = _autocorrelation(rows.third(), tables, wave, pitch, count, nodes + 1)
         error = max(float(np.max(np.abs(a - b))) for a, b in zip(fine, coarse, strict=True))
-        if error < SETTLED:
+        if error < CONVERGED:
             break
         nodes += 1
     if not error < WORST_TRANSFER:
         raise UnphysicalError(
-            f"the transfer function of a pupil that edges cut still changes by {error:.2g} with further lines (at most "
+            f"the transfer function of a vignetted pupil still changes by {error:.2g} with more lines (at most "
             f"{WORST_TRANSFER:g}): its wavefront is too steep"
         )
-    return LineTransfer(fine[0][::every], fine[1][::every], error)
+    return LineTransfer(fine[0][::cells_per_step], fine[1][::cells_per_step], error)
 
 
-def _sensed(polygon: np.ndarray) -> np.ndarray:
+def _counterclockwise(polygon: np.ndarray) -> np.ndarray:
     """Return a polygon (V,), complex, counterclockwise."""
-    turned = np.sum((np.conj(polygon) * np.roll(polygon, -1)).imag) < 0.0
-    return polygon[::-1] if turned else polygon
+    clockwise = np.sum((np.conj(polygon) * np.roll(polygon, -1)).imag) < 0.0
+    return polygon[::-1] if clockwise else polygon
 
 
-def _turned(cut: CutPupil, turn: complex) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _rotated(cut: VignettedPupil, turn: complex) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return clear outlines, the pupil's own edge first, and blocked ones, rotated so that ``turn`` is along x."""
     angle = 2.0 * np.pi * np.arange(RIM_SIDES) / RIM_SIDES
-    rim = _sensed(np.sqrt(angle[1] / np.sin(angle[1])) * cut.pupil.edge.boundary(angle)[0])
+    rim = _counterclockwise(np.sqrt(angle[1] / np.sin(angle[1])) * cut.pupil.edge.boundary(angle)[0])
     back = np.conj(turn)
     return [back * p for p in (rim, *cut.clear)], [back * p for p in cut.blocked]
 
 
-def _turned_tables(pupil: PupilFunction, turn: complex) -> tuple[np.ndarray, np.ndarray]:
+def _rotated_tables(pupil: PupilFunction, turn: complex) -> tuple[np.ndarray, np.ndarray]:
     """Return the coefficients of eikonal and amplitude in coordinates whose x is ``turn``, (D + 1, D + 1) each."""
     count = len(pupil.eikonal_terms)
     node, to_table = _chebyshev_nodes(count)
@@ -326,7 +326,7 @@ class _Lines:
         Weights of the rule on a third of the lines, 0 for the others.
     begins, ends : (N, K) ndarray
         Ends of the illuminated intervals; both equal where there is none.
-    lit : (N, K) ndarray of bool
+    bright : (N, K) ndarray of bool
         True where there is an interval.
     low, high : float
         Limits of all lines along x.
@@ -337,7 +337,7 @@ class _Lines:
     coarse: np.ndarray
     begins: np.ndarray
     ends: np.ndarray
-    lit: np.ndarray
+    bright: np.ndarray
     low: float
     high: float
 
@@ -353,39 +353,39 @@ class _Lines:
         y, weight, coarse, start, stop = (a[used] for a in (y, weight, coarse, start, stop))
         dark = [_chords(polygon, y) for polygon in blocked]
         left, right = (np.array([chord[k] for chord in dark]).reshape(len(dark), len(y)).T for k in (0, 1))
-        right = np.where(right > left, right, np.inf)  # what a line does not meet lies behind its end
+        right = np.where(right > left, right, np.inf)  # shadows that a line does not meet are put behind its end
         order = np.argsort(left, axis=1)
         left, right = (np.take_along_axis(ends, order, axis=1) for ends in (left, right))
         # light begins where the shadows before end, and ends where the next one begins
         begins = np.maximum.accumulate(np.concatenate([start[:, None], right], axis=1), axis=1)
         ends = np.minimum(np.concatenate([left, stop[:, None]], axis=1), stop[:, None])
-        lit = ends > begins
-        most = max(int(np.max(np.sum(lit, axis=1), initial=0)), 1)
-        first = np.argsort(~lit, axis=1, kind="stable")[:, :most]
-        begins, ends, lit = (np.take_along_axis(a, first, axis=1) for a in (begins, ends, lit))
+        bright = ends > begins
+        most = max(int(np.max(np.sum(bright, axis=1), initial=0)), 1)
+        first = np.argsort(~bright, axis=1, kind="stable")[:, :most]
+        begins, ends, bright = (np.take_along_axis(a, first, axis=1) for a in (begins, ends, bright))
         rim = clear[0].real
-        begins, ends = (np.where(lit, a, start[:, None]) for a in (begins, ends))
-        return cls(y, weight, coarse, begins, ends, lit, float(np.min(rim)), float(np.max(rim)))
+        begins, ends = (np.where(bright, a, start[:, None]) for a in (begins, ends))
+        return cls(y, weight, coarse, begins, ends, bright, float(np.min(rim)), float(np.max(rim)))
 
     def third(self) -> _Lines:
         """Return the third of the lines that is a rule of its own."""
-        some = self.coarse != 0.0
-        y, weight, begins, ends, lit = (a[some] for a in (self.y, self.coarse, self.begins, self.ends, self.lit))
-        return _Lines(y, weight, weight, begins, ends, lit, self.low, self.high)
+        used = self.coarse != 0.0
+        y, weight, begins, ends, bright = (a[used] for a in (self.y, self.coarse, self.begins, self.ends, self.bright))
+        return _Lines(y, weight, weight, begins, ends, bright, self.low, self.high)
 
 
 def _between(clear: Sequence[np.ndarray], blocked: Sequence[np.ndarray]) -> list[tuple[float, float]]:
     """Return intervals of y between the positions where outlines begin, end or have a corner."""
     rim = clear[0].imag
     low, high = float(np.min(rim)), float(np.max(rim))
-    places = [low, high]
+    positions = [low, high]
     for polygon in (*clear[1:], *blocked):
         before, after = polygon - np.roll(polygon, 1), np.roll(polygon, -1) - polygon
         sharp = np.abs(np.angle(after * np.conj(before))) > _CORNER
-        places += [float(np.min(polygon.imag)), float(np.max(polygon.imag)), *polygon.imag[sharp].tolist()]
-    some = np.unique(np.clip(places, low, high))
-    some = some[np.concatenate([[True], np.diff(some) > _APART])]
-    return [(float(a), float(b)) for a, b in pairwise(some)]
+        positions += [float(np.min(polygon.imag)), float(np.max(polygon.imag)), *polygon.imag[sharp].tolist()]
+    distinct = np.unique(np.clip(positions, low, high))
+    distinct = distinct[np.concatenate([[True], np.diff(distinct) > _APART])]
+    return [(float(a), float(b)) for a, b in pairwise(distinct)]
 
 
 def _rule(low: float, high: float, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -393,7 +393,7 @@ def _rule(low: float, high: float, number: int) -> tuple[np.ndarray, np.ndarray,
 
     The result is positions, weights, and weights of the rule on every third position.
     """
-    count = max(_LEAST, 3 * int(np.ceil(number * (high - low) / 6.0)))
+    count = max(_MIN_LINES, 3 * int(np.ceil(number * (high - low) / 6.0)))
     half = 0.5 * (high - low)
     coarse = np.zeros(count)
     coarse[1::3] = half * _fejer(count // 3)
@@ -448,40 +448,40 @@ def _autocorrelation(
     nodes : int
         Number of nodes on a cell.
     """
-    place, weight, rest = _cell_weights(nodes)
+    position, weight, rest = _cell_weights(nodes)
     cells = int((rows.high - rows.low) / pitch) + 2
-    x = rows.low + pitch * (place[:, None] + np.arange(cells))
+    x = rows.low + pitch * (position[:, None] + np.arange(cells))
     last = len(tables[0]) - 1
     along, across = chebyshev.chebvander(x.ravel(), last).T, chebyshev.chebvander(rows.y, last)
     size = next_fast_len(cells + count)
     with_wave, without = np.zeros(size), np.zeros(size // 2 + 1)
     at_edges, at_edges_with = [], []
     edges = _Edges.of(rows, pitch, cells, rest)
-    some = max(1, _AT_ONCE // (nodes * cells))
-    for start in range(0, len(rows.y), some):
-        block = slice(start, start + some)
+    block_lines = max(1, _BLOCK_NODES // (nodes * cells))
+    for start in range(0, len(rows.y), block_lines):
+        block = slice(start, start + block_lines)
         path, light = ((across[block] @ table.T) @ along for table in tables)
         light = light.reshape(-1, nodes, cells)
-        counted, own = edges.counted(start, len(light), cells, weight)
+        share, edge_nodes = edges.counted(start, len(light), cells, weight)
         phase, values = (wave * path).reshape(light.shape), np.empty(light.shape, complex)
         np.multiply(light, np.cos(phase), out=values.real)
         np.multiply(light, np.sin(phase), out=values.imag)
-        at_edges.append(light.ravel()[own])
-        at_edges_with.append(values.ravel()[own])
-        every = np.outer(rows.weight[block], weight).ravel()
+        at_edges.append(light.ravel()[edge_nodes])
+        at_edges_with.append(values.ravel()[edge_nodes])
+        line_weights = np.outer(rows.weight[block], weight).ravel()
         for total, spectrum in (
-            (with_wave, fft(values * counted, size, axis=-1)),
-            (without, rfft(light * counted, size, axis=-1)),
+            (with_wave, fft(values * share, size, axis=-1)),
+            (without, rfft(light * share, size, axis=-1)),
         ):
-            squares = np.square(spectrum.reshape(len(every), -1).view(float))
-            total += (every @ squares).reshape(-1, 2).sum(axis=-1)
-    first, second, step, more = edges.pairs(rows.weight, count, weight)
+            squares = np.square(spectrum.reshape(len(line_weights), -1).view(float))
+            total += (line_weights @ squares).reshape(-1, 2).sum(axis=-1)
+    first, second, step, extra = edges.pairs(rows.weight, count, weight)
     light, values = np.concatenate(at_edges, axis=1), np.concatenate(at_edges_with, axis=1)
-    real = np.bincount(step, np.sum(more * light[:, first] * light[:, second], axis=0), count)
-    product = np.sum(more * values[:, first] * np.conj(values[:, second]), axis=0)
+    real = np.bincount(step, np.sum(extra * light[:, first] * light[:, second], axis=0), count)
+    product = np.sum(extra * values[:, first] * np.conj(values[:, second]), axis=0)
     both = np.bincount(step, product.real, count) + 1j * np.bincount(step, product.imag, count)
-    found, perfect = ifft(with_wave)[:count] + both, irfft(without, size)[:count] + real
-    return found / found[0].real, perfect / perfect[0]
+    transfer, perfect = ifft(with_wave)[:count] + both, irfft(without, size)[:count] + real
+    return transfer / transfer[0].real, perfect / perfect[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -514,12 +514,12 @@ class _Edges:
     @classmethod
     def of(cls, rows: _Lines, pitch: float, cells: int, rest: np.ndarray) -> _Edges:
         """Return the edges of lines."""
-        there = np.concatenate([rows.lit, rows.lit], axis=1)
-        row, number = np.nonzero(there)
-        sign = np.where(number < rows.lit.shape[1], 1.0, -1.0)
-        place = (np.concatenate([rows.begins, rows.ends], axis=1)[there] - rows.low) / pitch
-        cell = np.clip(np.floor(place).astype(int), 0, cells - 2)
-        return cls(row, cell, place - cell, sign, _rest(place - cell, rest), rest)
+        valid = np.concatenate([rows.bright, rows.bright], axis=1)
+        row, number = np.nonzero(valid)
+        sign = np.where(number < rows.bright.shape[1], 1.0, -1.0)
+        position = (np.concatenate([rows.begins, rows.ends], axis=1)[valid] - rows.low) / pitch
+        cell = np.clip(np.floor(position).astype(int), 0, cells - 2)
+        return cls(row, cell, position - cell, sign, _rest(position - cell, rest), rest)
 
     def counted(self, start: int, lines: int, cells: int, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the illuminated share of each node of some lines, and the indices of the nodes of edge cells.
@@ -568,21 +568,21 @@ class _Edges:
         near = (step >= 0) & (step < count)
         first, second, step = first[near], second[near], step[near]
         share = self.behind / weight[:, None]
-        more = _rest(np.maximum(self.bent[first], self.bent[second]), self.rest)
-        more -= self.behind[:, first] * share[:, second]
-        return first, second, step, more * (self.sign[first] * self.sign[second] * lines[self.row[first]])
+        extra = _rest(np.maximum(self.bent[first], self.bent[second]), self.rest)
+        extra -= self.behind[:, first] * share[:, second]
+        return first, second, step, extra * (self.sign[first] * self.sign[second] * lines[self.row[first]])
 
 
-def _rest(place: np.ndarray, polynomials_of_rest: np.ndarray) -> np.ndarray:
+def _rest(position: np.ndarray, polynomials_of_rest: np.ndarray) -> np.ndarray:
     """Return the weights (I, P) of a cell's nodes behind positions (P,) from 0 to 1 in it."""
-    return np.asarray(polynomials_of_rest.T @ legendre.legvander(2.0 * place - 1.0, len(polynomials_of_rest) - 1).T)
+    return np.asarray(polynomials_of_rest.T @ legendre.legvander(2.0 * position - 1.0, len(polynomials_of_rest) - 1).T)
 
 
 def _same_rows(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return all ordered pairs of items with the same row, from the ascending rows (P,) of all items."""
-    many = np.bincount(row)
-    start = np.cumsum(many) - many
-    own = many[row]
-    first = np.repeat(np.arange(len(row)), own)
-    second = np.arange(len(first)) - np.repeat(np.cumsum(own) - own, own) + np.repeat(start[row], own)
+    counts = np.bincount(row)
+    start = np.cumsum(counts) - counts
+    many = counts[row]
+    first = np.repeat(np.arange(len(row)), many)
+    second = np.arange(len(first)) - np.repeat(np.cumsum(many) - many, many) + np.repeat(start[row], many)
     return first, second

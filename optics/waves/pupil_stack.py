@@ -1,13 +1,13 @@
-"""The exit pupils of images as smooth functions: their edges, eikonals and amplitudes over direction cosines.
+"""Exit pupils of images as smooth functions: their edges, eikonals and amplitudes over direction cosines.
 
 A traced field is a set of nodes that serves one quadrature. A transfer function needs the pupil between the nodes and
 exactly up to its edge, so the field is fitted. In coordinates p, (u, v) = centre + axes @ p, the edge is the unit
-circle but for small harmonics (``optics.waves.pupil_terms``), shadows of bodies that stand in the beam are polygons
-(``optics.waves.pupil_shadow``), and eikonal and amplitude are polynomials in products of Chebyshev's. Through mirrors
-the eikonal in metres does not depend on the wavelength, so one fit serves a whole band.
+circle apart from small harmonics (``optics.waves.pupil_terms``), shadows of bodies in the beam are polygons
+(``optics.waves.pupil_shadow``), and eikonal and amplitude are polynomials in products of Chebyshev polynomials. Through
+mirrors the eikonal in metres does not depend on the wavelength, so one fit serves a whole band.
 
-There is one fit. The integrals are worked out in two ways: here at once for thousands of perturbed states, each at two
-frequencies and one focus, where code for one pupil spends its time on calls and not on numbers; in
+There is one fit, and two ways to compute the integrals: here at once for thousands of perturbed states, each at two
+frequencies and one focus, where code for one pupil would spend its time on calls and not on arithmetic; in
 ``optics.waves.optical_transfer`` for one pupil at any number of frequencies and focuses, with nodes for each.
 """
 
@@ -24,48 +24,74 @@ from optics.numerics.backend import one_blas_thread
 from optics.numerics.quadrature import PupilNodes, gauss, nodes_for
 from optics.waves.diffraction import PupilField
 from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES, PupilShadow, in_rows
-from optics.waves.pupil_terms import FAINTLY, PupilEdge, orders, polynomials, products, slopes, smooth_terms, to_terms
+from optics.waves.pupil_terms import (
+    DARK_WEIGHT,
+    PupilEdge,
+    orders,
+    polynomials,
+    products,
+    slopes,
+    smooth_terms,
+    to_terms,
+)
 
 DEGREE = 8
-"""Degree of the polynomials. The library's gf7 leaves 1e-8 wavelengths of eikonal, nominal or perturbed; with 5 nm of
-every Zernike term to seventh order on each mirror it leaves 2e-5."""
+"""Degree of the polynomials.
 
-CUT_DEGREES = (DEGREE, 10, 12, 14, 16, 18, 20)
-"""Degrees of the polynomials of a pupil with cut edges; the first that fits is used, or the best if none does. Light
-that edges leave comes from near the rims of fast aspheres, where no polynomial of a round pupil is the best one."""
+The library's gf7 leaves an eikonal residual of 1e-8 wavelengths, nominal or perturbed; with 5 nm of every Zernike term
+to seventh order on each mirror it leaves 2e-5.
+"""
+
+VIGNETTED_DEGREES = (DEGREE, 10, 12, 14, 16, 18, 20)
+"""Degrees of the polynomials of a vignetted pupil; the first that fits is used, or the best if none does.
+
+Light that edges let pass comes from near the rims of fast aspheres, where the polynomials of a round pupil are not
+optimal.
+"""
 
 MORE_DEGREES = (24, 28)
-"""Further ones of a pupil of which no shadows are taken off again: what they say of the dark is too large for that."""
+"""Further degrees for a pupil from which no shadows are subtracted; otherwise their values in the dark are too large.
+"""
 
-CUT_RINGS = 20
-"""Rings of the quadrature of a pupil with cut edges: a thin ring or a crescent of light has to hold rays enough for
-polynomials."""
+VIGNETTED_RINGS = 20
+"""Number of rings of the quadrature of a vignetted pupil.
 
-CUT_RESIDUAL = 1e-4
-"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the best of CUT_DEGREES may
-leave more. Their errors are largest along the edges, at which the overlap of a pupil with itself ends.
+A thin ring or a crescent of light has to contain enough rays for the polynomials.
+"""
+
+VIGNETTED_RESIDUAL = 1e-4
+"""Rms eikonal residual up to which a fit to a vignetted pupil is accepted at once, wavelengths.
+
+The best of VIGNETTED_DEGREES may leave more. The errors of the polynomials are largest along the edges, at which the
+overlap of a pupil with itself ends.
 """
 
 WORST_RESIDUAL = 1e-3
-"""Rms eikonal that a fit may leave, wavelengths; it changes the transfer function by about (2 pi)^2 of its square,
-4e-5, where the overlap averages over it."""
+"""Largest allowed rms eikonal residual of a fit, wavelengths.
+
+It changes the transfer function by about (2 pi)^2 of its square, 4e-5, where the overlap averages over it.
+"""
 
 LEAST_ALONG = 6
 LEAST_ACROSS = 10
 LEAST_SHADOW = 2
-"""Nodes on and across the chords of an overlap, and on each side of a shadow's box, for a constant phase. The transfer
-function is then right to 2e-6, and to 5e-5 with shadows."""
+"""Numbers of nodes along and across the chords of an overlap, and on each side of a shadow's box, for a constant phase.
 
-FEWEST_LIT = (DEGREE + 1) * (DEGREE + 2) // 2
-"""Nodes in the light from which polynomials are told: as many as those of the lowest degree."""
+The transfer function is then accurate to 2e-6, and to 5e-5 with shadows."""
 
-EVENLY = 1e-2
-"""As ``FAINTLY``, of direction cosines and amplitudes, which vary so little that nothing has to be added to them."""
+MIN_ILLUMINATED = (DEGREE + 1) * (DEGREE + 2) // 2
+"""Smallest number of illuminated nodes for a fit: the number of polynomials of the lowest degree."""
 
-_AT_ONCE = 2**14
-"""Points of overlaps worked on together: some arrays of 1 MB that stay in the cache."""
-_SHADOWS_AT_ONCE = 2**16
-"""Nodes at once for shadows, where the way to the points is longer than what is done there."""
+EVEN_WEIGHT = 1e-2
+"""Relative weight of dark nodes, like ``DARK_WEIGHT``, for direction cosines and amplitudes.
+
+These vary so little that no higher polynomials are needed.
+"""
+
+_BLOCK = 2**14
+"""Number of points of overlaps per block: some arrays of 1 MB that stay in the cache."""
+_BLOCK_SHADOWS = 2**16
+"""Number of nodes per block for shadows, where finding the points takes longer than the arithmetic."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,23 +100,23 @@ class PupilStack:
 
     Attributes
     ----------
-    centre : np.ndarray
-        Direction cosines (u, v) of p = 0, (B, 2).
-    axes : np.ndarray
-        d(u, v)/dp, (B, 2, 2).
-    harmonics : np.ndarray
-        Of the edges in p, complex (2H + 1, B).
-    eikonal_terms, amplitude_terms : np.ndarray
-        Coefficients of T_i(x) T_j(y), (B, D + 1, D + 1); metres, and of the amplitude density (unit power: its square
+    centre : (B, 2) ndarray
+        Direction cosines (u, v) of p = 0.
+    axes : (B, 2, 2) ndarray
+        Derivatives d(u, v)/dp.
+    harmonics : (2H + 1, B) ndarray
+        Complex harmonics of the edges in p.
+    eikonal_terms, amplitude_terms : (B, D + 1, D + 1) ndarray
+        Coefficients of T_i(x) T_j(y) of the eikonal, metres, and of the amplitude density (unit power: its square
         integrates to 1 over du dv).
-    span : np.ndarray
-        How far the eikonal runs over each pupil, a plane taken out, (B,), metres.
-    residual : np.ndarray
-        Rms eikonal that the fit leaves, (B,), metres.
-    amplitude_residual : np.ndarray
-        Rms of what it leaves of the amplitude, share of its mean, (B,).
-    shadow : PupilShadow | None
-        What bodies in the beams take, None if nothing stands there.
+    span : (B,) ndarray
+        Peak-to-valley of the eikonal over each pupil after removal of a plane, metres.
+    residual : (B,) ndarray
+        Rms residual of the eikonal fit, metres.
+    amplitude_residual : (B,) ndarray
+        Rms residual of the amplitude fit, relative to the mean amplitude.
+    shadow : PupilShadow, optional
+        Shadows of bodies in the beams; None without any.
     """
 
     centre: np.ndarray
@@ -114,61 +140,59 @@ class PupilStack:
         degree: int = DEGREE,
         shadows: np.ndarray | None = None,
         rim_sides: int = FEW_SIDES,
-        lit: np.ndarray | None = None,
+        bright: np.ndarray | None = None,
     ) -> PupilStack:
         """Fit pupils traced at nodes of the stop, all of which carry light.
 
         Parameters
         ----------
-        u : np.ndarray
-            Direction cosines along the detector's first axis, (B, N).
-        v : np.ndarray
-            Likewise along the second.
-        eikonal : np.ndarray
-            (B, N), metres.
-        amplitude : np.ndarray
-            Of the nodes as in ``optics.waves.diffraction.PupilField``, (B, N), positive.
+        u, v : (B, N) ndarray
+            Direction cosines along the detector's two axes.
+        eikonal : (B, N) ndarray
+            Eikonal, metres.
+        amplitude : (B, N) ndarray
+            Amplitudes of the nodes as in ``optics.waves.diffraction.PupilField``, positive.
         nodes : PupilNodes
             N nodes of a quadrature over the stop's unit disk.
         degree : int
-            Of the polynomials.
-        shadows : np.ndarray | None
-            Polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for free beams.
+            Degree of the polynomials.
+        shadows : (B, K, V, 2) ndarray, optional
+            Polygons on the stop's unit disk that do not overlap; None for free beams.
         rim_sides : int
-            Of the polygon that stands for the edge where a shadow reaches over it.
-        lit : np.ndarray | None
-            Which nodes lie outside of the shadows, (B, N); None for all. What the others hold, NaN too, is not looked
-            at: what the polynomials say there is taken off again, see ``smooth_terms``.
+            Number of sides of the polygon that represents the edge where a shadow extends over it.
+        bright : (B, N) ndarray of bool, optional
+            Mask of the nodes outside the shadows; None for all. The values of the others, NaN too, are ignored: the
+            polynomials there are subtracted again, see ``smooth_terms``.
 
         Raises
         ------
         ValueError
-            Too few nodes for the degree.
+            There are too few nodes for the degree.
         """
         root = np.sqrt(nodes.weight)
         i, j = orders(degree)
         cosines = np.stack([u, v], axis=1)
-        if lit is None:
+        if bright is None:
             terms = cosines @ to_terms(nodes, degree).T
         else:
             on_stop = products(nodes.x, nodes.y, degree)
-            terms = smooth_terms(on_stop, nodes.weight, lit, np.swapaxes(cosines, 1, 2), EVENLY).swapaxes(1, 2)
-            cosines = np.where(lit[:, None], cosines, terms @ on_stop.T)
+            terms = smooth_terms(on_stop, nodes.weight, bright, np.swapaxes(cosines, 1, 2), EVEN_WEIGHT).swapaxes(1, 2)
+            cosines = np.where(bright[:, None], cosines, terms @ on_stop.T)
         centre, axes, harmonics = _edges(terms, degree)
         (ux, vx), (uy, vy) = (np.moveaxis(terms @ slope.T, 1, 0) for slope in slopes(nodes, degree))
         density = amplitude / (nodes.weight * np.abs(ux * vy - uy * vx))
-        place = np.linalg.solve(axes, cosines - centre[..., None])
-        plain = products(place[:, 0], place[:, 1], degree)
+        position = np.linalg.solve(axes, cosines - centre[..., None])
+        plain = products(position[:, 0], position[:, 1], degree)
         design = plain * root[:, None]
         both = np.stack([eikonal, density], axis=-1)
-        if lit is None:
-            turned, weight = np.swapaxes(design, 1, 2), np.sum(nodes.weight)
-            solution = np.linalg.solve(turned @ design, turned @ (both * root[:, None]))
+        if bright is None:
+            transposed, weight = np.swapaxes(design, 1, 2), np.sum(nodes.weight)
+            solution = np.linalg.solve(transposed @ design, transposed @ (both * root[:, None]))
         else:
-            parts = zip((both[..., :1], both[..., 1:]), (FAINTLY, EVENLY), strict=True)
-            solution = np.concatenate([smooth_terms(plain, nodes.weight, lit, *part) for part in parts], axis=-1)
-            both = np.where(lit[..., None], both, plain @ solution)
-            weight = (lit @ nodes.weight)[:, None]
+            parts = zip((both[..., :1], both[..., 1:]), (DARK_WEIGHT, EVEN_WEIGHT), strict=True)
+            solution = np.concatenate([smooth_terms(plain, nodes.weight, bright, *part) for part in parts], axis=-1)
+            both = np.where(bright[..., None], both, plain @ solution)
+            weight = (bright @ nodes.weight)[:, None]
         both = both * root[:, None]
         rest = np.sqrt(np.sum((both - design @ solution) ** 2, axis=1) / weight)
         level = i + j < 2
@@ -176,20 +200,20 @@ class PupilStack:
         bent = (both[..., 0] - plane) / root
         table = np.zeros((2, len(u), degree + 1, degree + 1))
         table[:, :, i, j] = np.moveaxis(solution, -1, 0)
-        mean = np.mean(density, axis=-1) if lit is None else np.mean(density, axis=-1, where=lit)
+        mean = np.mean(density, axis=-1) if bright is None else np.mean(density, axis=-1, where=bright)
         shadow = None
         if shadows is not None and shadows.shape[1]:
-            # where no rays are followed, polynomials of high degree run away beyond the rim, and p is nearly the stop's
-            within = shadows if lit is None else shadows / np.maximum(np.hypot(*shadows.T).T, 1.0)[..., None]
+            # beyond the rim there are no rays and polynomials of high degree diverge; p is nearly the stop's coordinate
+            within = shadows if bright is None else shadows / np.maximum(np.hypot(*shadows.T).T, 1.0)[..., None]
             corner = products(within[..., 0], within[..., 1], degree).reshape(len(u), -1, len(i))
-            place = np.linalg.solve(axes, terms @ corner.swapaxes(1, 2) - centre[..., None])
-            place = place.swapaxes(1, 2).reshape(shadows.shape) + (shadows - within)
-            shadow = PupilShadow.within(place, harmonics, rim_sides)
+            position = np.linalg.solve(axes, terms @ corner.swapaxes(1, 2) - centre[..., None])
+            position = position.swapaxes(1, 2).reshape(shadows.shape) + (shadows - within)
+            shadow = PupilShadow.within(position, harmonics, rim_sides)
         span, amplitude_rest = np.ptp(bent, axis=-1), rest[:, 1] / mean
         return cls(centre, axes, harmonics, table[0], table[1], span, rest[:, 0], amplitude_rest, shadow)
 
     @classmethod
-    def followed(
+    def fit_vignetted(
         cls,
         u: np.ndarray,
         v: np.ndarray,
@@ -198,52 +222,48 @@ class PupilStack:
         nodes: PupilNodes,
         wavelength: float,
         shadows: np.ndarray | None,
-        lit: np.ndarray,
+        bright: np.ndarray,
     ) -> PupilStack:
-        """``fit`` to pupils that edges cut, by polynomials of the first degree that follows all of them, or of that
-        which leaves the least.
+        """Fit vignetted pupils by polynomials of the first degree that is accurate enough, or of the best degree.
 
         Parameters
         ----------
-        u : np.ndarray
-            As of ``fit``, and so are those below.
-        v : np.ndarray
-            As of ``fit``.
-        eikonal : np.ndarray
-            As of ``fit``.
-        amplitude : np.ndarray
-            As of ``fit``.
+        u, v : (B, N) ndarray
+            Direction cosines, as for ``fit``.
+        eikonal, amplitude : (B, N) ndarray
+            Eikonal and amplitude, as for ``fit``.
         nodes : PupilNodes
-            As of ``fit``.
+            Quadrature over the stop, as for ``fit``.
         wavelength : float
-            Of the light, metres.
-        shadows : np.ndarray | None
-            As of ``fit``.
-        lit : np.ndarray
-            As of ``fit``.
+            Wavelength, metres.
+        shadows : (B, K, V, 2) ndarray, optional
+            Shadows, as for ``fit``.
+        bright : (B, N) ndarray of bool
+            Mask of the nodes outside the shadows, as for ``fit``.
         """
         best: PupilStack | None = None
-        for degree in CUT_DEGREES + (() if shadows is not None and shadows.shape[1] else MORE_DEGREES):
+        for degree in VIGNETTED_DEGREES + (() if shadows is not None and shadows.shape[1] else MORE_DEGREES):
             if (degree + 1) * (degree + 2) // 2 > nodes.count:
                 break
-            stack = cls.fit(u, v, eikonal, amplitude, nodes, degree, shadows, RIM_SIDES, lit)
+            stack = cls.fit(u, v, eikonal, amplitude, nodes, degree, shadows, RIM_SIDES, bright)
             if best is None or np.max(stack.residual) < np.max(best.residual):
                 best = stack
-            if np.all(stack.residual <= CUT_RESIDUAL * wavelength):
+            if np.all(stack.residual <= VIGNETTED_RESIDUAL * wavelength):
                 break
         assert best is not None
         return best
 
     @property
     def bend(self) -> np.ndarray:
-        """How far each edge is from an ellipse, (B,); ``transfer`` needs at most
-        ``optics.waves.pupil_terms.WORST_BEND``.
+        """Departure of each edge from an ellipse, (B,).
+
+        ``transfer`` allows at most ``optics.waves.pupil_terms.WORST_BEND``.
         """
         last = len(self.harmonics) // 2
         return np.asarray(np.arange(-last, last + 1) ** 2 @ np.abs(self.harmonics) - 1.0)
 
     def take(self, which: np.ndarray | slice) -> PupilStack:
-        """The pupils of the given indices."""
+        """Return the pupils of the given indices."""
         return PupilStack(
             self.centre[which],
             self.axes[which],
@@ -257,7 +277,7 @@ class PupilStack:
         )
 
     def functions(self) -> tuple[PupilFunction, ...]:
-        """Each pupil by itself."""
+        """Return each pupil as a ``PupilFunction``."""
         return tuple(
             PupilFunction(
                 self.centre[i],
@@ -273,26 +293,26 @@ class PupilStack:
         )
 
     def transfer(self, frequency: np.ndarray, wavelengths: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Polychromatic transfer functions in the plane of the traced detector.
+        """Return polychromatic transfer functions in the plane of the traced detector.
 
         Parameters
         ----------
-        frequency : np.ndarray
-            (M, 2) along the detector's two axes, cycles/m.
-        wavelengths : np.ndarray
-            (K,), metres.
-        weights : np.ndarray
-            (K,) share of the signal at each; they need not sum to 1.
+        frequency : (M, 2) ndarray
+            Spatial frequencies along the detector's two axes, cycles/m.
+        wavelengths : (K,) ndarray
+            Wavelengths, metres.
+        weights : (K,) ndarray
+            Share of the signal at each wavelength; they need not sum to 1.
 
         Returns
         -------
-        np.ndarray
-            Complex (B, M), 0 beyond the cut-off.
+        (B, M) ndarray
+            Complex transfer functions, 0 beyond the cut-off.
 
         Raises
         ------
         ValueError
-            An edge that is far from an ellipse.
+            An edge is far from an ellipse.
         """
         total = self._clear(frequency, wavelengths, weights / np.sum(weights))
         if self.shadow is not None:
@@ -300,19 +320,19 @@ class PupilStack:
         return np.asarray(total / self.power[:, None])
 
     def _shifts(self, frequency: np.ndarray, wavelengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normalised shifts, complex (B, K * M), and the wave numbers of each, (K * M,)."""
+        """Return normalised shifts, complex (B, K * M), and the wave number of each, (K * M,)."""
         steps = (wavelengths[:, None, None] * frequency).reshape(-1, 2)
         moved = np.linalg.solve(self.axes, np.broadcast_to(steps.T, (len(self.axes), 2, len(steps))))
         return moved[:, 0] + 1j * moved[:, 1], np.repeat(2.0 * np.pi / wavelengths, len(frequency))
 
     def _clear(self, frequency: np.ndarray, wavelengths: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """The integral over the overlaps of the clear pupils, mean over the band, (B, M)."""
+        """Return the integral over the overlaps of the clear pupils, mean over the band, (B, M)."""
         shift, wave = self._shifts(frequency, wavelengths)
         steps = shift.shape[1]
         edges = PupilEdge(np.repeat(self.harmonics, steps, axis=1))
         right, left, inside = edges.corners(shift.ravel())
         values = np.zeros(shift.shape, complex)
-        for which, across, along in self._pieces(float(np.max(wave)), steps, _AT_ONCE):
+        for which, across, along in self._pieces(float(np.max(wave)), steps, _BLOCK):
             flat = (which[:, None] * steps + np.arange(steps)).ravel()
             part = PupilEdge(edges.harmonics[:, flat])
             rules = (gauss(count) for count in (across, along))
@@ -325,22 +345,22 @@ class PupilStack:
     def _shadowed(
         self, shadow: PupilShadow, frequency: np.ndarray, wavelengths: np.ndarray, share: np.ndarray
     ) -> np.ndarray:
-        """What the shadows add to ``_clear``."""
+        """Return the shadows' contribution to ``_clear``."""
         shift, wave = self._shifts(frequency, wavelengths)
         values = np.zeros(shift.shape, complex)
-        for which, _, along in self._pieces(float(np.max(wave)), 1, _SHADOWS_AT_ONCE):
-            some, moved = self.take(which), shift[which]
+        for which, _, along in self._pieces(float(np.max(wave)), 1, _BLOCK_SHADOWS):
+            stack, moved = self.take(which), shift[which]
             parts = shadow.take(which).parts(moved, LEAST_SHADOW + along - LEAST_ALONG)
-            # light of whole pieces once for all shifts, of others and in the other pupil for every region by itself
+            # whole pieces are evaluated once for all shifts, other regions and those in the other pupil one by one
             pieces, count = parts.whole.shape[1], len(parts.piece)
             other = parts.points - (parts.sign * moved[parts.pupil, parts.step])[:, None]
             owner = np.concatenate([np.repeat(np.arange(len(which)), pieces), parts.pupil, parts.pupil[count:]])
-            every = np.concatenate([parts.whole.reshape(-1, other.shape[1]), other, parts.points[count:]])
-            path, light = some._values_at(owner, every)
+            points = np.concatenate([parts.whole.reshape(-1, other.shape[1]), other, parts.points[count:]])
+            path, light = stack._values_at(owner, points)
             first, last = len(which) * pieces, len(which) * pieces + len(other)
-            own = np.concatenate([parts.pupil[:count] * pieces + parts.piece, np.arange(last, len(owner))])
-            phase = (parts.sign * wave[parts.step])[:, None] * (path[own] - path[first:last])
-            light = light[own] * light[first:last] * parts.weights
+            indices = np.concatenate([parts.pupil[:count] * pieces + parts.piece, np.arange(last, len(owner))])
+            phase = (parts.sign * wave[parts.step])[:, None] * (path[indices] - path[first:last])
+            light = light[indices] * light[first:last] * parts.weights
             at = parts.pupil * shift.shape[1] + parts.step
             real, imaginary = (
                 np.bincount(at, np.einsum("fq,fq->f", part(phase), light), moved.size) for part in (np.cos, np.sin)
@@ -349,7 +369,7 @@ class PupilStack:
         return np.asarray(np.einsum("k,bkm->bm", share, values.reshape(len(values), len(share), len(frequency))))
 
     def _pieces(self, wave: float, shifts: int, points: int) -> Iterator[tuple[np.ndarray, int, int]]:
-        """Pupils that take the same numbers of nodes, in pieces of bounded size."""
+        """Yield pupils that need the same numbers of nodes, in blocks of bounded size."""
         along = np.array([nodes_for(float(span), LEAST_ALONG) for span in wave * self.span])
         for count in np.unique(along):
             rows = int(count) + LEAST_ACROSS - LEAST_ALONG
@@ -359,7 +379,7 @@ class PupilStack:
                 yield some[start : start + room], rows, int(count)
 
     def _sums(self, points: np.ndarray, weight: np.ndarray, shift: np.ndarray, wave: np.ndarray) -> np.ndarray:
-        """Integrals over overlaps with points c and weights (B, S, Q), of shifts (B, S) at wave numbers (S,)."""
+        """Return integrals over overlaps with points c and weights (B, S, Q), of shifts (B, S) at wave numbers (S,)."""
         half = 0.5 * shift[..., None]
         (path, light), (path_behind, light_behind) = (self._values(c) for c in (points + half, points - half))
         phase = wave[:, None] * (path - path_behind)
@@ -368,7 +388,7 @@ class PupilStack:
         return np.asarray(real + 1j * imaginary)
 
     def _values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Eikonal and amplitude at p (B, S, Q), of its shape."""
+        """Return eikonal and amplitude at p (B, S, Q), of its shape."""
         eikonal, amplitude = (
             part.reshape(p.shape)
             for part in polynomials((self.eikonal_terms, self.amplitude_terms), p.reshape(len(p), -1))
@@ -376,25 +396,25 @@ class PupilStack:
         return eikonal, amplitude
 
     def _values_at(self, owner: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values at places p (F, Q) of pupils (F,)."""
-        order, place, most = in_rows(owner, len(self.axes))
-        points = np.zeros((len(self.axes), most, p.shape[1]), complex)
-        points[owner[order], place] = p[order]
-        back = np.empty_like(order)
-        back[order] = place
-        step = max(1, _AT_ONCE // (most * p.shape[1]))
+        """Return eikonal and amplitude at positions p (F, Q) of pupils (F,)."""
+        order, column, width = in_rows(owner, len(self.axes))
+        points = np.zeros((len(self.axes), width, p.shape[1]), complex)
+        points[owner[order], column] = p[order]
+        columns = np.empty_like(order)
+        columns[order] = column
+        step = max(1, _BLOCK // (width * p.shape[1]))
         parts = [slice(k, k + step) for k in range(0, len(points), step)]
         path, light = (np.concatenate(a) for a in zip(*(self.take(s)._values(points[s]) for s in parts), strict=True))
-        return path[owner, back], light[owner, back]
+        return path[owner, columns], light[owner, columns]
 
     @property
     def light(self) -> np.ndarray:
-        """Share of the clear pupils' light that the shadows leave, (B,)."""
+        """Fraction of the clear pupils' light that passes the shadows, (B,)."""
         return np.asarray(self.power / self._clear_power)
 
     @cached_property
     def power(self) -> np.ndarray:
-        """Integral of the amplitude's square over each pupil in p, (B,)."""
+        """Integral of the squared amplitude over each pupil in p, (B,)."""
         if self.shadow is None:
             return self._clear_power
         points, weight = (a.reshape(len(self.axes), -1) for a in self.shadow.whole(LEAST_SHADOW + 2))
@@ -402,18 +422,19 @@ class PupilStack:
 
     @cached_property
     def _clear_power(self) -> np.ndarray:
+        """Integral of the squared amplitude over each clear pupil in p, (B,)."""
         return clear_power(self.harmonics, self.amplitude_terms)
 
 
 def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarray:
-    """Integral of the amplitude's square over pupils in p, no shadows in them, (B,).
+    """Return the integral of the squared amplitude over pupils in p without shadows, (B,).
 
     Parameters
     ----------
-    harmonics : np.ndarray
-        Of their edges, complex (2H + 1, B).
-    amplitude_terms : np.ndarray
-        As in ``PupilStack``, (B, D + 1, D + 1).
+    harmonics : (2H + 1, B) ndarray
+        Complex harmonics of their edges.
+    amplitude_terms : (B, D + 1, D + 1) ndarray
+        Amplitude coefficients, as in ``PupilStack``.
     """
     edges, nothing = PupilEdge(harmonics), np.zeros(len(amplitude_terms), complex)
     right, left, _ = edges.corners(nothing)
@@ -423,7 +444,7 @@ def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarra
 
 
 def _edges(terms: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres (B, 2), axes (B, 2, 2) and harmonics (2H + 1, B) of the images of the unit circle by maps (B, 2, K)."""
+    """Return centres (B, 2), axes (B, 2, 2) and harmonics (2H + 1, B) of the unit circle's images by maps (B, 2, K)."""
     samples = 4 * degree
     angle = 2.0 * np.pi * np.arange(samples) / samples
     rim = terms @ products(np.cos(angle), np.sin(angle), degree).T
@@ -439,7 +460,7 @@ def _edges(terms: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 SHADOW_NODES = 8
-"""Along each side of a shadow's box, for the light that it takes: the amplitude is nearly even."""
+"""Number of nodes along each side of a shadow's box for the light that it blocks: the amplitude is nearly uniform."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -448,26 +469,26 @@ class PupilFunction:
 
     Attributes
     ----------
-    centre : np.ndarray
-        Direction cosines (u, v) of p = 0, (2,).
-    axes : np.ndarray
-        d(u, v)/dp, (2, 2).
+    centre : (2,) ndarray
+        Direction cosines (u, v) of p = 0.
+    axes : (2, 2) ndarray
+        Derivatives d(u, v)/dp.
     edge : PupilEdge
-        Of the pupil in p.
-    eikonal_terms : np.ndarray
-        Coefficients of T_i(x) T_j(y), metres, (D + 1, D + 1).
-    amplitude_terms : np.ndarray
-        Likewise of the amplitude density (unit power: its square integrates to 1 over du dv).
+        Edge of the pupil in p.
+    eikonal_terms : (D + 1, D + 1) ndarray
+        Coefficients of T_i(x) T_j(y) of the eikonal, metres.
+    amplitude_terms : (D + 1, D + 1) ndarray
+        Coefficients of the amplitude density (unit power: its square integrates to 1 over du dv).
     eikonal_residual : float
-        Rms eikonal that the fit leaves, metres.
+        Rms residual of the eikonal fit, metres.
     amplitude_residual : float
-        Rms of what the fit leaves of the amplitude, share of its mean.
-    shadow : PupilShadow | None
-        What bodies in the beam take of the pupil (one pupil's), None if nothing stands there.
+        Rms residual of the amplitude fit, relative to the mean amplitude.
+    shadow : PupilShadow, optional
+        Shadow of bodies in the beam (of this one pupil); None without any.
     finer : int
-        Further nodes along each direction that its transfer function takes.
+        Number of additional nodes along each direction for its transfer function.
     transfer_error : float
-        Change of that from fewer nodes; NaN where nobody has looked.
+        Change of the transfer function from fewer nodes; NaN where it was not determined.
     """
 
     centre: np.ndarray
@@ -482,18 +503,18 @@ class PupilFunction:
     transfer_error: float = np.nan
 
     def normalised(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Normalised shift, complex, of shifts (x, y) of the direction cosines, any equal shapes."""
+        """Return the normalised shift, complex, of shifts (x, y) of the direction cosines, of any equal shapes."""
         (a, b), (c, d) = np.linalg.inv(self.axes)
         return np.asarray((a * x + b * y) + 1j * (c * x + d * y))
 
     def cosines(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Direction cosines (u, v, w) at p, of p's shape; w > 0 along the detector's normal, downstream."""
+        """Return direction cosines (u, v, w) at p, of p's shape; w > 0 along the detector's normal, downstream."""
         u = self.centre[0] + self.axes[0, 0] * p.real + self.axes[0, 1] * p.imag
         v = self.centre[1] + self.axes[1, 0] * p.real + self.axes[1, 1] * p.imag
         return u, v, np.sqrt(np.maximum(1.0 - u * u - v * v, 0.0))
 
     def values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Eikonal (metres) and amplitude density at p, of p's shape."""
+        """Return eikonal (metres) and amplitude density at p, of p's shape."""
         eikonal, amplitude = (
             part.reshape(p.shape)
             for part in polynomials((self.eikonal_terms[None], self.amplitude_terms[None]), p.reshape(1, -1))
@@ -501,28 +522,28 @@ class PupilFunction:
         return eikonal, amplitude
 
     def cutoff(self, direction: np.ndarray, wavelength: float) -> np.ndarray:
-        """Cut-off frequencies, cycles/m, (M,), along directions (M, 2) in detector x, y (need not be unit)."""
+        """Return cut-off frequencies, cycles/m, (M,), along directions (M, 2) in detector x, y (need not be unit)."""
         unit = np.asarray(direction) / np.linalg.norm(direction, axis=-1, keepdims=True)
         way = self.normalised(unit[..., 0], unit[..., 1])
         return np.asarray(self.edge.reach(np.angle(way))[0] / (np.abs(way) * wavelength))
 
     @cached_property
     def power(self) -> float:
-        """Integral of the amplitude's square over du dv: 1 but for the fit, and for what the shadow takes."""
+        """Integral of the squared amplitude over du dv: 1 apart from fit errors and the light blocked by the shadow."""
         if self.shadow is None:
             return self.clear_power
-        # as the transfer function has it at frequency zero
+        # as in the transfer function at frequency zero
         points, weight = self.shadow.overlap(np.zeros((1, 1), complex), SHADOW_NODES)
         return self.clear_power + float(np.sum(self.values(points)[1] ** 2 * weight) * abs(np.linalg.det(self.axes)))
 
     @property
     def light(self) -> float:
-        """Share of the clear pupil's light that the shadow leaves."""
+        """Fraction of the clear pupil's light that passes the shadow."""
         return self.power / self.clear_power
 
     @cached_property
     def clear_power(self) -> float:
-        """``power`` of the pupil without its shadow."""
+        """Integral of the squared amplitude over du dv, without the shadow."""
         (power,) = clear_power(self.edge.harmonics[:, None], self.amplitude_terms[None])
         return float(power * abs(np.linalg.det(self.axes)))
 
@@ -532,55 +553,55 @@ def fit_pupils(
     nodes: PupilNodes,
     degree: int = DEGREE,
     shadows: np.ndarray | None = None,
-    lit: np.ndarray | None = None,
+    bright: np.ndarray | None = None,
 ) -> tuple[PupilFunction, ...]:
-    """Smooth pupils of B images.
+    """Fit smooth pupils to the traced fields of B images.
 
     Parameters
     ----------
     field : PupilField
-        Traced at ``nodes`` of the stop.
+        Field traced at ``nodes`` of the stop.
     nodes : PupilNodes
         Quadrature over the stop's unit disk, without a hole.
     degree : int
-        Of the polynomials for the map from the stop, the eikonal and the amplitude; with ``lit`` that of the first of
-        ``CUT_DEGREES`` that follows the light is taken.
-    shadows : np.ndarray | None
-        Polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for a free beam.
-    lit : np.ndarray | None
-        Which nodes lie outside of the shadows of edges, (B, N), as of ``PupilStack.fit``.
+        Degree of the polynomials for the map from the stop, the eikonal and the amplitude; with ``bright`` the first of
+        ``VIGNETTED_DEGREES`` that is accurate enough is used instead.
+    shadows : (B, K, V, 2) ndarray, optional
+        Polygons on the stop's unit disk that do not overlap; None for a free beam.
+    bright : (B, N) ndarray of bool, optional
+        Mask of the nodes outside the shadows of edges, as for ``PupilStack.fit``.
 
     Returns
     -------
-    tuple[PupilFunction, ...]
+    tuple of PupilFunction
         B pupils.
 
     Raises
     ------
     ValueError
-        a node carries no light (a beam cut by another aperture than the stop is not modelled), too few nodes for the
-        degree, an edge far from an ellipse, or a wavefront that the polynomials do not follow.
+        A node carries no light (a beam vignetted by another aperture than the stop is not modelled), there are too few
+        nodes for the degree, an edge is far from an ellipse, or the polynomials do not follow the wavefront.
     """
-    stopped = ~(field.amplitude > 0.0) & (True if lit is None else lit)
+    stopped = ~(field.amplitude > 0.0) & (True if bright is None else bright)
     dark = np.any(stopped, axis=-1)
     if np.any(dark):
         which = int(np.argmax(dark))
         share = float(np.mean(stopped[which]))
         raise UnphysicalError(
-            f"{share:.1%} of the pupil of image {which} carries no light: a beam that another aperture than the stop "
-            "cuts has no smooth pupil; enlarge that aperture or move the field point inward"
+            f"{share:.1%} of the pupil of image {which} carries no light: a beam vignetted by another aperture than "
+            "the stop has no smooth pupil; enlarge that aperture or move the field point inward"
         )
-    if lit is not None and np.any(few := np.sum(lit, axis=-1) < FEWEST_LIT):
+    if bright is not None and np.any(few := np.sum(bright, axis=-1) < MIN_ILLUMINATED):
         which = int(np.argmax(few))
         raise UnphysicalError(
-            f"edges leave light at {int(np.sum(lit[which]))} of {nodes.count} rays of image {which}: too few to follow"
+            f"edges pass only {int(np.sum(bright[which]))} of {nodes.count} rays of image {which}: too few for a fit"
         )
     with one_blas_thread():
         traced = field.u, field.v, field.eikonal, field.amplitude, nodes
-        if lit is None:
+        if bright is None:
             stack = PupilStack.fit(*traced, degree, shadows, RIM_SIDES)
         else:
-            stack = PupilStack.followed(*traced, field.wavelength, shadows, lit)
+            stack = PupilStack.fit_vignetted(*traced, field.wavelength, shadows, bright)
     worst = int(np.argmax(stack.residual))
     if stack.residual[worst] > WORST_RESIDUAL * field.wavelength:
         used, left = stack.eikonal_terms.shape[-1] - 1, stack.residual[worst] / field.wavelength
@@ -592,14 +613,16 @@ def fit_pupils(
 
 
 def circular_pupil(f_number: float, eikonal_terms: np.ndarray | None = None) -> PupilFunction:
-    """Evenly lit circular pupil of a telecentric image: its edge is at sqrt(u^2 + v^2) = 1 / (2 f_number).
+    """Return a circular pupil of uniform amplitude for a telecentric image.
+
+    Its edge is at sqrt(u^2 + v^2) = 1 / (2 f_number).
 
     Parameters
     ----------
     f_number : float
-        Of the beam.
-    eikonal_terms : np.ndarray | None
-        Wavefront over the unit disk as in ``PupilFunction``, metres; default none.
+        Focal ratio of the beam.
+    eikonal_terms : ndarray, optional
+        Wavefront over the unit disk as in ``PupilFunction``, metres; none by default.
     """
     aperture = 0.5 / f_number
     flat = np.zeros((1, 1)) if eikonal_terms is None else np.asarray(eikonal_terms, float)

@@ -1,8 +1,6 @@
-"""Polynomials over a pupil: products of Chebyshev's, their values, their slopes and fits of them.
+"""Polynomials over a pupil (products of Chebyshev polynomials), and the edge of a pupil and its self-overlap.
 
-Coefficients of the products T_i(x) T_j(y) with i + j <= degree stand in the order of ``orders``.
-
-The edge of an exit pupil, and the region where the pupil overlaps a shifted copy of itself.
+Coefficients of the products T_i(x) T_j(y) with i + j <= degree are in the order of ``orders``.
 
 Points of the normalised pupil plane are complex numbers p = x + iy. The edge is the image of the stop's rim under a
 smooth map; normalised so that its first harmonic is the unit circle it is
@@ -24,14 +22,14 @@ from optics.numerics.quadrature import PupilNodes
 
 
 def orders(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Orders (i, j) with i + j <= degree, (K,) each."""
+    """Return the orders (i, j) with i + j <= degree, (K,) each."""
     i, j = np.indices((degree + 1, degree + 1))
     keep = i + j <= degree
     return i[keep], j[keep]
 
 
 def _series(x: np.ndarray, degree: int) -> np.ndarray:
-    """T_0 .. T_degree of x (B, P), shape (B, degree + 1, P)."""
+    """Return T_0 .. T_degree of x (B, P), shape (B, degree + 1, P)."""
     out = np.empty((len(x), degree + 1, x.shape[1]))
     out[:, 0], twice = 1.0, 2.0 * x
     if degree:
@@ -43,19 +41,19 @@ def _series(x: np.ndarray, degree: int) -> np.ndarray:
 
 
 def polynomials(tables: Iterable[np.ndarray], p: np.ndarray) -> list[np.ndarray]:
-    """Sums of T_i(x) T_j(y) at the same points.
+    """Return sums of T_i(x) T_j(y) for several tables of coefficients at the same points.
 
     Parameters
     ----------
-    tables : Iterable[np.ndarray]
-        Their coefficients, each (B, D + 1, D + 1).
-    p : np.ndarray
-        Points x + iy, complex (B, P).
+    tables : iterable of (B, D + 1, D + 1) ndarray
+        Coefficients.
+    p : (B, P) ndarray
+        Complex points x + iy.
 
     Returns
     -------
-    list[np.ndarray]
-        For each table the sums, (B, P).
+    list of (B, P) ndarray
+        Sums for each table.
     """
     tables = tuple(tables)
     x, y = (_series(part, tables[0].shape[-1] - 1) for part in (p.real, p.imag))
@@ -63,14 +61,12 @@ def polynomials(tables: Iterable[np.ndarray], p: np.ndarray) -> list[np.ndarray]
 
 
 def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
-    """Products T_i(x) T_j(y) of Chebyshev's polynomials with i + j <= degree at points of any shape, (..., K).
+    """Return the products T_i(x) T_j(y) with i + j <= degree at points of any shape, (..., K).
 
     Parameters
     ----------
-    x : np.ndarray
-        In [-1, 1], any shape.
-    y : np.ndarray
-        Of the same shape.
+    x, y : ndarray
+        Coordinates in [-1, 1], of one shape.
     degree : int
         Highest i + j.
     """
@@ -86,12 +82,12 @@ def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def to_terms(nodes: PupilNodes, degree: int) -> np.ndarray:
-    """From values at nodes of the stop to coefficients of ``products``, by least squares, (K, N).
+    """Return the matrix from values at nodes of the stop to least-squares coefficients of ``products``, (K, N).
 
     Raises
     ------
     ValueError
-        Too few nodes for the degree.
+        There are too few nodes for the degree.
     """
     root = np.sqrt(nodes.weight)
     stop = products(nodes.x, nodes.y, degree) * root[:, None]
@@ -100,56 +96,57 @@ def to_terms(nodes: PupilNodes, degree: int) -> np.ndarray:
     return np.asarray(np.linalg.pinv(stop) * root)
 
 
-TAME_DEGREE, STIFFNESS = 8, 1e-6
-"""Of the polynomials that go on into the dark, and the weight there of the squares of their coefficients, times their
-orders beyond a plane's, of the squares over the light."""
+BASE_DEGREE, STIFFNESS = 8, 1e-6
+"""Degree of the polynomials that are continued into the dark, and the penalty on the squares of their coefficients
+times their orders above those of a plane, relative to the squared residuals in the light."""
 
-FAINTLY = 1e-6
-"""Weight of a node in the dark, of one in the light, for what those leave of a wavefront."""
+DARK_WEIGHT = 1e-6
+"""Weight of a dark node relative to an illuminated one, for the remainder of a wavefront."""
 
 
 def smooth_terms(
-    design: np.ndarray, weight: np.ndarray, lit: np.ndarray, values: np.ndarray, faintly: float = FAINTLY
+    design: np.ndarray, weight: np.ndarray, bright: np.ndarray, values: np.ndarray, dark_weight: float = DARK_WEIGHT
 ) -> np.ndarray:
-    """Coefficients of ``products`` through values where there is light, that stay near them where there is none.
+    """Return coefficients of ``products`` fitted to values in the light, and continued smoothly into the dark.
 
-    Polynomials of a low degree that do not run away are fitted to the light first. All others add what these leave of
-    it, and nothing in the dark. Rays there, of which some pass the rims of lenses far outside, have no part in it.
+    Polynomials of a low degree with a penalty on their size are fitted to the light first. All polynomials are then
+    fitted to the remainder in the light, and to zero in the dark. Rays in the dark, some of which pass the rims of
+    lenses far outside, have no influence.
 
     Parameters
     ----------
-    design : np.ndarray
-        ``products`` at the nodes, (N, K) or (B, N, K).
-    weight : np.ndarray
-        Of the nodes, (N,).
-    lit : np.ndarray
-        Where there is light, (B, N).
-    values : np.ndarray
-        (B, N, C); whatever stands where there is no light.
-    faintly : float
-        Weight of nodes in the dark; the larger it is the less the polynomials add there.
+    design : (N, K) or (B, N, K) ndarray
+        ``products`` at the nodes.
+    weight : (N,) ndarray
+        Weights of the nodes.
+    bright : (B, N) ndarray of bool
+        Mask of the illuminated nodes.
+    values : (B, N, C) ndarray
+        Values to fit; ignored where there is no light.
+    dark_weight : float
+        Weight of dark nodes; the larger it is, the less the higher polynomials contribute there.
 
     Returns
     -------
-    np.ndarray
-        (B, K, C).
+    (B, K, C) ndarray
+        Coefficients.
     """
     i, j = orders(round(np.sqrt(2.0 * design.shape[-1] + 0.25) - 1.5))
-    tame = i + j <= TAME_DEGREE
-    known = np.where(lit[..., None], values, 0.0)
-    few = design[..., tame]
-    stiff = STIFFNESS * np.sum(weight) * np.diag(np.maximum(i + j - 1.0, 0.0)[tame] ** 2)
-    turned = np.swapaxes(few * (weight * lit)[..., None], 1, 2)
-    first = np.linalg.solve(turned @ few + stiff, turned @ known)
-    left = np.where(lit[..., None], known - few @ first, 0.0)
-    turned = np.swapaxes(design * (weight * np.where(lit, 1.0, faintly))[..., None], 1, 2)
-    out = np.linalg.solve(turned @ design, turned @ left)
-    out[:, tame] += first
+    base = i + j <= BASE_DEGREE
+    bright_values = np.where(bright[..., None], values, 0.0)
+    base_design = design[..., base]
+    penalty = STIFFNESS * np.sum(weight) * np.diag(np.maximum(i + j - 1.0, 0.0)[base] ** 2)
+    transposed = np.swapaxes(base_design * (weight * bright)[..., None], 1, 2)
+    first = np.linalg.solve(transposed @ base_design + penalty, transposed @ bright_values)
+    remainder = np.where(bright[..., None], bright_values - base_design @ first, 0.0)
+    transposed = np.swapaxes(design * (weight * np.where(bright, 1.0, dark_weight))[..., None], 1, 2)
+    out = np.linalg.solve(transposed @ design, transposed @ remainder)
+    out[:, base] += first
     return np.asarray(out)
 
 
 def slopes(nodes: PupilNodes, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of ``products`` along x and along y at the nodes, (N, K) each."""
+    """Return the derivatives of ``products`` along x and along y at the nodes, (N, K) each."""
     i, j = orders(degree)
     derive = chebyshev.chebder(np.eye(degree + 1), axis=0)
     tx, ty = (chebyshev.chebvander(c, degree) for c in (nodes.x, nodes.y))
@@ -158,11 +155,11 @@ def slopes(nodes: PupilNodes, degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 WORST_BEND = 0.3
-"""Largest sum of n^2 |c_n|: up to there the edge is convex and the iterations for its chords converge."""
+"""Largest sum of n^2 |c_n|: up to it the edge is convex and the iterations for its chords converge."""
 
 _ITERATIONS = 60
 _CLOSE = 1e-13
-"""Length of a chord, of 2: a thousand roundings."""
+"""Tolerance of the length of a chord, whose largest value is 2: a thousand rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +168,8 @@ class PupilEdge:
 
     Attributes
     ----------
-    harmonics : np.ndarray
-        c_-H .. c_H, complex, (2H + 1,) or (2H + 1, S), with c_1 = 1 and c_0 = c_-1 = 0.
+    harmonics : (2H + 1,) or (2H + 1, S) ndarray
+        Complex harmonics c_-H .. c_H, with c_1 = 1 and c_0 = c_-1 = 0.
 
     Raises
     ------
@@ -191,24 +188,29 @@ class PupilEdge:
             )
 
     def boundary(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Edge points B and dB/da at angles a of the stop's rim, complex, of the angles' shape; of S edges (S, ...)."""
+        """Return edge points B and dB/da at angles a of the stop's rim, complex, of the angles' shape.
+
+        For S edges the shape is (S, ...).
+        """
         last = len(self.harmonics) // 2
-        turn = np.exp(1j * angle)
-        own = self.harmonics
-        if own.ndim > 1:
-            own = own.reshape(*own.shape, *(1,) * (turn.ndim - 1))
-        point, slope, power = own[last] + 0.0 * turn, 0.0 * turn, turn
+        phasor = np.exp(1j * angle)
+        harmonics = self.harmonics
+        if harmonics.ndim > 1:
+            harmonics = harmonics.reshape(*harmonics.shape, *(1,) * (phasor.ndim - 1))
+        point, slope, power = harmonics[last] + 0.0 * phasor, 0.0 * phasor, phasor
         for n in range(1, last + 1):
-            plus, minus = own[last + n] * power, own[last - n] * np.conj(power)
+            plus, minus = harmonics[last + n] * power, harmonics[last - n] * np.conj(power)
             point += plus + minus
             slope += 1j * n * (plus - minus)
-            power = power * turn
+            power = power * phasor
         return point, slope
 
     def reach(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Longest chord along directions (radians, normalised coordinates), and its half angle (see ``_chord``).
+        """Return the longest chord along directions, and its half angle (see ``_chord``).
 
-        A shift by a longer way leaves no overlap of the pupil with itself: this is the cut-off.
+        Directions are in radians, in normalised coordinates.
+
+        A longer shift leaves no overlap of the pupil with itself: this is the cut-off.
         """
         half = np.full(np.shape(direction), 0.5 * np.pi)
         mean = np.asarray(direction) + 0.5 * np.pi
@@ -224,7 +226,7 @@ class PupilEdge:
         return self._chord(direction, mean, half)[1], half
 
     def _chord(self, direction: np.ndarray, mean: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Chord along ``direction`` between the edge's angles mean - half and mean + half.
+        """Return the chord along ``direction`` between the edge's angles mean - half and mean + half.
 
         B(m - d) - B(m + d) = 2 sin d exp(i direction) H, H = -i exp(-i direction) sum c_n exp(inm) sin(nd) / sin d. A
         given d in [0, pi] (from the tangent chord on one side to that on the other) has one m with real H; it is well
@@ -232,30 +234,32 @@ class PupilEdge:
 
         Parameters
         ----------
-        direction : np.ndarray
-            (S,).
-        mean : np.ndarray
-            Start, (S,).
-        half : np.ndarray
-            (S,).
+        direction : (S,) ndarray
+            Directions, radians.
+        mean : (S,) ndarray
+            Initial mean angles.
+        half : (S,) ndarray
+            Half angles d.
 
         Returns
         -------
-        tuple[np.ndarray, np.ndarray]
-            Mean angle and length, negative for negative ``half``, (S,) each.
+        mean : (S,) ndarray
+            Mean angles m.
+        length : (S,) ndarray
+            Lengths, negative for negative ``half``.
         """
         last = len(self.harmonics) // 2
         factor = -1j * np.exp(-1j * np.asarray(direction))
         cos = np.cos(half)
         for _ in range(_ITERATIONS):
-            turn = np.exp(1j * mean)
-            value, slope = np.zeros_like(turn), np.zeros_like(turn)
-            power, ratio, before = turn, np.ones_like(cos), np.zeros_like(cos)
+            phasor = np.exp(1j * mean)
+            value, slope = np.zeros_like(phasor), np.zeros_like(phasor)
+            power, ratio, before = phasor, np.ones_like(cos), np.zeros_like(cos)
             for n in range(1, last + 1):
                 plus, minus = self.harmonics[last + n] * power, self.harmonics[last - n] * np.conj(power)
                 value += ratio * (plus - minus)
                 slope += (1j * n) * ratio * (plus + minus)
-                power = power * turn
+                power = power * phasor
                 ratio, before = 2.0 * cos * ratio - before, ratio  # sin(nd)/sin d: Chebyshev's second kind
             value, slope = factor * value, factor * slope
             step = value.imag / slope.imag
@@ -265,17 +269,19 @@ class PupilEdge:
         return mean, 2.0 * np.sin(half) * (value.real - step * slope.real)
 
     def corners(self, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the edges of two copies of the pupil, shifted by s, cross.
+        """Return the intersections of the edges of two copies of the pupil, shifted by s.
 
         Parameters
         ----------
-        shift : np.ndarray
-            Normalised shifts s, complex, (S,).
+        shift : (S,) ndarray
+            Normalised complex shifts s.
 
         Returns
         -------
-        tuple[np.ndarray, np.ndarray, np.ndarray]
-            Angles a (2, S) and b (2, S) with B(a) - B(b) = s at both crossings, and whether there is an overlap, (S,).
+        a, b : (2, S) ndarray
+            Angles with B(a) - B(b) = s at both intersections.
+        inside : (S,) ndarray of bool
+            True where the copies overlap.
         """
         direction, size = np.angle(shift), np.abs(shift)
         longest, middle = self.reach(direction)
@@ -301,28 +307,30 @@ class PupilEdge:
         across: tuple[np.ndarray, np.ndarray],
         along: tuple[np.ndarray, np.ndarray],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Quadrature over the overlap of the pupil shifted by -s/2 and by +s/2.
+        """Return a quadrature over the overlap of the pupil shifted by -s/2 and by +s/2.
 
         The region lies between two arcs of the edge that meet in the corners. Straight lines between points of equal
         parameter t on the arcs sweep it smoothly, so that Gauss' rules in t and along the lines converge exponentially.
 
         Parameters
         ----------
-        shift : np.ndarray
-            (S,) normalised.
-        right : np.ndarray
-            Angles a of ``corners``, (2, S).
-        left : np.ndarray
-            Angles b, (2, S).
-        across : tuple[np.ndarray, np.ndarray]
+        shift : (S,) ndarray
+            Normalised shifts s.
+        right : (2, S) ndarray
+            Angles a of ``corners``.
+        left : (2, S) ndarray
+            Angles b of ``corners``.
+        across : (ndarray, ndarray)
             Points and weights in t over [-1, 1], (I,) each.
-        along : tuple[np.ndarray, np.ndarray]
-            Likewise on the lines, (J,) each.
+        along : (ndarray, ndarray)
+            Points and weights on the lines over [-1, 1], (J,) each.
 
         Returns
         -------
-        tuple[np.ndarray, np.ndarray]
-            Points c, complex, (S, I * J), such that c - s/2 and c + s/2 are in the pupil, and area weights in p.
+        points : (S, I * J) ndarray
+            Complex points c, such that c - s/2 and c + s/2 are in the pupil.
+        weight : (S, I * J) ndarray
+            Area weights in p.
         """
         t = across[0]
         arcs = []

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from ruamel.yaml import YAML
 
-from optics.design.design_variables import Prescription, Stand, Variable
+from optics.design.design_variables import Prescription, Variable, VertexPose
 from optics.design.merit_function import Beams, Operands
 from optics.geometry.surface import plane
 from optics.numerics import quadrature
@@ -49,8 +49,8 @@ class CameraDesignSetup(ExperimentSetup[CameraDesignSpec]):
 def prescription_of(camera: CameraSpec) -> Prescription:
     """The prescription of a camera's file."""
     surfaces = {name: surface_of(mirror) for name, mirror in camera.mirrors.items()}
-    image = Stand(camera.image.z, tilt=camera.image.tilt or 0.0)
-    stands = {n: Stand(m.z) for n, m in camera.mirrors.items()}
+    image = VertexPose(camera.image.z, tilt=camera.image.tilt or 0.0)
+    stands = {n: VertexPose(m.z) for n, m in camera.mirrors.items()}
     return Prescription({**surfaces, IMAGE: plane()}, {**stands, IMAGE: image}, camera.stop, camera.field_bias)
 
 
@@ -85,14 +85,14 @@ def camera_of(start: CameraSpec, prescription: Prescription, name: str, descript
     ValueError
         Mirrors are tilted or surfaces decentred, which a camera's file cannot say.
     """
-    image = prescription.stands[IMAGE]
-    if image.y or any(stand.y or stand.tilt for n, stand in prescription.stands.items() if n != IMAGE):
+    image = prescription.poses[IMAGE]
+    if image.y or any(pose.y or pose.tilt for n, pose in prescription.poses.items() if n != IMAGE):
         raise ValueError("a camera's file has no place for tilted or decentred surfaces")
     mirrors = {}
     for mirror in start.mirrors:
         surface = prescription.surfaces[mirror]
         terms = {f"A{2 * n + 4}": a for n, a in enumerate(surface.even)}
-        numbers = {"z": prescription.stands[mirror].z, "radius": 1.0 / surface.curvature, "conic": surface.conic}
+        numbers = {"z": prescription.poses[mirror].z, "radius": 1.0 / surface.curvature, "conic": surface.conic}
         mirrors[mirror] = start.mirrors[mirror].model_copy(update={**numbers, "aspheric": terms})
     update = {
         "name": name,
@@ -113,7 +113,7 @@ def with_plane(camera: CameraSpec, plane: FocalPlane) -> CameraSpec:
 def file_with_plane(camera: CameraSpec, plane: FocalPlane, name: str) -> str:
     """Text of the camera's file with another image plane and name.
 
-    Data sheets that it names by a path relative to itself are named by their whole path, for the new file may stand
+    Data sheets that it names by a path relative to itself are named by their whole path, for the new file may pose
     elsewhere. A camera that has no file of its own gets one without comments.
 
     Parameters

@@ -75,7 +75,7 @@ class FocalPlane:
         return cls(camera.image.z, camera.image.tilt or 0.0)
 
 
-FEWEST_LIT = 20
+MIN_ILLUMINATED = 20
 """Of ``EVEN`` rays those that have to come through a field's edges: of fewer, two in a thousand, nothing is told."""
 
 Cut = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -179,7 +179,7 @@ class FieldBeams:
         if model.edges:
             valid = valid[0] & model.uncut(lambda name: traced.hit(model.mirrors.index(name))[0])
             lit = valid.reshape(shape)[:, 1:]
-            dark = np.flatnonzero(np.sum(lit, axis=-1) < FEWEST_LIT)
+            dark = np.flatnonzero(np.sum(lit, axis=-1) < MIN_ILLUMINATED)
             if dark.size:
                 found = (
                     f"field {field_text(spec, fields[dark[0]])}, {dark.size} of {len(fields)} fields that were tried"

@@ -6,7 +6,7 @@ import pytest
 from optics.numerics import quadrature
 from optics.numerics.quadrature import PupilNodes
 from optics.waves import diffraction
-from optics.waves.diffraction import LONGEST, FieldSamples, Grid, PupilField, airy, image
+from optics.waves.diffraction import MAX_POINTS, FieldSamples, Grid, PupilField, airy, image
 from tests.tiers import quick
 
 WAVELENGTH, F_NUMBER = 650e-9, 9.2
@@ -70,7 +70,7 @@ def test_few_samples_of_the_field_make_the_image(single: bool, error: float) -> 
     eikonal = 1.5 * WAVELENGTH * (NODES.x**2 + NODES.x * NODES.y**2 - 0.5 * NODES.y)
     field = perfect(0.02, -0.01, apodisation=1)
     field = PupilField(field.u, field.v, eikonal[None], field.amplitude, WAVELENGTH)
-    x, y = shifted(centred(LONGEST + 9, 0.5e-6), 7e-6), shifted(centred(96, 0.7e-6), -11e-6)
+    x, y = shifted(centred(MAX_POINTS + 9, 0.5e-6), 7e-6), shifted(centred(96, 0.7e-6), -11e-6)
     for grid in (x, y):
         samples = FieldSamples.of(96, 2.0 * np.pi * APERTURE * grid.step / WAVELENGTH, single)
         assert samples is not None

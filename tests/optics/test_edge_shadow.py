@@ -8,7 +8,7 @@ from optics.geometry.polygon import area, covered
 from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError
 from optics.waves import edge_shadow
-from optics.waves.edge_shadow import LitStop, holes
+from optics.waves.edge_shadow import IlluminatedStop, holes
 from optics.waves.pupil_shadow import separate
 from optics.waves.pupil_terms import products, smooth_terms
 from tests.tiers import quick
@@ -85,7 +85,7 @@ def test_too_many_pieces_and_rays_that_no_polynomials_follow_are_refused(monkeyp
         )
     monkeypatch.setattr(edge_shadow, "MOST_PIECES", 3)
     with pytest.raises(UnphysicalError, match="pieces of shadow"):
-        edge_shadow.settled_shadows(by_sides([Edge(Circle(0.3), True), *VANES]), 1)
+        edge_shadow.converged_shadows(by_sides([Edge(Circle(0.3), True), *VANES]), 1)
 
 
 def test_edges_that_stop_nothing_leave_no_shadow() -> None:
@@ -110,13 +110,13 @@ def test_a_polygon_falls_into_the_same_parts_wherever_it_is_turned_to(turn: floa
 
 def test_circles_that_nearly_coincide_get_more_sides() -> None:
     """Between two circles that all but coincide lies less than between a circle and its polygon."""
-    one, error = edge_shadow.settled_shadows(by_sides([Edge(Circle(0.5), True)]), 1)
+    one, error = edge_shadow.converged_shadows(by_sides([Edge(Circle(0.5), True)]), 1)
     assert error < 1e-6
     assert edge_shadow.shares_of_stop(one)[0] == pytest.approx(0.25, abs=1e-6)
     # one circle twice, by polygons whose corners are not the same: what both let through is smaller than either
     twice = [Edge(Circle(0.8)), Edge(Circle(0.8), rotation=np.pi / edge_shadow.ROUND_SIDES[0])]
     few = edge_shadow.shares_of_stop(by_sides(twice)(edge_shadow.ROUND_SIDES[0]).shadows(1))[0]
-    many, error = edge_shadow.settled_shadows(by_sides(twice), 1)
+    many, error = edge_shadow.converged_shadows(by_sides(twice), 1)
     assert few - 0.36 > edge_shadow.FINE_SHARE > error > 0.0
     assert edge_shadow.shares_of_stop(many)[0] == pytest.approx(0.36, abs=error)
 
@@ -124,8 +124,8 @@ def test_circles_that_nearly_coincide_get_more_sides() -> None:
 def test_edges_that_no_sides_are_enough_for_are_refused(monkeypatch) -> None:
     monkeypatch.setattr(edge_shadow, "FINE_SHARE", 1e-12)
     monkeypatch.setattr(edge_shadow, "COARSE_SHARE", 1e-12)
-    with pytest.raises(UnphysicalError, match="edges all but coincide"):
-        edge_shadow.settled_shadows(by_sides([Edge(Circle(0.5, (0.8, 0.0)), True)]), 1)
+    with pytest.raises(UnphysicalError, match="edges nearly coincide"):
+        edge_shadow.converged_shadows(by_sides([Edge(Circle(0.5, (0.8, 0.0)), True)]), 1)
 
 
 def test_clear_edges_beyond_the_light_are_followed_nowhere() -> None:
@@ -135,14 +135,14 @@ def test_clear_edges_beyond_the_light_are_followed_nowhere() -> None:
     edges = [Edge(Circle(0.9))]
     with pytest.raises(UnphysicalError, match="polynomials of degree"):
         edge_shadow.outlines_on_stop(wild[None], edges, NODES)
-    assert not edge_shadow.outlines_on_stop(wild[None], edges, NODES, lit=lit[None]).clear
+    assert not edge_shadow.outlines_on_stop(wild[None], edges, NODES, bright=lit[None]).clear
 
 
 @pytest.mark.second
 def test_a_stop_without_its_shadows() -> None:
     """Area and moments of a ring, and whether it is one: a vane or a shift makes it none."""
-    ring = edge_shadow.settled_shadows(by_sides([Edge(Circle(0.6), True)]), 1)[0]
-    stop = LitStop.of(ring, 6, 6)
+    ring = edge_shadow.converged_shadows(by_sides([Edge(Circle(0.6), True)]), 1)[0]
+    stop = IlluminatedStop.of(ring, 6, 6)
     assert stop.light[0] == pytest.approx(1.0 - 0.36, abs=1e-6)
     fourth = float(stop.weight[0] @ (stop.x[0] ** 2 + stop.y[0] ** 2) ** 2)
     assert fourth == pytest.approx(np.pi / 3.0 * (1.0 - 0.6**6), rel=1e-4)
@@ -153,7 +153,7 @@ def test_a_stop_without_its_shadows() -> None:
         [Edge(Circle(0.6, (0.02, 0.0)), True)],
         [Edge(Circle(0.95))],
     ):
-        assert np.isnan(holes(edge_shadow.settled_shadows(by_sides(edges), 1)[0])[0])
+        assert np.isnan(holes(edge_shadow.converged_shadows(by_sides(edges), 1)[0])[0])
     assert edge_shadow.nodes_in_shadows(np.zeros((2, 0, 3, 2)), 4)[0].shape == (2, 0)
 
 

@@ -6,7 +6,7 @@ import pytest
 from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError
 from optics.waves.edge_shadow import StopOutlines
-from optics.waves.line_transfer import CutPupil, cut_pupils, line_transfers, lit_at
+from optics.waves.line_transfer import VignettedPupil, line_transfers, unvignetted_at, vignetted_pupils
 from optics.waves.optical_transfer import transfer
 from optics.waves.pupil_shadow import PupilShadow, separate
 from optics.waves.pupil_stack import PupilFunction, circular_pupil
@@ -51,14 +51,14 @@ def aberrated(waves: float) -> PupilFunction:
     return circular_pupil(F_NUMBER, waves * WAVELENGTH * terms)
 
 
-def by_lines(cut: CutPupil, direction: np.ndarray = ALONG, step: float = STEP, count: int = COUNT, lines=()):
+def by_lines(cut: VignettedPupil, direction: np.ndarray = ALONG, step: float = STEP, count: int = COUNT, lines=()):
     ((told,),) = line_transfers([cut], [WAVELENGTH], direction[None], step, count, lines)
     return told
 
 
 @pytest.mark.parametrize("hole", [0.2, 0.35, 0.7])
 def test_a_ring_as_in_closed_form(hole: float) -> None:
-    told = by_lines(CutPupil(circular_pupil(F_NUMBER), (), (disk(hole),)))
+    told = by_lines(VignettedPupil(circular_pupil(F_NUMBER), (), (disk(hole),)))
     shift = 2.0 * np.arange(COUNT) / (COUNT - 1)
     exact = shared(1.0, 1.0, shift) - 2.0 * shared(1.0, hole, shift) + shared(hole, hole, shift)
     np.testing.assert_allclose(told.perfect, exact / (np.pi * (1.0 - hole**2)), rtol=0, atol=AGREE)
@@ -68,7 +68,7 @@ def test_a_ring_as_in_closed_form(hole: float) -> None:
 
 
 def test_a_clear_edge_is_a_smaller_pupil() -> None:
-    told = by_lines(CutPupil(circular_pupil(F_NUMBER), (disk(0.8, 0.1j),), ()))
+    told = by_lines(VignettedPupil(circular_pupil(F_NUMBER), (disk(0.8, 0.1j),), ()))
     shift = 2.0 * np.arange(COUNT) / (COUNT - 1)
     np.testing.assert_allclose(told.perfect, shared(0.8, 0.8, shift) / (np.pi * 0.64), rtol=0, atol=AGREE)
     assert np.max(np.abs(told.values[shift > 1.6])) < 1e-12
@@ -86,7 +86,7 @@ def test_disk_and_vanes_as_by_pieces_of_shadows(turn: float) -> None:
         pupil.centre, pupil.axes, pupil.edge, pupil.eikonal_terms, pupil.amplitude_terms, shadow=shadow, finer=8
     )
     direction = np.array([np.cos(turn), np.sin(turn)])
-    told = by_lines(CutPupil(pupil, (), tuple(dark)), direction)
+    told = by_lines(VignettedPupil(pupil, (), tuple(dark)), direction)
     frequency = STEP * np.arange(COUNT)[:, None] * direction
     theirs = transfer(other, frequency, WAVELENGTH, np.zeros(1))[0]
     np.testing.assert_allclose(told.values, theirs, rtol=0, atol=AGREE)
@@ -94,8 +94,8 @@ def test_disk_and_vanes_as_by_pieces_of_shadows(turn: float) -> None:
 
 
 def test_too_few_lines_are_refused() -> None:
-    with pytest.raises(UnphysicalError, match=r"still changes by .* with further lines"):
-        by_lines(CutPupil(circular_pupil(F_NUMBER), (), (disk(0.35), vane(0.7), vane(2.3))), lines=(12,))
+    with pytest.raises(UnphysicalError, match=r"still changes by .* with more lines"):
+        by_lines(VignettedPupil(circular_pupil(F_NUMBER), (), (disk(0.35), vane(0.7), vane(2.3))), lines=(12,))
 
 
 def test_outlines_come_from_the_stop_and_tell_what_is_lit() -> None:
@@ -107,10 +107,10 @@ def test_outlines_come_from_the_stop_and_tell_what_is_lit() -> None:
     on_stop = np.stack([dark.real, dark.imag], axis=-1)[None]
     smooth = PupilFunction(pupil.centre, pupil.axes, pupil.edge, np.zeros((9, 9)), np.eye(9))
     lit = np.abs(nodes.x + 1j * nodes.y - (0.1 + 0.2j))[None] > 0.35
-    (cut,) = cut_pupils([smooth], u, v, nodes, StopOutlines((), (on_stop,)), lit)
+    (cut,) = vignetted_pupils([smooth], u, v, nodes, StopOutlines((), (on_stop,)), lit)
     np.testing.assert_allclose(cut.blocked[0][::-1], np.conj(dark), atol=1e-12)
     points = nodes.x - 1j * nodes.y
-    np.testing.assert_array_equal(lit_at(cut, points), np.abs(points - (0.1 - 0.2j)) > 0.35)
+    np.testing.assert_array_equal(unvignetted_at(cut, points), np.abs(points - (0.1 - 0.2j)) > 0.35)
     nothing = np.zeros((1, 3, 2))
-    with pytest.raises(UnphysicalError, match="leaves no light in the pupil of image 0"):
-        cut_pupils([cut.pupil], u, v, nodes, StopOutlines((nothing,), ()), lit)
+    with pytest.raises(UnphysicalError, match="blocks all light in the pupil of image 0"):
+        vignetted_pupils([cut.pupil], u, v, nodes, StopOutlines((nothing,), ()), lit)

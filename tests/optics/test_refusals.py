@@ -24,7 +24,7 @@ from optics.thermal.nodal_temperature import NodalTemperature
 from optics.waves import optical_transfer, pupil_shadow
 from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import outlines_on_stop
-from optics.waves.optical_transfer import TransferTable, with_nodes_enough
+from optics.waves.optical_transfer import TransferTable, with_enough_nodes
 from optics.waves.pupil_shadow import PupilShadow
 from optics.waves.pupil_stack import PupilFunction, circular_pupil, fit_pupils
 
@@ -69,7 +69,7 @@ def test_what_cannot_be_is_refused() -> None:
         (lambda: NodalTemperature(NODE[:2], np.zeros(2)), "2 different nodes"),
         (lambda: elastic_mesh._right_handed(turned), "too steep for its mesh"),
         (lambda: outlines_on_stop(on_stop, [Edge(CROSSED, True)], NODES), "sides of a polygonal edge cross each other"),
-        (lambda: fit_pupils(BEAM, NODES, lit=(NODES.x > 0.95)[None]), "too few to follow"),
+        (lambda: fit_pupils(BEAM, NODES, bright=(NODES.x > 0.95)[None]), "too few for a fit"),
     ):
         with pytest.raises(ValueError, match=words):
             make()
@@ -89,7 +89,7 @@ def test_numerics_that_do_not_come_out_are_refused(monkeypatch) -> None:
 
     def cut() -> PupilFunction:
         shadow = PupilShadow.within(square, pupil.edge.harmonics[:, None])
-        return with_nodes_enough(replace(pupil, shadow=shadow, finer=1), 650e-9)
+        return with_enough_nodes(replace(pupil, shadow=shadow, finer=1), 650e-9)
 
     def table() -> TransferTable:
         return TransferTable.build(pupil, np.array([650e-9]), np.ones(1))
@@ -101,8 +101,8 @@ def test_numerics_that_do_not_come_out_are_refused(monkeypatch) -> None:
         (fresnel_scatter, "MOST_CELLS", 1, lambda: replace(TABLE), "cells are more than 1"),
         (elastic_mesh, "ConvexHull", failing, lambda: polyhedron_mesh(BOX, 0.5), "degenerate: QH6154"),
         (elastic_mesh, "_volumes", lambda nodes, t: np.zeros(len(t)), lambda: polyhedron_mesh(BOX, 0.5), "watertight"),
-        (pupil_shadow, "_ROOM", -1.0, within, "came out larger than the whole"),
-        (pupil_shadow, "quadrature", doubled, cut, "came out of another size than it has"),
+        (pupil_shadow, "_AREA_TOLERANCE", -1.0, within, "is larger than the shadow"),
+        (pupil_shadow, "quadrature", doubled, cut, "does not have its area"),
         (optical_transfer, "WORST_TRANSFER", -1.0, cut, "still changes by"),
         (optical_transfer, "_MOST_NODES", 1, table, "too many waves for a table"),
     ):

@@ -236,7 +236,9 @@ def test_a_chamfer_that_shrinks_to_nothing(width) -> None:
     """V = 1 - t^2 / 2 for edges cut by t; narrower than what counts, the face is none and the cube is whole."""
     normals = np.concatenate([CUBE[0], unit([[1, 1, 0]])])
     body, volume = checked(normals, np.append(CUBE[1], (1.0 - width) / np.sqrt(2.0)))
-    assert volume == pytest.approx(1.0 - 0.5 * width**2, abs=2.0 * solids.MERGE_LENGTH if width < solids.MERGE_LENGTH else 1e-14)
+    assert volume == pytest.approx(
+        1.0 - 0.5 * width**2, abs=2.0 * solids.MERGE_LENGTH if width < solids.MERGE_LENGTH else 1e-14
+    )
     assert len(body.rings[6]) == (0 if width * np.sqrt(2.0) < solids.MERGE_LENGTH else 4)
     assert len(body.vertices) == (8 if width * np.sqrt(2.0) < solids.MERGE_LENGTH else 10)
 

@@ -282,7 +282,7 @@ def test_nodes_in_another_frame(tmp_path, nodes, gf7_pair) -> None:
     )
     np.testing.assert_allclose(one.rotate, two.rotate, rtol=0, atol=1e-13)
     np.testing.assert_allclose(one.shift, two.shift, rtol=0, atol=1e-13)
-    with pytest.raises(InputError, match="stand on the clear aperture"):
+    with pytest.raises(InputError, match="lie on the clear aperture"):
         deformed_face(gf7_pair, read, BODY, spec(base))
     with pytest.raises(InputError, match="no such node"):
         deformed_face(gf7_pair, read, BODY, spec(base, frame="base/forwrd"))

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from optics.design.merit_function import Operands
-from optics.design.optimiser import DesignError, Held, _require_held, judged
+from optics.design.optimiser import ActiveConstraint, DesignError, _require_fulfilled, initial_merit
 from scenes.models.camera_design import CameraDesignSetup, beams_of, file_with_plane, prescription_of
 from scenes.models.camera_sharpness import FIELDS, FocalPlane, sharpness
 from scenes.models.monitor_layout import Beam
@@ -200,7 +200,7 @@ def test_constraints_that_contradict_the_camera(tmp_path, envelope: str, clearan
         "",
         file,
         key,
-        ("no prescription near the start holds all constraints", remedy),
+        ("no prescription near the start fulfils all constraints", remedy),
     )
 
 
@@ -298,17 +298,19 @@ def test_a_constraint_that_blocks_is_named(tmp_path) -> None:
 
 def test_an_anamorphism_is_a_share(backend) -> None:
     """Of a principal distance of 5 m across the line one of 0.05 m along it less or more is 1 %."""
-    one = Held("anamorphism", 0.005, 0.05, 0.4)
+    one = ActiveConstraint("anamorphism", 0.005, 0.05, 0.4)
     text = _held_text((one,), "old", 5.0)
     assert text == "the anamorphism (0.5 %, which old breaks by 1 %; easing it by 1 % is worth 0.02 waves)"
     row = HELD_BY(one)
     assert (row["limit_m"], row["limit_percent"]) == (None, pytest.approx(0.5))
     assert HELD_BY(replace(one, name="envelope", limit=2.0))["limit_m"] == 2.0
     camera = load_camera("gf7")
-    merit, found = judged(backend, prescription_of(camera), (), beams_of(camera), Operands(650e-9, anamorphism=0.005))
+    merit, found = initial_merit(
+        backend, prescription_of(camera), (), beams_of(camera), Operands(650e-9, anamorphism=0.005)
+    )
     along, across = found.principal_distance, found.distance_across
     with pytest.raises(DesignError, match=r"anamorphism \(off by ") as refused:
-        _require_held(merit, found)
+        _require_fulfilled(merit, found)
     off = float(re.search(r"off by (\S+) %", str(refused.value))[1])
     assert off == pytest.approx(100.0 * (abs(along / across - 1.0) - 0.005), rel=2e-3)
 

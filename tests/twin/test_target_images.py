@@ -304,10 +304,10 @@ def test_outlines_that_are_wrong_about_the_light_are_refused(backend, camera, mo
     model = camera("ritchey_chretien")
     path = TargetPath(camera_alone(model), ROOT, ROOT, model, backend)
     middle = np.zeros((1, 2))
-    assert len(path.cut_pupils({}, path.directions(middle), middle)) == 1
+    assert len(path.vignetted_pupils({}, path.directions(middle), middle)) == 1
     monkeypatch.setattr("twin.targets.target_path.WORST_PLACED", -1.0)
     with pytest.raises(UnphysicalError, match="outlines of its edges are wrong about"):
-        path.cut_pupils({}, path.directions(middle), middle)
+        path.vignetted_pupils({}, path.directions(middle), middle)
 
 
 def test_a_line_too_short_for_the_windows(before_gf7):

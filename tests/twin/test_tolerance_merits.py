@@ -203,7 +203,7 @@ def test_light_of_a_band_takes_as_many_wavelengths_as_it_needs(backend: Backend,
 
 
 @pytest.mark.parametrize(
-    ("changes", "why"), [({"spectrum": "[400 nm, 1000 nm]"}, ""), ({"image": "300 mm"}, ": a transfer function takes")]
+    ("changes", "why"), [({"spectrum": "[400 nm, 1000 nm]"}, ""), ({"image": "300 mm"}, ": a transfer function needs")]
 )
 def test_a_blurred_camera_has_no_mtf_for_tolerances(backend: Backend, tmp_path: Path, changes: dict, why: str) -> None:
     with pytest.raises(InputError, match=rf"merits\.mtf: the MTF of the designed camera is not settled{why}"):

@@ -444,7 +444,7 @@ class CameraOptics:
         light = self.directions(fields)
         places = self.path.places(self.state, light)
         used = colours if lenses(self.model.spec) else [np.min(colours)]
-        cut = [self.path.cut_pupils(self.state, light, places, float(colour)) for colour in used]
+        cut = [self.path.vignetted_pupils(self.state, light, places, float(colour)) for colour in used]
         if frequency is None:
             shortest = float(np.min(colours))
             cutoff = max(float(np.max(one.pupil.cutoff(np.eye(2), shortest))) for own in cut for one in own)

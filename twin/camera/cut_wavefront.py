@@ -12,7 +12,7 @@ from optics.geometry.tree import State
 from optics.numerics import quadrature
 from optics.numerics.array_math import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
-from optics.waves.edge_shadow import LitStop, holes
+from optics.waves.edge_shadow import IlluminatedStop, holes
 from optics.waves.imaging import PartFit, fit_part, fit_wavefront, orthonormal_parts
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, smooth_terms
@@ -104,7 +104,7 @@ def exact_fit(
     except UnphysicalError:
         return None
     more = (0, 0), (_FINER_RINGS, _FINER_NODES)
-    stops = [LitStop.of(pieces, rings + r, _SHADOW_NODES + n) for r, n in more]
+    stops = [IlluminatedStop.of(pieces, rings + r, _SHADOW_NODES + n) for r, n in more]
     if abs(float(stops[1].light[0]) - light) > WORST_LIGHT:
         return None
     points = [np.stack([stop.x[0], stop.y[0]], axis=-1) for stop in stops]
@@ -130,7 +130,7 @@ def exact_fit(
     return None
 
 
-def _tamed(stop: LitStop, pieces: np.ndarray, rings: int, wave: np.ndarray) -> np.ndarray:
+def _tamed(stop: IlluminatedStop, pieces: np.ndarray, rings: int, wave: np.ndarray) -> np.ndarray:
     """The wavefront (N,) with a smooth continuation of the light's where rays in the dark go far astray, as those do
     that pass the rims of lenses outside; what it is there is taken off again.
     """

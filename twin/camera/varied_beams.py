@@ -22,7 +22,7 @@ from optics.numerics.backend import one_blas_thread
 from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
-from optics.waves.edge_shadow import LitStop
+from optics.waves.edge_shadow import IlluminatedStop
 from optics.waves.imaging import path_to_sphere
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, to_terms
@@ -281,7 +281,7 @@ class VariedBeams:
             return [(nodes.x, nodes.y, nodes.share)] * len(self.fields)
         out = []
         for own in self.pieces:
-            lit = LitStop.of(own[None], self.degree, max(6, self.degree // 2 + 2))
+            lit = IlluminatedStop.of(own[None], self.degree, max(6, self.degree // 2 + 2))
             out.append((lit.x[0], lit.y[0], lit.weight[0] / np.sum(lit.weight)))
         return out
 

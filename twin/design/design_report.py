@@ -70,7 +70,7 @@ def design_report(run: DesignRun) -> Report:
         "Least distance in y of every stretch of the beams from the edge that it passes, in the plane of symmetry, mm.",
         ("from", "to", "passes", "before", "after"),
         [
-            [names[p.stretch], names[p.stretch + 1], names[p.surface], 1e3 * float(b), 1e3 * float(a)]
+            [names[p.segment], names[p.segment + 1], names[p.surface], 1e3 * float(b), 1e3 * float(a)]
             for p, b, a in zip(found.merit.passages, before.clearances, after.clearances, strict=True)
         ],
         (None, None, None, 1, 1),
@@ -156,7 +156,7 @@ def _layout(axes: Axes, design: Design, prescription: Prescription) -> None:
         axes.plot(points[:, middle, ray, 1], points[:, middle, ray, 0], color=colour, lw=0.8)
     for k, name in enumerate(prescription.names):
         y = np.linspace(points[k + 1, ..., 0].min(), points[k + 1, ..., 0].max(), 60)
-        stand = prescription.stands[name]
+        stand = prescription.poses[name]
         sag = prescription.surfaces[name].sag(0.0, y - stand.y)
         axes.plot(stand.z + sag, y, color=INK, lw=2.2)
         axes.annotate(name, (float(stand.z + sag[-1]), float(y[-1])), (4, 4), textcoords="offset points")

@@ -14,10 +14,10 @@ from optics.design.optimiser import (
     HELD,
     ITERATIONS,
     SAME,
+    ActiveConstraint,
     Attempt,
     Design,
     DesignError,
-    Held,
     Search,
     rms_error,
     search,
@@ -149,21 +149,24 @@ def _chief_rays(run: DesignRun) -> dict[str, np.ndarray]:
         direction = trace_beams(merit.backend, prescription, merit.beams).direction[:, 0]
         return np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), np.abs(direction[:, 2]))
 
-    return {"before": angles(found.begun), "after": angles(found.prescription)}
+    return {"before": angles(found.initial), "after": angles(found.prescription)}
 
 
-def _anamorphism(held: Held) -> bool:
+def _anamorphism(held: ActiveConstraint) -> bool:
     return held.name.startswith("anamorphism")
 
 
-HELD_BY: Record[Held] = Record(
+HELD_BY: Record[ActiveConstraint] = Record(
     "A constraint that keeps the camera from becoming better.",
     Quantity("constraint", lambda held: held.name, "its name"),
     Quantity("limit_m", lambda held: None if _anamorphism(held) else held.limit, "its limit"),
     Quantity("limit_percent", lambda held: held.limit if _anamorphism(held) else None, "likewise of the anamorphism"),
     Quantity("broken_at_start_m", lambda held: max(held.start, 0.0), "by how much the start breaks it"),
     Quantity(
-        "worth_waves_per_mm", lambda held: 1e-3 * held.worth, "fall of the error when it is eased", converted=False
+        "worth_waves_per_mm",
+        lambda held: 1e-3 * held.sensitivity,
+        "fall of the error when it is eased",
+        converted=False,
     ),
 )
 START: Record[Attempt] = Record(
@@ -194,7 +197,7 @@ DESIGN: Record[DesignRun] = Record(
     Quantity("chief_ray_deg", _chief_rays, "angle of the chief ray from the normal of the focal plane, by field"),
     Quantity("clearance_m", _pair(lambda one: one.clearances), "room between beams and edges, by passage"),
     Quantity("improved", lambda run: run.found.improved, "whether the new camera is better"),
-    Quantity("held_by", lambda run: run.found.held, "what keeps it from more, the dearest first", record=HELD_BY),
+    Quantity("held_by", lambda run: run.found.active, "what keeps it from more, the dearest first", record=HELD_BY),
     Quantity("jacobians", lambda run: run.found.evaluations, "Jacobians that were traced for the best"),
     Quantity("converged", lambda run: run.found.converged, "whether the best search settled", warning=_unsettled),
     Quantity("starts", lambda run: run.searched.attempts, "what came of every start", record=START),
@@ -225,7 +228,7 @@ def verdict(run: DesignRun) -> str:
     found, start, name = run.found, run.setup.camera.name, run.setup.test.name
     across = found.before.distance_across
     errors = f"{rms_error(found.after):.4f} waves rms over the field ({rms_error(found.before):.4f} in {start})"
-    held = tuple(one for one in found.held if 1e-3 * one.worth > WORTH * rms_error(found.after))
+    held = tuple(one for one in found.active if 1e-3 * one.sensitivity > WORTH * rms_error(found.after))
     if found.improved:
         text = f"Improved: {name} has a wavefront error of {errors}"
         return f"{text}; more is held by {_held_text(held, start, across)}." if held else f"{text}."
@@ -234,12 +237,12 @@ def verdict(run: DesignRun) -> str:
     return f"Not improved: nothing that varies makes {start} better; {name} has a wavefront error of {errors}."
 
 
-def _held_text(held: tuple[Held, ...], start: str, across: float) -> str:
+def _held_text(held: tuple[ActiveConstraint, ...], start: str, across: float) -> str:
     """Return the dearest constraints, at most three, each with by how much.
 
     Parameters
     ----------
-    held : tuple[Held, ...]
+    held : tuple[ActiveConstraint, ...]
         The constraints.
     start : str
         Name of the camera that the design starts from.
@@ -255,5 +258,5 @@ def _held_text(held: tuple[Held, ...], start: str, across: float) -> str:
         text = f"the {one.name} ({limit}"
         if one.start > HELD:
             text += f", which {start} breaks by {one.start / step:.3g} {unit}"
-        parts.append(f"{text}; easing it by 1 {unit} is worth {step * one.worth:.2g} waves)")
+        parts.append(f"{text}; easing it by 1 {unit} is worth {step * one.sensitivity:.2g} waves)")
     return " and ".join(parts)

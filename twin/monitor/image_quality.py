@@ -38,9 +38,9 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError
 from optics.waves.edge_shadow import StopOutlines
 from optics.waves.imaging import ImagingRays, eikonal, imaging_rays, path_to_sphere
-from optics.waves.line_transfer import LINE_SIDES, cut_pupils, line_transfers
+from optics.waves.line_transfer import LINE_SIDES, line_transfers, vignetted_pupils
 from optics.waves.pupil_shadow import FEW_SIDES, SMALLEST
-from optics.waves.pupil_stack import CUT_RINGS, DEGREE, WORST_RESIDUAL, PupilStack
+from optics.waves.pupil_stack import DEGREE, VIGNETTED_RINGS, WORST_RESIDUAL, PupilStack
 from optics.waves.pupil_terms import WORST_BEND, products, smooth_terms, to_terms
 from scenes.models import shadow
 from scenes.models.camera_model import LAUNCH_DISTANCE, coloured, lenses, line_body
@@ -446,7 +446,7 @@ class _CameraBench:
         assert isinstance(stop, Circle)
         self.stop = stop
         self.refracts = len(self.colours) > 1 and bool(lenses(spec))
-        self.nodes = quadrature.disk(CUT_RINGS if self.model.edges else RINGS)
+        self.nodes = quadrature.disk(VIGNETTED_RINGS if self.model.edges else RINGS)
         self.assembly = instrument.assembly
 
     def fill(self, states: list[State], which: np.ndarray, out: np.ndarray, reasons: list[str]) -> None:
@@ -588,7 +588,7 @@ class _CameraBench:
         if traced.free is None:
             pupils = PupilStack.fit(*beams, DEGREE, taken, FEW_SIDES)
         else:
-            pupils = PupilStack.followed(*beams, colour, taken, traced.free[lit])
+            pupils = PupilStack.fit_vignetted(*beams, colour, taken, traced.free[lit])
         return pupils, pupils.residual <= WORST_RESIDUAL * colour, (u, v)
 
     def _in_colours(self, traced: _Traced, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -621,7 +621,7 @@ class _CameraBench:
             u, v = (part[k : k + 1] for part in cosines)
             own = slice(beam, beam + 1)
             try:
-                cut = cut_pupils([pupil], u, v, self.nodes, traced.outlines.take(own), traced.free[own])
+                cut = vignetted_pupils([pupil], u, v, self.nodes, traced.outlines.take(own), traced.free[own])
                 for colour, share in zip(colours, shares, strict=True):
                     (ways,) = line_transfers(cut, [float(colour)], np.eye(2), self.nyquist, 2)
                     total[k] += share * np.array([way.values[1] for way in ways])

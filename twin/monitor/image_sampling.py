@@ -18,7 +18,7 @@ import numpy as np
 from optics.numerics import quadrature
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.trace import BeamMissedError
-from optics.waves.diffraction import Grid, PupilField, at_crossings
+from optics.waves.diffraction import Grid, PupilField, at_intersections
 from twin.framework.provenance import SelfCheck
 
 SPOT_RANGES = (0.25, 0.5, 0.8)
@@ -199,7 +199,7 @@ def disagreement(images: np.ndarray, second: PupilField, x: Grid, y: Grid) -> np
         for at, n in ((row, rows), (column, columns))
     ]
     seen = images[np.arange(count)[:, None, None], along[0][:, :, None], along[1][:, None, :]]
-    want = at_crossings(second, x.start + x.step * along[1], y.start + y.step * along[0])
+    want = at_intersections(second, x.start + x.step * along[1], y.start + y.step * along[0])
     peak = np.maximum(images.reshape(count, -1).max(axis=-1), want.reshape(count, -1).max(axis=-1))
     return np.asarray(np.max(np.abs(seen - want), axis=(-2, -1)) / peak)
 

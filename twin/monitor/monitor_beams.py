@@ -398,7 +398,7 @@ class MonitorBeams:
         amplitude = np.sqrt(np.abs(self.area_ratio(u, v)) / np.pi) * self.nodes.weight * rays.valid
         phase = eikonal(rays.size[:, None, None] * rays.position, direction, rays.path, np.zeros(3))
         phase = phase - phase[:, :1]
-        return PupilField(u, v, phase, amplitude, self.wavelength).in_lengths_of(rays.size)
+        return PupilField(u, v, phase, amplitude, self.wavelength).scaled_by(rays.size)
 
     def _require_on_ccd(self, channel: Channel, place: np.ndarray) -> None:
         """Raise BeamMissedError when the middle of a spot (S, 2), pixels from the middle, is outside its CCD."""

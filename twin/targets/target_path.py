@@ -27,12 +27,12 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_rays, trace
 from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
-from optics.waves.edge_shadow import StopOutlines, settled_shadows
+from optics.waves.edge_shadow import StopOutlines, converged_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
-from optics.waves.line_transfer import LINE_SIDES, CutPupil, cut_pupils, lit_at
-from optics.waves.optical_transfer import with_nodes_enough
+from optics.waves.line_transfer import LINE_SIDES, VignettedPupil, vignetted_pupils, unvignetted_at
+from optics.waves.optical_transfer import with_enough_nodes
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import CUT_RESIDUAL, CUT_RINGS, DEGREE, PupilFunction, fit_pupils
+from optics.waves.pupil_stack import VIGNETTED_RESIDUAL, VIGNETTED_RINGS, DEGREE, PupilFunction, fit_pupils
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
 from scenes.models.shadow import ImagingShadows, SeenEdges, TracedBeams
 
@@ -152,7 +152,7 @@ class TargetPath:
         stop = assembly.elements[f"{name}/{model.spec.stop}"].aperture
         assert isinstance(stop, Circle)
         self.stop = stop
-        self.nodes = quadrature.disk(CUT_RINGS if model.edges else RINGS)
+        self.nodes = quadrature.disk(VIGNETTED_RINGS if model.edges else RINGS)
         self._axes = assembly.nominal_pose(root).rotation
 
     @property
@@ -317,7 +317,7 @@ class TargetPath:
         points = np.stack([self.nodes.x, self.nodes.y], axis=-1)
         lit = ~covered(taken, points, SMALLEST)
         cut = fit_pupils(turned, self.nodes, DEGREE, taken, lit)
-        return tuple(with_nodes_enough(pupil, turned.wavelength) for pupil in cut)
+        return tuple(with_enough_nodes(pupil, turned.wavelength) for pupil in cut)
 
     def _field(
         self, rays: ImagingRays, systems: SystemBatch, places: np.ndarray, wavelength: float, target_shift: float = 0.0
@@ -328,18 +328,18 @@ class TargetPath:
         incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
         field = pupil_field(rays, wavelength, origin, incoming)
         turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
-        return turned.in_lengths_of(systems.size)
+        return turned.scaled_by(systems.size)
 
-    def cut_pupils(
+    def vignetted_pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, wavelength: float | None = None
-    ) -> tuple[CutPupil, ...]:
+    ) -> tuple[VignettedPupil, ...]:
         """Pupils of a camera with edges for ``optics.waves.line_transfer``; arguments and exceptions as ``pupils``.
 
         A smooth wavefront needs no more nodes than a free pupil's; any other is traced at those of ``nodes``, and at
         more where polynomials through these do not follow it.
         """
         colour = self.model.spec.wavelength if wavelength is None else wavelength
-        for nodes, rest in ((quadrature.disk(RINGS), SMOOTH), (self.nodes, CUT_RESIDUAL)):
+        for nodes, rest in ((quadrature.disk(RINGS), SMOOTH), (self.nodes, VIGNETTED_RESIDUAL)):
             with suppress(UnphysicalError):
                 cut = self._cut_pupils(state, directions, places, colour, nodes)
                 if all(one.pupil.eikonal_residual <= rest * colour for one in cut):
@@ -348,7 +348,7 @@ class TargetPath:
 
     def _cut_pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, colour: float, nodes: PupilNodes
-    ) -> tuple[CutPupil, ...]:
+    ) -> tuple[VignettedPupil, ...]:
         state = self.coloured(state, colour)
         placed, systems, rays = self._imaging(state, directions, nodes)
         owner = np.zeros(len(directions), dtype=int)
@@ -358,13 +358,13 @@ class TargetPath:
         outlines = seen.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(bodies, 1, 0)))
         lit = seen.passed[-1] & ~covered(bodies, np.stack([nodes.x, nodes.y], axis=-1), SMALLEST)
         field = self._field(rays, systems, places, colour)
-        cut = cut_pupils(fit_pupils(field, nodes, DEGREE, None, lit), field.u, field.v, nodes, outlines, lit)
+        cut = vignetted_pupils(fit_pupils(field, nodes, DEGREE, None, lit), field.u, field.v, nodes, outlines, lit)
         for k, pupil in enumerate(cut):
             (x, y), (a, b) = (
                 np.linalg.inv(pupil.pupil.axes),
                 np.stack([field.u[k], field.v[k]]) - pupil.pupil.centre[:, None],
             )
-            off = float(nodes.share @ (lit_at(pupil, (x[0] * a + x[1] * b) + 1j * (y[0] * a + y[1] * b)) != lit[k]))
+            off = float(nodes.share @ (unvignetted_at(pupil, (x[0] * a + x[1] * b) + 1j * (y[0] * a + y[1] * b)) != lit[k]))
             if off > WORST_PLACED:
                 raise UnphysicalError(f"outlines of its edges are wrong about {off:.2g} of a traced beam's rays")
         return cut
@@ -399,7 +399,7 @@ class TargetPath:
             return taken, 0.0
         others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
         seen = SeenEdges.of(beams, self.model, self.name, self.backend)
-        return settled_shadows(seen.outlines, len(directions), others)
+        return converged_shadows(seen.outlines, len(directions), others)
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
         """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""
