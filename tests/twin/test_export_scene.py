@@ -20,7 +20,7 @@ from twin.framework.data_files import FrameFacts, tiff
 from twin.orbit.export import ground_accuracy, line_scanner
 from twin.orbit.export.export_report import _warnings as export_warnings
 from twin.orbit.export.export_report import quality_warnings
-from twin.orbit.export.export_run import Controlled, Quality
+from twin.orbit.export.export_run import ControlledPolynomial, Quality
 from twin.orbit.export.rational_polynomial import read_rpc, sensor_polynomial
 from twin.orbit.measured.platform_files import read_scene
 
@@ -86,7 +86,7 @@ def test_control_points_correct_the_polynomials(folder: Path, tmp_path: Path, ki
     result = run("export", folder / "DIM_SCENE.XML", *arguments, "--out", tmp_path / "out")
     assert result.exit_code == 0, result.stderr
     told = json.loads((tmp_path / "out" / "export.json").read_text())["control"]["SCENE_P"]
-    assert (told["kind"], told["points"], told["left_out"]) == (kind, COUNT, ["3"])
+    assert (told["kind"], told["points"], told["rejected_points"]) == (kind, COUNT, ["3"])
     found = read_rpc(tmp_path / "out" / "models" / "SCENE_P_RPC.TXT")
     assert found.bias_m == pytest.approx(told["err_bias_m"])
     assert 0.02 < found.bias_m < 0.4  # 0.2 px of 0.7 m, of 13 points; at the corners of an affine function more
@@ -131,9 +131,9 @@ def test_what_is_refused(folder: Path, tmp_path: Path) -> None:
     points = (folder / "points.gcp").read_text()
     rows = points.splitlines()
     for text, message in (
-        ("\n".join(" ".join(row.split()[:7]) for row in rows[1:]), "without places in images"),
+        ("\n".join(" ".join(row.split()[:7]) for row in rows[1:]), "without image positions"),
         ("\n".join(rows[:3]), "3 or more"),
-        (points.replace("SCENE_P.tif", "a.tif", 2).replace("SCENE_P", "b"), "in one of the images"),
+        (points.replace("SCENE_P.tif", "a.tif", 2).replace("SCENE_P", "b"), "in any of the images"),
     ):
         (tmp_path / "p.gcp").write_text(text)
         refused(folder / "DIM_SCENE.XML", tmp_path / "out", ("--control", tmp_path / "p.gcp"), message)
@@ -142,7 +142,7 @@ def test_what_is_refused(folder: Path, tmp_path: Path) -> None:
     model, other = folder / "RPC_SCENE.XML", ("--control", tmp_path / "other.gcp")
     refused(tmp_path / "a.ntf", tmp_path / "out", (), "a NITF file, which is not read")
     refused(Path("simulate"), tmp_path / "out", ("--band", "B1"), "only the scene of a DIMAP file has bands")
-    refused(model, tmp_path / "out", other, "no control point is in the image of these polynomials")
+    refused(model, tmp_path / "out", other, "no control point lies in the image of these polynomials")
 
 
 @pytest.mark.second
@@ -163,7 +163,7 @@ def test_polynomials_alone_are_corrected(folder: Path, tmp_path: Path, form: str
     scene = json.loads((tmp_path / "whole" / "export.json").read_text())["control"]["SCENE_P"]
     # offsets of DIMAP 2 have lost 1e-12 by the 1 that was added
     np.testing.assert_allclose(told["coefficients_px"], scene["coefficients_px"], rtol=0, atol=1e-6)
-    assert told["left_out"] == ["3"]
+    assert told["rejected_points"] == ["3"]
     found, other = (
         read_rpc(tmp_path / place / "models" / f"{one}_RPC.TXT") for place, one in (("out", name), ("whole", "SCENE_P"))
     )
@@ -196,18 +196,18 @@ def test_doubts_of_polynomials_and_control_points_are_told() -> None:
 
     def control(used=True, probability=2e-3, freedom=1) -> Any:
         correction = SimpleNamespace(used=np.array([True, used]), probability=probability, factor=9.0, freedom=freedom)
-        return Quality(control={"A": Controlled(np.array(["1", "2"], object), correction, None)})
+        return Quality(control={"A": ControlledPolynomial(np.array(["1", "2"], object), correction, None)})
 
-    stands = "the correction by control points stands in the polynomials, not in the ISD"
+    stands = "the correction by control points is in the polynomials, not in the ISD"
     assert quality_warnings(Quality()) == ()
-    assert quality_warnings(SimpleNamespace(products={"A": SimpleNamespace(most=0.99)}, control={})) == ()
+    assert quality_warnings(SimpleNamespace(products={"A": SimpleNamespace(largest=0.99)}, control={})) == ()
     assert quality_warnings(control()) == (stands,)
-    off = SimpleNamespace(products={"A": SimpleNamespace(most=1.2)}, control={})
+    off = SimpleNamespace(products={"A": SimpleNamespace(largest=1.2)}, control={})
     for found, words in (
-        (off, "the polynomials of the product are off the rigorous model of A by up to 1.2 pixels"),
-        (control(used=False), "control points of A lie beyond their covariances and are left out: 2"),
+        (off, "the polynomials of the product differ from the rigorous model of A by up to 1.2 pixels"),
+        (control(used=False), "control points of A lie beyond their covariances and are rejected: 2"),
         (control(probability=9e-4), "control points of A scatter by 3.0 times their sigmas: "),
-        (control(freedom=0), "no control point of A is left over to check its correction"),
+        (control(freedom=0), "no redundant control point of A checks its correction"),
     ):
         assert quality_warnings(found)[0].startswith(words), words
     smooth, rough = (SimpleNamespace(error_px=(0.01, error)) for error in (0.09, 0.2))
@@ -225,7 +225,7 @@ def test_looks_that_miss_the_earth_and_ground_on_the_180th_meridian_are_refused(
     none = SimpleNamespace(
         lines=4, camera=SimpleNamespace(pixels=4), ground=lambda at, *_: np.full((len(at), 3), np.nan)
     )
-    with pytest.raises(ValueError, match="no look meets the Earth"):
+    with pytest.raises(ValueError, match="no line of sight meets the Earth"):
         ground_accuracy._places(none, np.zeros(2), np.zeros(2), 0.0)
     with pytest.raises(ValueError, match="a line of sight misses the Earth"):
         line_scanner._error(none, None, 0.0, (0, 4))

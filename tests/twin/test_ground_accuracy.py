@@ -14,7 +14,7 @@ from twin.orbit.export.ground_accuracy import (
     AccuracyMap,
     CameraUncertainty,
     intersected_accuracy,
-    maps_of,
+    accuracy_maps,
     single_accuracy,
 )
 from twin.orbit.flight.earth import east_north_up
@@ -128,7 +128,7 @@ def test_intersected_points_against_least_squares(sensors) -> None:
     k = MIDDLE
     first = pair["nadir"]
     point = first.ground(found.line[k], found.pixel[k], HEIGHT)
-    assert found.seen[k]
+    assert found.valid[k]
     axes = level(first, point)[0]
     root = np.linalg.cholesky(np.linalg.inv(stated.image))
     there = {name: np.stack(s.image(point), axis=-1)[0] for name, s in pair.items()}
@@ -170,10 +170,10 @@ def test_intersected_points_against_least_squares(sensors) -> None:
 @pytest.mark.second
 def test_maps_of_a_pass(sensors) -> None:
     places = {name: (s, 0, s.camera.pixels) for name, s in sensors.items()}
-    maps = maps_of(places, uncertainty(), HEIGHT)
+    maps = accuracy_maps(places, uncertainty(), HEIGHT)
     assert set(maps) == {*sensors, TOGETHER}
     # without a measured place nothing can be intersected
-    assert TOGETHER not in maps_of(places, uncertainty(image=np.zeros((2, 2))), HEIGHT)
+    assert TOGETHER not in accuracy_maps(places, uncertainty(image=np.zeros((2, 2))), HEIGHT)
     with pytest.raises(ValueError, match="two lines"):
         intersected_accuracy({"nadir": sensors["nadir"]}, uncertainty(), HEIGHT)
     short = replace(sensors["forward"], first_line_time=sensors["forward"].first_line_time, lines=20)

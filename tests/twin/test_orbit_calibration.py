@@ -317,7 +317,7 @@ def test_rates_that_residuals_show_are_assumed_with_their_uncertainty(monkeypatc
     """Of two passes the larger of each axis; of a rate that nothing settles nothing is known."""
     estimate, sigma = 1e-6 * np.array([[3.0, 0.0, 1.0, 1.0, 0.0, 9.0], [4.0, 2.0, 0.0, 1.0, 1.0, np.inf]])
     rates = SimpleNamespace(p_value=0.0, estimate=estimate, sigma=sigma)
-    found = SimpleNamespace(rates=rates, courses=SimpleNamespace(p_value=0.5), factors={"attitude walk": 4.0})
+    found = SimpleNamespace(rates=rates, slow_variations=SimpleNamespace(p_value=0.5), factors={"attitude walk": 4.0})
     monkeypatch.setattr(campaign_adjustment, "simultaneous", lambda *_, **__: found)
     campaign = Campaign(SETUP.test, {"nadir": SimpleNamespace(interior=(0.5,))}, Noise(1e-6), ())
     drifts = campaign_adjustment.with_detected_drift(campaign).drifts

@@ -66,7 +66,7 @@ from twin.orbit.conventions.check_run import run_check
 from twin.orbit.export.export_run import read_exportable, run_export
 from twin.orbit.export.ground_accuracy import ground_rows
 from twin.orbit.export.quality_run import read_polynomial_source
-from twin.orbit.export.rational_polynomial import controlled, read_rpc, sensor_polynomial
+from twin.orbit.export.rational_polynomial import corrected_polynomial, read_rpc, sensor_polynomial
 from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.image_points import PointsError, measure_points
@@ -352,15 +352,15 @@ CASES: list[tuple[Callable[[], object], type[Exception], str]] = [
         "a line of sight misses",
     ),
     (
-        lambda: controlled(NOWHERE, Ns(at=lambda line, sample: np.zeros((len(line), 2)))),
+        lambda: corrected_polynomial(NOWHERE, Ns(at=lambda line, sample: np.zeros((len(line), 2)))),
         ValueError,
-        "do not lead back to the",
+        "cannot be inverted to the",
     ),
     (lambda: Patch.true_point(STEEP, "nadir", np.ones(1), np.ones(1)), PatchError, "as steep as the look"),
     (
-        lambda: sights._start(Ns(ground=TIES), {"blue": OFF}, np.arange(1), Ns(height=0.0)),
+        lambda: sights._prior_of(Ns(ground=TIES), {"blue": OFF}, np.arange(1), Ns(height=0.0)),
         SightsError,
-        "lines look past",
+        "lines of sight miss",
     ),
     (lambda: angle_camera(UNMADE, None), ValueError, "an instrument's lines need a backend"),
     (lambda: fit_rpc(PLACES[:, :2], PLACES[:, 2:]), ValueError, "the 180th meridian or a pole"),

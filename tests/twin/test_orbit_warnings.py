@@ -138,7 +138,7 @@ def test_tables_of_accuracy_and_control_have_their_units() -> None:
     covariance = np.array([np.diag([4.0, 9.0, 16.0])] * 3)
     errors = {"ce90": np.array([5.0, 7.0, 99.0]), "le90": np.array([2.0, 3.0, 99.0]), "covariance": covariance}
     numbers = {"line": np.array([1.0, 2.0, 0.0]), "pixel": np.array([3.0, 4.0, 0.0]), "horizontal": lambda: (1.5, 0.5)}
-    maps = {"nadir": Ns(seen=seen, **places, **errors, **numbers)}
+    maps = {"nadir": Ns(valid=seen, **places, **errors, **numbers)}
     table, _, grid = export_report._map_section(maps).artefacts
     assert table.rows == [["nadir", 6.0, 7.0, 2.5, 3.0, 1.5, 0.5]]
     assert grid.rows[0] == pytest.approx(("nadir", 1.0, 3.0, 116.0, 40.0, 300.0, 5.0, 2.0, 2.0, 3.0, 4.0))
@@ -151,18 +151,18 @@ def test_tables_of_accuracy_and_control_have_their_units() -> None:
         control = {"nadir": Ns(correction=correction, names=IDS[:1])}
         table, full = export_report.control_section(control).artefacts
     assert table.rows == [("nadir", 3.0, pytest.approx(0.2), -4.0, pytest.approx(0.5), 5.0, 2)]
-    assert full.rows == [("nadir", "a", 0.1, 0.3, 0.2, 0.4, "left out")]
+    assert full.rows == [("nadir", "a", 0.1, 0.3, 0.2, 0.4, "rejected")]
 
 
 def test_sentences_of_accuracy_and_residuals_name_their_own_numbers() -> None:
     """Points that are used, the bias after the correction, the largest CE90 and the LE90 of intersected points."""
     correction = Ns(used=np.array([True, False]), kind="shift")
-    controlled = Ns(correction=correction, after=Ns(bias_m=0.25), names=IDS)
+    corrected_polynomial = Ns(correction=correction, after=Ns(bias_m=0.25), names=IDS)
     maps = {
         TOGETHER: Ns(ce90=np.array([1.0, 2.0]), le90=np.array([3.0, np.nan])),
         "nadir": Ns(ce90=np.array([4.0, np.nan])),
     }
-    first, second, third = quality_answers(Ns(control={"nadir": controlled}, maps=maps))
+    first, second, third = quality_answers(Ns(control={"nadir": corrected_polynomial}, maps=maps))
     assert first.startswith("1 of 2 control points correct the polynomials of nadir by a shift, to 0.25 m")
     assert second == "CE90 is at most 4.00 m, of points of nadir"
     assert third == "LE90 of intersected points is at most 3.00 m"
@@ -185,7 +185,7 @@ def test_verdicts_among_the_numbers_warn_when_they_are_false() -> None:
         (STEPWISE["converged"], "stepwise", None, "has not converged after 7 rounds"),
         (PROPAGATION["agrees"], "scatter", None, "ratio 1.5, limits 0.80 to 1.20"),
         (SMOOTHING["shifts_agree"], "smoothed", "consistency", "contradict the prior: chi-square 9.5, limit 8.25"),
-        (SMOOTHING["agrees"], "smoothed", None, "wrong by up to 5 of their sigma, limit 8.25"),
+        (SMOOTHING["agrees"], "smoothed", None, "reach 5 times their sigma, limit 8.25"),
     ):
         for one, value in ((right, True), (wrong, False)):
             found = Ns(**vars(one), converged=value, rounds=7)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from analysis.orbit.rational_polynomial import RationalPolynomial
-from twin.orbit.export.quality_run import compared
+from twin.orbit.export.quality_run import compare_product
 from twin.orbit.export.rational_polynomial import sensor_polynomial
 from twin.orbit.measured.platform_files import read_scene
 
@@ -94,7 +94,7 @@ def test_a_pleiades_scene_meets_its_own_polynomials(tmp_path: Path) -> None:
       </Refined_Model></Geometric_Data></Dimap_Document>""")
     scene = read_scene(path)
     assert scene.read.inertial_velocity
-    found = compared(scene.sensor, polynomials(root), str(path))
+    found = compare_product(scene.sensor, polynomials(root), str(path))
     assert found.heights == (160.0, 240.0)
     # the fit of the polynomials themselves: 0.0104 px by the product
-    assert found.most < 0.0125
+    assert found.largest < 0.0125

@@ -13,7 +13,7 @@ from tests.tiers import quick
 from tests.twin.dimap_bench import Scene, rpc, write
 from twin.framework.data_files import FrameFacts, tiff
 from twin.orbit.export.rational_polynomial import (
-    controlled,
+    corrected_polynomial,
     image_slope,
     polynomial_correction,
     read_rpc,
@@ -100,7 +100,7 @@ def test_errors_on_the_ground_are_errors_in_the_image(sensor, model: RationalPol
     np.testing.assert_allclose(found.at(*place.T), wanted.at(*place.T), rtol=1e-6)
     np.testing.assert_allclose(found.covariance_at(*place.T), wanted.covariance_at(*place.T), rtol=1e-5)
     assert (found.chi_square, found.freedom) == (pytest.approx(wanted.chi_square, rel=1e-5), wanted.freedom)
-    after = np.stack(controlled(model, found).image(*where), axis=-1)
+    after = np.stack(corrected_polynomial(model, found).image(*where), axis=-1)
     np.testing.assert_allclose(after, predicted + found.at(*predicted.T), rtol=0, atol=1e-5)
 
 
@@ -115,9 +115,9 @@ def test_err_bias_and_err_rand(sensor, model: RationalPolynomial) -> None:
     middle = 0.5 * (np.array([SCENE.lines, SCENE.pixels]) - 1.0)
     ground = sensor.ground(middle[0] + [0.0, 1.0, 0.0], middle[1] + [0.0, 0.0, 1.0], 1000.0)
     size = np.linalg.norm(ground[1:] - ground[0], axis=1) / np.sqrt(2.0)
-    quiet = controlled(model, polynomial_correction(model, itrs, none, place + 0.2 * noise, spread, "shift"))
+    quiet = corrected_polynomial(model, polynomial_correction(model, itrs, none, place + 0.2 * noise, spread, "shift"))
     assert quiet.bias_m == pytest.approx(0.2 * np.hypot(*size) / np.sqrt(40.0), rel=0.02)
     assert quiet.random_m == 0.0
-    rough = controlled(model, polynomial_correction(model, itrs, none, place + noise, spread, "shift", screened=False))
+    rough = corrected_polynomial(model, polynomial_correction(model, itrs, none, place + noise, spread, "shift", screened=False))
     assert rough.bias_m == pytest.approx(quiet.bias_m, rel=1e-6)
     assert rough.random_m == pytest.approx(np.sqrt(1.0 - 0.04) * np.hypot(*size), rel=0.25)  # 40 points: 11 %

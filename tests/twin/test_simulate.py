@@ -322,7 +322,7 @@ def test_a_spoilt_run_is_refused(tmp_path: Path) -> None:
     image.unlink()
     assert _told(tmp_path, "nadir.tiff")
     (tmp_path / "run" / "simulate.json").write_text('{"lines": []}')
-    assert _told(tmp_path, "where the images lie")
+    assert _told(tmp_path, "the positions of the images are missing")
 
 
 def _told(folder: Path, word: str) -> bool:

@@ -191,29 +191,31 @@ def export(
         "image": image_sigma,
         "height": height_sigma,
     }
-    asked = [word for name, one in sigmas.items() if one is not None for word in (f"--{name}-sigma", str(one))]
-    asked += [] if band is None else ["--band", band]
-    asked += [] if control is None else ["--control", str(control), "--correction", correction.value]
+    options_text = [
+        word for name, sigma in sigmas.items() if sigma is not None for word in (f"--{name}-sigma", str(sigma))
+    ]
+    options_text += [] if band is None else ["--band", band]
+    options_text += [] if control is None else ["--control", str(control), "--correction", correction.value]
 
     def resolve() -> tuple[Exportable, tuple[float, float] | None, CameraUncertainty | None, ControlPoints | None]:
         from twin.orbit.export.export_run import read_control, read_exportable
         from twin.orbit.export.ground_accuracy import CameraUncertainty
         from twin.orbit.export.quality_run import read_polynomial_source
 
-        stated = {name: _sigma(name, one) for name, one in sigmas.items() if one is not None}
-        uncertainty = CameraUncertainty.of(**stated) if stated else None
+        given_sigmas = {name: _sigma(name, sigma) for name, sigma in sigmas.items() if sigma is not None}
+        uncertainty = CameraUncertainty.of(**given_sigmas) if given_sigmas else None
         points = None if control is None else read_control(control, correction.value)
         read = read_polynomial_source(source, band) or read_exportable(source, options.seed, band)
         return read, _ground(lowest, highest), uncertainty, points
 
-    def work(given: tuple[Any, ...], session: Session) -> Result:
+    def work(arguments: tuple[Any, ...], session: Session) -> Result:
         from scenes.yaml.errors import InputError, Issue
         from twin.framework.procedure import BenchError
         from twin.orbit.export import export_report, quality_run
         from twin.orbit.export.export_run import SceneSource, run_export
         from twin.orbit.export.quality_run import PolynomialSource, run_polynomial_export, with_quality
 
-        read, heights, uncertainty, points = given
+        read, heights, uncertainty, points = arguments
         contents: dict[str, bytes]
         if isinstance(read, PolynomialSource):
             alone = run_polynomial_export(read, uncertainty, points)
@@ -233,7 +235,7 @@ def export(
             session.folder.write_bytes(name, content)
         ends = () if heights is None else ("--lowest", f"{heights[0]!r} m", "--highest", f"{heights[1]!r} m")
         name = session.backend.name
-        words = (*ends, *(["--truth"] if truth else []), *asked, "--seed", str(drawn))
+        words = (*ends, *(["--truth"] if truth else []), *options_text, "--seed", str(drawn))
         again = (PROGRAM, "export", str(source), *words, *(() if name == "llvm" else ("--backend", name)))
         inputs = (source,) if control is None else (source, control)
         facts = {"config": read.config, "seed": drawn, "again": again, "given": inputs}
@@ -243,7 +245,7 @@ def export(
     run_command(f"{stem}-export", options, resolve, work)
 
 
-def _sigma(name: str, given: str | float) -> float:
+def _sigma(name: str, text: str | float) -> float:
     """Return the standard deviation that an option gives, in SI units; pixels stay pixels.
 
     Raises
@@ -251,15 +253,15 @@ def _sigma(name: str, given: str | float) -> float:
     InputErrorText
         The text is not a standard deviation with a unit, or the value is too large.
     """
-    if not isinstance(given, str):
-        return float(given)
-    (kind, most, example), option = _SIGMAS[name], f"--{name}-sigma"
+    if not isinstance(text, str):
+        return float(text)
+    (kind, largest, example), option = _SIGMAS[name], f"--{name}-sigma"
     try:
-        value = parse_quantity(given, kind)
+        value = parse_quantity(text, kind)
     except Problem as problem:
         raise InputErrorText(f"{option}: {problem}; for example '{example}'") from None
-    if not 0.0 <= value <= most:
-        raise InputErrorText(f"{option} must lie between 0 and {most:g} in SI units; for example '{example}'")
+    if not 0.0 <= value <= largest:
+        raise InputErrorText(f"{option} must lie between 0 and {largest:g} in SI units; for example '{example}'")
     return value
 
 

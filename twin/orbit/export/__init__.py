@@ -1,1 +1,1 @@
-"""Line cameras for other photogrammetric software: USGS CSM line scanners and rational polynomials."""
+"""Export of line cameras to other photogrammetric software: CSM line scanners (USGS) and rational polynomials."""

@@ -1,7 +1,4 @@
-"""Files, quantities and report of an export.
-
-What an export tells of the worth of its models: numbers, tables, maps and warnings.
-"""
+"""Files, result keys (export.json) and report of an export, with the accuracy of the exported models."""
 
 from __future__ import annotations
 
@@ -17,77 +14,82 @@ from twin.framework.artefact import Cell, SvgFigure, Table, significant
 from twin.framework.data_files import FrameFacts, tiff
 from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, Section, answer
-from twin.orbit.export.export_run import Controlled, Export, ExportedLine, ProductPolynomial, Quality, SceneSource
+from twin.orbit.export.export_run import (
+    ControlledPolynomial,
+    Export,
+    ExportedLine,
+    ProductPolynomial,
+    Quality,
+    SceneSource,
+)
 from twin.orbit.export.ground_accuracy import TOGETHER, AccuracyMap, GroundSigma
 from twin.orbit.export.line_scanner import ModelError
 from twin.orbit.export.rational_polynomial import residual_sigma
 
 _UNLIKELY = 1e-3
-"""Chance of a chi-square below which covariances of control points cannot be true."""
+"""p-value of chi-square below which the covariances of control points are reported as too small."""
 _MOST_PANELS = 6
 _MOST_ROWS = 400
-"""Of control points in a page's table."""
+"""Largest number of control points in the table of a report."""
 _OFF = 1.0
-"""Pixels by which a product's polynomials may be off before a warning."""
+"""Difference of a product's polynomials from the rigorous model, in pixels, above which there is a warning."""
 
 
 def _over(
-    values: Callable[[AccuracyMap], np.ndarray], how: Callable[[np.ndarray], float]
+    values: Callable[[AccuracyMap], np.ndarray], statistic: Callable[[np.ndarray], float]
 ) -> Callable[[AccuracyMap], float]:
-    return lambda found: float(how(values(found)[found.seen]))
+    return lambda accuracy: float(statistic(values(accuracy)[accuracy.valid]))
 
 
 ACCURACY: Record[AccuracyMap] = Record(
-    "Errors on the ground of points over a scene, by what is uncertain of camera, orbit and attitude.",
-    Quantity("height_m", lambda found: found.height, "of the ground above the ellipsoid"),
-    Quantity("points", lambda found: int(np.sum(found.seen)), "of the grid, at which errors were taken"),
-    Quantity("ce90_median_m", _over(lambda f: f.ce90, np.median), "of 90 % of horizontal errors", "CE90 median", 3),
-    Quantity("ce90_largest_m", _over(lambda f: f.ce90, np.max), "the largest", "CE90 largest", 3),
-    Quantity("le90_median_m", _over(lambda f: f.le90, np.median), "of 90 % of vertical errors", "LE90 median", 3),
-    Quantity("le90_largest_m", _over(lambda f: f.le90, np.max), "the largest", "LE90 largest", 3),
-    Quantity("common_m", lambda f: f.horizontal()[0], "that points have in common, of each axis", "in common", 3),
-    Quantity("random_m", lambda f: f.horizontal()[1], "of measured places, without heights", "random", 3),
+    "Errors on the ground of points over a scene, by the uncertainty of camera, orbit and attitude.",
+    Quantity("height_m", lambda found: found.height, "height of the ground above the ellipsoid"),
+    Quantity("points", lambda found: int(np.sum(found.valid)), "number of points of the grid"),
+    Quantity("ce90_median_m", _over(lambda f: f.ce90, np.median), "90% horizontal error", "CE90 median", 3),
+    Quantity("ce90_largest_m", _over(lambda f: f.ce90, np.max), "largest 90% horizontal error", "CE90 largest", 3),
+    Quantity("le90_median_m", _over(lambda f: f.le90, np.median), "90% vertical error", "LE90 median", 3),
+    Quantity("le90_largest_m", _over(lambda f: f.le90, np.max), "largest 90% vertical error", "LE90 largest", 3),
+    Quantity("common_m", lambda f: f.horizontal()[0], "error that points share, per axis", "shared", 3),
+    Quantity("random_m", lambda f: f.horizontal()[1], "by measured positions, without heights", "random", 3),
 )
-CONTROL: Record[Controlled] = Record(
-    "How control points corrected a line's polynomials; measured minus predicted.",
-    Quantity("kind", lambda one: one.correction.kind, "shift, or affine function of line and sample"),
-    Quantity("points", lambda one: len(one.names), "how many"),
-    Quantity("left_out", lambda one: one.left_out, "names of points that lie beyond their covariances"),
-    Quantity("middle_px", lambda one: one.correction.middle, "line and sample from which places count"),
-    Quantity("size_px", lambda one: one.correction.size, "unit of places, line and sample"),
-    Quantity(
-        "coefficients_px", lambda one: one.correction.coefficients, "of line and sample: constant, by line, sample"
-    ),
-    Quantity("covariance_px2", lambda one: one.correction.covariance, "of them, those of the line first"),
-    Quantity("chi_square", lambda one: one.correction.chi_square, "of what is left, by the covariances"),
-    Quantity("freedom", lambda one: one.correction.freedom, "of it"),
-    Quantity("probability", lambda one: one.correction.probability, "of as large a chi-square"),
-    Quantity("fit_error_px", lambda one: max(one.after.error_px), "largest of the written polynomials' fit"),
-    Quantity("err_bias_m", lambda one: one.after.bias_m, "ERR_BIAS: sigma of the correction along a horizontal axis"),
-    Quantity("err_rand_m", lambda one: one.after.random_m, "ERR_RAND: what scatters beyond the covariances"),
+CONTROL: Record[ControlledPolynomial] = Record(
+    "Correction of a line's polynomials by control points, measured minus predicted.",
+    Quantity("kind", lambda c: c.correction.kind, "shift, or affine function of line and sample"),
+    Quantity("points", lambda c: len(c.names), "number of control points"),
+    Quantity("rejected_points", lambda c: c.rejected_points, "names of points that lie beyond their covariances"),
+    Quantity("middle_px", lambda c: c.correction.middle, "origin of the positions, line and sample"),
+    Quantity("size_px", lambda c: c.correction.size, "unit of the positions, line and sample"),
+    Quantity("coefficients_px", lambda c: c.correction.coefficients, "of line and sample: constant, by line, sample"),
+    Quantity("covariance_px2", lambda c: c.correction.covariance, "covariance of the coefficients, line first"),
+    Quantity("chi_square", lambda c: c.correction.chi_square, "chi-square of the residuals, by the covariances"),
+    Quantity("freedom", lambda c: c.correction.freedom, "degrees of freedom of chi-square"),
+    Quantity("probability", lambda c: c.correction.probability, "p-value of chi-square"),
+    Quantity("fit_error_px", lambda c: max(c.after.error_px), "largest error of the written polynomials' fit"),
+    Quantity("err_bias_m", lambda c: c.after.bias_m, "ERR_BIAS: sigma of the correction along a horizontal axis"),
+    Quantity("err_rand_m", lambda c: c.after.random_m, "ERR_RAND: scatter beyond the covariances"),
 )
 PRODUCT: Record[ProductPolynomial] = Record(
     "Rational polynomials that came with a scene, minus its rigorous model.",
-    Quantity("file", lambda one: one.file, "where they are from"),
-    Quantity("mean_line_px", lambda one: one.mean[0], "mean difference along the track", "mean, line", 3),
-    Quantity("mean_sample_px", lambda one: one.mean[1], "along the line", "mean, sample", 3),
-    Quantity("rms_line_px", lambda one: one.rms[0], "root mean square about the mean, along the track", "rms, line", 3),
-    Quantity("rms_sample_px", lambda one: one.rms[1], "along the line", "rms, sample", 3),
-    Quantity("largest_px", lambda one: one.most, "largest of all", "largest", 3),
-    Quantity("heights_m", lambda one: one.heights, "lowest and highest ground of the polynomials, which is compared"),
+    Quantity("file", lambda p: p.file, "file of the polynomials"),
+    Quantity("mean_line_px", lambda p: p.mean[0], "mean difference along the track", "mean, line", 3),
+    Quantity("mean_sample_px", lambda p: p.mean[1], "mean difference along the line", "mean, sample", 3),
+    Quantity("rms_line_px", lambda p: p.rms[0], "RMS about the mean, along the track", "rms, line", 3),
+    Quantity("rms_sample_px", lambda p: p.rms[1], "RMS about the mean, along the line", "rms, sample", 3),
+    Quantity("largest_px", lambda p: p.largest, "largest difference", "largest", 3),
+    Quantity("heights_m", lambda p: p.heights, "lowest and highest ground of the polynomials, which is compared"),
 )
 
 
 def quality_sections(quality: Quality) -> tuple[Section, ...]:
-    """Sections of what was asked for; none for nothing."""
+    """Return the sections on product polynomials, control points and accuracy maps that were requested."""
     parts: list[Section] = []
     if quality.products:
         table = PRODUCT.table(
             "product_rpc",
             "The product's own polynomials",
             "Polynomials minus rigorous model; rms about the mean. A mean along the track of 12 m would be the "
-            "aberration of the light, which the rigorous model does not have.",
-            {name: PRODUCT(one) for name, one in quality.products.items()},
+            "aberration of light, which the rigorous model does not include.",
+            {name: PRODUCT(product) for name, product in quality.products.items()},
             PRODUCT.headed,
             "line",
         )
@@ -97,96 +99,102 @@ def quality_sections(quality: Quality) -> tuple[Section, ...]:
 
 
 def quality_answers(quality: Quality) -> tuple[str, ...]:
-    """Sentences for the head of a page."""
-    found = []
-    for name, one in quality.control.items():
-        used = int(np.sum(one.correction.used))
-        bias = significant(one.after.bias_m or 0.0, 2)
-        how = "a shift" if one.correction.kind == "shift" else "an affine function"
-        found.append(
-            f"{used} of {len(one.names)} control points correct the polynomials of {name} by {how}, to {bias} m on the "
-            "ground along each axis"
+    """Return sentences on control points and accuracy for the head of a report."""
+    sentences = []
+    for name, controlled in quality.control.items():
+        used = int(np.sum(controlled.correction.used))
+        bias = significant(controlled.after.bias_m or 0.0, 2)
+        form = "a shift" if controlled.correction.kind == "shift" else "an affine function"
+        sentences.append(
+            f"{used} of {len(controlled.names)} control points correct the polynomials of {name} by {form}, to {bias} "
+            "m on the ground along each axis"
         )
     if quality.maps:
         name, worst = max(quality.maps.items(), key=lambda item: float(np.nanmax(item[1].ce90)))
-        whose = "points that the lines intersect" if name == TOGETHER else f"points of {name}"
-        found.append(f"CE90 is at most {significant(float(np.nanmax(worst.ce90)), 3)} m, of {whose}")
-        both = quality.maps.get(TOGETHER)
-        if both is not None:
-            found.append(f"LE90 of intersected points is at most {significant(float(np.nanmax(both.le90)), 3)} m")
-    return tuple(found)
+        whose = "intersected points" if name == TOGETHER else f"points of {name}"
+        sentences.append(f"CE90 is at most {significant(float(np.nanmax(worst.ce90)), 3)} m, of {whose}")
+        intersected = quality.maps.get(TOGETHER)
+        if intersected is not None:
+            sentences.append(
+                f"LE90 of intersected points is at most {significant(float(np.nanmax(intersected.le90)), 3)} m"
+            )
+    return tuple(sentences)
 
 
 def quality_warnings(quality: Quality) -> tuple[str, ...]:
-    """Warnings of polynomials and control points."""
-    found = []
+    """Return warnings of product polynomials and control points."""
+    warnings = []
     for name, product in quality.products.items():
-        if product.most > _OFF:
-            found.append(
-                f"the polynomials of the product are off the rigorous model of {name} by up to "
-                f"{significant(product.most, 2)} pixels"
+        if product.largest > _OFF:
+            warnings.append(
+                f"the polynomials of the product differ from the rigorous model of {name} by up to "
+                f"{significant(product.largest, 2)} pixels"
             )
-    for name, one in quality.control.items():
-        correction = one.correction
-        if left := one.left_out:
-            found.append(
-                f"control points of {name} lie beyond their covariances and are left out: {', '.join(left[:10])}"
+    for name, controlled in quality.control.items():
+        correction = controlled.correction
+        if rejected := controlled.rejected_points:
+            warnings.append(
+                f"control points of {name} lie beyond their covariances and are rejected: {', '.join(rejected[:10])}"
             )
         if correction.probability < _UNLIKELY:
-            found.append(
+            warnings.append(
                 f"control points of {name} scatter by {significant(np.sqrt(correction.factor), 2)} times their sigmas: "
                 "ERR_RAND states it, and sigmas of the correction are too small by as much"
             )
         if correction.freedom == 0:
-            found.append(f"no control point of {name} is left over to check its correction")
+            warnings.append(f"no redundant control point of {name} checks its correction")
     if quality.control:
-        found.append("the correction by control points stands in the polynomials, not in the ISD")
-    return tuple(found)
+        warnings.append("the correction by control points is in the polynomials, not in the ISD")
+    return tuple(warnings)
 
 
-def control_section(control: Mapping[str, Controlled]) -> Section:
-    """Corrections and residuals of every line."""
+def control_section(control: Mapping[str, ControlledPolynomial]) -> Section:
+    """Return the section with corrections and residuals of every line."""
     rows: list[tuple[Cell, ...]] = []
     points: list[tuple[Cell, ...]] = []
-    for name, one in control.items():
-        correction = one.correction
+    for name, controlled in control.items():
+        correction = controlled.correction
         at = correction.at(*correction.middle)[0]
         sigma = np.sqrt(np.diagonal(correction.covariance_at(*correction.middle)[0]))
         middle = np.stack([at, sigma], axis=-1).ravel().tolist()
         rows.append((name, *middle, correction.chi_square, correction.freedom))
-        left = np.stack([correction.residual, residual_sigma(correction)], axis=-1).reshape(len(one.names), -1)
-        for point, numbers, used in zip(one.names.tolist(), left.tolist(), correction.used.tolist(), strict=True):
-            points.append((name, str(point), *numbers, "used" if used else "left out"))
+        residuals = np.stack([correction.residual, residual_sigma(correction)], axis=-1).reshape(
+            len(controlled.names), -1
+        )
+        for point, numbers, used in zip(
+            controlled.names.tolist(), residuals.tolist(), correction.used.tolist(), strict=True
+        ):
+            points.append((name, str(point), *numbers, "used" if used else "rejected"))
     heads = ("line [px]", "sigma [px]", "sample [px]", "sigma [px] ")
     table = Table(
         "correction",
         "Correction in the middle of the points",
-        "Measured minus predicted; sigmas are those of the control points on the ground and in the image, and of "
-        "nothing else.",
+        "Measured minus predicted; sigmas contain only the errors of the control points on the ground and in the "
+        "image.",
         ("line", *heads, "chi-square", "freedom"),
         rows,
         digits=4,
     )
-    caption = f"After the correction, with what they are expected to be{'; the first' * (len(points) > _MOST_ROWS)}."
+    caption = f"After the correction, with expected sigmas{'; the first points' * (len(points) > _MOST_ROWS)}."
     full = Table("control", "Residuals", caption, ("line", "point", *heads, ""), points[:_MOST_ROWS], digits=3)
     return Section("Control points", (), (table, full), folded=1, name="control")
 
 
 def _map_section(maps: Mapping[str, AccuracyMap]) -> Section:
     points: list[tuple[Cell, ...]] = []
-    for name, found in maps.items():
-        places = (found.line, found.pixel, np.degrees(found.longitude), np.degrees(found.latitude))
-        height = np.full_like(found.line, found.height)
-        sigma = np.sqrt(np.einsum("nii->ni", found.covariance))
-        columns = np.stack([*places, height, found.ce90, found.le90, *sigma.T], axis=-1)[found.seen]
-        points += [(_called(name), *row) for row in columns.tolist()]
+    for name, accuracy in maps.items():
+        places = (accuracy.line, accuracy.pixel, np.degrees(accuracy.longitude), np.degrees(accuracy.latitude))
+        height = np.full_like(accuracy.line, accuracy.height)
+        sigma = np.sqrt(np.einsum("nii->ni", accuracy.covariance))
+        columns = np.stack([*places, height, accuracy.ce90, accuracy.le90, *sigma.T], axis=-1)[accuracy.valid]
+        points += [(_map_title(name), *row) for row in columns.tolist()]
     table = ACCURACY.table(
         "accuracy",
         "Errors on the ground",
         "CE90: radius of the circle that holds 90 % of the horizontal errors; LE90: half the interval that holds 90 % "
-        "of the vertical ones, of one line those of its heights from elsewhere. In common: errors of camera, orbit and "
-        "attitude; random: of the measured places.",
-        {_called(name): ACCURACY(found) for name, found in maps.items()},
+        "of the vertical ones, for a single line those of its heights from another source. Shared: errors of camera, "
+        "orbit and attitude; random: of the measured positions.",
+        {_map_title(name): ACCURACY(accuracy) for name, accuracy in maps.items()},
         ACCURACY.headed,
         "points of",
     )
@@ -198,21 +206,23 @@ def _map_section(maps: Mapping[str, AccuracyMap]) -> Section:
     return Section("Accuracy on the ground", (), (table, figure, grid), folded=1, name="accuracy")
 
 
-def _called(name: str) -> str:
+def _map_title(name: str) -> str:
     return "all lines, intersected" if name == TOGETHER else name
 
 
 def _figure(maps: Mapping[str, AccuracyMap]) -> Figure:
-    """A panel for each map."""
-    panels = [(f"CE90, {_called(name)}", found, found.ce90) for name, found in maps.items()]
-    panels += [(f"LE90, {_called(name)}", found, found.le90) for name, found in maps.items() if name == TOGETHER]
+    """Draw a panel for each accuracy map."""
+    panels = [(f"CE90, {_map_title(name)}", accuracy, accuracy.ce90) for name, accuracy in maps.items()]
+    panels += [
+        (f"LE90, {_map_title(name)}", accuracy, accuracy.le90) for name, accuracy in maps.items() if name == TOGETHER
+    ]
     panels = panels[-_MOST_PANELS:]
     wide = min(3, len(panels))
     figure = svg.new_figure(3.4 * -(-len(panels) // wide))
-    for k, (title, found, values) in enumerate(panels):
+    for k, (title, accuracy, values) in enumerate(panels):
         axes = figure.add_subplot(-(-len(panels) // wide), wide, k + 1)
-        seen = found.seen
-        longitude, latitude = np.degrees(found.longitude[seen]), np.degrees(found.latitude[seen])
+        seen = accuracy.valid
+        longitude, latitude = np.degrees(accuracy.longitude[seen]), np.degrees(accuracy.latitude[seen])
         marks = axes.scatter(longitude, latitude, c=values[seen], s=26, marker="s", cmap="viridis", linewidths=0.0)
         axes.set_aspect(1.0 / max(float(np.cos(np.radians(np.mean(latitude)))), 0.05), adjustable="datalim")
         axes.set(title=f"{title} [m]", xlabel="longitude [deg]", ylabel="latitude [deg]")
@@ -224,10 +234,11 @@ def _figure(maps: Mapping[str, AccuracyMap]) -> Figure:
 
 
 FOLDER = "models"
+"""Folder of the models in the run folder."""
 
 
 def _names(line: ExportedLine) -> dict[str, str]:
-    """What is written of a line -> its path in the run folder."""
+    """Return the paths in the run folder of a line's files: ISD, and image and RPC where there are any."""
     stem = f"{FOLDER}/{line.window.name}"
     names = {"isd": f"{stem}.json"}
     if line.window.frame is not None:
@@ -238,50 +249,50 @@ def _names(line: ExportedLine) -> dict[str, str]:
 
 
 ISD_ERROR: Record[ModelError] = Record(
-    "How far the community sensor model is from the rigorous sensor at one height, the largest over the image.",
-    Quantity("height_m", lambda one: one.height_m, "above the ellipsoid"),
-    Quantity("sample_px", lambda one: one.sample_px, "along the line"),
-    Quantity("line_px", lambda one: one.line_px, "along the track"),
+    "Largest difference of the community sensor model from the rigorous sensor over the image, at one height.",
+    Quantity("height_m", lambda error: error.height_m, "height above the ellipsoid"),
+    Quantity("sample_px", lambda error: error.sample_px, "difference along the line"),
+    Quantity("line_px", lambda error: error.line_px, "difference along the track"),
 )
 RPC_ERROR: Record[RationalPolynomial] = Record(
-    "How far the polynomials are from the rigorous sensor between the places that were fitted.",
+    "Difference of the polynomials from the rigorous sensor between the fitted points.",
     Quantity("largest_line_px", lambda model: model.error_px[0], "largest difference along the track"),
     Quantity("largest_sample_px", lambda model: model.error_px[1], "largest difference along the line"),
     Quantity("rms_line_px", lambda model: model.rms_px[0], "root mean square along the track"),
     Quantity("rms_sample_px", lambda model: model.rms_px[1], "root mean square along the line"),
 )
 GROUND: Record[GroundSigma] = Record(
-    "What the error of the camera's estimated change is on the ground, root mean square over the image.",
-    Quantity("height_m", lambda one: one.height_m, "of the ground above the ellipsoid"),
-    Quantity("err_bias_m", lambda one: one.bias_m, "ERR_BIAS: of each horizontal axis, in common with other images"),
-    Quantity("err_rand_m", lambda one: one.random_m, "ERR_RAND: of each horizontal axis, another in every image"),
-    Quantity("bias_east_m", lambda one: one.bias_east_m, "the same to the east"),
-    Quantity("bias_north_m", lambda one: one.bias_north_m, "the same to the north"),
-    Quantity("random_east_m", lambda one: one.random_east_m, "the random part to the east"),
-    Quantity("random_north_m", lambda one: one.random_north_m, "the random part to the north"),
+    "Error on the ground by the camera's estimated change, root mean square over the image.",
+    Quantity("height_m", lambda sigma: sigma.height_m, "height of the ground above the ellipsoid"),
+    Quantity("err_bias_m", lambda sigma: sigma.bias_m, "ERR_BIAS: per horizontal axis, shared with other images"),
+    Quantity("err_rand_m", lambda sigma: sigma.random_m, "ERR_RAND: per horizontal axis, independent in every image"),
+    Quantity("bias_east_m", lambda sigma: sigma.bias_east_m, "shared part to the east"),
+    Quantity("bias_north_m", lambda sigma: sigma.bias_north_m, "shared part to the north"),
+    Quantity("random_east_m", lambda sigma: sigma.random_east_m, "independent part to the east"),
+    Quantity("random_north_m", lambda sigma: sigma.random_north_m, "independent part to the north"),
 )
 LINE: Record[ExportedLine] = Record(
-    "One line's image and its models; files are paths in the run folder, None for those that were not written.",
-    Quantity("lines", lambda line: line.window.sensor.lines, "how many", "lines"),
-    Quantity("pixels", lambda line: line.window.pixels, "how many", "pixels"),
-    Quantity("first_pixel", lambda line: line.window.first_pixel, "of the image on the line", "first pixel"),
-    Quantity("first_line_time_s", lambda line: line.window.sensor.first_line_time, "from the epoch"),
-    Quantity("line_time_s", lambda line: line.window.sensor.line_time, "from one line to the next"),
+    "Image and models of a line; files are paths in the run folder, null for those that were not written.",
+    Quantity("lines", lambda line: line.window.sensor.lines, "number of image lines", "lines"),
+    Quantity("pixels", lambda line: line.window.pixels, "number of pixels", "pixels"),
+    Quantity("first_pixel", lambda line: line.window.first_pixel, "first pixel of the image", "first pixel"),
+    Quantity("first_line_time_s", lambda line: line.window.sensor.first_line_time, "time from the epoch"),
+    Quantity("line_time_s", lambda line: line.window.sensor.line_time, "time from one line to the next"),
     Quantity("image", lambda line: _names(line).get("image"), "GeoTIFF with the polynomials inside", "image"),
     Quantity("isd", lambda line: _names(line)["isd"], "image support data of the community sensor model", "ISD"),
     Quantity("rpc", lambda line: _names(line).get("rpc"), "rational polynomials", "RPC"),
-    Quantity("isd_nodes", lambda line: len(line.scanner.camera.seconds), "times at which station and attitude stand"),
-    Quantity("isd_errors", lambda line: line.scanner.errors, "at every height", record=ISD_ERROR),
-    Quantity("rpc_errors", lambda line: line.polynomial, "over all heights", record=RPC_ERROR),
-    Quantity("rpc_refused", lambda line: line.refused or None, "why there are no polynomials"),
-    Quantity("ground", lambda line: line.ground, "uncertain of a camera's change", record=GROUND, where_known=True),
+    Quantity("isd_nodes", lambda line: len(line.scanner.camera.seconds), "number of nodes of station and attitude"),
+    Quantity("isd_errors", lambda line: line.scanner.errors, "differences at every height", record=ISD_ERROR),
+    Quantity("rpc_errors", lambda line: line.polynomial, "differences over all heights", record=RPC_ERROR),
+    Quantity("rpc_refused", lambda line: line.refused or None, "reason why there are no polynomials"),
+    Quantity("ground", lambda line: line.ground, "error by a camera's change", record=GROUND, where_known=True),
 )
 EXPORT: Record[Export] = Record(
-    "export.json. Line cameras for other software.",
+    "Content of export.json: line cameras for other software.",
     Quantity("epoch_utc", lambda run: run.epoch, "second 0 of the orbit"),
-    Quantity("truth", lambda run: run.truth, "whether camera and orbit are the true ones"),
-    Quantity("heights_m", lambda run: run.heights, "of the ground that models were fitted to: lowest, middle, highest"),
-    Quantity("lines", lambda run: run.lines, "every line and its models", record=LINE),
+    Quantity("truth", lambda run: run.truth, "true if camera and orbit are the true ones"),
+    Quantity("heights_m", lambda run: run.heights, "ground to which models were fitted: lowest, middle, highest"),
+    Quantity("lines", lambda run: run.lines, "models of every line", record=LINE),
     Quantity("accuracy", lambda run: run.quality.maps or None, "line or `together`", record=ACCURACY, where_known=True),
     Quantity("control", lambda run: run.quality.control or None, "by line", record=CONTROL, where_known=True),
     Quantity("product_rpc", lambda run: run.quality.products or None, "by line", record=PRODUCT, where_known=True),
@@ -289,32 +300,35 @@ EXPORT: Record[Export] = Record(
 
 
 def export_files(run: Export) -> dict[str, bytes]:
-    """Path in the run folder -> contents: ISD and RPC of every line, and its image as a GeoTIFF with the RPC inside."""
-    found = {}
+    """Return the files of an export, path -> content.
+
+    Each line has an ISD, an RPC file, and its image as a GeoTIFF with the RPC inside.
+    """
+    files = {}
     for line in run.lines.values():
         names = _names(line)
-        found[names["isd"]] = (json.dumps(line.scanner.isd, allow_nan=False) + "\n").encode()
+        files[names["isd"]] = (json.dumps(line.scanner.isd, allow_nan=False) + "\n").encode()
         if line.polynomial is not None:
-            found[names["rpc"]] = line.polynomial.text().encode()
+            files[names["rpc"]] = line.polynomial.text().encode()
         if line.window.frame is not None:
             note = f"second 0 of its orbit is {run.epoch}"
             facts = FrameFacts(line.window.name, line.window.pitch, note=note, place=line.polynomial)
-            found[names["image"]] = bytes(tiff(line.window.frame[None], facts))
-    return found
+            files[names["image"]] = bytes(tiff(line.window.frame[None], facts))
+    return files
 
 
 _ROUGH = 0.1
-"""Pixels: a model that is further off is worth a warning."""
+"""Difference of rational polynomials from the rigorous sensor, in pixels, above which there is a warning."""
 
 
 def export_report(run: Export) -> Report:
-    """What was written, and how well it agrees with the rigorous sensor."""
+    """Return the report of an export: its files, and their differences from the rigorous sensor."""
     isd = max((e.worst_px, name) for name, line in run.lines.items() for e in line.scanner.errors)
     rpc = [(max(line.polynomial.error_px), name) for name, line in run.lines.items() if line.polynomial is not None]
     low, _, high = run.heights
     images = sum(line.window.frame is not None for line in run.lines.values())
     verdict, more = answer(
-        f"The folder has {len(run.lines)} lines as community sensor models and rational polynomials"
+        f"The folder contains {len(run.lines)} lines as community sensor models and rational polynomials"
         + (f", with {images} images" if images else ""),
         f"on ground {low:.0f} to {high:.0f} m high the sensor models are within {significant(isd[0], 2)} pixels of the "
         f"rigorous sensor ({isd[1]} is the worst)",
@@ -326,13 +340,13 @@ def export_report(run: Export) -> Report:
     rows: list[tuple[Cell, ...]] = []
     for name, line in run.lines.items():
         polynomial = line.polynomial
-        most = (None, None) if polynomial is None else (max(polynomial.error_px), max(polynomial.rms_px))
-        rows.append((name, *(one.worst_px for one in line.scanner.errors), *most))
+        largest = (None, None) if polynomial is None else (max(polynomial.error_px), max(polynomial.rms_px))
+        rows.append((name, *(error.worst_px for error in line.scanner.errors), *largest))
     summary = Table(
         "models",
         "Models against the rigorous sensor",
-        "Largest difference over the image, of lines and samples the larger one; of the polynomials between the places "
-        "that were fitted, over all heights.",
+        "Largest difference over the image, in lines or samples; for the polynomials, between the fitted points over "
+        "all heights.",
         ("line", *(f"ISD at {height:.0f} m [px]" for height in run.heights), "RPC largest [px]", "RPC rms [px]"),
         rows,
         digits=2,
@@ -348,13 +362,13 @@ def export_report(run: Export) -> Report:
         "line",
     )
     read = "the run folder of a simulation" if run.source.folder is not None else "a test without images"
-    known = "camera and orbit as they truly are" if run.truth else "the laboratory's camera on the measured orbit"
+    model = "true camera and orbit" if run.truth else "the laboratory's camera on the measured orbit"
     if isinstance(run.source, SceneSource):
         scene = run.source.scene.read
-        known = f"the rigorous model of the file, {'with' if scene.refracted else 'without'} refraction"
+        model = f"the rigorous model of the file, {'with' if scene.refracted else 'without'} refraction"
         read = f"{scene.profile} {scene.name}, DIMAP {scene.version}"
     facts = (
-        ("Lines", known),
+        ("Lines", model),
         ("Second 0 of the orbit", run.epoch),
         ("Ground", f"{low:.0f} to {high:.0f} m above the ellipsoid"),
         ("Read", read),
@@ -365,28 +379,26 @@ def export_report(run: Export) -> Report:
         more,
         facts,
         summary,
-        (Section("What was written", (), (files,)), *quality_sections(run.quality)),
+        (Section("Files", (), (files,)), *quality_sections(run.quality)),
         warnings=(*_warnings(run), *quality_warnings(run.quality)),
     )
 
 
 def _warnings(run: Export) -> tuple[str, ...]:
-    found = []
+    warnings = []
     if isinstance(run.source, SceneSource) and run.source.scene.read.inertial_velocity:
-        found.append(
-            "the file's velocities are against the stars, in Earth-fixed axes: omega x P has been taken off them"
-        )
+        warnings.append("the file's velocities are inertial, in Earth-fixed axes: omega x P has been subtracted")
     if isinstance(run.source, SceneSource) and run.source.scene.read.light_speed:
-        found.append(
+        warnings.append(
             "the file's LIGHT_SPEED_SETTING is true: light time and aberration are not in the model, up to 13 m along "
             "the track; compare it with the product's own polynomials"
         )
     for name, line in run.lines.items():
         if line.polynomial is None:
-            found.append(f"{name} has no rational polynomials: {line.refused}")
+            warnings.append(f"{name} has no rational polynomials: {line.refused}")
         elif max(line.polynomial.error_px) > _ROUGH:
-            found.append(
+            warnings.append(
                 f"the rational polynomials of {name} are off by up to {significant(max(line.polynomial.error_px), 2)} "
-                "pixels, as attitude and orbit are not smooth; the ISD follows them"
+                "pixels, because attitude and orbit are not smooth; the ISD follows them"
             )
-    return tuple(found)
+    return tuple(warnings)

@@ -1,12 +1,12 @@
-"""What is exported: lines of a camera on their way, from a simulated pass or a test in orbit, as models for other
-software, with their images where there are any.
+"""Export of a camera's lines on their trajectory as models for other software, with images where there are any.
 
-The camera is the laboratory's and the way the measured one, as the user of the images knows them; or, where asked for,
-both as they truly are. An instrument's cameras can be those that its monitor has estimated in orbit. The scene of a
-DIMAP file is as that file tells it.
+The lines come from a simulated pass or a test in orbit. Camera and trajectory are the laboratory's and the measured
+one, as the user of the images knows them, or, on request, the true ones. An instrument's cameras can be those that its
+monitor has estimated in orbit. The scene of a DIMAP file has the rigorous model of that file.
 
-What is told of the worth of exported models: their errors on the ground by what is uncertain of camera and way, how
-control points correct the polynomials, and how a product's own polynomials agree with its rigorous model.
+The quality of exported models comprises their errors on the ground by the uncertainty of camera and trajectory, the
+correction of the polynomials by control points, and the difference of a product's own polynomials from its rigorous
+model.
 """
 
 from __future__ import annotations
@@ -51,16 +51,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ControlPoints:
-    """Control points with their places in images.
+    """Control points with their image positions.
 
     Attributes
     ----------
     file : str
-        That they are from.
+        File of the points.
     read : GroundFile
-        What it holds; places count from the centre of the first pixel.
+        Content of the file; image positions count from the centre of the first pixel.
     kind : Kind
-        Of the correction that they determine.
+        Kind of the correction that they determine.
     """
 
     file: str
@@ -69,17 +69,17 @@ class ControlPoints:
 
 
 @dataclass(frozen=True, eq=False)
-class Controlled:
-    """A line's polynomials after control.
+class ControlledPolynomial:
+    """Polynomials of a line corrected by control points.
 
     Attributes
     ----------
-    names : NDArray[np.object_]
-        (N,) of the points.
+    names : (N,) ndarray of object
+        Names of the points.
     correction : ImageCorrection
-        Of the image.
+        Correction in the image.
     after : RationalPolynomial
-        Polynomials with the correction inside.
+        Polynomials that include the correction.
     """
 
     names: NDArray[np.object_]
@@ -87,103 +87,104 @@ class Controlled:
     after: RationalPolynomial
 
     @property
-    def left_out(self) -> list[str]:
+    def rejected_points(self) -> list[str]:
         """Names of the points that lie beyond their covariances."""
         return [str(name) for name in self.names[~self.correction.used]]
 
 
 @dataclass(frozen=True)
 class ProductPolynomial:
-    """Rational polynomials that came with a product, against its rigorous model, over the image and the heights that
-    the polynomials cover; polynomials minus rigorous.
+    """Comparison of a product's rational polynomials with its rigorous model: polynomials minus rigorous model.
+
+    It covers the image and the heights of the polynomials.
 
     Attributes
     ----------
     file : str
-        Where they are from.
-    mean : tuple[float, float]
-        Mean difference of line and sample, pixels.
-    rms : tuple[float, float]
-        Root mean square about the mean, likewise.
-    most : float
-        Largest of all differences, pixels.
-    heights : tuple[float, float]
-        Lowest and highest ground that the polynomials cover, metres.
+        File of the polynomials.
+    mean : tuple of float
+        Mean difference of line and sample, in pixels.
+    rms : tuple of float
+        Root mean square about the mean, of line and sample, in pixels.
+    largest : float
+        Largest absolute difference, in pixels.
+    heights : tuple of float
+        Lowest and highest ground that the polynomials cover, in metres.
     """
 
     file: str
     mean: tuple[float, float]
     rms: tuple[float, float]
-    most: float
+    largest: float
     heights: tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """What the models of an export are worth.
+    """Accuracy of the models of an export.
 
     Attributes
     ----------
     maps : Mapping[str, AccuracyMap]
-        Line, or `together` for points that all lines intersect -> errors on the ground; empty where nobody asked.
-    control : Mapping[str, Controlled]
-        Line -> how control points corrected its polynomials.
+        Line, or `together` for points intersected from all lines -> errors on the ground; empty where not requested.
+    control : Mapping[str, ControlledPolynomial]
+        Line -> polynomials corrected by control points.
     products : Mapping[str, ProductPolynomial]
-        Line -> polynomials that came with it.
+        Line -> comparison of the polynomials that came with it.
     """
 
     maps: Mapping[str, AccuracyMap] = field(default_factory=FrozenMap)
-    control: Mapping[str, Controlled] = field(default_factory=FrozenMap)
+    control: Mapping[str, ControlledPolynomial] = field(default_factory=FrozenMap)
     products: Mapping[str, ProductPolynomial] = field(default_factory=FrozenMap)
 
 
 def read_control(path: Path, kind: Kind) -> ControlPoints:
-    """Control points of a .gcp file of the Ames Stereo Pipeline.
+    """Read control points from a .gcp file of the Ames Stereo Pipeline.
 
     Parameters
     ----------
     path : Path
-        Of it; without a header `# WKT:` its latitudes and longitudes are those of WGS 84, heights above it.
+        Path of the file; without a header `# WKT:`, its latitudes, longitudes and heights refer to WGS 84.
     kind : Kind
-        Of the correction.
+        Kind of the correction.
 
     Raises
     ------
     InputError
-        It cannot be read, or has no places in images.
+        The file cannot be read, or has no image positions.
     """
     if path.suffix.lower() != ".gcp":
-        raise InputError(Issue("not a .gcp file", str(path), allowed="control points with places in images, .gcp"))
-    stated = any("WKT:" in line for line in text_lines(path, "a .gcp file") if line.lstrip().startswith("#"))
-    spec = GroundFileSpec(file=str(path), crs=None if stated else "EPSG:4979")
-    found = read_ground_points(spec, Path())
-    if not found.images:
+        raise InputError(Issue("not a .gcp file", str(path), allowed="control points with image positions, .gcp"))
+    has_crs = any("WKT:" in line for line in text_lines(path, "a .gcp file") if line.lstrip().startswith("#"))
+    spec = GroundFileSpec(file=str(path), crs=None if has_crs else "EPSG:4979")
+    points = read_ground_points(spec, Path())
+    if not points.images:
         allowed = "after the sigmas of each point: image, column, row, two sigmas"
-        raise InputError(Issue("control points without places in images", str(path), allowed=allowed))
-    return ControlPoints(str(path), found, kind)
+        raise InputError(Issue("control points without image positions", str(path), allowed=allowed))
+    return ControlPoints(str(path), points, kind)
 
 
 READS = ("orbit_simulate", "orbit_angle")
-"""Kinds of files that say a camera and its way."""
+"""Kinds of files that define a camera and its trajectory."""
 _PAYLOAD_HINT = "a payload has no orbit: the YAML file of a simulation or of a test of angles that names it"
 
 
 @dataclass(frozen=True, eq=False)
 class ExportSource:
-    """What was read.
+    """Simulation or test whose lines are exported.
 
     Attributes
     ----------
-    setup : SimulateSetup | AngleSetup
-        Of the test.
+    setup : SimulateSetup or AngleSetup
+        Resolved test file.
     config : str
-        It, as YAML with all that it refers to.
-    folder : Path | None
-        Of a simulation's run, None for a file.
+        Test as YAML, with everything that it refers to.
+    folder : Path or None
+        Run folder of a simulation; None for a file.
     seed : int
-        Of the measured orbit and attitude.
+        Seed of the measured orbit and attitude.
     windows : Mapping[str, tuple[int, int, int, int]]
-        Line -> its first line, first pixel, lines and pixels, of the images of a run.
+        Line -> first line, first pixel, number of lines and of pixels of the images of a run.
     """
 
     setup: SimulateSetup | AngleSetup
@@ -195,14 +196,14 @@ class ExportSource:
 
 @dataclass(frozen=True, eq=False)
 class SceneSource:
-    """The scene of a DIMAP file.
+    """Scene of a DIMAP file.
 
     Attributes
     ----------
     scene : DimapScene
-        What the file tells.
+        Content of the file.
     config : str
-        Its path and what was chosen of it, as YAML.
+        Path of the file and chosen band, as YAML.
     """
 
     scene: DimapScene
@@ -210,33 +211,33 @@ class SceneSource:
 
     @property
     def folder(self) -> None:
-        """No run."""
+        """None: a scene has no run folder."""
         return None
 
     @property
     def seed(self) -> int:
-        """Any: nothing is drawn."""
+        """Seed 0, which is not used: nothing is drawn."""
         return 0
 
 
 @dataclass(frozen=True, eq=False)
 class ImagedWindow:
-    """A line's image, or where it would be.
+    """Window of a line's image, rendered or not.
 
     Attributes
     ----------
     name : str
-        Of the line.
+        Name of the line.
     sensor : Sensor
-        Its lines are those of the window.
+        Sensor whose lines are those of the window.
     first_pixel, pixels : int
-        Of the window on the line.
+        First pixel and number of pixels of the window on the line.
     pitch : float
-        Of the pixels, metres.
-    frame : np.ndarray | None
-        Grey values, (lines, pixels); None where nothing was rendered.
-    calibrated : CalibratedLine | None
-        The line before its estimated change; None where none was estimated.
+        Pixel pitch, in metres.
+    frame : (lines, pixels) ndarray or None
+        Grey values; None where nothing was rendered.
+    calibrated : CalibratedLine or None
+        Line before its estimated change; None where none was estimated.
     """
 
     name: str
@@ -250,20 +251,20 @@ class ImagedWindow:
 
 @dataclass(frozen=True, eq=False)
 class ExportedLine:
-    """A line as other software gets it.
+    """Exported models of a line.
 
     Attributes
     ----------
     window : ImagedWindow
-        Of it.
+        Window of the image.
     scanner : LineScanner
         Community sensor model.
-    polynomial : RationalPolynomial | None
-        Rational polynomials; None where they cannot be, and why.
+    polynomial : RationalPolynomial or None
+        Rational polynomials; None where they cannot be fitted.
     refused : str
-        Why there are no polynomials, empty where there are.
-    ground : GroundSigma | None
-        What is uncertain of the camera's estimated change, on the ground; None where none was estimated.
+        Reason why there are no polynomials; empty where there are.
+    ground : GroundSigma or None
+        Uncertainty of the camera's estimated change on the ground; None where none was estimated.
     """
 
     window: ImagedWindow
@@ -275,22 +276,22 @@ class ExportedLine:
 
 @dataclass(frozen=True, eq=False)
 class Export:
-    """All that is written.
+    """All models of an export.
 
     Attributes
     ----------
-    source : ExportSource | SceneSource
-        What was read.
+    source : ExportSource or SceneSource
+        Source of the lines.
     epoch : str
         UTC of second 0 of the orbit.
     truth : bool
-        Whether camera and orbit are the true ones.
-    heights : tuple[float, float, float]
-        Of the ground above the ellipsoid that models were fitted to: lowest, middle, highest, metres.
+        True if camera and orbit are the true ones.
+    heights : tuple of float
+        Lowest, middle and highest ground above the ellipsoid to which models were fitted, in metres.
     lines : Mapping[str, ExportedLine]
-        By name.
+        Models by name of the line.
     quality : Quality
-        What they are worth; None where it was not looked at.
+        Accuracy of the models; empty where not requested.
     """
 
     source: ExportSource | SceneSource
@@ -302,21 +303,21 @@ class Export:
 
 
 def read_exportable(path: Path, seed: int | None = None, band: str | None = None) -> ExportSource | SceneSource:
-    """Whatever has a camera and its way: what `read_source` takes, or the DIMAP file of a scene.
+    """Read a source that has a camera and its trajectory: those of `read_source`, or the DIMAP file of a scene.
 
     Parameters
     ----------
     path : Path
-        Of it.
-    seed : int | None
-        In place of the file's.
-    band : str | None
-        Of a scene whose bands do not look alike.
+        Path of the file or run folder.
+    seed : int, optional
+        Seed in place of the file's.
+    band : str, optional
+        Band of a scene whose bands have different lines of sight.
 
     Raises
     ------
     InputError
-        It is neither, or cannot be read.
+        The source is neither of them, or cannot be read.
     """
     if path.is_file() and path.suffix.lower() in _SCENES:
         return SceneSource(read_scene(path, band), dump_yaml({"source": str(path)} | ({"band": band} if band else {})))
@@ -324,12 +325,12 @@ def read_exportable(path: Path, seed: int | None = None, band: str | None = None
         allowed = "the scene's DIM_NAME.XML, or its rational polynomials as NAME_RPC.TXT, RPC_NAME.XML or GeoTIFF"
         raise InputError(Issue("a NITF file, which is not read", str(path), allowed=allowed))
     if band is not None:
-        raise no_bands(path, band)
+        raise band_error(path, band)
     return read_source(path, seed)
 
 
-def no_bands(path: Path, band: str) -> InputError:
-    """Return the error of a band that was asked for of a source without bands."""
+def band_error(path: Path, band: str) -> InputError:
+    """Return the error for a band requested of a source without bands."""
     return InputError(Issue("only the scene of a DIMAP file has bands", str(path), None, ("band",), band))
 
 
@@ -338,19 +339,19 @@ _NITF = (".ntf", ".nitf", ".nsf")
 
 
 def read_source(path: Path, seed: int | None = None) -> ExportSource:
-    """The run folder of a simulation or of a test of angles, or the YAML file of one.
+    """Read the run folder of a simulation or of a test of angles, or the YAML file of one.
 
     Parameters
     ----------
     path : Path
-        Of it.
-    seed : int | None
-        In place of the file's.
+        Path of the file or run folder.
+    seed : int, optional
+        Seed in place of the file's.
 
     Raises
     ------
     InputError
-        It is neither, or cannot be read.
+        The source is neither of them, or cannot be read.
     """
     if path.is_dir():
         return _of_run(path)
@@ -380,11 +381,18 @@ def _of_run(folder: Path) -> ExportSource:
     try:
         windows = {}
         for name in setup.test.lines:
-            one = numbers["lines"][name]
-            windows[name] = int(one["first_line"]), int(one["first_pixel"]), int(one["lines"]), int(one["pixels"])
+            image = numbers["lines"][name]
+            windows[name] = (
+                int(image["first_line"]),
+                int(image["first_pixel"]),
+                int(image["lines"]),
+                int(image["pixels"]),
+            )
     except (KeyError, TypeError, ValueError):
         where = str(folder / "simulate.json")
-        raise InputError(Issue("does not say where the images lie", where, allowed="as the run wrote it")) from None
+        raise InputError(
+            Issue("the positions of the images are missing", where, allowed="as the run wrote it")
+        ) from None
     return ExportSource(setup, setup.to_yaml(), folder, manifest.seed, FrozenMap(windows))
 
 
@@ -400,28 +408,28 @@ def run_export(
 
     Parameters
     ----------
-    source : ExportSource | SceneSource
-        What was read.
+    source : ExportSource or SceneSource
+        Source of the lines.
     backend : Backend
-        Where the lines of an instrument are traced.
-    heights : tuple[float, float] | None
-        Lowest and highest ground above the ellipsoid, metres; None for those of a run's elevation model, else for 0 to
-        2 000 m.
+        Backend on which the lines of an instrument are traced.
+    heights : tuple of float, optional
+        Lowest and highest ground above the ellipsoid, in metres; None for those of a run's elevation model, else 0 to
+        2000 m.
     truth : bool
-        Camera and orbit as they are in place of those that the user knows.
+        True for the true camera and orbit instead of those that the user knows.
     advance : Advance
-        Told how far it is.
-    changes : Mapping[str, EstimatedChange] | None
-        Camera -> what is estimated of it in orbit; of an instrument, and not of the truth.
+        Callback that reports the progress.
+    changes : Mapping[str, EstimatedChange], optional
+        Camera -> its change estimated in orbit; only for an instrument, and not with `truth`.
 
     Raises
     ------
     InputError
-        An image of the run is missing or another one.
+        An image of the run is missing or has another size.
     BenchError
-        No such orbit, or ground that cannot be modelled.
+        No such orbit exists, or the ground cannot be modelled.
     ValueError
-        Changes of a payload, or of the truth.
+        Changes are given for a payload, or with `truth`.
     """
     setup = None if isinstance(source, SceneSource) else source.setup
     if changes is not None and (truth or not isinstance(setup, AngleSetup) or setup.instrument is None):
@@ -439,9 +447,9 @@ def run_export(
 
 
 USUAL_HEIGHTS = (0.0, 2000.0)
-"""Metres above the ellipsoid."""
+"""Lowest and highest ground by default, in metres above the ellipsoid."""
 _ROOM = 100.0
-"""Metres about the heights of an elevation model, which has errors."""
+"""Margin about the heights of an elevation model, which has errors, in metres."""
 
 
 def _heights(source: ExportSource | SceneSource, heights: tuple[float, float] | None) -> tuple[float, float, float]:
@@ -455,7 +463,7 @@ def _heights(source: ExportSource | SceneSource, heights: tuple[float, float] | 
 
 
 def _level(source: ExportSource | SceneSource, heights: tuple[float, float, float]) -> float:
-    """Mean height of the ground, metres: that of a test's terrain, within the heights that are modelled."""
+    """Return the mean height of the ground, in metres: that of a test's terrain, within the modelled heights."""
     if isinstance(source, ExportSource) and isinstance(source.setup, AngleSetup):
         return float(np.clip(source.setup.test.terrain.height, heights[0], heights[2]))
     return heights[1]
@@ -464,7 +472,7 @@ def _level(source: ExportSource | SceneSource, heights: tuple[float, float, floa
 def _windows(
     source: ExportSource | SceneSource, backend: Backend, truth: bool, changes: Mapping[str, EstimatedChange] | None
 ) -> tuple[str, dict[str, ImagedWindow]]:
-    """Epoch, and the images by line."""
+    """Return the epoch, and the windows of the images by line."""
     if isinstance(source, SceneSource):
         return source.scene.epoch, _of_scene(source.scene, truth)
     setup = source.setup
@@ -481,7 +489,9 @@ def _windows(
             if frame.shape != (lines, pixels):
                 found = f"{frame.shape[0]} lines of {frame.shape[1]} pixels"
                 where = str(_file(source.folder, name))
-                raise InputError(Issue("another image", where, found=found, allowed=f"{lines} lines of {pixels}"))
+                raise InputError(
+                    Issue("an image of another size", where, found=found, allowed=f"{lines} lines of {pixels}")
+                )
         part = replace(sensor, first_line_time=float(sensor.time(np.array([first_line]))[0]), lines=lines)
         windows[name] = ImagedWindow(name, part, first_pixel, pixels, setup.camera.pitch_of(name), frame)
     return str(setup.test.orbit.epoch), windows
@@ -490,47 +500,49 @@ def _windows(
 def _of_angle(
     setup: AngleSetup, backend: Backend, seed: int, truth: bool, changes: Mapping[str, EstimatedChange] | None
 ) -> dict[str, ImagedWindow]:
-    """Images as long as they are wide, their lines spaced as their pixels are, about the moment of the test."""
+    """Return square images about the moment of a test, with lines spaced as the pixels are."""
     camera = angle_camera(setup, backend)
-    flown = fly(setup, camera, np.random.SeedSequence(seed))
+    flight = fly(setup, camera, np.random.SeedSequence(seed))
     windows = {}
-    chosen, known = camera.cameras if truth else camera.laboratory, {}
+    chosen, calibrated = camera.cameras if truth else camera.laboratory, {}
     if changes is not None and setup.instrument is not None:
         instrument = build_instrument(setup.instrument, setup.cameras, backend)
-        known = calibrated_lines(camera.laboratory, instrument, backend)
-        chosen = {name: corrected_line(line, known[name], changes[name].values) for name, line in chosen.items()}
+        calibrated = calibrated_lines(camera.laboratory, instrument, backend)
+        chosen = {name: corrected_line(line, calibrated[name], changes[name].values) for name, line in chosen.items()}
     for name, line in chosen.items():
         pitch = _pitch(setup, name)
         time = setup.test.time
-        room = min(time - flown.trajectory.first, flown.trajectory.last - time)
-        step = _line_time(line, flown.trajectory, flown.earth, time) if room > 2.0 * _PROBE else np.inf
+        room = min(time - flight.trajectory.first, flight.trajectory.last - time)
+        step = _line_time(line, flight.trajectory, flight.earth, time) if room > 2.0 * _PROBE else np.inf
         lines = min(line.pixels, int(2.0 * room / step) - 1)
         if lines < 2:
             raise BenchError("the orbit ends at the moment of the test", ("time",), "a longer orbit")
         first = time - 0.5 * (lines - 1) * step
-        sensor = Sensor(line, flown.trajectory, flown.earth, step, first, lines, flown.effects)
-        windows[name] = ImagedWindow(name, sensor, 0, line.pixels, pitch, None, known.get(name))
+        sensor = Sensor(line, flight.trajectory, flight.earth, step, first, lines, flight.effects)
+        windows[name] = ImagedWindow(name, sensor, 0, line.pixels, pitch, None, calibrated.get(name))
     return windows
 
 
 def _of_scene(scene: DimapScene, truth: bool) -> dict[str, ImagedWindow]:
-    """The one image of a scene. What is told of it is all that is known."""
+    """Return the single image of a scene, which has no known truth."""
     read = scene.read
     if truth:
-        raise InputError(Issue("nobody knows the truth of a scene", read.file, allowed="no --truth"))
+        raise InputError(Issue("the truth of a scene is not known", read.file, allowed="no --truth"))
     name = _UNSAFE.sub("_", read.name)[:_LONGEST] or "scene"
     return {name: ImagedWindow(name, scene.sensor, 0, read.pixels, read.pitch or _USUAL_PITCH, None)}
 
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
-"""Letters of a data set's name that names of files do without."""
+"""Characters of a data set's name that are replaced in names of files."""
 _LONGEST = 100
 _USUAL_PITCH = 13e-6
-"""Metres, of Pleiades; a camera model is the same for every pitch, as its principal distance goes with it."""
+"""Pixel pitch of Pleiades, in metres; a camera model is the same for every pitch, as its principal distance scales with
+it.
+"""
 
 
 def _pitch(setup: AngleSetup, name: str) -> float:
-    """Pitch of a line's pixels, metres."""
+    """Return the pitch of a line's pixels, in metres."""
     if setup.camera is not None:
         return setup.camera.pitch_of(name)
     assert setup.instrument is not None
@@ -538,11 +550,11 @@ def _pitch(setup: AngleSetup, name: str) -> float:
 
 
 _PROBE = 1e-3
-"""Seconds over which the motion of an image is looked at."""
+"""Time over which the motion of an image is computed, in seconds."""
 
 
 def _line_time(line: LineCamera, trajectory: Trajectory, earth: Any, time: float) -> float:
-    """Seconds in which the image of the line's middle moves by a pixel along the track."""
+    """Return the time in which the image of the line's middle moves by a pixel along the track, in seconds."""
     middle = np.array([0.5 * (line.pixels - 1)])
     probe = Sensor(line, trajectory, earth, _PROBE, time, 1)
     ground = probe.ground(np.array([0.0, 0.0]), middle + np.array([-0.5, 0.5]), 0.0)
@@ -556,9 +568,9 @@ def _exported(
 ) -> ExportedLine:
     ground = None
     try:
-        place = window.first_pixel, window.pixels
+        extent = window.first_pixel, window.pixels
         notes = () if change is None else change.notes
-        scanner = line_scanner(window.sensor, window.name, epoch, window.pitch, heights, place, notes)
+        scanner = line_scanner(window.sensor, window.name, epoch, window.pitch, heights, extent, notes)
         if change is not None and window.calibrated is not None:
             ground = ground_sigma(window.sensor, window.calibrated, change, level)
     except ValueError as error:
@@ -578,10 +590,10 @@ def _file(folder: Path, name: str) -> Path:
 
 
 def _image(folder: Path, name: str) -> np.ndarray:
-    """(rows, columns) of a run's image."""
+    """Return the (rows, columns) array of a run's image."""
     path = _file(folder, name)
     try:
         return np.asarray(tifffile.imread(path, key=0)).squeeze()
-    # readers of spoilt files fail in ways that cannot be foreseen
+    # readers of damaged files raise many kinds of errors
     except Exception as error:
         raise InputError(Issue(f"cannot be read: {error}", str(path), allowed="as the run wrote it")) from None

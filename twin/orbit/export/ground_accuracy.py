@@ -1,16 +1,14 @@
-"""What errors of camera, orbit and attitude are on the ground: covariances of points over a scene, CE90 and LE90.
+"""Errors on the ground by errors of camera, orbit and attitude: covariances of points over a scene, CE90 and LE90.
 
-The rigorous sensor is asked where pixels see the ground after each error was given a little; these derivatives take the
-covariances to the ground. A point of one line has a height from elsewhere. A point that several lines see is
-intersected from all of them, weighted by the covariance of its places in the images; the errors of orbit and attitude
-are those of the pass, which its lines have in common, and each line has its own interior.
+The rigorous sensor computes where pixels see the ground after each error is changed by a small step; these derivatives
+propagate the covariances to the ground. A point of one line has a height from another source. A point that several
+lines see is intersected from all of them, weighted by the covariance of its image positions; the errors of orbit and
+attitude are those of the pass, which its lines share, and each line has its own interior orientation.
 
-What is estimated of a camera's change in orbit, and what is still uncertain of it: on the ground it is the error of
-the exported models, which rational polynomials state as ERR_BIAS and ERR_RAND.
-
-A line is corrected by the estimate. Each of the four numbers of the change is then moved a little, the rigorous sensor
-is asked where the same pixels see the ground now, and these derivatives take the covariance of the estimate's error to
-the horizontal plane of each point.
+`ground_sigma` propagates the uncertainty of a camera's change that was estimated in orbit. On the ground it is the
+error of the exported models, which rational polynomials state as ERR_BIAS and ERR_RAND. A line is corrected by the
+estimate; the derivatives by the four numbers of the change take the covariance of the estimate's error to the
+horizontal plane of each point.
 """
 
 from __future__ import annotations
@@ -30,31 +28,32 @@ from twin.orbit.flight.line_camera import LineCamera, corrected_line
 from twin.orbit.flight.sensor import OffsetPlatform, Sensor
 
 _GRID = (13, 13)
-"""Lines and pixels of an image at which errors are taken; they are smooth."""
+"""Lines and pixels of an image at which errors are computed; they are smooth."""
 _MOVED = 1.0
+"""Step of the derivatives by position, in metres."""
 _TURNED = 1e-6
-"""Steps of derivatives, metres and radians: metres on the ground, over which it is straight to 1e-6."""
+"""Step of the derivatives by rotation, in radians: metres on the ground, over which it is linear to 1e-6."""
 _RAISED = 10.0
-"""Metres."""
+"""Step of the derivatives by height, in metres."""
 _EDGE = 0.5
-"""Pixels and lines: half a step, and from the image's edge."""
+"""Half step of the derivatives by line and pixel, in pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraUncertainty:
-    """What is uncertain of a camera and of its way, as covariances.
+    """Covariances of a camera and its trajectory.
 
     Attributes
     ----------
-    platform : Array
-        (6, 6) of the position along X, Y, Z of the body, metres, and of turns about X, Y, Z of the body, radians;
-        constant over the pass and shared by its lines.
-    interior : Array
-        (3, 3) of line and pixel, pixels, and of the principal distance, relative; of each line on its own.
-    image : Array
-        (2, 2) of a point's measured line and pixel, pixels^2; another in every point.
+    platform : (6, 6) ndarray
+        Covariance of the position along X, Y, Z of the body, in metres, and of rotations about X, Y, Z of the body, in
+        radians; constant over the pass and shared by its lines.
+    interior : (3, 3) ndarray
+        Covariance of line and pixel, in pixels, and of the relative principal distance; independent for each line.
+    image : (2, 2) ndarray
+        Covariance of a point's measured line and pixel, in pixels^2; independent for each point.
     height : float
-        Standard deviation of the heights that points of one line have from elsewhere, metres.
+        Standard deviation of the heights that points of one line have from another source, in metres.
     """
 
     platform: Array
@@ -72,22 +71,22 @@ class CameraUncertainty:
         image: float = 0.0,
         height: float = 0.0,
     ) -> CameraUncertainty:
-        """Independent errors, alike along and about all axes.
+        """Return independent errors, equal along and about all axes.
 
         Parameters
         ----------
         position : float
-            Standard deviation along each axis, metres.
+            Standard deviation along each axis, in metres.
         attitude : float
-            About each axis, radians.
+            Standard deviation about each axis, in radians.
         interior : float
-            Of line and pixel, pixels.
+            Standard deviation of line and pixel by the interior orientation, in pixels.
         scale : float
-            Of the principal distance, relative.
+            Relative standard deviation of the principal distance.
         image : float
-            Of a measured line and pixel, pixels.
+            Standard deviation of a measured line and pixel, in pixels.
         height : float
-            Of heights from elsewhere, metres.
+            Standard deviation of heights from another source, in metres.
         """
         platform = np.diag([position**2] * 3 + [attitude**2] * 3)
         return cls(platform, np.diag([interior**2, interior**2, scale**2]), image**2 * np.eye(2), height)
@@ -95,24 +94,26 @@ class CameraUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class AccuracyMap:
-    """Covariances of points over a scene.
+    """Covariances of points on a grid over a scene.
 
     Attributes
     ----------
-    line, pixel : Array
-        (N,) of the grid, in the image that it is of.
-    longitude, latitude : Array
-        (N,) radians; NaN where a line of sight misses the Earth or, of several lines, fewer than two see.
+    line, pixel : (N,) ndarray
+        Image positions of the grid.
+    longitude, latitude : (N,) ndarray
+        Ground positions, in radians; NaN where a line of sight misses the Earth or fewer than two of several lines see
+        the point.
     height : float
-        Of the ground above the ellipsoid, metres.
-    constant : Array
-        (N, 3, 3) to the east, to the north and up, m^2, of what points have in common.
-    random : Array
-        (N, 3, 3) of what is another in every point: its measured places.
-    heights : Array
-        (N, 3, 3) of the heights that points of one line have from elsewhere, which move them in plan as well.
-    shape : tuple[int, int]
-        Of the grid.
+        Height of the ground above the ellipsoid, in metres.
+    constant : (N, 3, 3) ndarray
+        Covariance east, north and up of the errors that points share, in m^2.
+    random : (N, 3, 3) ndarray
+        Covariance of the errors that are independent from point to point, those of measured image positions, in m^2.
+    heights : (N, 3, 3) ndarray
+        Covariance by the heights that points of one line have from another source, which also move them in plan, in
+        m^2.
+    shape : tuple of int
+        Shape of the grid.
     """
 
     line: Array
@@ -127,50 +128,51 @@ class AccuracyMap:
 
     @property
     def covariance(self) -> Array:
-        """(N, 3, 3) of a point, m^2."""
+        """Covariance (N, 3, 3) of a point, in m^2."""
         return self.constant + self.random + self.heights
 
     @property
     def ce90(self) -> Array:
-        """(N,) radius of the circle that holds 90 % of the horizontal errors, metres."""
+        """Radius (N,) of the circle that holds 90 % of the horizontal errors, in metres."""
         return self._where_seen(lambda c: circular_error(c[:, :2, :2]))
 
     @property
     def le90(self) -> Array:
-        """(N,) half width of the interval that holds 90 % of the vertical errors, metres."""
+        """Half width (N,) of the interval that holds 90 % of the vertical errors, in metres."""
         return self._where_seen(lambda c: linear_error(c[:, 2, 2]))
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
-        """(N,) where there is a covariance."""
+    def valid(self) -> NDArray[np.bool_]:
+        """Mask (N,) of points that have a covariance."""
         return np.isfinite(self.longitude)
 
     def horizontal(self) -> tuple[float, float]:
-        """Root mean square errors of a horizontal axis over the scene, metres: of what points have in common, and of
-        their measured places; without heights from elsewhere.
+        """Return the root mean square horizontal errors per axis, shared and random, in metres.
+
+        Errors of heights from another source are excluded.
         """
-        return axis_sigma(self.constant[self.seen, :2, :2]), axis_sigma(self.random[self.seen, :2, :2])
+        return axis_sigma(self.constant[self.valid, :2, :2]), axis_sigma(self.random[self.valid, :2, :2])
 
     def _where_seen(self, function) -> Array:  # type: ignore[no-untyped-def]
-        found = np.full(len(self.line), np.nan)
-        found[self.seen] = function(self.covariance[self.seen])
-        return found
+        values = np.full(len(self.line), np.nan)
+        values[self.valid] = function(self.covariance[self.valid])
+        return values
 
 
 @dataclass(frozen=True, eq=False)
 class _Derivatives:
-    """Of where pixels (N,) see a height, east and north, metres.
+    """Derivatives of the ground position east and north, in metres, that pixels (N,) see at a height.
 
     Attributes
     ----------
-    place : Array
-        (N, 2, 2) by line and pixel.
-    platform : Array
-        (N, 2, 6) by the errors of the platform.
-    interior : Array
-        (N, 2, 3) by those of the interior.
-    height : Array
-        (N, 2) by the height.
+    place : (N, 2, 2) ndarray
+        Derivatives by line and pixel.
+    platform : (N, 2, 6) ndarray
+        Derivatives by the errors of the platform.
+    interior : (N, 2, 3) ndarray
+        Derivatives by the errors of the interior orientation.
+    height : (N, 2) ndarray
+        Derivatives by the height.
     """
 
     place: Array
@@ -181,10 +183,10 @@ class _Derivatives:
 
 def _derivatives(sensor: Sensor, line: Array, pixel: Array, height: float, level: Array) -> _Derivatives:
     def seen(at: Array, which: Array, up: float = height, moved: Array | None = None) -> Array:
-        where = sensor
+        moved_sensor = sensor
         if moved is not None:
-            where = replace(sensor, trajectory=OffsetPlatform(sensor.trajectory, moved[:3], moved[3:]))
-        return np.einsum("nij,nj->ni", level, where.ground(at, which, up))
+            moved_sensor = replace(sensor, trajectory=OffsetPlatform(sensor.trajectory, moved[:3], moved[3:]))
+        return np.einsum("nij,nj->ni", level, moved_sensor.ground(at, which, up))
 
     by_line = (seen(line + _EDGE, pixel) - seen(line - _EDGE, pixel)) / (2.0 * _EDGE)
     by_pixel = (seen(line, pixel + _EDGE) - seen(line, pixel - _EDGE)) / (2.0 * _EDGE)
@@ -195,14 +197,14 @@ def _derivatives(sensor: Sensor, line: Array, pixel: Array, height: float, level
         move[k] = step
         columns.append((seen(line, pixel, moved=move) - seen(line, pixel, moved=-move)) / (2.0 * step))
     raised = (seen(line, pixel, height + _RAISED) - seen(line, pixel, height - _RAISED)) / (2.0 * _RAISED)
-    # a longer principal distance draws what pixels see toward the line's middle
+    # a longer principal distance moves the ground positions of pixels toward the line's middle
     from_middle = pixel - 0.5 * (sensor.camera.pixels - 1)
     interior = np.stack([by_line, by_pixel, -by_pixel * from_middle[:, None]], axis=-1)
     return _Derivatives(np.stack([by_line, by_pixel], axis=-1), np.stack(columns, axis=-1), interior, raised)
 
 
 def _grid(sensor: Sensor, first_pixel: int, pixels: int) -> tuple[Array, Array]:
-    """Lines and pixels (N,) over an image."""
+    """Return lines and pixels (N,) of a grid over an image."""
     line = np.linspace(min(0.0, 0.5 * (sensor.lines - 1)), sensor.lines - 1.0, _GRID[0])
     pixel = np.linspace(first_pixel, first_pixel + pixels - 1.0, _GRID[1])
     at, which = np.meshgrid(line, pixel, indexing="ij")
@@ -212,34 +214,36 @@ def _grid(sensor: Sensor, first_pixel: int, pixels: int) -> tuple[Array, Array]:
 def single_accuracy(
     sensor: Sensor, uncertainty: CameraUncertainty, height: float, first_pixel: int = 0, pixels: int | None = None
 ) -> AccuracyMap:
-    """Errors of points of known height that one line locates.
+    """Compute the errors of points of known height that one line locates.
 
     Parameters
     ----------
     sensor : Sensor
-        Of the line; its lines are those of the image.
+        Sensor of the line; its lines are those of the image.
     uncertainty : CameraUncertainty
-        Of camera and way.
+        Uncertainty of camera and trajectory.
     height : float
-        Of the ground above the ellipsoid, metres.
+        Height of the ground above the ellipsoid, in metres.
     first_pixel : int
-        Of the image on the line.
-    pixels : int | None
-        Of the image; None for the whole line.
+        First pixel of the image on the line.
+    pixels : int, optional
+        Number of pixels of the image; None for the whole line.
 
     Raises
     ------
     ValueError
-        No look meets the Earth.
+        No line of sight meets the Earth.
     """
     line, pixel = _grid(sensor, first_pixel, sensor.camera.pixels if pixels is None else pixels)
     longitude, latitude, level = _places(sensor, line, pixel, height)
-    found = _derivatives(sensor, line, pixel, height, level[:, :2])
+    derivatives = _derivatives(sensor, line, pixel, height, level[:, :2])
     constant, random = np.zeros((2, len(line), 3, 3))
-    constant[:, :2, :2] = _taken(found.platform, uncertainty.platform) + _taken(found.interior, uncertainty.interior)
-    tilt = np.concatenate([found.height, np.ones((len(line), 1))], axis=1)
+    constant[:, :2, :2] = _propagate(derivatives.platform, uncertainty.platform) + _propagate(
+        derivatives.interior, uncertainty.interior
+    )
+    tilt = np.concatenate([derivatives.height, np.ones((len(line), 1))], axis=1)
     heights = uncertainty.height**2 * tilt[:, :, None] * tilt[:, None, :]
-    random[:, :2, :2] = _taken(found.place, uncertainty.image)
+    random[:, :2, :2] = _propagate(derivatives.place, uncertainty.image)
     return AccuracyMap(line, pixel, longitude, latitude, height, constant, random, heights, _GRID)
 
 
@@ -250,28 +254,28 @@ def intersected_accuracy(
     first_pixel: int = 0,
     pixels: int | None = None,
 ) -> AccuracyMap:
-    """Errors of points that several lines of one pass see and that are intersected from them.
+    """Compute the errors of points that are intersected from several lines of one pass.
 
     Parameters
     ----------
     sensors : Mapping[str, Sensor]
         Line -> its sensor; the grid is that of the first one's image.
     uncertainty : CameraUncertainty
-        Of camera and way; heights from elsewhere are not used.
+        Uncertainty of camera and trajectory; heights from another source are not used.
     height : float
-        Of the ground above the ellipsoid, metres.
+        Height of the ground above the ellipsoid, in metres.
     first_pixel : int
-        Of the first one's image on its line.
-    pixels : int | None
-        Of it; None for the whole line.
+        First pixel of the first one's image on its line.
+    pixels : int, optional
+        Number of pixels of that image; None for the whole line.
 
     Raises
     ------
     ValueError
-        Fewer than two lines, no look meets the Earth, images that nowhere show the same ground.
+        There are fewer than two lines, no line of sight meets the Earth, or the images do not overlap.
     """
     if len(sensors) < 2:
-        raise ValueError("an intersection takes two lines or more")
+        raise ValueError("an intersection needs two lines or more")
     first = next(iter(sensors.values()))
     line, pixel = _grid(first, first_pixel, first.camera.pixels if pixels is None else pixels)
     longitude, latitude, level = _places(first, line, pixel, height)
@@ -279,110 +283,114 @@ def intersected_accuracy(
     count = len(line)
     weight = np.linalg.inv(uncertainty.image if np.any(uncertainty.image) else np.eye(2))
     normal, platform = np.zeros((count, 3, 3)), np.zeros((count, 3, 6))
-    own: list[tuple[NDArray[np.bool_], Array, Array]] = []
+    parts: list[tuple[NDArray[np.bool_], Array, Array]] = []
     views = np.zeros(count, dtype=int)
     for sensor in sensors.values():
         at, which = (line, pixel) if sensor is first else sensor.image(ground)
-        held = (at >= 0.0) & (at <= sensor.lines - 1.0) & (which >= 0.0) & (which <= sensor.camera.pixels - 1.0)
-        if not np.any(held):
+        inside = (at >= 0.0) & (at <= sensor.lines - 1.0) & (which >= 0.0) & (which <= sensor.camera.pixels - 1.0)
+        if not np.any(inside):
             continue
-        part = _derivatives(sensor, at[held], which[held], height, level[held, :2])
+        part = _derivatives(sensor, at[inside], which[inside], height, level[inside, :2])
         to_image = np.linalg.inv(part.place)
-        # a point's place in the image by its place on the ground, and by the errors at that place
+        # derivatives of image position by ground position, and by the errors there
         by_ground = to_image @ np.concatenate(
-            [np.tile(np.eye(2), (int(np.sum(held)), 1, 1)), -part.height[:, :, None]], axis=2
+            [np.tile(np.eye(2), (int(np.sum(inside)), 1, 1)), -part.height[:, :, None]], axis=2
         )
-        turned = np.swapaxes(by_ground, 1, 2) @ weight
-        normal[held] += turned @ by_ground
-        platform[held] += turned @ to_image @ part.platform
-        own.append((held, turned @ to_image @ part.interior, turned))
-        views += held
+        weighted = np.swapaxes(by_ground, 1, 2) @ weight
+        normal[inside] += weighted @ by_ground
+        platform[inside] += weighted @ to_image @ part.platform
+        parts.append((inside, weighted @ to_image @ part.interior, weighted))
+        views += inside
     good = views >= 2
     if not np.any(good):
-        raise ValueError("the images nowhere show the same ground")
+        raise ValueError("the images do not overlap on the ground")
     inverse = np.full((count, 3, 3), np.nan)
     inverse[good] = np.linalg.inv(normal[good])
-    constant = _taken(inverse @ platform, uncertainty.platform)
+    constant = _propagate(inverse @ platform, uncertainty.platform)
     random = np.zeros((count, 3, 3))
-    for held, interior, turned in own:
-        constant[held] += _taken(inverse[held] @ interior, uncertainty.interior)
-        random[held] += _taken(inverse[held] @ turned, uncertainty.image)
-    nowhere = np.where(good, 0.0, np.nan)
+    for inside, interior, weighted in parts:
+        constant[inside] += _propagate(inverse[inside] @ interior, uncertainty.interior)
+        random[inside] += _propagate(inverse[inside] @ weighted, uncertainty.image)
+    mask = np.where(good, 0.0, np.nan)
     none = np.zeros_like(random)
-    return AccuracyMap(line, pixel, longitude + nowhere, latitude + nowhere, height, constant, random, none, _GRID)
+    return AccuracyMap(line, pixel, longitude + mask, latitude + mask, height, constant, random, none, _GRID)
 
 
 def _places(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[Array, Array, Array]:
-    """Longitude and latitude (N,) that pixels see, and the level frame there (N, 3, 3)."""
+    """Return longitude and latitude (N,) that pixels see, and the level frames there (N, 3, 3)."""
     ground = sensor.ground(line, pixel, height)
     if not np.any(np.isfinite(ground)):
-        raise ValueError("no look meets the Earth")
+        raise ValueError("no line of sight meets the Earth")
     longitude, latitude, _ = sensor.earth.geodetic(ground)
     return longitude, latitude, east_north_up(longitude, latitude)
 
 
-def _taken(rows: Array, covariance: ArrayLike) -> Array:
-    """(N, K, K) covariances of what has these derivatives (N, K, P)."""
+def _propagate(rows: Array, covariance: ArrayLike) -> Array:
+    """Return the (N, K, K) covariances propagated through derivatives (N, K, P)."""
     return np.asarray(rows @ np.asarray(covariance) @ np.swapaxes(rows, 1, 2))
 
 
-def maps_of(
+def accuracy_maps(
     sensors: Mapping[str, tuple[Sensor, int, int]], uncertainty: CameraUncertainty, height: float
 ) -> dict[str, AccuracyMap]:
-    """The map of each line by itself and, of several whose images overlap, of points that are intersected, `together`.
+    """Compute the accuracy map of each line and, where several images overlap, that of intersected points, `together`.
 
     Parameters
     ----------
     sensors : Mapping[str, tuple[Sensor, int, int]]
         Line -> its sensor, and first pixel and number of pixels of its image.
     uncertainty : CameraUncertainty
-        Of camera and way.
+        Uncertainty of camera and trajectory.
     height : float
-        Of the ground above the ellipsoid, metres.
+        Height of the ground above the ellipsoid, in metres.
 
     Raises
     ------
     ValueError
-        No look meets the Earth.
+        No line of sight meets the Earth.
     """
-    found = {name: single_accuracy(one, uncertainty, height, at, count) for name, (one, at, count) in sensors.items()}
+    maps = {
+        name: single_accuracy(sensor, uncertainty, height, at, count) for name, (sensor, at, count) in sensors.items()
+    }
     if len(sensors) > 1 and np.any(uncertainty.image):
         _, at, count = next(iter(sensors.values()))
         try:
-            found[TOGETHER] = intersected_accuracy(
-                FrozenMap({name: one for name, (one, _, _) in sensors.items()}), uncertainty, height, at, count
+            maps[TOGETHER] = intersected_accuracy(
+                FrozenMap({name: sensor for name, (sensor, _, _) in sensors.items()}), uncertainty, height, at, count
             )
         except ValueError:
             pass  # images of different ground; each line has its own map
-    return found
+    return maps
 
 
 TOGETHER = "together"
-"""Name of the map of intersected points."""
+"""Key of the map of intersected points."""
 
 
 _STEPS = (1e-7, 1e-7, 1e-7, 1e-6)
-"""Half steps of d_alpha, d_beta, d_gamma (rad) and d_f (m): centimetres on the ground, over which it is linear to 1e-7
-and its coordinates are rounded to 1e-9 m."""
+"""Half steps of d_alpha, d_beta, d_gamma (rad) and d_f (m): centimetres on the ground, over which it is linear to 1e-7,
+while its coordinates are rounded to 1e-9 m.
+"""
 _CHANGE_GRID = (3, 9)
-"""Lines and pixels of an image at which errors are taken; they are smooth along a line and hardly change along the
-track."""
+"""Lines and pixels of an image at which errors by a camera's change are computed; they are smooth along a line and
+hardly change along the track.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class EstimatedChange:
-    """A camera's change since its calibration.
+    """Estimated change of a camera since its calibration.
 
     Attributes
     ----------
-    values : Array
-        (4,) d_alpha, d_beta, d_gamma (rad) and d_f (m).
-    constant : Array
-        (4, 4) covariance of their error, as far as it goes on from image to image.
-    random : Array
-        (4, 4) covariance of what is another in every image.
-    notes : tuple[str, ...]
-        On the estimate, for formats that hold remarks.
+    values : (4,) ndarray
+        d_alpha, d_beta, d_gamma (rad) and d_f (m).
+    constant : (4, 4) ndarray
+        Covariance of the part of their error that persists from image to image.
+    random : (4, 4) ndarray
+        Covariance of the part that is independent in every image.
+    notes : tuple of str
+        Remarks on the estimate, for formats that hold remarks.
     """
 
     values: Array
@@ -393,21 +401,22 @@ class EstimatedChange:
 
 @dataclass(frozen=True)
 class GroundSigma:
-    """Horizontal error on the ground of points of known height that an image's model locates, root mean square over the
-    image; the camera's change alone makes it, and not the orbit or the attitude.
+    """Horizontal error on the ground of points of known height, by a camera's estimated change alone.
+
+    Orbit and attitude do not contribute. Values are root mean squares over the image.
 
     Attributes
     ----------
     height_m : float
-        Of the points above the ellipsoid.
+        Height of the points above the ellipsoid.
     bias_m : float
-        That other images near in time have as well, of each horizontal axis: ERR_BIAS.
+        Error of each horizontal axis that other images near in time share: ERR_BIAS.
     random_m : float
-        Likewise of what is another in every image.
+        Error of each horizontal axis that is independent in every image: ERR_RAND.
     bias_east_m, bias_north_m : float
-        The two axes, whose mean square is that of ``bias_m``.
+        Errors of the two axes, whose mean square is that of ``bias_m``.
     random_east_m, random_north_m : float
-        Likewise of ``random_m``.
+        Errors of the two axes, whose mean square is that of ``random_m``.
     """
 
     height_m: float
@@ -420,24 +429,25 @@ class GroundSigma:
 
 
 def ground_rows(sensor: Sensor, calibrated: CalibratedLine, values: Array, height: float) -> Array:
-    """Derivatives of where pixels over an image see the ground by their camera's change, (N, 2, 4): east and north in
-    metres per rad and per metre of principal distance.
+    """Return the derivatives (N, 2, 4) of the ground position, east and north, by a camera's change.
+
+    They are in metres per rad, and per metre of principal distance, on a grid over the image.
 
     Parameters
     ----------
     sensor : Sensor
-        With the corrected line.
+        Sensor with the corrected line.
     calibrated : CalibratedLine
-        The line without the change.
-    values : Array
-        (4,) of the change.
+        Line without the change.
+    values : (4,) ndarray
+        Values of the change.
     height : float
-        Of the ground above the ellipsoid, metres.
+        Height of the ground above the ellipsoid, in metres.
 
     Raises
     ------
     ValueError
-        a line of sight misses the Earth.
+        A line of sight misses the Earth.
     """
     line = np.linspace(-0.5, sensor.lines - 0.5, _CHANGE_GRID[0])
     pixel = np.linspace(-0.5, sensor.camera.pixels - 0.5, _CHANGE_GRID[1])
@@ -465,18 +475,18 @@ def ground_sigma(sensor: Sensor, calibrated: CalibratedLine, change: EstimatedCh
     Parameters
     ----------
     sensor : Sensor
-        With the corrected line.
+        Sensor with the corrected line.
     calibrated : CalibratedLine
-        The line without the change.
+        Line without the change.
     change : EstimatedChange
-        That is estimated.
+        Estimated change.
     height : float
-        Of the ground above the ellipsoid, metres.
+        Height of the ground above the ellipsoid, in metres.
 
     Raises
     ------
     ValueError
-        a line of sight misses the Earth.
+        A line of sight misses the Earth.
     """
     rows = ground_rows(sensor, calibrated, change.values, height)
     spreads = [rows @ covariance @ np.swapaxes(rows, 1, 2) for covariance in (change.constant, change.random)]

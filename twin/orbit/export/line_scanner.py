@@ -1,15 +1,15 @@
-"""A line sensor as an image support data file (ISD) of the community sensor model, for Ames Stereo Pipeline and ISIS.
+"""Line sensor as an image support data file (ISD) of the community sensor model, for Ames Stereo Pipeline and ISIS.
 
 The model is USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL: a station and a rotation over time, both interpolated by Lagrange
-polynomials through eight nodes, and one camera with a distortion cubic in its coordinates, which does not change with
-time. It knows nothing of what happens to light. So the file gets the camera and the attitude that the light seems to
-come to: at every node the directions from the station to where the rigorous sensor really sees the ground, at one
-height, are held against one common camera, and the rotation that fits them best is the attitude. Aberration and light
-time are alike at all heights and go in nearly whole; of refraction only what it is at that height.
+polynomials through eight nodes, and one camera with a distortion cubic in its coordinates, constant in time. It has no
+effects on the light. The file therefore gets the camera and the attitude from which the light seems to come: at every
+node, the directions from the station to where the rigorous sensor sees the ground, at one height, are compared with one
+common camera, and the rotation that fits them best is the attitude. Aberration and light time are nearly the same at
+all heights and are almost fully included; of refraction, only its value at that height.
 
-Of its conventions: image coordinates count from the corner, the centre of the first pixel is (0.5, 0.5); quaternions
-are w, x, y, z and turn Earth-fixed axes into the camera's; the focal plane is in millimetres, x along the flight and y
-along the line; the distortion takes ideal coordinates to real ones.
+Conventions of the model: image coordinates count from the corner, the centre of the first pixel is (0.5, 0.5);
+quaternions are w, x, y, z and rotate Earth-fixed axes into the camera's; the focal plane is in millimetres, x along the
+flight and y along the line; the distortion maps ideal coordinates to real ones.
 """
 
 from __future__ import annotations
@@ -29,44 +29,47 @@ from twin.orbit.flight.platform_table import continuous_quaternions
 from twin.orbit.flight.sensor import Sensor
 
 MODEL = "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"
+"""Name of the sensor model."""
 _TICK = 2.0**-20
-"""Seconds. Times of nodes are whole multiples of it: of ephemeris times, seconds since the year 2000, a float64 holds
-these exactly, but decimal fractions only to 6e-8 s, a thousandth of a line.
+"""Time unit of which times of nodes are whole multiples, in seconds. A float64 holds such ephemeris times (seconds
+since the year 2000) exactly, but decimal fractions only to 6e-8 s, a thousandth of a line.
 """
 _SPARE = 6
-"""Nodes beyond either end of the image."""
+"""Number of nodes beyond either end of the image."""
 _FEWEST, _MOST = 64, 8192
 _PIXELS = 33
-"""Places along the line where looks are compared; they are smooth to 1e-10 of a pixel."""
+"""Number of positions along the line at which directions are compared; they are smooth to 1e-10 of a pixel."""
 _ROUNDS = 4
+"""Number of alternations between rotations and the common camera."""
 _CUBIC = (0, 2, 5, 9)
-"""Terms 1, y, y^2 and y^3 of the distortion's ten; a line has no width in x for the others."""
+"""Indices of the terms 1, y, y^2 and y^3 among the distortion's ten; a line has no extent in x for the others."""
 
 
 @dataclass(frozen=True, eq=False)
 class EffectiveCamera:
-    """A camera and its way that see, with straight light, what a sensor sees at one height.
+    """Camera and trajectory that see, with straight light, what a sensor sees at one height.
 
     Attributes
     ----------
-    seconds : Array
-        Of the nodes, evenly spaced, (N,), of the trajectory.
-    station : Array
-        Projection centre, ITRS, (N, 3), metres.
-    velocity : Array
-        Of it, (N, 3), m/s.
+    seconds : (N,) ndarray
+        Evenly spaced times of the nodes, of the trajectory.
+    station : (N, 3) ndarray
+        Projection centre, ITRS, in metres.
+    velocity : (N, 3) ndarray
+        Velocity of the projection centre, in m/s.
     rotation : Rotation
-        From the camera's axes to the ITRS; X along the flight, Y along the line, Z toward the scene.
+        Rotations from the camera's axes to the ITRS; X along the flight, Y along the line, Z toward the scene.
     focal_length : float
-        metres.
+        Focal length, in metres.
     pitch : float
-        Of the pixels, metres.
+        Pixel pitch, in metres.
     pixels : int
-        Of the line.
-    along : Array
-        (4,) coefficients of the real y by powers of the ideal one, both in millimetres.
-    across : Array
-        (4,) likewise, what is added to the ideal x of a point on the line to make it 0.
+        Number of pixels of the line.
+    along : (4,) ndarray
+        Coefficients of the real y by powers of the ideal one, both in millimetres.
+    across : (4,) ndarray
+        Coefficients, by powers of the ideal y, of what is added to the ideal x of a point on the line to make it 0, in
+        millimetres.
     """
 
     seconds: Array
@@ -80,7 +83,7 @@ class EffectiveCamera:
     across: Array
 
     def looks(self, pixel: Array) -> Array:
-        """Unit looks (K, 3) of places on the line (K,), camera axes."""
+        """Return the unit directions (K, 3) of positions (K,) on the line, in camera axes."""
         real = 1e3 * self.pitch * (np.asarray(pixel) - 0.5 * (self.pixels - 1))
         ideal = real.copy()
         slope = self.along[1:] * np.arange(1.0, len(self.along))
@@ -91,6 +94,7 @@ class EffectiveCamera:
 
 
 _NEWTON = 12
+"""Number of Newton steps that invert the distortion."""
 
 
 def _power(coefficients: Array, at: Array) -> Array:
@@ -99,8 +103,16 @@ def _power(coefficients: Array, at: Array) -> Array:
 
 @dataclass(frozen=True)
 class ModelError:
-    """How far a model sees from where the rigorous sensor does, pixels: largest over an image, along its lines and
-    along the track, at one height (metres above the ellipsoid).
+    """Largest difference of a model from the rigorous sensor over an image at one height.
+
+    Attributes
+    ----------
+    height_m : float
+        Height above the ellipsoid, in metres.
+    sample_px : float
+        Difference along the lines, in pixels.
+    line_px : float
+        Difference along the track, in pixels.
     """
 
     height_m: float
@@ -109,22 +121,22 @@ class ModelError:
 
     @property
     def worst_px(self) -> float:
-        """The larger one, pixels."""
+        """Larger of the two differences, in pixels."""
         return max(self.sample_px, self.line_px)
 
 
 @dataclass(frozen=True, eq=False)
 class LineScanner:
-    """An ISD, and how well it agrees.
+    """ISD of a line, and its differences from the rigorous sensor.
 
     Attributes
     ----------
     isd : Mapping[str, Any]
-        Contents of the file, plain data.
+        Content of the file, plain data.
     camera : EffectiveCamera
-        That it describes.
-    errors : tuple[ModelError, ...]
-        At the heights that were asked for.
+        Camera that it describes.
+    errors : tuple of ModelError
+        Differences at the heights that were requested.
     """
 
     isd: Mapping[str, Any]
@@ -141,29 +153,29 @@ def line_scanner(
     window: tuple[int, int] | None = None,
     notes: tuple[str, ...] = (),
 ) -> LineScanner:
-    """The ISD of an image, or of a window of it.
+    """Fit the ISD of an image, or of a window of it.
 
     Parameters
     ----------
     sensor : Sensor
-        The line on its trajectory; its lines are those of the window, its camera is the whole line.
+        Line on its trajectory; its lines are those of the window, its camera is the whole line.
     name : str
-        Of the line.
+        Name of the line.
     epoch : str
         UTC of the trajectory's second 0, ISO 8601.
     pitch : float
-        Of the pixels, metres.
-    heights : tuple[float, float, float]
-        Of the ground above the ellipsoid, lowest, middle, highest, metres; it is right at the middle one.
-    window : tuple[int, int] | None
-        Its first pixel on the line, and how many; None for the whole line.
-    notes : tuple[str, ...]
-        More of them, on what the line is taken to be.
+        Pixel pitch, in metres.
+    heights : tuple of float
+        Lowest, middle and highest ground above the ellipsoid, in metres; the model is fitted at the middle one.
+    window : tuple of int, optional
+        First pixel of the window on the line, and number of pixels; None for the whole line.
+    notes : tuple of str
+        Further notes on the camera.
 
     Raises
     ------
     ValueError
-        a line of sight misses the Earth, or the trajectory is too rough for `_MOST` nodes.
+        A line of sight misses the Earth, or the trajectory is too rough for `_MOST` nodes.
     """
     camera = _effective_camera(sensor, pitch, heights[1], epoch)
     first, pixels = (0, camera.pixels) if window is None else window
@@ -174,27 +186,27 @@ def line_scanner(
 
 
 def _effective_camera(sensor: Sensor, pitch: float, height: float, epoch: str) -> EffectiveCamera:
-    """The camera with straight light that sees what a sensor sees at a height above the ellipsoid, metres.
+    """Return the camera with straight light that sees what a sensor sees at a height.
 
     Parameters
     ----------
     sensor : Sensor
-        The line on its trajectory.
+        Line on its trajectory.
     pitch : float
-        Of its pixels, metres.
+        Pixel pitch, in metres.
     height : float
-        metres.
+        Height above the ellipsoid, in metres.
     epoch : str
         UTC of the trajectory's second 0; only its fraction of a second matters.
 
     Raises
     ------
     ValueError
-        As `line_scanner`.
+        See `line_scanner`.
     """
     count = _FEWEST
     while True:
-        camera = _fitted(sensor, pitch, height, _nodes(sensor, count, epoch))
+        camera = _fit_camera(sensor, pitch, height, _nodes(sensor, count, epoch))
         if _smooth(camera):
             return camera
         count *= 2
@@ -203,30 +215,30 @@ def _effective_camera(sensor: Sensor, pitch: float, height: float, epoch: str) -
 
 
 def _ephemeris_time(epoch: str) -> tuple[int, float]:
-    """Ephemeris time of an epoch (UTC), seconds since the noon of 2000-01-01: whole ones, and the rest.
+    """Return the ephemeris time of an epoch (UTC) in seconds since noon of 2000-01-01, whole and fractional part.
 
-    It is terrestrial time, from which that of the barycentre differs by 2 ms at most; only the place of the Sun depends
-    on it.
+    It is terrestrial time, which differs from barycentric time by at most 2 ms; only the position of the Sun depends on
+    it.
     """
-    one, two = tai_of(epoch)
-    days = one - erfa.DJ00
-    seconds = (days - np.floor(days)) * erfa.DAYSEC + two * erfa.DAYSEC + erfa.TTMTAI
+    day, part = tai_of(epoch)
+    days = day - erfa.DJ00
+    seconds = (days - np.floor(days)) * erfa.DAYSEC + part * erfa.DAYSEC + erfa.TTMTAI
     whole = int(np.floor(seconds))
     return int(np.floor(days)) * int(erfa.DAYSEC) + whole, float(seconds) - whole
 
 
 def _nodes(sensor: Sensor, count: int, epoch: str) -> Array:
-    """Times of nodes (N,), seconds of the trajectory: even, whole ticks of ephemeris time."""
+    """Return the times of nodes (N,), in seconds of the trajectory, evenly spaced at whole ticks of ephemeris time."""
     ends = sensor.time(np.array([-0.5, sensor.lines - 0.5]))
     step = max(np.ceil((ends[1] - ends[0]) / count / _TICK), 1.0) * _TICK
-    rest = _ephemeris_time(epoch)[1]
-    first = np.floor((ends[0] + rest) / _TICK) * _TICK - rest - _SPARE * step
+    fraction = _ephemeris_time(epoch)[1]
+    first = np.floor((ends[0] + fraction) / _TICK) * _TICK - fraction - _SPARE * step
     times = first + step * np.arange(np.ceil((ends[1] - first) / step) + _SPARE + 1.0)
     return np.asarray(times[_known(sensor, times)])
 
 
 def _known(sensor: Sensor, times: Array) -> NDArray[np.bool_]:
-    """Whether the trajectory knows these times."""
+    """Return the mask of times that the trajectory covers."""
 
     def known(time: float) -> bool:
         try:
@@ -235,12 +247,12 @@ def _known(sensor: Sensor, times: Array) -> NDArray[np.bool_]:
             return False
         return True
 
-    # only those beyond the image can be unknown
+    # times within the image are always covered
     first, last = sensor.time(np.array([-0.5, sensor.lines - 0.5]))
     return np.array([first <= time <= last or known(time) for time in times])
 
 
-def _fitted(sensor: Sensor, pitch: float, height: float, seconds: Array) -> EffectiveCamera:
+def _fit_camera(sensor: Sensor, pitch: float, height: float, seconds: Array) -> EffectiveCamera:
     line = sensor.camera
     middle = np.array([0.5 * (line.pixels - 1)])
     pixel = 0.5 * (line.pixels - 1) * (1.0 - np.cos(np.pi * np.arange(_PIXELS) / (_PIXELS - 1.0)))
@@ -250,13 +262,13 @@ def _fitted(sensor: Sensor, pitch: float, height: float, seconds: Array) -> Effe
     y = slope[0] / np.linalg.norm(slope[0])
     axes = np.stack([np.cross(y, z), y, z], axis=-1)
     looks = line.look(pixel) @ axes
-    turn = np.empty((len(seconds), 3, 3))
+    rotations = np.empty((len(seconds), 3, 3))
     for _ in range(_ROUNDS):
-        # the rotation that takes the looks to the directions best (Wahba's problem, by singular values)
+        # the rotation that best takes the looks to the directions (Wahba's problem, by singular values)
         u, _, vt = np.linalg.svd(np.einsum("nki,kj->nij", directions, looks))
         u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-        turn = u @ vt
-        looks = np.mean(np.einsum("nij,nki->nkj", turn, directions), axis=0)
+        rotations = u @ vt
+        looks = np.mean(np.einsum("nij,nki->nkj", rotations, directions), axis=0)
         looks = looks / np.linalg.norm(looks, axis=-1, keepdims=True)
     focal = pitch / float(np.linalg.norm(slope[0]))
     ideal = 1e3 * focal * looks[:, :2] / looks[:, 2:]
@@ -266,16 +278,16 @@ def _fitted(sensor: Sensor, pitch: float, height: float, seconds: Array) -> Effe
     along, across = (np.linalg.lstsq(basis / scale, side, rcond=None)[0] / scale for side in (real, -ideal[:, 0]))
     step = seconds[1] - seconds[0]
     velocity = np.gradient(station, step, axis=0, edge_order=2)
-    rotation = Rotation.from_matrix(turn)
+    rotation = Rotation.from_matrix(rotations)
     return EffectiveCamera(seconds, station, velocity, rotation, focal, pitch, line.pixels, along, across)
 
 
 def _directions(sensor: Sensor, seconds: Array, pixel: Array, height: float) -> tuple[Array, Array]:
-    """Stations (N, 3), and unit directions (N, K, 3) from them to what the pixels (K,) see at a height, ITRS."""
+    """Return stations (N, 3), and unit directions (N, K, 3) to the ground that pixels (K,) see at a height, ITRS."""
     count = len(seconds)
     step = float(seconds[1] - seconds[0])
-    way = _AtNodes(sensor, seconds)
-    nodes = replace(sensor, trajectory=way, line_time=step, first_line_time=float(seconds[0]), lines=count)
+    trajectory = _AtNodes(sensor, seconds)
+    nodes = replace(sensor, trajectory=trajectory, line_time=step, first_line_time=float(seconds[0]), lines=count)
     at, which = (v.ravel() for v in np.meshgrid(np.arange(float(count)), pixel, indexing="ij"))
     ground = nodes.ground(at, which, height).reshape(count, len(pixel), 3)
     if not np.all(np.isfinite(ground)):
@@ -283,40 +295,44 @@ def _directions(sensor: Sensor, seconds: Array, pixel: Array, height: float) -> 
     middle = np.array([0.5 * (sensor.camera.pixels - 1)])
     to_itrs = sensor.trajectory.body_to_itrs(seconds)
     station = sensor.trajectory.position(seconds) + to_itrs @ sensor.camera.origin(middle)[0]
-    away = ground - station[:, None]
-    return station, away / np.linalg.norm(away, axis=-1, keepdims=True)
+    arms = ground - station[:, None]
+    return station, arms / np.linalg.norm(arms, axis=-1, keepdims=True)
 
 
 def _lagrange(times: Array, values: Array, at: Array) -> Array:
-    """Values (M, K) at times (M,) from those at even nodes (N, K), as the community's model does it: through eight
-    nodes, and through fewer near the ends.
+    """Interpolate values (N, K) at evenly spaced nodes to times (M,), as the community sensor model does.
+
+    It uses eight nodes, and fewer near the ends.
     """
-    place = (np.asarray(at) - times[0]) / (times[1] - times[0])
-    before = np.clip(np.floor(place).astype(int), 0, len(times) - 2)
+    position = (np.asarray(at) - times[0]) / (times[1] - times[0])
+    before = np.clip(np.floor(position).astype(int), 0, len(times) - 2)
     half = np.minimum(np.minimum(before + 1, len(times) - 1 - before), 4)
-    share = place - before
+    share = position - before
     offsets = np.arange(-3, 5)
     used = (offsets > -half[:, None]) & (offsets <= half[:, None])
-    found = np.zeros((len(place), values.shape[1]))
+    interpolated = np.zeros((len(position), values.shape[1]))
     for k, offset in enumerate(offsets):
         others = np.delete(np.arange(8), k)
         factors = np.where(used[:, others], (share[:, None] - offsets[others]) / (offset - offsets[others]), 1.0)
         weight = np.where(used[:, k], np.prod(factors, axis=1), 0.0)
-        found += weight[:, None] * values[np.clip(before + offset, 0, len(times) - 1)]
-    return found
+        interpolated += weight[:, None] * values[np.clip(before + offset, 0, len(times) - 1)]
+    return interpolated
 
 
-def _joined(rotation: Rotation) -> Array:
-    """Quaternions (N, 4) x, y, z, w of the way from the ITRS to the camera; neighbours on one side."""
+def _quaternions(rotation: Rotation) -> Array:
+    """Return continuous quaternions (N, 4), x, y, z, w, of the rotations from the ITRS to the camera."""
     return continuous_quaternions(rotation.inv().as_quat(canonical=False))
 
 
 def _smooth(camera: EffectiveCamera) -> bool:
-    """Whether every other node tells those between, to `_FOLLOWED` pixels; all of them tell what is between better."""
+    """Return True if every other node predicts those between to `_FOLLOWED` pixels.
+
+    The interpolation between all nodes is then more accurate still.
+    """
     coarse, between = camera.seconds[::2], camera.seconds[1:-1:2]
     inner = slice(_SPARE, -_SPARE) if len(between) > 4 * _SPARE else slice(None)
     station = _lagrange(coarse, camera.station[::2], between) - camera.station[1:-1:2]
-    quaternion = _joined(camera.rotation)
+    quaternion = _quaternions(camera.rotation)
     turned = _lagrange(coarse, quaternion[::2], between) - quaternion[1:-1:2]
     angle = 2.0 * np.max(np.linalg.norm(turned[inner], axis=-1))
     shift = np.max(np.linalg.norm(station[inner], axis=-1)) / _NEAREST
@@ -324,12 +340,13 @@ def _smooth(camera: EffectiveCamera) -> bool:
 
 
 _FOLLOWED = 0.01
+"""Largest interpolation error between nodes, in pixels."""
 _NEAREST = 2e5
-"""Metres to the ground, no more than which a satellite is high; a shift of the station is an angle there."""
+"""Least height of a satellite, in metres, at which a shift of the station is converted to an angle."""
 
 
 def _error(sensor: Sensor, camera: EffectiveCamera, height: float, window: tuple[int, int]) -> ModelError:
-    """Against the rigorous sensor on a grid of its image that is not the one that was fitted."""
+    """Compare a camera with the rigorous sensor on a grid of its image that is not the one of the fit."""
     line = np.linspace(-0.5, sensor.lines - 0.5, _GRID[0])
     pixel = window[0] + np.linspace(-0.5, window[1] - 0.5, _GRID[1])
     at, which = (v.ravel() for v in np.meshgrid(line, pixel, indexing="ij"))
@@ -337,11 +354,11 @@ def _error(sensor: Sensor, camera: EffectiveCamera, height: float, window: tuple
     if not np.all(np.isfinite(ground)):
         raise ValueError("a line of sight misses the Earth")
     seconds = sensor.time(at)
-    here = _image(camera, seconds, ground)
+    now = _image(camera, seconds, ground)
     later = _image(camera, seconds + sensor.line_time, ground)
-    # the line on which the model sees the point, and what of its pixel the image moves by until then
-    lines = here[:, 0] / (here[:, 0] - later[:, 0])
-    sample = here[:, 1] + lines * (later[:, 1] - here[:, 1]) - (which - 0.5 * (camera.pixels - 1))
+    # line on which the model sees the point, and sample there by the motion of the image
+    lines = now[:, 0] / (now[:, 0] - later[:, 0])
+    sample = now[:, 1] + lines * (later[:, 1] - now[:, 1]) - (which - 0.5 * (camera.pixels - 1))
     return ModelError(height, float(np.max(np.abs(sample))), float(np.max(np.abs(lines))))
 
 
@@ -349,16 +366,16 @@ _GRID = (37, 41)
 
 
 def _image(camera: EffectiveCamera, seconds: Array, ground: Array) -> Array:
-    """Image (N, 2) at given times, pixels from the line and along it."""
-    turn = Rotation.from_quat(_lagrange(camera.seconds, _joined(camera.rotation), seconds))
-    look = turn.apply(ground - _lagrange(camera.seconds, camera.station, seconds))
+    """Return the image (N, 2) of ground points at given times, in pixels from the line and along it."""
+    rotation = Rotation.from_quat(_lagrange(camera.seconds, _quaternions(camera.rotation), seconds))
+    look = rotation.apply(ground - _lagrange(camera.seconds, camera.station, seconds))
     ideal = 1e3 * camera.focal_length * look[:, :2] / look[:, 2:]
     real = np.stack([ideal[:, 0] + _power(camera.across, ideal[:, 1]), _power(camera.along, ideal[:, 1])], axis=-1)
     return real / (1e3 * camera.pitch)
 
 
 class _AtNodes:
-    """A trajectory that is asked at its nodes alone: a sensor looks half a line beyond them, where it may end."""
+    """Trajectory evaluated at its nodes alone: a sensor evaluates it half a line beyond them, where it may end."""
 
     def __init__(self, sensor: Sensor, seconds: Array) -> None:
         self._known, self._first, self._last = sensor.trajectory, seconds[0], seconds[-1]
@@ -382,20 +399,20 @@ def _isd(
     window: tuple[int, int],
     errors: tuple[ModelError, ...],
 ) -> dict[str, Any]:
-    """Contents of the file."""
-    whole, rest = _ephemeris_time(epoch)
+    """Return the content of the ISD file."""
+    whole, fraction = _ephemeris_time(epoch)
     ends = sensor.time(np.array([-0.5, sensor.lines - 0.5]))
-    # in whole ticks from a whole second, ephemeris times are exact
-    middle = round(0.5 * float(ends[0] + ends[1]) + rest)
+    # ephemeris times at whole ticks from a whole second are exact
+    middle = round(0.5 * float(ends[0] + ends[1]) + fraction)
     center = float(whole + middle)
-    start = float(ends[0]) + rest - middle
-    nodes = (center + np.round((camera.seconds + rest - middle) / _TICK) * _TICK).tolist()
+    start = float(ends[0]) + fraction - middle
+    nodes = (center + np.round((camera.seconds + fraction - middle) / _TICK) * _TICK).tolist()
     first = np.zeros(10)
     first[list(_CUBIC)] = camera.across
     first[1] = 1.0
     second = np.zeros(10)
     second[list(_CUBIC)] = camera.along
-    quaternion = np.roll(_joined(camera.rotation), 1, axis=1)
+    quaternion = np.roll(_quaternions(camera.rotation), 1, axis=1)
     per_mm = 1e-3 / camera.pitch
     return {
         "isis_camera_version": 1,
@@ -431,8 +448,10 @@ def _isd(
             "ephemeris_times": nodes,
             "reference_frame": 1,
         },
-        "instrument_pointing": _turns(1, nodes, quaternion, _turning(camera)),
-        "body_rotation": _turns(2, nodes, np.tile([1.0, 0.0, 0.0, 0.0], (len(nodes), 1)), np.zeros((len(nodes), 3))),
+        "instrument_pointing": _rotation_record(1, nodes, quaternion, _angular_velocity(camera)),
+        "body_rotation": _rotation_record(
+            2, nodes, np.tile([1.0, 0.0, 0.0, 0.0], (len(nodes), 1)), np.zeros((len(nodes), 3))
+        ),
         "sun_position": {
             "unit": "km",
             "positions": [_sun(sensor, epoch, center).tolist()],
@@ -444,8 +463,8 @@ def _isd(
     }
 
 
-def _turns(number: int, nodes: list[float], quaternion: Array, rate: Array) -> dict[str, Any]:
-    """Turns of frame number 1 against frame -``number``, over the nodes."""
+def _rotation_record(number: int, nodes: list[float], quaternion: Array, rate: Array) -> dict[str, Any]:
+    """Return the ISD record of the rotations between frame 1 and frame -``number``, over the nodes."""
     return {
         "quaternions": quaternion.tolist(),
         "ephemeris_times": nodes,
@@ -457,38 +476,39 @@ def _turns(number: int, nodes: list[float], quaternion: Array, rate: Array) -> d
     }
 
 
-def _turning(camera: EffectiveCamera) -> Array:
-    """Angular velocity of the camera's axes against the Earth-fixed ones, in the latter, rad/s, (N, 3)."""
+def _angular_velocity(camera: EffectiveCamera) -> Array:
+    """Return the angular velocity (N, 3) of the camera's axes against the Earth-fixed ones, in the latter, in rad/s."""
     step = camera.seconds[1] - camera.seconds[0]
-    turn = (camera.rotation[1:] * camera.rotation[:-1].inv()).as_rotvec() / step
-    return np.concatenate([turn[:1], 0.5 * (turn[1:] + turn[:-1]), turn[-1:]])
+    rate = (camera.rotation[1:] * camera.rotation[:-1].inv()).as_rotvec() / step
+    return np.concatenate([rate[:1], 0.5 * (rate[1:] + rate[:-1]), rate[-1:]])
 
 
 def _sun(sensor: Sensor, epoch: str, center: float) -> Array:
-    """Place of the Sun, ITRS, kilometres, at an ephemeris time."""
-    whole, rest = _ephemeris_time(epoch)
-    seconds = center - whole - rest
+    """Return the position of the Sun at an ephemeris time, ITRS, in kilometres."""
+    whole, fraction = _ephemeris_time(epoch)
+    seconds = center - whole - fraction
     heliocentric = erfa.epv00(erfa.DJ00, center / erfa.DAYSEC)[0]["p"]
-    turn = sensor.earth.rotation(epoch, seconds, seconds).matrix(seconds)
-    return np.asarray(turn @ (-1e-3 * erfa.DAU * heliocentric))
+    rotation = sensor.earth.rotation(epoch, seconds, seconds).matrix(seconds)
+    return np.asarray(rotation @ (-1e-3 * erfa.DAU * heliocentric))
 
 
 def _notes(sensor: Sensor, heights: tuple[float, float, float], errors: tuple[ModelError, ...]) -> list[str]:
-    """What the model cannot carry, and how much that is."""
+    """Return notes on conventions, on effects that the model cannot represent, and on its largest differences."""
     on = sensor.effects.names
     carried = (
-        f"{', '.join(on)} stand in the attitude and the distortion as they are at {heights[1]:g} m above the ellipsoid"
+        f"{', '.join(on)} are included in the attitude and the distortion, exactly at {heights[1]:g} m above the "
+        "ellipsoid"
         if on
-        else "nothing happens to the light"
+        else "no effects"
     )
     notes = [
         "Earth-fixed axes are those of the ITRS (WGS84), ephemeris times are terrestrial time; lines and samples count "
         "from the corner of the image, the centre of its first pixel is 0.5, 0.5.",
         f"Light: {carried}.",
     ]
-    for one in errors:
+    for error in errors:
         notes.append(
-            f"Against the rigorous sensor, largest over the image at {one.height_m:g} m: {one.sample_px:.2g} samples, "
-            f"{one.line_px:.2g} lines."
+            f"Against the rigorous sensor, largest over the image at {error.height_m:g} m: {error.sample_px:.2g} "
+            f"samples, {error.line_px:.2g} lines."
         )
     return notes

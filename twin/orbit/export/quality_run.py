@@ -1,6 +1,6 @@
-"""The worth of exported models: errors on the ground, polynomials after control, a product's own polynomials.
+"""Accuracy of exported models: errors on the ground, correction by control points, a product's polynomials.
 
-Rational polynomials that come alone, without a rigorous model, corrected by control points.
+Rational polynomials without a rigorous model can also be corrected by control points alone.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from twin.framework.record import Quantity, Record
 from twin.framework.report import Report, answer
 from twin.orbit.export.export_report import CONTROL, FOLDER, control_section, quality_answers, quality_warnings
 from twin.orbit.export.export_run import (
-    Controlled,
+    ControlledPolynomial,
     ControlPoints,
     Export,
     ExportedLine,
     ProductPolynomial,
     Quality,
     SceneSource,
-    no_bands,
+    band_error,
 )
-from twin.orbit.export.ground_accuracy import AccuracyMap, CameraUncertainty, maps_of
-from twin.orbit.export.rational_polynomial import controlled, is_rpc, polynomial_correction, read_rpc
+from twin.orbit.export.ground_accuracy import AccuracyMap, CameraUncertainty, accuracy_maps
+from twin.orbit.export.rational_polynomial import corrected_polynomial, is_rpc, polynomial_correction, read_rpc
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.platform_files import DimapScene
 
@@ -41,45 +41,50 @@ _COMPARED = (15, 15, 3)
 
 
 def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: ControlPoints | None) -> Export:
-    """The export with what was asked for: corrected polynomials, ERR_BIAS and ERR_RAND in them, notes in the ISD.
+    """Return the export with corrected polynomials, ERR_BIAS and ERR_RAND in them, and notes in the ISD, as requested.
 
     Parameters
     ----------
     run : Export
-        Its models.
-    uncertainty : CameraUncertainty | None
-        Of camera and way; None for no map.
-    points : ControlPoints | None
-        That correct the polynomials; None for none.
+        Exported models.
+    uncertainty : CameraUncertainty or None
+        Uncertainty of camera and trajectory; None for no map.
+    points : ControlPoints or None
+        Control points that correct the polynomials; None for no correction.
 
     Raises
     ------
     InputError
-        Control points that are of none of the images, or do not determine a correction.
+        No control point lies in an image, or the points do not determine a correction.
     """
     lines = dict(run.lines)
     products = _products(run, run.source.scene) if isinstance(run.source, SceneSource) else {}
     control = {} if points is None else _controlled(points, lines)
-    for name, one in control.items():
-        lines[name] = replace(lines[name], polynomial=one.after)
+    for name, controlled in control.items():
+        lines[name] = replace(lines[name], polynomial=controlled.after)
     maps: Mapping[str, AccuracyMap] = {}
     if uncertainty is not None:
         places = {n: (x.window.sensor, x.window.first_pixel, x.window.pixels) for n, x in lines.items()}
-        maps = maps_of(places, uncertainty, run.heights[1])
+        maps = accuracy_maps(places, uncertainty, run.heights[1])
         lines = {name: _with_errors(line, maps[name], name in control) for name, line in lines.items()}
     return replace(run, lines=FrozenMap(lines), quality=Quality(FrozenMap(maps), FrozenMap(control), products))
 
 
-def _with_errors(line: ExportedLine, found: AccuracyMap, is_controlled: bool) -> ExportedLine:
-    """A line whose models state its errors. What control points determine is not what camera and way leave open."""
-    polynomial, (bias, random) = line.polynomial, found.horizontal()
+def _with_errors(line: ExportedLine, accuracy: AccuracyMap, is_controlled: bool) -> ExportedLine:
+    """Return a line whose models state its errors.
+
+    Polynomials corrected by control points keep the errors of the correction.
+    """
+    polynomial, (bias, random) = line.polynomial, accuracy.horizontal()
     if polynomial is not None and not is_controlled:
-        old = (polynomial.bias_m or 0.0, polynomial.random_m or 0.0)
-        polynomial = replace(polynomial, bias_m=float(np.hypot(bias, old[0])), random_m=float(np.hypot(random, old[1])))
-    worst = np.nanargmax(found.ce90)
-    (a, b), (_, c) = found.covariance[worst, :2, :2]
+        before = (polynomial.bias_m or 0.0, polynomial.random_m or 0.0)
+        polynomial = replace(
+            polynomial, bias_m=float(np.hypot(bias, before[0])), random_m=float(np.hypot(random, before[1]))
+        )
+    worst = np.nanargmax(accuracy.ce90)
+    (a, b), (_, c) = accuracy.covariance[worst, :2, :2]
     notes = (
-        f"on ground {found.height:.0f} m high points have CE90 up to {found.ce90[worst]:.4g} m, of camera, orbit "
+        f"on ground {accuracy.height:.0f} m high points have CE90 up to {accuracy.ce90[worst]:.4g} m, of camera, orbit "
         f"and attitude; covariance there, east east, east north, north north: {a:.6g} {b:.6g} {c:.6g} m^2",
         f"of it in common to all points {bias:.4g} m, of measured places {random:.4g} m: root mean square of a "
         "horizontal axis over the image",
@@ -88,39 +93,39 @@ def _with_errors(line: ExportedLine, found: AccuracyMap, is_controlled: bool) ->
     return replace(line, polynomial=polynomial, scanner=replace(line.scanner, isd=FrozenMap(isd)))
 
 
-def _controlled(control: ControlPoints, lines: Mapping[str, ExportedLine]) -> dict[str, Controlled]:
-    """Line -> its polynomials after control."""
-    found: dict[str, Controlled] = {}
+def _controlled(control: ControlPoints, lines: Mapping[str, ExportedLine]) -> dict[str, ControlledPolynomial]:
+    """Return the polynomials of each line corrected by control points."""
+    controlled: dict[str, ControlledPolynomial] = {}
     for name, line in lines.items():
         if line.polynomial is not None:
-            one = controlled_line(control, name, line.polynomial, len(lines) == 1)
-            found |= {} if one is None else {name: one}
-    if not found:
-        problem, allowed = "no control point is in one of the images", names_text(f"{name}.tif" for name in lines)
+            corrected = correct_line(control, name, line.polynomial, len(lines) == 1)
+            controlled |= {} if corrected is None else {name: corrected}
+    if not controlled:
+        problem, allowed = "no control point lies in any of the images", names_text(f"{name}.tif" for name in lines)
         raise InputError(Issue(problem, control.file, None, (), names_text(control.read.images), allowed))
-    return found
+    return controlled
 
 
-def controlled_line(
+def correct_line(
     control: ControlPoints, name: str, polynomial: RationalPolynomial, alone: bool
-) -> Controlled | None:
-    """Polynomials of an image after control; None where no point is in it.
+) -> ControlledPolynomial | None:
+    """Return the polynomials of an image corrected by control points; None where no point lies in it.
 
     Parameters
     ----------
     control : ControlPoints
-        Points with their places in images.
+        Points with their image positions.
     name : str
-        Of the image, without its ending.
+        Name of the image, without its ending.
     polynomial : RationalPolynomial
-        Of it.
+        Polynomials of the image.
     alone : bool
-        Whether it is the only one, whatever the points' only image is called.
+        True if it is the only image; points of a single image are then used whatever that image is called.
 
     Raises
     ------
     InputError
-        Points that do not determine a correction.
+        The points do not determine a correction.
     """
     images = control.read.images
     rows = next((places for image, places in images.items() if name in (image, Path(image).stem)), None)
@@ -134,26 +139,26 @@ def controlled_line(
         correction = polynomial_correction(
             polynomial, ground.itrs, ground.covariance, rows[:, 1:3], spread, control.kind
         )
-        return Controlled(ground.ids, correction, controlled(polynomial, correction))
+        return ControlledPolynomial(ground.ids, correction, corrected_polynomial(polynomial, correction))
     except ValueError as error:
         allowed = f"{LEAST_POINTS[control.kind]} points or more, spread over the image of {name}"
         raise InputError(Issue(str(error), control.file, allowed=allowed)) from None
 
 
 def _products(run: Export, scene: DimapScene) -> Mapping[str, ProductPolynomial]:
-    """Polynomials that stand beside a scene's file, where it names some."""
+    """Return the comparison of the polynomials beside a scene's file, where it names some."""
     folder = Path(scene.read.file).parent
     (name, line), *_ = run.lines.items()
     for href in scene.read.rpc:
         path = folder / href
-        # names in a file lead nowhere else
+        # names in a file must not lead to another folder
         if Path(href).name == href and path.is_file():
-            return FrozenMap({name: compared(line.window.sensor, read_rpc(path), str(path))})
+            return FrozenMap({name: compare_product(line.window.sensor, read_rpc(path), str(path))})
     return FrozenMap()
 
 
-def compared(sensor: Sensor, model: RationalPolynomial, file: str) -> ProductPolynomial:
-    """Return how far polynomials are from the sensor over the heights that they cover: beyond them they say nothing."""
+def compare_product(sensor: Sensor, model: RationalPolynomial, file: str) -> ProductPolynomial:
+    """Compare polynomials with the sensor over the heights that they cover, beyond which they are not valid."""
     low, high = (model.offset[4] + sign * model.scale[4] for sign in (-1.0, 1.0))
     axes = (
         np.linspace(0.0, sensor.lines - 1.0, _COMPARED[0]),
@@ -162,11 +167,11 @@ def compared(sensor: Sensor, model: RationalPolynomial, file: str) -> ProductPol
     )
     line, pixel, height = (v.ravel() for v in np.meshgrid(*axes, indexing="ij"))
     longitude, latitude, _ = sensor.earth.geodetic(sensor.ground(line, pixel, height))
-    there = np.stack(model.image(np.degrees(latitude), np.degrees(longitude), height), axis=-1)
-    off = there - np.stack([line, pixel], axis=-1)
-    (line_mean, sample_mean), (line_rms, sample_rms) = off.mean(axis=0).tolist(), off.std(axis=0).tolist()
-    most, heights = float(np.max(np.abs(off))), (float(low), float(high))
-    return ProductPolynomial(file, (line_mean, sample_mean), (line_rms, sample_rms), most, heights)
+    predicted = np.stack(model.image(np.degrees(latitude), np.degrees(longitude), height), axis=-1)
+    difference = predicted - np.stack([line, pixel], axis=-1)
+    (line_mean, sample_mean), (line_rms, sample_rms) = difference.mean(axis=0).tolist(), difference.std(axis=0).tolist()
+    largest, heights = float(np.max(np.abs(difference))), (float(low), float(high))
+    return ProductPolynomial(file, (line_mean, sample_mean), (line_rms, sample_rms), largest, heights)
 
 
 _ENDING = re.compile(r"(_RPC|_rpc)$")
@@ -180,13 +185,13 @@ class PolynomialSource:
     Attributes
     ----------
     name : str
-        Of the image that they belong to, as far as the file's name tells it.
+        Name of their image, from the name of the file.
     file : str
-        That they are from.
+        File of the polynomials.
     polynomial : RationalPolynomial
-        As they were read.
+        Polynomials as they were read.
     config : str
-        The file's path, as YAML.
+        Path of the file, as YAML.
     """
 
     name: str
@@ -197,39 +202,39 @@ class PolynomialSource:
 
 @dataclass(frozen=True, eq=False)
 class PolynomialExport:
-    """Polynomials after control.
+    """Polynomials corrected by control points.
 
     Attributes
     ----------
     source : PolynomialSource
-        What was read.
-    control : Controlled
-        What the points made of it.
+        Polynomials before the correction.
+    control : ControlledPolynomial
+        Correction and corrected polynomials.
     """
 
     source: PolynomialSource
-    control: Controlled
+    control: ControlledPolynomial
 
 
 def read_polynomial_source(path: Path, band: str | None = None) -> PolynomialSource | None:
-    """Rational polynomials, where a file holds them alone; None for another file.
+    """Read rational polynomials from a file that contains them alone; return None for another file.
 
     Parameters
     ----------
     path : Path
-        Of it.
-    band : str | None
-        That was asked for, which polynomials do not have.
+        Path of the file.
+    band : str, optional
+        Requested band, which polynomials do not have.
 
     Raises
     ------
     InputError
-        It holds polynomials that cannot be read, or a band is asked for.
+        The polynomials cannot be read, or a band is requested.
     """
     if not path.is_file() or not is_rpc(path):
         return None
     if band is not None:
-        raise no_bands(path, band)
+        raise band_error(path, band)
     name = _UNSAFE.sub("_", _ENDING.sub("", path.stem)) or "image"
     return PolynomialSource(name, str(path), read_rpc(path), dump_yaml({"source": str(path)}))
 
@@ -237,39 +242,39 @@ def read_polynomial_source(path: Path, band: str | None = None) -> PolynomialSou
 def run_polynomial_export(
     source: PolynomialSource, uncertainty: CameraUncertainty | None, points: ControlPoints | None
 ) -> PolynomialExport:
-    """Correct the polynomials.
+    """Correct rational polynomials by control points.
 
     Parameters
     ----------
     source : PolynomialSource
-        What was read.
-    uncertainty : CameraUncertainty | None
-        Which only a rigorous model can have.
-    points : ControlPoints | None
-        That correct them.
+        Polynomials of a file.
+    uncertainty : CameraUncertainty or None
+        Must be None: uncertainties need a rigorous model.
+    points : ControlPoints or None
+        Control points that correct them.
 
     Raises
     ------
     InputError
-        There are none, they do not determine a correction, or something was asked for that takes a rigorous model.
+        There are no control points, they do not determine a correction, or an option needs a rigorous model.
     """
     if uncertainty is not None:
         allowed = "a source with a rigorous model for --position-sigma, --attitude-sigma and the like"
-        raise InputError(Issue("polynomials alone know no camera and no orbit", source.file, allowed=allowed))
+        raise InputError(Issue("uncertainties need a rigorous model", source.file, allowed=allowed))
     if points is None:
-        raise InputError(Issue("nothing to do with polynomials alone", source.file, allowed="--control points.gcp"))
-    found = controlled_line(points, source.name, source.polynomial, alone=True)
-    if found is None:
-        problem = "no control point is in the image of these polynomials"
+        raise InputError(Issue("polynomials alone need control points", source.file, allowed="--control points.gcp"))
+    controlled = correct_line(points, source.name, source.polynomial, alone=True)
+    if controlled is None:
+        problem = "no control point lies in the image of these polynomials"
         raise InputError(Issue(problem, points.file, allowed=f"points in {source.name}.tif"))
-    return PolynomialExport(source, found)
+    return PolynomialExport(source, controlled)
 
 
 POLYNOMIALS: Record[PolynomialExport] = Record(
-    "export.json of rational polynomials alone.",
-    Quantity("source", lambda run: run.source.file, "that they were read from"),
-    Quantity("rpc", lambda run: _file(run), "path in the run folder of the corrected ones"),
-    Quantity("control", lambda run: {run.source.name: run.control}, "how points corrected them", record=CONTROL),
+    "Content of export.json for rational polynomials alone.",
+    Quantity("source", lambda run: run.source.file, "file of the polynomials"),
+    Quantity("rpc", lambda run: _file(run), "path of the corrected polynomials in the run folder"),
+    Quantity("control", lambda run: {run.source.name: run.control}, "correction by control points", record=CONTROL),
 )
 
 
@@ -278,12 +283,12 @@ def _file(run: PolynomialExport) -> str:
 
 
 def polynomial_files(run: PolynomialExport) -> dict[str, bytes]:
-    """Path in the run folder -> contents."""
+    """Return the file of the corrected polynomials, path in the run folder -> content."""
     return {_file(run): run.control.after.text().encode()}
 
 
 def polynomial_report(run: PolynomialExport) -> Report:
-    """Report of the correction."""
+    """Return the report of the correction."""
     quality = Quality(control=FrozenMap({run.source.name: run.control}))
     verdict, more = answer(*quality_answers(quality))
     before, after = run.source.polynomial, run.control.after
@@ -292,6 +297,6 @@ def polynomial_report(run: PolynomialExport) -> Report:
     size = " x ".join(f"{2.0 * value:.0f}" for value in before.scale[:2])
     low, high = before.offset[4] + np.array([-1.0, 1.0]) * before.scale[4]
     facts = (("Read", run.source.file), ("Image", f"{size} pixels"), ("Ground", f"{low:.0f} to {high:.0f} m high"))
-    warnings = tuple(one for one in quality_warnings(quality) if "ISD" not in one)
+    warnings = tuple(warning for warning in quality_warnings(quality) if "ISD" not in warning)
     sections = (control_section(quality.control),)
     return Report("Corrected rational polynomials", verdict, more, facts, table, sections, warnings=warnings)

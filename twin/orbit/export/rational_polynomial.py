@@ -1,17 +1,15 @@
-"""A line sensor as rational polynomials (RPC00B, NIMA STDI-0002): line and sample as ratios of cubics in latitude,
-longitude and height, the one model that all photogrammetric software reads.
+"""Line sensor as rational polynomials (RPC00B, NIMA STDI-0002), their files, and their correction by control points.
 
-Coordinates are scaled to -1 .. 1 over the ground that the fit covers; beyond it the polynomials say nothing. Image
-coordinates count from the centre of the first pixel, heights are above the ellipsoid (WGS84).
+Line and sample are ratios of cubics in latitude, longitude and height, the one model that all photogrammetric software
+reads. Coordinates are scaled to -1 .. 1 over the ground that the fit covers; beyond it the polynomials are not valid.
+Image coordinates count from the centre of the first pixel, heights are above the ellipsoid (WGS84).
 
-Rational polynomials of other people's files: RPC00B as text beside an image or inside a GeoTIFF, and the RPC files
-of DIMAP 2 and 3.
+Files that are read: RPC00B as text beside an image or inside a GeoTIFF, and the RPC files of DIMAP 2 and 3, of which
+the model from the ground to the image is used. DIMAP 2 counts lines and samples from 1, which becomes 0 here; DIMAP 3
+counts them from 0, as a scene of Pléiades Neo shows, whose RPC file has the first pixel at 0.0005, -0.0006.
 
-DIMAP's model from the ground to the image is read. Version 2 counts lines and samples from 1, which becomes 0 here;
-version 3 counts them from 0, as a scene of Pléiades Neo shows, whose RPC file has the first pixel at 0.0005, -0.0006.
-
-Rational polynomials corrected by control points: what is off in the image, with its covariance and residuals, and
-polynomials of the same form with the correction inside.
+Control points determine a correction in the image, with its covariance and residuals, and polynomials of the same form
+that include it.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.xml_file import Element, first_lines, numbers, read_xml, text_lines
 
 _GRID = (24, 24, 9)
-"""Lines, pixels and heights that are fitted; the checks lie between them."""
+"""Lines, pixels and heights of the fit; the checks lie between them."""
 
 
 def sensor_polynomial(
@@ -57,9 +55,11 @@ def sensor_polynomial(
     ValueError
         A line of sight misses the Earth, or the ground crosses a pole or the 180th meridian.
     """
-    places = _seen(sensor, first_pixel, pixels, heights, _GRID, at_ends=True)
-    others = _seen(sensor, first_pixel, pixels, heights, tuple(count - 1 for count in _GRID), at_ends=False)
-    return fit_rpc(places[:, :2], places[:, 2:], check=(others[:, :2], others[:, 2:]))
+    fit_points = _image_to_ground(sensor, first_pixel, pixels, heights, _GRID, at_ends=True)
+    check_points = _image_to_ground(
+        sensor, first_pixel, pixels, heights, tuple(count - 1 for count in _GRID), at_ends=False
+    )
+    return fit_rpc(fit_points[:, :2], fit_points[:, 2:], check=(check_points[:, :2], check_points[:, 2:]))
 
 
 def axis_sigma(covariance: Array) -> float:
@@ -73,7 +73,7 @@ def axis_sigma(covariance: Array) -> float:
     return float(np.sqrt(0.5 * np.mean(np.trace(covariance, axis1=-2, axis2=-1))))
 
 
-def _seen(
+def _image_to_ground(
     sensor: Sensor,
     first_pixel: int,
     pixels: int,
@@ -82,11 +82,12 @@ def _seen(
     *,
     at_ends: bool,
 ) -> Array:
-    """Line, sample, latitude, longitude (degrees) and height (metres) over an image, (N, 5); image coordinates from the
-    window's first pixel.
+    """Return line, sample, latitude, longitude (degrees) and height (metres) over an image, (N, 5).
+
+    Image coordinates count from the window's first pixel.
     """
     low, high = np.array([(-0.5, sensor.lines - 0.5), (-0.5, pixels - 0.5), heights]).T
-    line, sample, height = _places(0.5 * (low + high), 0.5 * (high - low), counts, at_ends)
+    line, sample, height = _chebyshev_grid(0.5 * (low + high), 0.5 * (high - low), counts, at_ends)
     ground = sensor.ground(line, first_pixel + sample, height)
     if not np.all(np.isfinite(ground)):
         raise ValueError("a line of sight misses the Earth")
@@ -94,8 +95,8 @@ def _seen(
     return np.stack([line, sample, np.degrees(latitude), np.degrees(longitude), height], axis=-1)
 
 
-def _places(middle: Array, half: Array, counts: tuple[int, ...], at_ends: bool) -> list[Array]:
-    """Lines, samples and heights of a grid of Chebyshev points, with the ends or between those that have them."""
+def _chebyshev_grid(middle: Array, half: Array, counts: tuple[int, ...], at_ends: bool) -> list[Array]:
+    """Return lines, samples and heights of a grid of Chebyshev points, with the ends or between its points."""
     angles = (np.linspace(0.0, np.pi, n) if at_ends else (np.arange(n) + 0.5) * np.pi / n for n in counts)
     axes = (m - h * np.cos(angle) for m, h, angle in zip(middle, half, angles, strict=True))
     return [v.ravel() for v in np.meshgrid(*axes, indexing="ij")]
@@ -112,17 +113,17 @@ _LEAST_SCALE = 1e-9
 
 
 def read_rpc(path: str | Path) -> RationalPolynomial:
-    """The polynomials of a file; its contents or ending decide on the format.
+    """Read the polynomials of a file; its content or ending decides on the format.
 
     Parameters
     ----------
-    path : str | Path
-        Of it.
+    path : str or Path
+        Path of the file.
 
     Raises
     ------
     InputError
-        It cannot be read, or is not whole; with file, line and key.
+        The file cannot be read or is incomplete; with file, line and key.
     """
     if Path(path).suffix.lower() in _TIFF:
         return _from_tiff(Path(path))
@@ -132,12 +133,12 @@ def read_rpc(path: str | Path) -> RationalPolynomial:
 
 
 def is_rpc(path: Path) -> bool:
-    """Whether a file holds rational polynomials alone: NAME_RPC.TXT, a GeoTIFF, or the RPC file of DIMAP.
+    """Return True if a file holds rational polynomials alone: NAME_RPC.TXT, a GeoTIFF, or the RPC file of DIMAP.
 
     Raises
     ------
     InputError
-        It is XML that cannot be read.
+        The file is XML that cannot be read.
     """
     match path.suffix.lower():
         case ".tif" | ".tiff" | ".txt":
@@ -147,27 +148,27 @@ def is_rpc(path: Path) -> bool:
     return False
 
 
-def _made(
+def _polynomial_of(
     file: str, offset: list[float], scale: list[float], parts: list[np.ndarray], errors: list[float | None]
 ) -> RationalPolynomial:
     small = [name for name, value in zip(_AXES, scale, strict=True) if not value > _LEAST_SCALE]
     if small:
-        raise InputError(Issue("a scale that is not above zero", file, None, (f"{small[0]}_SCALE",)))
+        raise InputError(Issue("the scale is not above zero", file, None, (f"{small[0]}_SCALE",)))
     if not (-90.0 <= offset[2] <= 90.0 and -180.0 <= offset[3] <= 360.0):
         found = f"{offset[2]:g}, {offset[3]:g}"
-        raise InputError(Issue("no latitude and longitude, degrees", file, None, ("LAT_OFF", "LONG_OFF"), found))
+        raise InputError(Issue("not a latitude and longitude in degrees", file, None, ("LAT_OFF", "LONG_OFF"), found))
     for name, part in zip(_PARTS, parts, strict=True):
         if name.endswith("DEN") and not np.any(part):
-            raise InputError(Issue("a denominator of zeros", file, None, (f"{name}_COEFF",)))
-    stated = [None if one is None or one < 0.0 else one for one in errors]  # -1 where nobody states one
+            raise InputError(Issue("all coefficients of the denominator are zero", file, None, (f"{name}_COEFF",)))
+    error_terms = [None if error is None or error < 0.0 else error for error in errors]  # -1 if not stated
     line, below, sample, under = parts
     return RationalPolynomial(
-        np.array(offset), np.array(scale), line, below, sample, under, bias_m=stated[0], random_m=stated[1]
+        np.array(offset), np.array(scale), line, below, sample, under, bias_m=error_terms[0], random_m=error_terms[1]
     )
 
 
 def _from_text(path: Path) -> RationalPolynomial:
-    file, found = str(path), {}
+    file, values_by_name = str(path), {}
     for k, line in enumerate(text_lines(path, _WHAT)):
         if not line.strip():
             continue
@@ -175,17 +176,19 @@ def _from_text(path: Path) -> RationalPolynomial:
         if match is None:
             raise InputError(Issue("not NAME: value", file, k + 1, (), shown(line), "LINE_OFF: 5120.5 pixels"))
         name, text = match.groups()
-        if name in found:
-            raise InputError(Issue("a key that stands twice", file, k + 1, (name,)))
-        found[name] = float(numbers(file, [[text]], [k + 1], [name])[0, 0])
+        if name in values_by_name:
+            raise InputError(Issue("this key occurs twice", file, k + 1, (name,)))
+        values_by_name[name] = float(numbers(file, [[text]], [k + 1], [name])[0, 0])
     names = [f"{axis}_{what}" for what in ("OFF", "SCALE") for axis in _AXES]
     names += [f"{part}_COEFF_{k + 1}" for part in _PARTS for k in range(TERMS)]
     for name in names:
-        if name not in found:
-            raise InputError(Issue(f"no {name}", file, None, (name,), None, _WHAT, nearest(name, found)))
-    values = [found[name] for name in names]
+        if name not in values_by_name:
+            raise InputError(Issue(f"no {name}", file, None, (name,), None, _WHAT, nearest(name, values_by_name)))
+    values = [values_by_name[name] for name in names]
     parts = [np.array(values[10 + TERMS * k : 10 + TERMS * (k + 1)]) for k in range(4)]
-    return _made(file, values[:5], values[5:10], parts, [found.get("ERR_BIAS"), found.get("ERR_RAND")])
+    return _polynomial_of(
+        file, values[:5], values[5:10], parts, [values_by_name.get("ERR_BIAS"), values_by_name.get("ERR_RAND")]
+    )
 
 
 def _from_dimap(root: Element) -> RationalPolynomial:
@@ -201,7 +204,7 @@ def _from_dimap(root: Element) -> RationalPolynomial:
     offset[0] -= _FIRST_PIXEL[version]
     offset[1] -= _FIRST_PIXEL[version]
     parts = [np.array([values.number(f"{part}_COEFF_{k + 1}") for k in range(TERMS)]) for part in _PARTS]
-    return _made(root.file, offset, scale, parts, [None, None])
+    return _polynomial_of(root.file, offset, scale, parts, [None, None])
 
 
 def _from_tiff(path: Path) -> RationalPolynomial:
@@ -222,16 +225,19 @@ def _from_tiff(path: Path) -> RationalPolynomial:
     offset = [rpc.line_off, rpc.samp_off, rpc.lat_off, rpc.long_off, rpc.height_off]
     scale = [rpc.line_scale, rpc.samp_scale, rpc.lat_scale, rpc.long_scale, rpc.height_scale]
     parts = [rpc.line_num_coeff, rpc.line_den_coeff, rpc.samp_num_coeff, rpc.samp_den_coeff]
-    return _made(file, offset, scale, [np.array(part, np.float64) for part in parts], [rpc.err_bias, rpc.err_rand])
+    return _polynomial_of(
+        file, offset, scale, [np.array(part, np.float64) for part in parts], [rpc.err_bias, rpc.err_rand]
+    )
 
 
 _SLOPE_STEP = 10.0
-"""Metres on the ground of a derivative: polynomials are straight to 1e-9 over it."""
+"""Step of a derivative on the ground, in metres; polynomials are linear to 1e-9 over it."""
 _CORRECTED_GRID = (21, 21, 7)
-"""Lines, samples and heights through which corrected polynomials go."""
+"""Lines, samples and heights to which corrected polynomials are fitted."""
 _GROUND_GRID = 5
+"""Number of lines and of samples at which errors on the ground are computed."""
 _UNLIKELY = 0.05
-"""Chance of a chi-square from which residuals scatter beyond their covariances."""
+"""p-value of chi-square below which residuals count as scattering beyond their covariances."""
 
 
 def polynomial_correction(
@@ -243,29 +249,29 @@ def polynomial_correction(
     kind: Kind,
     screened: bool = True,
 ) -> ImageCorrection:
-    """By how much polynomials are off in the image.
+    """Estimate the correction of polynomials in the image from control points.
 
     Parameters
     ----------
     polynomial : RationalPolynomial
-        Of the image.
-    itrs : Array
-        (N, 3) of the points, metres.
-    ground_covariance : Array
-        (N, 3, 3) in its axes, m^2.
-    measured : Array
-        (N, 2) line and sample, the centre of the first pixel being 0, 0.
-    image_covariance : Array
-        (N, 2, 2), pixels^2.
+        Polynomials of the image.
+    itrs : (N, 3) ndarray
+        Ground points, in metres.
+    ground_covariance : (N, 3, 3) ndarray
+        Covariances of the ground points in ITRS axes, in m^2.
+    measured : (N, 2) ndarray
+        Measured line and sample; the centre of the first pixel is 0, 0.
+    image_covariance : (N, 2, 2) ndarray
+        Covariances of the measured positions, in pixels^2.
     kind : Kind
-        Of the correction, shift or affine.
+        Kind of the correction, shift or affine.
     screened : bool
-        Whether points far beyond their covariances are left out.
+        True to reject points far beyond their covariances.
 
     Raises
     ------
     ValueError
-        As `analysis.orbit.image_correction.image_correction`.
+        See `analysis.orbit.image_correction.image_correction`.
     """
     longitude, latitude, height = Earth().geodetic(itrs)
     slope = image_slope(polynomial, latitude, longitude, height) @ east_north_up(longitude, latitude)
@@ -275,7 +281,10 @@ def polynomial_correction(
 
 
 def image_slope(polynomial: RationalPolynomial, latitude: Array, longitude: Array, height: Array) -> Array:
-    """Derivatives of line and sample by metres east, north and up, (N, 2, 3), at places (N,) in radians and metres."""
+    """Return the derivatives (N, 2, 3) of line and sample by metres east, north and up, at positions (N,).
+
+    Latitudes and longitudes are in radians, heights in metres.
+    """
     meridian, normal = curvature_radii(latitude)
     moves = (
         (0.0, _SLOPE_STEP / ((normal + height) * np.cos(latitude)), 0.0),
@@ -297,38 +306,39 @@ def image_slope(polynomial: RationalPolynomial, latitude: Array, longitude: Arra
     return np.stack(columns, axis=-1)
 
 
-def controlled(polynomial: RationalPolynomial, correction: ImageCorrection) -> RationalPolynomial:
-    """Return the polynomials with a correction inside, and what is uncertain of them on the ground.
+def corrected_polynomial(polynomial: RationalPolynomial, correction: ImageCorrection) -> RationalPolynomial:
+    """Return the polynomials with a correction included, and with the errors on the ground that it leaves.
 
     Parameters
     ----------
     polynomial : RationalPolynomial
-        Of the image.
+        Polynomials of the image.
     correction : ImageCorrection
-        That was found for it.
+        Estimated correction.
 
     Raises
     ------
     ValueError
-        Polynomials that do not lead back to the ground, ground at a pole or the 180th meridian.
+        The polynomials cannot be inverted to the ground, or the ground lies at a pole or the 180th meridian.
     """
-    grids, kept = [], [0, 1, 4]
+    grids, axes = [], [0, 1, 4]
     for at_ends in (True, False):
         counts = _CORRECTED_GRID if at_ends else tuple(count - 1 for count in _CORRECTED_GRID)
-        line, sample, height = _places(polynomial.offset[kept], polynomial.scale[kept], counts, at_ends)
+        line, sample, height = _chebyshev_grid(polynomial.offset[axes], polynomial.scale[axes], counts, at_ends)
         latitude, longitude = polynomial.ground(line, sample, height)
         moved = np.stack([line, sample], axis=-1) + correction.at(line, sample)
         ground = np.stack([latitude, longitude, height], axis=-1)
         grids.append((moved[np.isfinite(latitude)], ground[np.isfinite(latitude)]))
     if min(len(moved) for moved, _ in grids) < np.prod(_CORRECTED_GRID) // 2:
-        raise ValueError("the polynomials do not lead back to the ground over the image that they state")
+        raise ValueError("the polynomials cannot be inverted to the ground over their image")
     bias, random = _on_the_ground(polynomial, correction)
     return replace(fit_rpc(*grids[0], check=grids[1]), bias_m=bias, random_m=random)
 
 
 def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) -> tuple[float, float]:
-    """Root mean square errors of a horizontal axis over the image, metres: of the correction, and of what scatters at
-    the control points beyond their own covariances.
+    """Return the root mean square errors of a horizontal axis over the image, in metres, as ERR_BIAS and ERR_RAND.
+
+    They are the error of the correction, and the scatter of the control points beyond their own covariances.
     """
     steps = np.linspace(-1.0, 1.0, _GROUND_GRID)
     line, sample = (
@@ -341,17 +351,17 @@ def _on_the_ground(polynomial: RationalPolynomial, correction: ImageCorrection) 
     slope = image_slope(polynomial, latitude[seen], longitude[seen], height[seen])[:, :, :2]
     to_ground = np.linalg.inv(slope)
     used = correction.used
-    own = np.einsum("nii->ni", correction.variance)[used]
+    predicted = np.einsum("nii->ni", correction.variance)[used]
     beyond = np.zeros(2)
     if correction.probability < _UNLIKELY:
-        beyond = np.maximum(np.mean(correction.residual[used] ** 2 - own, axis=0), 0.0)
-    known = correction.covariance_at(line[seen], sample[seen])
-    found = []
-    for variance in (known, np.broadcast_to(np.diag(beyond), known.shape)):
-        found.append(axis_sigma(to_ground @ variance @ np.swapaxes(to_ground, 1, 2)))
-    return found[0], found[1]
+        beyond = np.maximum(np.mean(correction.residual[used] ** 2 - predicted, axis=0), 0.0)
+    covariance = correction.covariance_at(line[seen], sample[seen])
+    sigmas = []
+    for variance in (covariance, np.broadcast_to(np.diag(beyond), covariance.shape)):
+        sigmas.append(axis_sigma(to_ground @ variance @ np.swapaxes(to_ground, 1, 2)))
+    return sigmas[0], sigmas[1]
 
 
 def residual_sigma(correction: ImageCorrection) -> Array:
-    """(N, 2) standard deviations of the residuals of line and sample, pixels."""
+    """Return the (N, 2) standard deviations of the residuals of line and sample, in pixels."""
     return np.sqrt(np.maximum(np.einsum("nii->ni", correction.variance), 0.0))

@@ -286,13 +286,12 @@ def _warnings(run: JitterRun) -> tuple[str, ...]:
     warnings = []
     for name, pass_jitter in run.passes.items():
         if pass_jitter.result.used.mean() < 1.0 - _MOST_WRONG:
-            warnings.append(
-                f"{1.0 - pass_jitter.result.used.mean():.0%} of the observations of {name} were left out as wrong"
-            )
+            share = 1.0 - pass_jitter.result.used.mean()
+            warnings.append(f"{share:.0%} of the observations of {name} were rejected as wrong matches")
         if max(pass_jitter.noise_factors.values()) > _FIT:
             warnings.append(
-                f"what remains in {name} is the noise that the points' covariances say times {_factors(pass_jitter)}: "
-                "noise of a band, or covariances that are too small"
+                f"the remaining noise in {name} is that of the points' covariances times {_factors(pass_jitter)}: "
+                "jitter in a band, or covariances that are too small"
             )
         warnings += [f"{name}: {text}" for line in pass_jitter.oscillations for text in _doubts(line)]
     return tuple(warnings)
