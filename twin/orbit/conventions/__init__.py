@@ -1,1 +1,1 @@
-"""Which conventions the numbers of a pass in files can have, tried on its ground points."""
+"""Check of the conventions of a pass's files against its ground points."""

@@ -271,10 +271,10 @@ def _key(changes: Changes) -> frozenset[str]:
     return frozenset(f"{name}={value}" for name, value in changes)
 
 
-def _rough(bench: PassBench, meant: PassConventions) -> float:
+def _rough(bench: PassBench, reading: PassConventions) -> float:
     """Return the root of the median squared residual of a few points, in metres; infinite if they have no position."""
     try:
-        return float(np.sqrt(np.median(np.sum(bench.residuals(meant, _ROUGH_POINTS) ** 2, axis=1))))
+        return float(np.sqrt(np.median(np.sum(bench.residuals(reading, _ROUGH_POINTS) ** 2, axis=1))))
     except ImpossibleError:
         return np.inf
 
@@ -365,17 +365,17 @@ def exported(run: Check) -> dict[str, str]:
 
 def measurements(run: Check) -> PassMeasurements:
     """Return the pass in the project's own conventions, under the stated reading."""
-    readings, meant = run.readings, run.stated
-    table = platform_table(readings.platform, meant.platform)
+    readings, reading = run.readings, run.stated
+    table = platform_table(readings.platform, reading.platform)
     times, images = {}, {}
     for name, raw in readings.images.items():
         clock = readings.lines[name]
-        middle, _ = line_times(clock, meant, table.epoch, clock.line)
+        middle, _ = line_times(clock, reading, table.epoch, clock.line)
         times[name] = LineTimes.of(clock.line - clock.line[0], middle)
         pixels = run.setup.camera.pixels_of(name)
         # A mirrored axis changes the sign of the correlation.
-        signs = np.array([-1.0 if meant.backward else 1.0, 1.0 if meant.first_pixel_sees == "right" else -1.0])
+        signs = np.array([-1.0 if reading.backward else 1.0, 1.0 if reading.first_pixel_sees == "right" else -1.0])
         spread = raw.covariance * signs[:, None] * signs
-        line = line_of(meant, raw, clock) - clock.line[0]
-        images[name] = ImagePoints.of(raw.point, line, pixel_of(meant, raw, pixels), spread)
+        line = line_of(reading, raw, clock) - clock.line[0]
+        images[name] = ImagePoints.of(raw.point, line, pixel_of(reading, raw, pixels), spread)
     return PassMeasurements(run.setup.test.name, table, FrozenMap(times), readings.ground.points, FrozenMap(images))

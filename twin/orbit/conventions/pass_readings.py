@@ -143,7 +143,7 @@ def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -
     InputError
         A file cannot be read, or has names that another file does not have.
     """
-    platform, meant = read_platform(spec.platform, folder)
+    platform, conventions = read_platform(spec.platform, folder)
     lines = read_line_clocks(spec.lines, tuple(camera.lines), folder)
     ground = read_ground_points(spec.ground, folder)
     if Path(spec.image_points.file).suffix.lower() == ".gcp":
@@ -152,7 +152,7 @@ def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -
         images = _image_points(spec.image_points, ground, lines, folder)
     half = 0.5 if spec.image_points.centre == "half" else 0.0
     stated = PassConventions(
-        meant,
+        conventions,
         spec.lines.time_scale,
         0.0,
         spec.lines.moment,
@@ -520,32 +520,32 @@ class PassBench:
         remaining = {name: raw for name, raw in images.items() if len(raw.line)}
         return replace(self, readings=replace(self.readings, images=remaining), _paths=self._paths)
 
-    def path(self, meant: Conventions) -> TabulatedTrajectory:
+    def path(self, conventions: Conventions) -> TabulatedTrajectory:
         """Return the trajectory under the conventions of a platform, or raise ImpossibleError."""
-        if meant not in self._paths:
-            self._paths[meant] = self._made(meant)
-        path = self._paths[meant]
+        if conventions not in self._paths:
+            self._paths[conventions] = self._made(conventions)
+        path = self._paths[conventions]
         if isinstance(path, ImpossibleError):
             raise path
         return path
 
-    def _made(self, meant: Conventions) -> TabulatedTrajectory | ImpossibleError:
+    def _made(self, conventions: Conventions) -> TabulatedTrajectory | ImpossibleError:
         """Return the trajectory under the conventions of a platform, or the error that prevents it."""
         platform = self.readings.platform
         if platform.earth is None:
             # UT1 - UTC is below a second, some hundred metres; other readings of an inertial frame are farther off.
             platform = replace(platform, earth=constant_orientation(self.epoch, 0.0, (0.0, 0.0)))
         try:
-            return TabulatedTrajectory(platform_table(platform, meant, self.epoch), meant.law)
+            return TabulatedTrajectory(platform_table(platform, conventions, self.epoch), conventions.law)
         except InputError as error:
             return ImpossibleError(error.issues[0].problem)
 
-    def places(self, meant: PassConventions, most: int | None = None) -> dict[str, np.ndarray]:
+    def places(self, reading: PassConventions, most: int | None = None) -> dict[str, np.ndarray]:
         """Return the ground positions of image points by line, ITRS, (n, 3), in metres.
 
         Parameters
         ----------
-        meant : PassConventions
+        reading : PassConventions
             The reading.
         most : int or None
             Largest number of points of each line, spread over them; None for all.
@@ -558,24 +558,24 @@ class PassBench:
         places = {}
         for name, raw in self.readings.images.items():
             part = raw if most is None else raw.taken(spread(len(raw.line), most))
-            places[name] = self._ground(name, meant, part, _PerturbedPlatform(self.path(meant.platform)))[0]
+            places[name] = self._ground(name, reading, part, _PerturbedPlatform(self.path(reading.platform)))[0]
         return places
 
-    def residuals(self, meant: PassConventions, most: int | None = None) -> np.ndarray:
+    def residuals(self, reading: PassConventions, most: int | None = None) -> np.ndarray:
         """Return the residuals of all lines, east and north, (n, 2), in metres; arguments and errors as `places`."""
         known, residuals = self.readings.ground.points.itrs, []
-        for name, at in self.places(meant, most).items():
+        for name, at in self.places(reading, most).items():
             point = self.readings.images[name].point
             residuals.append(_plan(known[point[spread(len(point), most or len(point))]], at))
         return np.concatenate(residuals)
 
-    def fit(self, meant: PassConventions) -> Fit:
+    def fit(self, reading: PassConventions) -> Fit:
         """Fit a reading to the ground points, or raise ImpossibleError."""
-        path, rows, common, noise, sizes = self.path(meant.platform), [], [], [], []
+        path, rows, common, noise, sizes = self.path(reading.platform), [], [], [], []
         size = self.uncertainty
         line_terms: list[np.ndarray] = []
         for name, raw in self.readings.images.items():
-            steps, pixel_step, line_time = self._steps(name, meant, raw, path)
+            steps, pixel_step, line_time = self._steps(name, reading, raw, path)
             known = self.readings.ground.points
             itrs = known.itrs[raw.point]
             base = steps[0]
@@ -588,7 +588,7 @@ class PassBench:
             rows.append(here)
             common.append(np.concatenate([rotation, shift, delay[..., None] * size.time], axis=-1))
             camera = self.cameras[name]
-            from_middle = pixel_of(meant, raw, camera.pixels) - 0.5 * (camera.pixels - 1)
+            from_middle = pixel_of(reading, raw, camera.pixels) - 0.5 * (camera.pixels - 1)
             scale = size.scale * from_middle[:, None]
             line_terms.append(np.stack([line * size.interior, pixel * size.interior, pixel * scale], axis=-1))
             image = np.stack([line, pixel], axis=-1)
@@ -609,7 +609,7 @@ class PassBench:
         return Fit(residual, rms, pixels, left.reshape(-1, 2), np.concatenate(noise), chi_square, cost, len(r))
 
     def _steps(
-        self, name: str, meant: PassConventions, raw: ImagePoints, path: TabulatedTrajectory
+        self, name: str, reading: PassConventions, raw: ImagePoints, path: TabulatedTrajectory
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Return ground positions for finite differences, the pixels' steps, and line times.
 
@@ -620,17 +620,17 @@ class PassBench:
         rotation[1:4] = rotation_matrix(_TURN * np.eye(3))[:, None]
         shift[4:7] = _SHIFT * np.eye(3)[:, None]
         delay, step, rise = np.zeros((10, n)), np.zeros((10, n)), np.zeros((10, n))
-        direction = np.where(pixel_of(meant, raw, pixels) + 1.0 <= pixels - 0.5, 1.0, -1.0)
+        direction = np.where(pixel_of(reading, raw, pixels) + 1.0 <= pixels - 0.5, 1.0, -1.0)
         delay[7], step[8], rise[9] = _DELAY, direction, _RISE
         moved = _PerturbedPlatform(path, rotation.reshape(-1, 3, 3), shift.reshape(-1, 3))
         repeated = raw.taken(np.tile(np.arange(n), 10))
-        ground, line_time = self._ground(name, meant, repeated, moved, delay.ravel(), step.ravel(), rise.ravel())
+        ground, line_time = self._ground(name, reading, repeated, moved, delay.ravel(), step.ravel(), rise.ravel())
         return list(ground.reshape(10, n, 3)), direction, line_time[:n]
 
     def _ground(
         self,
         name: str,
-        meant: PassConventions,
+        reading: PassConventions,
         raw: ImagePoints,
         platform: _PerturbedPlatform,
         delay: np.ndarray | float = 0.0,
@@ -639,13 +639,13 @@ class PassBench:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return ITRS positions (n, 3), in metres, at the ground points' heights, and the line times, in seconds."""
         clock = self.readings.lines[name]
-        number = line_of(meant, raw, clock)
+        number = line_of(reading, raw, clock)
         for worst in number[~in_span(number, clock.line[0] - 1.0, clock.line[-1] + 1.0)][:1]:
             span = f"{clock.line[0]:.10g} to {clock.line[-1]:.10g}"
             raise ImpossibleError(f"line {worst:.10g} of {name} is not in the table of times, which covers {span}")
-        times, line_time = line_times(clock, meant, self.epoch, number)
+        times, line_time = line_times(clock, reading, self.epoch, number)
         path, camera = platform.path, self.cameras[name]
-        pixel = pixel_of(meant, raw, camera.pixels) + step
+        pixel = pixel_of(reading, raw, camera.pixels) + step
         for worst in pixel[~in_span(pixel, -0.5, camera.pixels - 0.5)][:1]:
             raise ImpossibleError(f"pixel {worst:.6g} of {name} does not exist; the line has {camera.pixels} pixels")
         first, last = path.first, path.last
@@ -664,14 +664,16 @@ class PassBench:
         return ground, line_time
 
 
-def line_times(clock: LineClock, meant: PassConventions, epoch: str, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def line_times(
+    clock: LineClock, reading: PassConventions, epoch: str, line: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return middles of the exposures of lines and the time from one line to the next, in seconds, (n,) each.
 
     Parameters
     ----------
     clock : LineClock
         Readings at lines.
-    meant : PassConventions
+    reading : PassConventions
         The reading.
     epoch : str
         Zero of the times, UTC.
@@ -684,12 +686,12 @@ def line_times(clock: LineClock, meant: PassConventions, epoch: str, line: np.nd
         The clock cannot have shown its readings in this time scale.
     """
     try:
-        seconds = clock.clock.instants(meant.line_scale).since(epoch) + meant.line_offset
+        seconds = clock.clock.instants(reading.line_scale).since(epoch) + reading.line_offset
     except Problem as problem:
         raise ImpossibleError(problem.problem) from None
     table = LineTimes.of(clock.line, seconds)
     each = np.interp(line, clock.line, np.gradient(seconds, clock.line))
-    half = {"start": 0.5, "middle": 0.0, "end": -0.5}[meant.moment]
+    half = {"start": 0.5, "middle": 0.0, "end": -0.5}[reading.moment]
     return table.at(line) + half * each, each
 
 
@@ -698,16 +700,16 @@ def spread(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
-def line_of(meant: PassConventions, raw: ImagePoints, clock: LineClock) -> np.ndarray:
+def line_of(reading: PassConventions, raw: ImagePoints, clock: LineClock) -> np.ndarray:
     """Return lines of image points (n,) in the numbering of the table of times."""
-    number = raw.line - meant.line_origin
-    return clock.line[0] + clock.line[-1] - number if meant.backward else number
+    number = raw.line - reading.line_origin
+    return clock.line[0] + clock.line[-1] - number if reading.backward else number
 
 
-def pixel_of(meant: PassConventions, raw: ImagePoints, pixels: int) -> np.ndarray:
+def pixel_of(reading: PassConventions, raw: ImagePoints, pixels: int) -> np.ndarray:
     """Return pixels of image points (n,), counted from the one that looks farthest to the right of the track."""
-    number = raw.pixel - meant.pixel_origin
-    return number if meant.first_pixel_sees == "right" else pixels - 1.0 - number
+    number = raw.pixel - reading.pixel_origin
+    return number if reading.first_pixel_sees == "right" else pixels - 1.0 - number
 
 
 def _plan(known: np.ndarray, computed: np.ndarray) -> np.ndarray:

@@ -1,1 +1,1 @@
-"""Earth, orbit, attitude, line cameras on a satellite: pixel to ground and back."""
+"""Earth, orbit, attitude and line cameras on a satellite: from pixel to ground and back."""

@@ -164,7 +164,7 @@ The terms fall off by a thousandfold every few terms.
 
 @dataclass(frozen=True, eq=False)
 class LinePiece:
-    """One CCD of a line with its looks.
+    """Single CCD of a line with its looks.
 
     Attributes
     ----------

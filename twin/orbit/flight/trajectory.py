@@ -160,7 +160,7 @@ class Jitter:
     def read(self, times: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """Return the jitter as readings at times (K,), interpolated by a cubic spline, show it.
 
-        What is faster than half of the readings' rate is aliased to a lower frequency.
+        Jitter faster than half of the readings' rate is aliased to a lower frequency.
         """
         return CubicSpline(times, self(times))
 

@@ -294,7 +294,7 @@ class MatchedLine:
         Scatter of the displacements about the smooth one beyond their covariances, px.
     text : str
         Result of the consensus in words.
-    way : DisplacementField or None
+    displacement_field : DisplacementField or None
         Smooth displacement from predicted to measured; None in the frame that ties were chosen in.
     """
 

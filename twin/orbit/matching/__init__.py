@@ -1,1 +1,1 @@
-"""Points measured in a user's line images: what `twin.orbit match` does."""
+"""Points measured in a user's line images: the command `twin.orbit match`."""

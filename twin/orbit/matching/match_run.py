@@ -106,8 +106,8 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
     """
     advance("points", 0, 3)
     spec, folder = setup.test, Path()
-    readings, meant = read_platform(spec.platform, folder)
-    table = platform_table(readings, meant)
+    readings, conventions = read_platform(spec.platform, folder)
+    table = platform_table(readings, conventions)
     path = TabulatedTrajectory(table)
     clocks = read_line_clocks(spec.lines, tuple(setup.camera.lines), folder)
     cameras = line_cameras(setup.camera)
@@ -115,8 +115,8 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
     times = {}
     for name in spec.images:
         if name not in clocks:
-            meant_name, known = nearest(name, clocks), f"{names_text(clocks)}, of which the table has times"
-            raise spec.error("no such line", ("images", name), allowed=known, suggestion=meant_name)
+            suggestion, known = nearest(name, clocks), f"{names_text(clocks)}, of which the table has times"
+            raise spec.error("no such line", ("images", name), allowed=known, suggestion=suggestion)
         times[name] = _times(spec, clocks[name], table.epoch)
     photo = UserMap.open(spec.orthophoto, folder)
     dem = UserMap.open(spec.dem, folder, heights=True)
@@ -144,9 +144,9 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
 
 def _times(spec: OrbitMatchSpec, clock: LineClock, epoch: str) -> LineTimes:
     """Return line times by a line's own numbers, its first line in the table being 0."""
-    meant = PassConventions(None, spec.lines.time_scale, 0.0, spec.lines.moment, 0.0, 0.0, "right")  # type: ignore[arg-type]
+    reading = PassConventions(None, spec.lines.time_scale, 0.0, spec.lines.moment, 0.0, 0.0, "right")  # type: ignore[arg-type]
     try:
-        middle, _ = line_times(clock, meant, epoch, clock.line)
+        middle, _ = line_times(clock, reading, epoch, clock.line)
         return LineTimes.of(clock.line - clock.line[0], middle)
     except (ImpossibleError, ValueError) as error:
         raise spec.lines.error(str(error), ("file",)) from None

@@ -1,1 +1,1 @@
-"""What somebody measured of a pass: readings of the platform, line times, ground and image points; their files."""
+"""Measurements of a pass and their files: readings of the platform, line times, ground and image points."""

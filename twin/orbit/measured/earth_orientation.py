@@ -140,7 +140,7 @@ class TableRotation:
     def teme_to_itrs(self, seconds: Any) -> np.ndarray:
         """Return the rotation TEME -> ITRS, (...) -> (..., 3, 3).
 
-        By Greenwich mean sidereal time of 1982 and polar motion (Vallado et al., AIAA 2006-6753, appendix C).
+        It uses Greenwich mean sidereal time of 1982 and polar motion (Vallado et al., AIAA 2006-6753, appendix C).
         """
         ut1, pole, _ = self.turn(seconds)
         return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], 0.0) @ _about_z(erfa.gmst82(self.julian, ut1)))

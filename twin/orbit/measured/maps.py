@@ -407,7 +407,7 @@ class MapPart:
         Row and column of the first value in the raster.
     frame : GroundFrame
         Plane coordinates of the ground.
-    way : pyproj.Transformer
+    to_geographic : pyproj.Transformer
         Transformation from the raster's system to longitude and latitude, degrees.
     spacing : float
         Spacing of rows and columns on the ground, metres, their geometric mean.
@@ -448,7 +448,7 @@ class UserMap:
     ----------
     raster : GeoRaster
         The file.
-    way : pyproj.Transformer
+    to_geographic : pyproj.Transformer
         Transformation from the raster's system to longitude and latitude, degrees.
     geoid : Geoid or None
         Geoid to which the values refer; None for the ellipsoid, or for grey values.

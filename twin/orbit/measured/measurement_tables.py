@@ -98,7 +98,7 @@ def read_pass(
     camera : ThreeLineCameraSpec
         Payload whose lines the tables name.
     needed : mapping of str to int
-        By role, in how many line cameras one of its points must be seen.
+        Least number of line cameras that must see one of the points, by role.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def read_measurements(
     advance : Advance
         Callback that reports progress.
     needed : mapping of str to int
-        By role, in how many line cameras one of its points must be seen.
+        Least number of line cameras that must see one of the points, by role.
 
     Raises
     ------

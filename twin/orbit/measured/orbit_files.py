@@ -402,8 +402,10 @@ def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[
         s for s in segments if satellite in (s.keys.get(k, ("",))[0] for k in ("OBJECT_ID", "OBJECT_NAME"))
     ]
     if not found_segments:
-        meant = nearest(satellite, allowed)
-        raise InputError(Issue("no such satellite", file, None, ("satellite",), satellite, names_text(allowed), meant))
+        suggestion = nearest(satellite, allowed)
+        raise InputError(
+            Issue("no such satellite", file, None, ("satellite",), satellite, names_text(allowed), suggestion)
+        )
     return found_segments
 
 

@@ -156,14 +156,14 @@ def read_platform(spec: PlatformFilesSpec, folder: Path) -> tuple[PlatformReadin
     return PlatformReadings(orbit, attitude, _earth(spec, folder, orbit, conventions)), conventions
 
 
-def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | None = None) -> PlatformTable:
+def platform_table(readings: PlatformReadings, conventions: Conventions, epoch: str | None = None) -> PlatformTable:
     """Return the table of readings under given conventions.
 
     Parameters
     ----------
     readings : PlatformReadings
         Readings of the files.
-    meant : Conventions
+    conventions : Conventions
         Conventions of the readings.
     epoch : str or None
         Zero of the times, UTC, ISO 8601; None for the first second of the orbit.
@@ -177,12 +177,12 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
     orbit, attitude = readings.orbit, readings.attitude
     usable: Instants | None = None
     if orbit.segments:
-        orbit, usable = _one_segment(readings, meant)
-    fixes = _instants(orbit.file, orbit.clock, meant.orbit_scale, meant.orbit_offset)
-    looks = _instants(attitude.file, attitude.clock, meant.attitude_scale, meant.attitude_offset)
+        orbit, usable = _one_segment(readings, conventions)
+    fixes = _instants(orbit.file, orbit.clock, conventions.orbit_scale, conventions.orbit_offset)
+    looks = _instants(attitude.file, attitude.clock, conventions.attitude_scale, conventions.attitude_offset)
     epoch = epoch or epoch_before(fixes)
     time, turn_time = fixes.since(epoch), looks.since(epoch)
-    inertial = {meant.orbit_frame, meant.attitude_frame} - {"ITRS", "orbital"}
+    inertial = {conventions.orbit_frame, conventions.attitude_frame} - {"ITRS", "orbital"}
     rotation = None
     if inertial:
         if readings.earth is None:
@@ -191,11 +191,13 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
             raise InputError(Issue(what, orbit.file, None, (), None, allowed))
         first, last = min(time[0], turn_time[0]), max(time[-1], turn_time[-1])
         rotation = readings.earth.rotation(epoch, float(first), float(last))
-    position, velocity = _in_itrs(orbit, meant.orbit_frame, time, rotation)
-    matrix = _body(attitude, meant)
-    if meant.attitude_frame == "orbital":
+    position, velocity = _in_itrs(orbit, conventions.orbit_frame, time, rotation)
+    matrix = _body(attitude, conventions)
+    if conventions.attitude_frame == "orbital":
         unit = np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
-        flown = TabulatedTrajectory(PlatformTable.of(epoch, time, position, velocity, time[[0, -1]], unit), meant.law)
+        flown = TabulatedTrajectory(
+            PlatformTable.of(epoch, time, position, velocity, time[[0, -1]], unit), conventions.law
+        )
         known = flown.covers(turn_time)
         if np.sum(known) < 2:
             found = f"{turn_time[0]:.9g} s to {turn_time[-1]:.9g} s, and orbit from {flown.first:.9g} s"
@@ -203,8 +205,8 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
             raise InputError(Issue("attitude at times without orbit", attitude.file, None, (), found, allowed))
         turn_time = turn_time[known]
         matrix = flown.orbital_to_itrs(turn_time) @ matrix[known]
-    elif rotation is not None and meant.attitude_frame != "ITRS":
-        matrix = to_itrs(meant.attitude_frame, rotation)(turn_time) @ matrix
+    elif rotation is not None and conventions.attitude_frame != "ITRS":
+        matrix = to_itrs(conventions.attitude_frame, rotation)(turn_time) @ matrix
     quaternion = Rotation.from_matrix(matrix).as_quat(canonical=False)
     try:
         table = PlatformTable.of(epoch, time, position, velocity, turn_time, quaternion)
@@ -224,11 +226,11 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
     return replace(table, usable=(float(first), float(last)))
 
 
-def _one_segment(readings: PlatformReadings, meant: Conventions) -> tuple[OrbitReadings, Instants | None]:
+def _one_segment(readings: PlatformReadings, conventions: Conventions) -> tuple[OrbitReadings, Instants | None]:
     """Return the segment of an orbit with most of the attitude, and the instants between which it may be used."""
     orbit, attitude = readings.orbit, readings.attitude
-    looks = _instants(attitude.file, attitude.clock, meant.attitude_scale, meant.attitude_offset)
-    fixes = _instants(orbit.file, orbit.clock, meant.orbit_scale, meant.orbit_offset)
+    looks = _instants(attitude.file, attitude.clock, conventions.attitude_scale, conventions.attitude_offset)
+    fixes = _instants(orbit.file, orbit.clock, conventions.orbit_scale, conventions.orbit_offset)
     start = epoch_before(fixes)
     time, turn_time = fixes.since(start), looks.since(start)
     best, best_count, best_usable = orbit.segments[0], -1, None
@@ -236,7 +238,7 @@ def _one_segment(readings: PlatformReadings, meant: Conventions) -> tuple[OrbitR
         usable = (
             None
             if segment.usable is None
-            else _instants(orbit.file, segment.usable, meant.orbit_scale, meant.orbit_offset)
+            else _instants(orbit.file, segment.usable, conventions.orbit_scale, conventions.orbit_offset)
         )
         first, last = (time[segment.first], time[segment.last]) if usable is None else usable.since(start)
         count = int(np.sum(in_span(turn_time, first, last)))
@@ -269,18 +271,18 @@ def to_itrs(frame: str, rotation: TableRotation) -> Any:
     return rotation.matrix
 
 
-def _body(attitude: AttitudeReadings, meant: Conventions) -> np.ndarray:
+def _body(attitude: AttitudeReadings, conventions: Conventions) -> np.ndarray:
     """Return rotations (M, 3, 3) from the body to the attitude's frame."""
     if attitude.quaternion is not None:
-        q = attitude.quaternion if meant.scalar == "last" else np.roll(attitude.quaternion, -1, axis=1)
+        q = attitude.quaternion if conventions.scalar == "last" else np.roll(attitude.quaternion, -1, axis=1)
         matrix = np.asarray(Rotation.from_quat(q).as_matrix())
-        if meant.turns == "frame_to_body":
+        if conventions.turns == "frame_to_body":
             matrix = np.swapaxes(matrix, 1, 2)
     else:
         assert attitude.angles is not None
-        order = ["xyz".index(axis) for axis in meant.sequence]
-        matrix = np.asarray(Rotation.from_euler(meant.sequence.upper(), attitude.angles[:, order]).as_matrix())
-    return matrix @ np.array(body_axes_matrix(meant.body_axes), dtype=np.float64)
+        order = ["xyz".index(axis) for axis in conventions.sequence]
+        matrix = np.asarray(Rotation.from_euler(conventions.sequence.upper(), attitude.angles[:, order]).as_matrix())
+    return matrix @ np.array(body_axes_matrix(conventions.body_axes), dtype=np.float64)
 
 
 def _instants(file: str, clock: Readings, scale: str, offset: float) -> Instants:
@@ -300,12 +302,14 @@ def _stated(spec: Any, key: str, in_spec: str | None, in_file: str | None, what:
     return str(in_spec or in_file)
 
 
-def _earth(spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, meant: Conventions) -> EarthOrientation | None:
+def _earth(
+    spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, conventions: Conventions
+) -> EarthOrientation | None:
     """Return the Earth orientation of a table or of constant values; None where neither is given."""
     if spec.earth_orientation is not None:
         return earth_orientation.read_earth_orientation(folder / spec.earth_orientation)
     if spec.earth is not None:
-        first = epoch_before(_instants(orbit.file, orbit.clock, meant.orbit_scale, meant.orbit_offset))
+        first = epoch_before(_instants(orbit.file, orbit.clock, conventions.orbit_scale, conventions.orbit_offset))
         return earth_orientation.constant_orientation(first, spec.earth.ut1_utc, spec.earth.polar_motion)
     return None
 
