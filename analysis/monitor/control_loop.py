@@ -142,7 +142,7 @@ def spectral_radius(
     quantities : (n,) sequence of int or None
         Index of the quantity that each loop acts on; by default each has its own.
     """
-    every, g = np.asarray(coupling, np.float64), np.asarray(gains, np.float64)
+    coupling_matrix, g = np.asarray(coupling, np.float64), np.asarray(gains, np.float64)
     acting = np.flatnonzero(g != 0.0).tolist()
     if not acting:
         return 0.0
@@ -157,7 +157,7 @@ def spectral_radius(
     step[:n, :n] = np.eye(n)
     for k in acting:
         at = place[named[k]]
-        step[:n, n * int(delays[k]) + at] -= g[k] * every[rows, k] / every[rows[at], k]
+        step[:n, n * int(delays[k]) + at] -= g[k] * coupling_matrix[rows, k] / coupling_matrix[rows[at], k]
     step[n:, : n * longest] = np.eye(n * longest)
     return float(np.abs(np.linalg.eigvals(step)).max())
 

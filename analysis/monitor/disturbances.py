@@ -208,9 +208,9 @@ class Disturbances:
             "sigmas": (count,),
         }
         for name, shape in shapes.items():
-            found = getattr(self, name).shape
-            if found != shape:
-                raise ValueError(f"disturbances: {name} must be {shape} for {count} motions, found {found}")
+            actual = getattr(self, name).shape
+            if actual != shape:
+                raise ValueError(f"disturbances: {name} must be {shape} for {count} motions, found {actual}")
         if not all(len(getattr(self, name)) == count for name in ("bodies", "causes", "units", "laws")):
             raise ValueError(f"disturbances: {count} motions need as many bodies, causes, units and laws")
 
@@ -309,26 +309,26 @@ class Disturbances:
         law : TimeLaw
             Law in time of the copies.
         """
-        own = list(which)
+        indices = list(which)
         count = len(self.labels)
-        correlation = np.zeros((count + len(own),) * 2)
+        correlation = np.zeros((count + len(indices),) * 2)
         correlation[:count, :count] = self.correlation
-        correlation[count:, count:] = self.correlation[np.ix_(own, own)]
+        correlation[count:, count:] = self.correlation[np.ix_(indices, indices)]
 
         def more(values: tuple[str, ...]) -> tuple[str, ...]:
-            return (*values, *(values[k] for k in own))
+            return (*values, *(values[k] for k in indices))
 
         return Disturbances(
             self.name,
             more(self.labels),
             more(self.bodies),
             more(self.causes),
-            np.append(self.sigmas, times * self.sigmas[own]),
+            np.append(self.sigmas, times * self.sigmas[indices]),
             more(self.units),
-            np.concatenate([self.spots, times * self.spots[:, own]], axis=1),
-            np.concatenate([self.parameters, times * self.parameters[:, own]], axis=1),
+            np.concatenate([self.spots, times * self.spots[:, indices]], axis=1),
+            np.concatenate([self.parameters, times * self.parameters[:, indices]], axis=1),
             correlation,
-            (*self.laws, *(law,) * len(own)),
+            (*self.laws, *(law,) * len(indices)),
             self.jump_false_alarm,
         )
 
@@ -504,13 +504,15 @@ def consistency(
         return Consistency(square, count, limit, (), false_alarm, moved)
     candidates = {body: stated.spots[:, [b == body for b in stated.bodies]] for body in dict.fromkeys(stated.bodies)}
     candidates |= {body: np.asarray(table) for body, table in (others or {}).items() if body not in candidates}
-    found = []
+    suspects = []
     for body, table in candidates.items():
         u, s, _ = np.linalg.svd(np.linalg.solve(root, table), full_matrices=False)
         # log likelihood of white under I + x U S^2 U' against that under I
         added = _INFLATIONS[:, None] * s**2
         gain = 0.5 * np.sum((u.T @ white) ** 2 * added / (1.0 + added) - np.log1p(added), axis=1)
         best = int(np.argmax(gain))
-        found.append(Suspect(body, float(np.sqrt(1.0 + _INFLATIONS[best])), float(gain[best])))
-    found.sort(key=lambda one: -one.gain)
-    return Consistency(square, count, limit, tuple(one for one in found if one.gain > 0.0), false_alarm, moved)
+        suspects.append(Suspect(body, float(np.sqrt(1.0 + _INFLATIONS[best])), float(gain[best])))
+    suspects.sort(key=lambda suspect: -suspect.gain)
+    return Consistency(
+        square, count, limit, tuple(suspect for suspect in suspects if suspect.gain > 0.0), false_alarm, moved
+    )

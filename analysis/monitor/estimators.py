@@ -65,7 +65,7 @@ class Shifts:
     @property
     def coordinates(self) -> dict[str, slice]:
         """Range of each camera's spot coordinates among all."""
-        return {name: slice(2 * own.start, 2 * own.stop) for name, own in self.spots.items()}
+        return {name: slice(2 * spots.start, 2 * spots.stop) for name, spots in self.spots.items()}
 
 
 class Estimator(ABC):
@@ -137,9 +137,9 @@ class PerCameraEstimator(Estimator):
         """Return the block-diagonal gain, camera by camera."""
         count = PARAMETERS_PER_CAMERA * len(shifts.cameras)
         out = np.zeros((len(shifts.covariance), count, shifts.covariance.shape[-1]))
-        for k, (name, own) in enumerate(shifts.coordinates.items()):
+        for k, (name, columns) in enumerate(shifts.coordinates.items()):
             rows = slice(PARAMETERS_PER_CAMERA * k, PARAMETERS_PER_CAMERA * (k + 1))
-            out[:, rows, own] = self.camera_gain(shifts.cameras[name], shifts.covariance[:, own, own])
+            out[:, rows, columns] = self.camera_gain(shifts.cameras[name], shifts.covariance[:, columns, columns])
         return out
 
 
@@ -194,9 +194,9 @@ class Formula(PerCameraEstimator):
         if self.exact is None:
             return super().read(shifts)
         parts = []
-        for name, own in shifts.spots.items():
+        for name, spots in shifts.spots.items():
             camera = shifts.cameras[name]
-            at = [own.start + k for k in _pair(camera)]
+            at = [spots.start + k for k in _pair(camera)]
             rows = [2 * k + axis for k in at for axis in (0, 1)]
             covariance = shifts.covariance[:, rows][:, :, rows]
             seen = (shifts.before[:, at], shifts.after[:, at], covariance)
@@ -282,11 +282,11 @@ def preferred_estimator(names: Iterable[str]) -> str:
     ValueError
         None of the preferred estimators is among them.
     """
-    known = list(names)
+    present = list(names)
     for name in PREFERRED:
-        if name in known:
+        if name in present:
             return name
-    raise ValueError(f"results without {' or '.join(PREFERRED)}: there are {', '.join(known)}")
+    raise ValueError(f"results without {' or '.join(PREFERRED)}: there are {', '.join(present)}")
 
 
 def applicable(cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> dict[str, Estimator]:
@@ -299,4 +299,4 @@ def applicable(cameras: Mapping[str, CameraCalibration], disturbances: Disturban
     disturbances : Disturbances or None
         Prior of the disturbances; None for none.
     """
-    return {name: one for name, one in ESTIMATORS.items() if one.applies(cameras, disturbances)}
+    return {name: estimator for name, estimator in ESTIMATORS.items() if estimator.applies(cameras, disturbances)}

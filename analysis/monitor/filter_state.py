@@ -299,12 +299,12 @@ def jumping_bodies(
         Mean time between two jumps, s, of motions without a known rate; None to return only bodies with a rate.
     """
     out = []
-    for body in dict.fromkeys(one.body for one in may):
-        one = max((one for one in may if one.body == body), key=lambda one: len(one.motions))
-        rates = [otherwise if (rate := stated.laws[k].every_s) is None else rate for k in one.motions]
-        every = [rate for rate in rates if rate is not None]
-        if len(every) == len(rates):
-            out.append(JumpingBody(one.motions, one.spots, one.root, min(every)))
+    for body in dict.fromkeys(c.body for c in may):
+        c = max((c for c in may if c.body == body), key=lambda c: len(c.motions))
+        rates = [otherwise if (rate := stated.laws[k].every_s) is None else rate for k in c.motions]
+        intervals = [rate for rate in rates if rate is not None]
+        if len(intervals) == len(rates):
+            out.append(JumpingBody(c.motions, c.spots, c.root, min(intervals)))
     return tuple(out)
 
 
@@ -362,14 +362,14 @@ def _chances(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
 
     The window extends over the given number of readings on either side, or over all.
     """
-    every = np.logaddexp.reduce([one.log_weight for one in hints], axis=0)
+    log_weights = np.logaddexp.reduce([hint.log_weight for hint in hints], axis=0)
     if window is None:
-        total = np.logaddexp(0.0, np.logaddexp.reduce(every))
+        total = np.logaddexp(0.0, np.logaddexp.reduce(log_weights))
     else:
-        padded = np.pad(every, window, constant_values=-np.inf)
+        padded = np.pad(log_weights, window, constant_values=-np.inf)
         near = np.lib.stride_tricks.sliding_window_view(padded, 2 * window + 1)
         total = np.logaddexp(0.0, np.logaddexp.reduce(near, axis=1))
-    return [np.exp(one.log_weight - total) for one in hints]
+    return [np.exp(hint.log_weight - total) for hint in hints]
 
 
 def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequence[Array]) -> tuple[Array, Array]:
@@ -386,12 +386,12 @@ def mixture(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequen
     moved : sequence of (L, n, r) ndarrays
         Effect of unit amounts before each reading on the present states, for each body.
     """
-    found = _chances(hints)
-    away = [np.einsum("knr,kr->kn", m, one.mean) for m, one in zip(moved, hints, strict=True)]
-    shift = np.asarray(sum(p @ a for p, a in zip(found, away, strict=True)))
+    probabilities = _chances(hints)
+    away = [np.einsum("knr,kr->kn", m, hint.mean) for m, hint in zip(moved, hints, strict=True)]
+    shift = np.asarray(sum(p @ a for p, a in zip(probabilities, away, strict=True)))
     out = covariance - np.outer(shift, shift)
-    for chance, each, m, one in zip(found, away, moved, hints, strict=True):
-        inner = np.matmul(chance[:, None, None] * m, one.covariance)
+    for chance, each, m, hint in zip(probabilities, away, moved, hints, strict=True):
+        inner = np.matmul(chance[:, None, None] * m, hint.covariance)
         out = out + (chance[:, None] * each).T @ each + np.tensordot(inner, m, axes=([0, 2], [0, 2]))
     return mean + shift, 0.5 * (out + out.T)
 
@@ -419,13 +419,13 @@ def hinted_variance(
     if not bodies:
         return []
     hints = []
-    for one, b, j in zip(bodies, score, information, strict=True):
-        own = b, j
-        hints.append(Hint.of(own, own, np.eye(len(one.motions)), gap / one.every_s))
+    for body, b, j in zip(bodies, score, information, strict=True):
+        evidence = b, j
+        hints.append(Hint.of(evidence, evidence, np.eye(len(body.motions)), gap / body.every_s))
     out = []
-    for one, hint, chance in zip(bodies, hints, _chances(hints, window // 2), strict=True):
-        square = (hint.mean @ one.root.T) ** 2 + np.einsum("ij,kjl,il->ki", one.root, hint.covariance, one.root)
-        over = np.divide(chance * one.every_s, gap, out=np.zeros_like(gap), where=gap > 0.0)
+    for body, hint, chance in zip(bodies, hints, _chances(hints, window // 2), strict=True):
+        square = (hint.mean @ body.root.T) ** 2 + np.einsum("ij,kjl,il->ki", body.root, hint.covariance, body.root)
+        over = np.divide(chance * body.every_s, gap, out=np.zeros_like(gap), where=gap > 0.0)
         out.append(_AGAIN * over[:, None] * square)
     return out
 
@@ -540,8 +540,8 @@ def jump_evidence(track: Track, gap: Array, bodies: Sequence[JumpingBody], life:
         return 0.0
     unstated = np.eye(track.score.shape[1])[:, : len(noise)] * np.sqrt(np.diag(noise))
     cases = [(unstated, _ERRORS, np.full(len(_ERRORS), _UNSTATED - math.log(len(_ERRORS) * life)))]
-    cases += [(one.spots, _SIZES, _LOG_SIZE - math.log(one.every_s)) for one in bodies]
-    found = [0.0]
+    cases += [(body.spots, _SIZES, _LOG_SIZE - math.log(body.every_s)) for body in bodies]
+    logs = [0.0]
     log_gap = np.log(np.maximum(gap, 1e-300))
     for outputs, scale, beforehand in cases:
         values, vectors = np.linalg.eigh(outputs.T @ track.information @ outputs)
@@ -549,5 +549,5 @@ def jump_evidence(track: Track, gap: Array, bodies: Sequence[JumpingBody], life:
         square = scale[:, None, None] ** 2
         inner = 1.0 + square * np.maximum(values, 0.0)
         gain = 0.5 * np.sum(square * along**2 / inner - np.log(inner), axis=2)
-        found.append(float(logsumexp(gain + beforehand[:, None] + log_gap)))
-    return float(logsumexp(found))
+        logs.append(float(logsumexp(gain + beforehand[:, None] + log_gap)))
+    return float(logsumexp(logs))

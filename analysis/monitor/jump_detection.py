@@ -267,12 +267,12 @@ def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
     bodies: dict[str, list[int]] = {}
     for k in jumping:
         bodies.setdefault(stated.bodies[k], []).append(k)
-    groups = [(k,) for k in jumping] + [tuple(own) for own in bodies.values() if len(own) > 1]
+    groups = [(k,) for k in jumping] + [tuple(members) for members in bodies.values() if len(members) > 1]
     out = []
-    for own in groups:
-        values, vectors = np.linalg.eigh(stated.correlation[np.ix_(own, own)])
+    for members in groups:
+        values, vectors = np.linalg.eigh(stated.correlation[np.ix_(members, members)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        out.append(Candidate(stated.bodies[own[0]], own, stated.spots[:, own] @ root, root))
+        out.append(Candidate(stated.bodies[members[0]], members, stated.spots[:, members] @ root, root))
     return tuple(out)
 
 
@@ -301,9 +301,9 @@ def steps(root: Array, white: Array, when: Array, inside: slice, reference: floa
     come = (when[:, None] >= when[at]).astype(np.float64)
     if reference is not None:
         come -= reference >= when[at]
-    every = solve_triangular(root, np.kron(come, np.eye(each)), lower=True).reshape(len(white), len(at), each)
-    every = every.transpose(1, 2, 0)
-    return Steps(after[at], when[at], every @ white, every @ every.transpose(0, 2, 1))
+    responses = solve_triangular(root, np.kron(come, np.eye(each)), lower=True).reshape(len(white), len(at), each)
+    responses = responses.transpose(1, 2, 0)
+    return Steps(after[at], when[at], responses @ white, responses @ responses.transpose(0, 2, 1))
 
 
 def most_likely_jump(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturbances) -> Jump | None:
@@ -318,32 +318,32 @@ def most_likely_jump(found: Sequence[Steps], may: Sequence[Candidate], stated: D
     stated : Disturbances
         Prior that contains these motions.
     """
-    parts = [one for one in found if len(one.until)]
+    parts = [candidate for candidate in found if len(candidate.until)]
     if not parts or not may:
         return None
     score, information = (np.concatenate([getattr(p, name) for p in parts]) for name in ("score", "information"))
     after, until = (np.concatenate([getattr(p, name) for p in parts]) for name in ("after", "until"))
     squares, logs = np.empty((len(may), len(until))), np.empty((len(may), len(until)))
-    for c, one in enumerate(may):
-        values, vectors = np.linalg.eigh(one.spots.T @ information @ one.spots)
-        along = np.einsum("kij,ki->kj", vectors, score @ one.spots)
+    for c, candidate in enumerate(may):
+        values, vectors = np.linalg.eigh(candidate.spots.T @ information @ candidate.spots)
+        along = np.einsum("kij,ki->kj", vectors, score @ candidate.spots)
         seen = values > UNOBSERVABLE * values.max()
         squares[c] = np.sum(np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0), axis=1)
         logs[c] = _log_chance(squares[c], np.sum(seen, axis=1))
     which, k = np.unravel_index(int(np.argmin(logs)), logs.shape)
     best = may[int(which)]
-    own = list(best.motions)
+    members = list(best.motions)
     rivals: dict[str, float] = {}
-    for c, one in enumerate(may):
-        if one.body != best.body:
-            rivals[one.body] = max(rivals.get(one.body, 0.0), 0.5 * float(squares[c, k]))
+    for c, candidate in enumerate(may):
+        if candidate.body != best.body:
+            rivals[candidate.body] = max(rivals.get(candidate.body, 0.0), 0.5 * float(squares[c, k]))
     return Jump(
         body=best.body,
         motions=best.motions,
-        labels=tuple(stated.labels[m] for m in own),
-        units=tuple(stated.units[m] for m in own),
-        sizes=(np.nan,) * len(own),
-        sigmas=(np.nan,) * len(own),
+        labels=tuple(stated.labels[m] for m in members),
+        units=tuple(stated.units[m] for m in members),
+        sizes=(np.nan,) * len(members),
+        sigmas=(np.nan,) * len(members),
         after=float(after[k]),
         until=float(until[k]),
         chances=_chances(after, until, 0.5 * squares[which]),
@@ -420,8 +420,8 @@ def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
     found : sequence of Jump
         Jumps of their motions.
     """
-    for one in found:
-        stated = stated.with_copies(one.motions, one.times, one.law)
+    for jump in found:
+        stated = stated.with_copies(jump.motions, jump.times, jump.law)
     return stated
 
 
@@ -459,7 +459,7 @@ def with_subthreshold_jumps(
         Time of the last measurement, s, after which no jump is detected.
     """
     after, until, information = (
-        np.concatenate([getattr(one, name) for one in found]) for name in ("after", "until", "information")
+        np.concatenate([getattr(part, name) for part in found]) for name in ("after", "until", "information")
     )
     if not looks or not len(until):
         return model
@@ -468,24 +468,24 @@ def with_subthreshold_jumps(
         if law.every_s is None:
             continue
         column = stated.spots[:, k]
-        seen = np.sqrt(np.maximum(column @ information @ column, 0.0))
-        left = subthreshold_share(limit, seen)
-        grown = np.cumsum(left * (until - after)) / law.every_s
+        detectability = np.sqrt(np.maximum(column @ information @ column, 0.0))
+        left = subthreshold_share(limit, detectability)
+        variance = np.cumsum(left * (until - after)) / law.every_s
         ahead = _AHEAD * (last - float(after[0]))
-        knots = [(float(after[0]), 0.0), *zip(until.tolist(), grown.tolist(), strict=True)]
-        knots.append((last + ahead, float(grown[-1]) + ahead / law.every_s))
+        knots = [(float(after[0]), 0.0), *zip(until.tolist(), variance.tolist(), strict=True)]
+        knots.append((last + ahead, float(variance[-1]) + ahead / law.every_s))
         model = model.with_copies((k,), 1.0, TimeLaw(event=tuple(knots)))
     return model
 
 
 def with_sizes(
-    one: Jump, stated: Disturbances, root: Array, white: Array, when: Array, reference: float | None
+    jump: Jump, stated: Disturbances, root: Array, white: Array, when: Array, reference: float | None
 ) -> Jump:
     """Return the jump with its sizes, estimated from all measurements with all other jumps known.
 
     Parameters
     ----------
-    one : Jump
+    jump : Jump
         Jump of some motions.
     stated : Disturbances
         Prior that contains these motions.
@@ -498,14 +498,14 @@ def with_sizes(
     reference : float or None
         Time from which changes are counted, s; None for the calibration.
     """
-    own = list(one.motions)
-    prior = one.times**2 * stated.correlation[np.ix_(own, own)]
-    come = one.law.step_probability(when)
-    come -= 0.0 if reference is None else float(one.law.step_probability(reference))
-    weights = solve_triangular(root, np.kron(come[:, None], stated.spots[:, own] @ prior), lower=True)
-    sizes = stated.sigmas[own] * (weights.T @ white)
+    members = list(jump.motions)
+    prior = jump.times**2 * stated.correlation[np.ix_(members, members)]
+    probability = jump.law.step_probability(when)
+    probability -= 0.0 if reference is None else float(jump.law.step_probability(reference))
+    weights = solve_triangular(root, np.kron(probability[:, None], stated.spots[:, members] @ prior), lower=True)
+    sizes = stated.sigmas[members] * (weights.T @ white)
     left = np.maximum(np.diag(prior) - np.sum(weights**2, axis=0), 0.0)
-    return replace(one, sizes=tuple(sizes.tolist()), sigmas=tuple((stated.sigmas[own] * np.sqrt(left)).tolist()))
+    return replace(jump, sizes=tuple(sizes.tolist()), sigmas=tuple((stated.sigmas[members] * np.sqrt(left)).tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -559,30 +559,30 @@ class Bodies:
         state : tuple of ndarray
             Score and information that give the amounts for the estimate.
         """
-        place, found = int(np.argmin(np.abs(until - jump.until))), []
-        for body in dict.fromkeys(one.body for one in may):
-            one = max((one for one in may if one.body == body), key=lambda one: len(one.motions))
-            known = one.spots.T @ looking[1][place] @ one.spots, looking[0][place] @ one.spots
-            times = jump.times if body == jump.body else jump_scale(*known)
-            found.append((one, times, Amounts.of(*looking, one.spots, times), Amounts.of(*state, one.spots, times)))
-        logs = np.array([judged.log_weight for _, _, judged, _ in found])
+        place, out = int(np.argmin(np.abs(until - jump.until))), []
+        for body in dict.fromkeys(c.body for c in may):
+            c = max((c for c in may if c.body == body), key=lambda c: len(c.motions))
+            evidence = c.spots.T @ looking[1][place] @ c.spots, looking[0][place] @ c.spots
+            times = jump.times if body == jump.body else jump_scale(*evidence)
+            out.append((c, times, Amounts.of(*looking, c.spots, times), Amounts.of(*state, c.spots, times)))
+        logs = np.array([judged.log_weight for _, _, judged, _ in out])
         weight = np.exp(logs - logs.max()) * gap
         weight = np.where(weight > _UNLIKELY * weight.max(), weight, 0.0)
-        kept = np.flatnonzero(weight.sum(axis=1))
-        own, times_of, judged, amounts = zip(*(found[b] for b in kept), strict=True)
-        return cls(own, times_of, weight[kept] / weight.sum(), judged, amounts)
+        likely = np.flatnonzero(weight.sum(axis=1))
+        bodies, times_of, judged, amounts = zip(*(out[b] for b in likely), strict=True)
+        return cls(bodies, times_of, weight[likely] / weight.sum(), judged, amounts)
 
     @property
     def spots(self) -> list[Array]:
         """Effect of unit amounts of each body on the outputs, (q, r)."""
-        return [one.spots for one in self.own]
+        return [candidate.spots for candidate in self.own]
 
     @property
     def parts(self) -> tuple[tuple[tuple[int, ...], float], ...]:
         """Motions of each body, and their relative variance times the probability of the body."""
         chance = self.weight.sum(axis=1)
-        every = zip(self.own, chance.tolist(), self.times, strict=True)
-        return tuple((one.motions, share * times**2) for one, share, times in every)
+        rows = zip(self.own, chance.tolist(), self.times, strict=True)
+        return tuple((candidate.motions, share * times**2) for candidate, share, times in rows)
 
     def known(
         self, mean: Array, covariance: Array, response: Array, levels: Sequence[Array], amounts: Sequence[Amounts]
@@ -603,18 +603,18 @@ class Bodies:
             Amounts of each body.
         """
         shift, spread = np.zeros(len(mean)), np.zeros(covariance.shape)
-        for one, share, level, does in zip(amounts, self.weight, levels, self.spots, strict=True):
-            moved = level - response @ does
-            each = np.einsum("knr,kr->kn", moved, one.mean)
+        for amount, share, level, effect in zip(amounts, self.weight, levels, self.spots, strict=True):
+            moved = level - response @ effect
+            each = np.einsum("knr,kr->kn", moved, amount.mean)
             shift += share @ each
             spread += (share[:, None] * each).T @ each
-            inner = np.matmul(share[:, None, None] * moved, one.covariance)
+            inner = np.matmul(share[:, None, None] * moved, amount.covariance)
             spread += np.tensordot(inner, moved, axes=([0, 2], [0, 2]))
         out = covariance + spread - np.outer(shift, shift)
         return mean + shift, 0.5 * (out + out.T)
 
 
-def mixture_moments(amounts: Sequence[Amounts], does: Sequence[Array], weight: Array) -> tuple[Array, Array]:
+def mixture_moments(amounts: Sequence[Amounts], effects: Sequence[Array], weight: Array) -> tuple[Array, Array]:
     """Return mean and covariance of the effect of jumps, averaged over bodies and places by their probabilities.
 
     Parameters
@@ -626,10 +626,10 @@ def mixture_moments(amounts: Sequence[Amounts], does: Sequence[Array], weight: A
     weight : (B, L) ndarray
         Probabilities; their sum is 1.
     """
-    each = np.stack([one.mean @ do.T for one, do in zip(amounts, does, strict=True)])
+    each = np.stack([amount.mean @ effect.T for amount, effect in zip(amounts, effects, strict=True)])
     mean = np.einsum("bk,bko->o", weight, each)
     away = each - mean
     spread = np.einsum("bk,bko,bkp->op", weight, away, away)
-    for one, do, share in zip(amounts, does, weight, strict=True):
-        spread += do @ np.einsum("k,krs->rs", share, one.covariance) @ do.T
+    for amount, effect, share in zip(amounts, effects, weight, strict=True):
+        spread += effect @ np.einsum("k,krs->rs", share, amount.covariance) @ effect.T
     return mean, spread

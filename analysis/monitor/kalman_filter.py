@@ -180,23 +180,23 @@ class SeriesFilter:
     def _step_levels(self) -> list[Array]:
         """Covariance of the states by each step, (n, n)."""
         out = []
-        for one in self.steps:
-            if one.moment is not None:
+        for step in self.steps:
+            if step.moment is not None:
                 does = self.space.level_inverse
-                out.append(_symmetric(does @ one.moment @ does.T))
+                out.append(_symmetric(does @ step.moment @ does.T))
                 continue
             together = np.zeros((self.space.size, self.space.size))
-            for motions, variance in one.parts:
-                own = list(motions)
-                level = self.space.level_of(own)
-                together += variance * level @ self.stated.correlation[np.ix_(own, own)] @ level.T
+            for motions, variance in step.parts:
+                members = list(motions)
+                level = self.space.level_of(members)
+                together += variance * level @ self.stated.correlation[np.ix_(members, members)] @ level.T
             out.append(_symmetric(together))
         return out
 
     @cached_property
     def _step_ends(self) -> Array:
         """Interval in which each step occurs, (S, 2) s."""
-        return np.array([(one.chances[0][0], one.chances[-1][0]) for one in self.steps]).reshape(-1, 2)
+        return np.array([(step.chances[0][0], step.chances[-1][0]) for step in self.steps]).reshape(-1, 2)
 
     def _with_steps(self, covariance: Array, then: float, now: float) -> Array:
         """Return the covariance with the steps that occur between two times."""
@@ -204,8 +204,8 @@ class SeriesFilter:
             return covariance
         ends = self._step_ends
         for k in np.flatnonzero((ends[:, 1] > then) & (ends[:, 0] <= now)).tolist():
-            one = self.steps[k]
-            gained = one.step_probability(now) - (one.step_probability(then) if math.isfinite(then) else 0.0)
+            step = self.steps[k]
+            gained = step.step_probability(now) - (step.step_probability(then) if math.isfinite(then) else 0.0)
             if gained > 0.0:
                 covariance = covariance + gained * self._step_levels[k]
         return covariance
@@ -220,8 +220,8 @@ class SeriesFilter:
     @cached_property
     def walking(self) -> NDArray[np.int_]:
         """Indices of the motions that jump at a known rate, (m,)."""
-        own = [k for k, law in enumerate(self.stated.laws) if law.every_s is not None and self.unfound]
-        return np.array(own, int)
+        indices = [k for k, law in enumerate(self.stated.laws) if law.every_s is not None and self.unfound]
+        return np.array(indices, int)
 
     @cached_property
     def _walk(self) -> Array:
@@ -352,30 +352,32 @@ class SeriesFilter:
             The reading has no noise and repeats what is known exactly.
         """
         if not observed.spots:
-            put = current.pending and replace(
+            held = current.pending and replace(
                 current.pending, ingested=self.update(current.pending.ingested, observed)[0]
             )
             now = self.at(replace(current, pending=None), observed.time)
-            state, found = self.ingested(now.state, observed)
+            state, innovation = self.ingested(now.state, observed)
             search = None if now.search is None else self.ingested(now.search, observed)[0]
-            return replace(now, state=state, search=search, pending=put), found
+            return replace(now, state=state, search=search, pending=held), innovation
         pending = current.pending
-        own = self._evaluate(replace(current, pending=None), observed, pending is not None)
+        trial = self._evaluate(replace(current, pending=None), observed, pending is not None)
         if pending is not None:
             other = self._evaluate(pending.ingested, observed, True)
-            kept = pending.log_odds + own.likely < other.likely
-            if kept:
-                own = replace(other, innovation=replace(other.innovation, earlier=pending.innovation))
-            own = replace(own, innovation=replace(own.innovation, settled=True))
-            recent = (*current.recent[:-1], not kept)
-            own = replace(own, before=replace(own.before, recent=recent), after=replace(own.after, recent=recent))
-        if not sure and may_be_bad(own.bad, own.log_odds, own.before.recent):
-            found = replace(own.innovation, bad=own.bad)
-            put = PendingReading(self._with_detection(own.after)[0], found, own.log_odds)
-            return replace(own.before, recent=(*own.before.recent, True)[-RECENT:], pending=put), found
-        after = replace(own.after, recent=(*own.after.recent, False)[-RECENT:])
+            accepted = pending.log_odds + trial.likely < other.likely
+            if accepted:
+                trial = replace(other, innovation=replace(other.innovation, earlier=pending.innovation))
+            trial = replace(trial, innovation=replace(trial.innovation, settled=True))
+            recent = (*current.recent[:-1], not accepted)
+            trial = replace(
+                trial, before=replace(trial.before, recent=recent), after=replace(trial.after, recent=recent)
+            )
+        if not sure and may_be_bad(trial.bad, trial.log_odds, trial.before.recent):
+            innovation = replace(trial.innovation, bad=trial.bad)
+            held = PendingReading(self._with_detection(trial.after)[0], innovation, trial.log_odds)
+            return replace(trial.before, recent=(*trial.before.recent, True)[-RECENT:], pending=held), innovation
+        after = replace(trial.after, recent=(*trial.after.recent, False)[-RECENT:])
         now, jump = self._with_detection(after, True)
-        return now, replace(own.innovation, jump=jump)
+        return now, replace(trial.innovation, jump=jump)
 
     def _evaluate(self, current: FilterState, observed: Observed, weighed: bool) -> _Evaluation:
         """Return the state before a reading of spots and with it, and the evidence that the reading is bad.
@@ -393,27 +395,25 @@ class SeriesFilter:
         now = before
         first = math.isnan(current.last) and self.before_s > 0.0
         if self.candidates and (first or observed.time > current.last):
-            now = self._with_step_hypothesis(
-                now, observed.time - self.before_s if first else current.last, observed.time
-            )
+            now = self._with_step(now, observed.time - self.before_s if first else current.last, observed.time)
         w = self.whitened(now.state, observed)
-        state, found = self.ingested(now.state, observed, w)
-        search, judged = None, found
+        state, innovation = self.ingested(now.state, observed, w)
+        search, judged = None, innovation
         if now.search is not None:
             w = self.whitened(now.search, observed)
             search, judged = self.ingested(now.search, observed, w)
         after = replace(now, state=state, search=search, last=observed.time)
         bad = bad_reading(w.white, w.root, observed.noise) if self.leaving_out else None
         if bad is None and not weighed:
-            return _Evaluation(before, after, found, -math.inf, judged.log_score)
+            return _Evaluation(before, after, innovation, -math.inf, judged.log_score)
         log_ratio = -math.inf if bad is None else bad.log_ratio
         gap = now.until - now.after
         jumping = [
-            jump_evidence(one.jump_track, gap, self._jumping, self.life_s, observed.noise) for one in (now, after)
+            jump_evidence(each.jump_track, gap, self._jumping, self.life_s, observed.noise) for each in (now, after)
         ]
         good = jumping[1] - jumping[0]
         likely = judged.log_score + float(np.logaddexp(log_ratio, good))
-        return _Evaluation(before, after, found, log_ratio - good, likely, bad)
+        return _Evaluation(before, after, innovation, log_ratio - good, likely, bad)
 
     def _with_detection(self, current: FilterState, telling: bool = False) -> tuple[FilterState, Jump | None]:
         """Return the state with the share of undetectable jumps after a reading, and with the jump that is detected."""
@@ -423,7 +423,7 @@ class SeriesFilter:
         jump = self._detected(now) if telling else None
         return (now, None) if jump is None else self._with_jump(now, jump)
 
-    def _with_step_hypothesis(self, current: FilterState, after: float, until: float) -> FilterState:
+    def _with_step(self, current: FilterState, after: float, until: float) -> FilterState:
         """Return the state with a step hypothesis just before a reading added; the oldest one is discarded."""
         start = max(0, len(current.until) + 1 - self.window)
 
@@ -465,10 +465,10 @@ class SeriesFilter:
         values, rows, left = self.space.outputs(mean, covariance, observed.time)
         if observed.parameters is None:
             return values[:width], rows[:width], observed.noise + left[:width, :width], np.eye(width, q)
-        own = observed.parameters
-        picked = np.concatenate([np.zeros((len(own), width)), own], axis=1)[:, :q]
-        noise = observed.noise + own @ left[width:, width:] @ own.T
-        return own @ values[width:], own @ rows[width:], noise, picked
+        combinations = observed.parameters
+        picked = np.concatenate([np.zeros((len(combinations), width)), combinations], axis=1)[:, :q]
+        noise = observed.noise + combinations @ left[width:, width:] @ combinations.T
+        return combinations @ values[width:], combinations @ rows[width:], noise, picked
 
     def whitened(self, track: Track, observed: Observed) -> Whitened:
         """Return a reading divided by the root of its covariance.
@@ -540,26 +540,26 @@ class SeriesFilter:
         most = np.sum(track.score * np.linalg.solve(information, track.score[:, :, None])[:, :, 0], axis=1)
         if 1.01 * most.max() < self._limit(current):
             return None
-        one = most_likely_jump(
+        best = most_likely_jump(
             [Steps(current.after, current.until, track.score, track.information)], self.candidates, self._stacked
         )
-        if one is None:
+        if best is None:
             return None
         # `most_likely_jump` counts its own tests of these readings
-        alone = one.chance / (len(self.candidates) * len(current.until))
-        chance = min(1.0, alone * float(self.looks(one.until - one.after)))
+        alone = best.chance / (len(self.candidates) * len(current.until))
+        chance = min(1.0, alone * float(self.looks(best.until - best.after)))
         if chance > self.stated.jump_false_alarm:
             return None
-        place, seen = int(np.argmin(np.abs(current.until - one.until))), self.space.width
-        rest = max(float(most[place]) - 2.0 * one.log_ratio, 0.0), max(seen - len(one.motions), 1)
-        return replace(one, chance=chance, rest=rest)
+        place, seen = int(np.argmin(np.abs(current.until - best.until))), self.space.width
+        rest = max(float(most[place]) - 2.0 * best.log_ratio, 0.0), max(seen - len(best.motions), 1)
+        return replace(best, chance=chance, rest=rest)
 
     def _with_jump(self, current: FilterState, jump: Jump) -> tuple[FilterState, Jump]:
         """Return the state after a jump is detected, and the jump with its sizes."""
-        jump_track, own = ((track.score, track.information) for track in (current.jump_track, current.state))
+        jump_track, info = ((track.score, track.information) for track in (current.jump_track, current.state))
         gap = current.until - current.after
-        bodies = Bodies.of(self.candidates, jump, current.until, gap, jump_track, own)
-        levels = [self.space.level_of(one.motions) @ one.root for one in bodies.own]
+        bodies = Bodies.of(self.candidates, jump, current.until, gap, jump_track, info)
+        levels = [self.space.level_of(c.motions) @ c.root for c in bodies.own]
         state, search = current.state, current.search
         mean, covariance = bodies.known(state.mean, state.covariance, state.response, levels, bodies.amounts)
         state = replace(state.alone(), mean=mean, covariance=covariance)
@@ -567,15 +567,15 @@ class SeriesFilter:
             mean, covariance = bodies.known(search.mean, search.covariance, search.response, levels, bodies.judged)
             search = replace(search.alone(), mean=mean, covariance=covariance)
         # sizes are those of the motions that explain it best, if only these had jumped
-        alone, weight = next(one for one in self.candidates if one.motions == jump.motions), bodies.weight.sum(axis=0)
-        named = Amounts.of(*own, alone.spots, jump.times)
+        alone, weight = (next(c for c in self.candidates if c.motions == jump.motions), bodies.weight.sum(axis=0))
+        named = Amounts.of(*info, alone.spots, jump.times)
         size, size_spread = mixture_moments(
             [named], [self.stated.sigmas[list(alone.motions), None] * alone.root], weight[None]
         )
-        does = [self.space.outputs_of(one.motions) @ one.root for one in bodies.own]
-        change, spread = mixture_moments(bodies.amounts, does, bodies.weight)
+        effects = [self.space.outputs_of(c.motions) @ c.root for c in bodies.own]
+        change, spread = mixture_moments(bodies.amounts, effects, bodies.weight)
         empty = np.zeros(0)
-        told = replace(
+        sized = replace(
             jump,
             sizes=tuple(size.tolist()),
             sigmas=tuple(np.sqrt(np.diag(size_spread)).tolist()),
@@ -585,7 +585,7 @@ class SeriesFilter:
             spread=tuple(tuple(row) for row in spread.tolist()),
             width=self.space.width,
         )
-        return replace(current, state=state, search=search, after=empty, until=empty), told
+        return replace(current, state=state, search=search, after=empty, until=empty), sized
 
     @cached_property
     def _jumping(self) -> tuple[JumpingBody, ...]:
@@ -609,7 +609,7 @@ class SeriesFilter:
         """
         if current.pending is not None:
             share = chance_good(current.pending.log_odds)
-            bad, good = (self.mixture(one) for one in (replace(current, pending=None), current.pending.ingested))
+            bad, good = (self.mixture(body) for body in (replace(current, pending=None), current.pending.ingested))
             apart = good.mean - bad.mean
             covariance = (1.0 - share) * bad.covariance + share * good.covariance
             covariance = covariance + share * (1.0 - share) * np.outer(apart, apart)
@@ -619,11 +619,11 @@ class SeriesFilter:
         if not self.jumping_bodies or not len(current.until):
             return current
         track, jump_track, hints, moved = current.state, current.jump_track, [], []
-        for one in self.jumping_bodies:
-            expected = (current.until - current.after) / one.every_s
-            looked, own = ((t.score, t.information) for t in (jump_track, track))
-            hints.append(Hint.of(looked, own, one.spots, expected))
-            moved.append(self.space.level_of(one.motions) @ one.root - track.response @ one.spots)
+        for body in self.jumping_bodies:
+            expected = (current.until - current.after) / body.every_s
+            looked, evidence = ((t.score, t.information) for t in (jump_track, track))
+            hints.append(Hint.of(looked, evidence, body.spots, expected))
+            moved.append(self.space.level_of(body.motions) @ body.root - track.response @ body.spots)
         mean, covariance = mixture(track.mean, track.covariance, hints, moved)
         none = current.until[:0]
         return replace(
@@ -657,8 +657,8 @@ class SeriesFilter:
         """
         width = self.space.width
         values, rows, left = self.space.outputs(mean, covariance, time)
-        own = rows[width:]
-        return values[width:], own @ covariance @ own.T + left[width:, width:]
+        parameter_rows = rows[width:]
+        return values[width:], parameter_rows @ covariance @ parameter_rows.T + left[width:, width:]
 
     def motions_of(
         self, mean: Array, covariance: Array, time: float, since: float, acting: bool = False
@@ -679,12 +679,10 @@ class SeriesFilter:
             True to multiply temperatures of bodies with sensors by the estimated factor of their effect on light, so
             that the motions computed from them are those that are estimated.
         """
-        more = [
-            (motions, variance * one.step_probability(time)) for one in self.steps for motions, variance in one.parts
-        ]
+        more = [(motions, variance * s.step_probability(time)) for s in self.steps for motions, variance in s.parts]
         for motion in self.walking.tolist():
-            every = float(self.stated.laws[motion].every_s or math.inf)
-            more.append(((motion,), max(time - since, 0.0) / every))
+            interval = float(self.stated.laws[motion].every_s or math.inf)
+            more.append(((motion,), max(time - since, 0.0) / interval))
         rows, left = self.space.motion_gain(time, more)
         if not acting:
             return rows @ mean, rows @ covariance @ rows.T + left
@@ -725,9 +723,9 @@ def with_hinted_jumps(
     if not how.jumping_bodies or not observed:
         return start, list(left)
     at = how.space.level
-    levels = [how.space.level_of(one.motions)[at] @ one.root for one in how.jumping_bodies]
+    levels = [how.space.level_of(body.motions)[at] @ body.root for body in how.jumping_bodies]
     score = [np.empty((len(observed), level.shape[1])) for level in levels]
-    information = [np.empty((*one.shape, one.shape[1])) for one in score]
+    information = [np.empty((*array.shape, array.shape[1])) for array in score]
     scores = np.empty((_PIECE, at.stop - at.start))
     known_of = np.empty((*scores.shape, scores.shape[1]))
 
@@ -737,8 +735,8 @@ def with_hinted_jumps(
         if place == 0:  # readings come from the last to the first
             there = slice(number, min(number + _PIECE, len(observed)))
             count = there.stop - number
-            for level, one, more in zip(levels, score, information, strict=True):
-                one[there], more[there] = scores[:count] @ level, level.T @ (known_of[:count] @ level)
+            for level, part, more in zip(levels, score, information, strict=True):
+                part[there], more[there] = scores[:count] @ level, level.T @ (known_of[:count] @ level)
 
     plain = replace(knowing, unfound=False)
     none = np.zeros(0)
@@ -746,13 +744,13 @@ def with_hinted_jumps(
         plain, replace(start, undetected=none), observed, none, [none] * len(observed), knowing.parameters_of, note
     )
     first = how.before_s if math.isnan(start.last) else 0.0
-    gap = np.diff([one.time for one in observed], prepend=observed[0].time - first)
+    gap = np.diff([reading.time for reading in observed], prepend=observed[0].time - first)
     place = {k: i for i, k in enumerate(how.walking.tolist())}
     out = np.array(left)
-    for one, more in zip(
+    for body, more in zip(
         how.jumping_bodies, hinted_variance(score, information, gap, how.jumping_bodies, how.window), strict=True
     ):
-        out[:, [place[k] for k in one.motions]] += more
+        out[:, [place[k] for k in body.motions]] += more
     return how.with_random_walk(start, out[0] - left[0], first), list(out)
 
 
@@ -789,16 +787,16 @@ def smoothed(
     times = np.asarray(wanted, np.float64)
     order = np.argsort(times, kind="stable")
     piece_starts, current = [start], start
-    for k, one in enumerate(observed):
+    for k, reading in enumerate(observed):
         if k and k % _PIECE == 0:
             piece_starts.append(current)
-        there = how.at(replace(current, undetected=left[k]), one.time)
-        current = replace(there, state=how.ingested(there.state, one)[0])
+        there = how.at(replace(current, undetected=left[k]), reading.time)
+        current = replace(there, state=how.ingested(there.state, reading)[0])
     out: dict[int, T] = {}
     size, moved = how.space.size, how.space.moved
-    carried, known = np.zeros(size), np.zeros((size, size))
+    gradient, precision = np.zeros(size), np.zeros((size, size))
     # index of the first reading after each time: the time is processed in the piece of that reading
-    behind = np.searchsorted(np.array([one.time for one in observed]), times[order], side="right")
+    behind = np.searchsorted(np.array([reading.time for reading in observed]), times[order], side="right")
     for k in order[behind == len(observed)]:  # after the last reading the filter is final
         there = how.at(current, times[k])
         out[int(k)] = each(there.mean, there.covariance, float(times[k]))
@@ -810,20 +808,20 @@ def smoothed(
             now = observed[number].time
             # across the reading: (1 - KH)' N (1 - KH) + H' S^-1 H, in the form that stays symmetric to the last bit;
             # other forms of the same cost lose N to rounding
-            away = whitened.gain @ known
+            away = whitened.gain @ precision
             half = away - 0.5 * (np.eye(len(away)) + away @ whitened.gain.T) @ whitened.rows
             change = whitened.rows.T @ half
-            known = known - (change + change.T)
-            carried = carried + whitened.rows.T @ (whitened.white - whitened.gain @ carried)
-            note(number, carried, known)
+            precision = precision - (change + change.T)
+            gradient = gradient + whitened.rows.T @ (whitened.white - whitened.gain @ gradient)
+            note(number, gradient, precision)
             for k in order[behind == number]:
                 there = how.at(before, times[k])
-                back = moved(carried[:, None], times[k], now, back=True)[:, 0]
-                both = how.space.moved_both(known, times[k], now, back=True)
+                back = moved(gradient[:, None], times[k], now, back=True)[:, 0]
+                both = how.space.moved_both(precision, times[k], now, back=True)
                 gained = there.covariance @ both @ there.covariance
                 out[int(k)] = each(there.mean + there.covariance @ back, there.covariance - gained, float(times[k]))
-            carried = moved(carried[:, None], before.time, now, back=True)[:, 0]
-            known = how.space.moved_both(known, before.time, now, back=True)
+            gradient = moved(gradient[:, None], before.time, now, back=True)[:, 0]
+            precision = how.space.moved_both(precision, before.time, now, back=True)
     return [out[k] for k in range(len(times))]
 
 
@@ -850,9 +848,9 @@ def smooth_jointly(
     """
     times, space = np.asarray(wanted, np.float64), how.space
     size, ahead = space.size, 0
-    behind = np.searchsorted(np.array([one.time for one in observed]), times, side="right")
+    behind = np.searchsorted(np.array([reading.time for reading in observed]), times, side="right")
     last = int(behind[-1]) if len(times) else 0
-    means, own = np.empty((0, size)), np.empty((0, size, 0, size))
+    means, joint = np.empty((0, size)), np.empty((0, size, 0, size))
     across, current = np.empty((0, size, size)), start  # of each copy, the states now with it
     for k in range(last + 1):
         if k < len(observed):
@@ -860,9 +858,9 @@ def smooth_jointly(
         while ahead < len(times) and behind[ahead] == k:
             across = space.moved(across, current.time, times[ahead])
             current = how.at(current, times[ahead])
-            own = np.concatenate([own, across.transpose(0, 2, 1)[:, :, None]], axis=2)
+            joint = np.concatenate([joint, across.transpose(0, 2, 1)[:, :, None]], axis=2)
             row = np.concatenate([across.transpose(1, 0, 2), current.covariance[:, None]], axis=1)
-            own, across = np.concatenate([own, row[None]]), np.concatenate([across, current.covariance[None]])
+            joint, across = np.concatenate([joint, row[None]]), np.concatenate([across, current.covariance[None]])
             means = np.concatenate([means, current.mean[None]])
             ahead += 1
         if k == last:
@@ -872,7 +870,7 @@ def smooth_jointly(
         whitened = how.whitened(there.state, observed[k])
         gain = whitened.rows @ across
         means = means + np.einsum("kdn,d->kn", gain, whitened.white)
-        own = own - np.einsum("kdn,ldm->knlm", gain, gain)
+        joint = joint - np.einsum("kdn,ldm->knlm", gain, gain)
         across = across - whitened.gain.T @ gain
         current = replace(there, state=how.ingested(there.state, observed[k], whitened)[0])
     after: list[tuple[Array, Array]] = []
@@ -887,8 +885,8 @@ def smooth_jointly(
         back = space.moved(carried[:, None], current.time, until, back=True)[:, 0]
         both = space.moved_both(known, current.time, until, back=True)
         means = means + np.einsum("kmn,m->kn", across, back)
-        own = own - np.einsum("kmn,mo,lop->knlp", across, both, across, optimize=True)
-    values, covariance = space.outputs_jointly(means, own, times)
+        joint = joint - np.einsum("kmn,mo,lop->knlp", across, both, across, optimize=True)
+    values, covariance = space.outputs_jointly(means, joint, times)
     width = space.width
     return values[:, width:], covariance[:, width:, :, width:]
 
@@ -897,12 +895,12 @@ def _filtered(
     how: SeriesFilter, current: FilterState, observed: Sequence[Observed], left: Sequence[Array]
 ) -> Iterator[tuple[FilterState, Whitened]]:
     """Yield the state before each reading of one piece, and the whitened reading."""
-    for one, share in zip(observed, left, strict=True):
+    for reading, share in zip(observed, left, strict=True):
         before = replace(current, undetected=share)
-        there = how.at(before, one.time)
-        whitened = how.whitened(there.state, one)
+        there = how.at(before, reading.time)
+        whitened = how.whitened(there.state, reading)
         yield before, whitened
-        current = replace(there, state=how.ingested(there.state, one, whitened)[0])
+        current = replace(there, state=how.ingested(there.state, reading, whitened)[0])
 
 
 READINGS, SHARES = (1, 3, 10), (0.5, 0.95)
@@ -954,14 +952,14 @@ def detection_power(how: SeriesFilter, interval: float, noise: Array) -> tuple[D
     if not may:
         return ()
     looks = float(how.looks(interval))
-    tests = [[_test(one.spots, j, how.stated.jump_false_alarm / looks) for one in may] for j in informations]
+    tests = [[_test(c.spots, j, how.stated.jump_false_alarm / looks) for c in may] for j in informations]
     out: list[DetectionPower] = []
-    for body in dict.fromkeys(one.body for one in may):
-        own = max((one for one in may if one.body == body), key=lambda one: len(one.motions))
-        found = _detection_rates(own.spots, informations, tests, np.random.default_rng([0, len(out)]))
+    for body in dict.fromkeys(c.body for c in may):
+        whole = max((c for c in may if c.body == body), key=lambda c: len(c.motions))
+        rates = _detection_rates(whole.spots, informations, tests, np.random.default_rng([0, len(out)]))
         out.append(
             DetectionPower(
-                body, np.array([[_smallest_size(found[n - 1], share) for share in SHARES] for n in READINGS])
+                body, np.array([[_smallest_size(rates[n - 1], share) for share in SHARES] for n in READINGS])
             )
         )
     return tuple(out)
@@ -992,14 +990,14 @@ def _detection_rates(
     amounts = rng.standard_normal((_DRAWS, spots.shape[1]))
     amounts *= np.sqrt(spots.shape[1]) / np.linalg.norm(amounts, axis=1, keepdims=True)
     step, noise, before = amounts @ spots.T, np.zeros((_DRAWS, len(spots))), np.zeros_like(informations[0])
-    told, out = np.zeros((len(_SIZES), _DRAWS), bool), []
+    detected, out = np.zeros((len(_SIZES), _DRAWS), bool), []
     for information, those in zip(informations, tests, strict=True):
         drawn = rng.standard_normal(noise.shape) @ covariance_root(information - before).T
         noise, before = noise + drawn, information
         score = _SIZES[:, None, None] * (step @ information) + noise
         for away, limit in those:
-            told |= np.sum((score @ away.T) ** 2, axis=2) > limit
-        out.append(told.mean(axis=1))
+            detected |= np.sum((score @ away.T) ** 2, axis=2) > limit
+        out.append(detected.mean(axis=1))
     return np.array(out)
 
 

@@ -81,9 +81,9 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
     count = 4
     unit = np.eye(count * len(cameras))
     out = [
-        Quantity(name, one, row @ unit[count * c : count * (c + 1)])
+        Quantity(name, parameter, row @ unit[count * c : count * (c + 1)])
         for c, (name, camera) in enumerate(cameras.items())
-        for one, row in zip(parameters.CAMERA_PARAMETERS.values(), parameters.rows_of(camera), strict=True)
+        for parameter, row in zip(parameters.CAMERA_PARAMETERS.values(), parameters.rows_of(camera), strict=True)
     ]
     if len(cameras) == 2:
         first, second = (camera.look_rad for camera in cameras.values())
@@ -117,13 +117,13 @@ def unchanged_quantities(
     ground : GroundGeometry or None
         Ground geometry of a pair whose altitude is known.
     """
-    unit = np.concatenate([(1.0, 1.0, 1.0, one.geometry.principal_distance_m) for one in cameras.values()])
+    unit = np.concatenate([(1.0, 1.0, 1.0, item.geometry.principal_distance_m) for item in cameras.values()])
     size = np.max(np.abs(stated.parameters) / unit[:, None], axis=0, initial=0.0)
     least = np.maximum(_UNMOVED * size, _NEGLIGIBLE * np.max(size, initial=0.0))
     return frozenset(
-        (one.group, one.key)
-        for one in quantities(cameras, ground)
-        if np.all(np.abs(one.row @ stated.parameters) <= float(np.abs(one.row) @ unit) * least)
+        (item.group, item.key)
+        for item in quantities(cameras, ground)
+        if np.all(np.abs(item.row @ stated.parameters) <= float(np.abs(item.row) @ unit) * least)
     )
 
 
@@ -168,8 +168,8 @@ class Split:
         names : (M,) sequence of str
             Name of each motion's group, for example its body.
         """
-        own = np.array(names)
-        return {name: shares[:, own == name].sum(axis=1) for name in dict.fromkeys(names)}
+        groups = np.array(names)
+        return {name: shares[:, groups == name].sum(axis=1) for name in dict.fromkeys(names)}
 
 
 def split(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> Split:
@@ -274,9 +274,9 @@ def sigma_if_known(rows: Array, stated: Disturbances, noise: Array, groups: Sequ
     spread[:count, :count] += noise
     out = np.empty((len(groups), len(rows)))
     for g, group in enumerate(groups):
-        own = np.isin(labels, group)
-        told = both @ c[:, own]
-        left = spread - told @ np.linalg.pinv(c[np.ix_(own, own)], hermitian=True) @ told.T
+        known = np.isin(labels, group)
+        cross = both @ c[:, known]
+        left = spread - cross @ np.linalg.pinv(c[np.ix_(known, known)], hermitian=True) @ cross.T
         solved = np.linalg.solve(left[:count, :count], left[:count, count:])
         variance = np.diagonal(left)[count:] - np.einsum("qd,dq->q", left[count:, :count], solved)
         out[g] = np.sqrt(np.maximum(variance, 0.0))
@@ -376,8 +376,8 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
     parts = len(a), 2 * len(a)
     old = np.arange(len(measured)) >= parts[0]
     same = old[:, None] == old[None, :]
-    own = np.where(old, measured @ old_now @ measured.T, measured @ now @ measured.T)
-    spread = np.where(same, own, measured @ then @ measured.T)
+    within = np.where(old, measured @ old_now @ measured.T, measured @ now @ measured.T)
+    spread = np.where(same, within, measured @ then @ measured.T)
     spread[: parts[0], : parts[0]] += noise
     spread[parts[0] : parts[1], parts[0] : parts[1]] += noise
     spread[parts[1] :, parts[1] :] += field
@@ -494,23 +494,23 @@ def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -
     total = shares.sum(axis=1) + np.einsum("qd,de,qe->q", reading, noise, reading)
     safe = np.where(total > 0.0, total, np.inf)
     out = []
-    for number, own in prior_numbers(stated).items():
+    for number, indices in prior_numbers(stated).items():
         factors = np.ones(len(stated.labels))
-        factors[own] = 2.0
+        factors[indices] = 2.0
         wider = error * factors
         doubled = total - shares.sum(axis=1) + np.sum(wider * (wider @ stated.correlation), axis=1)
         out.append(
             Elasticity(
                 number=number,
-                size=float(stated.sigmas[own[0]]),
-                unit=stated.units[own[0]],
-                bodies=tuple(dict.fromkeys(stated.bodies[k] for k in own)),
-                elasticity=shares[:, own].sum(axis=1) / safe,
+                size=float(stated.sigmas[indices[0]]),
+                unit=stated.units[indices[0]],
+                bodies=tuple(dict.fromkeys(stated.bodies[k] for k in indices)),
+                elasticity=shares[:, indices].sum(axis=1) / safe,
                 doubled=np.sqrt(np.maximum(doubled, 0.0)),
                 told=posterior_sigma(rows, stated.scaled(factors), noise),
             )
         )
-    return tuple(sorted(out, key=lambda one: -float(one.elasticity[0])))
+    return tuple(sorted(out, key=lambda elasticity: -float(elasticity.elasticity[0])))
 
 
 def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> dict[str, Array]:
@@ -530,12 +530,12 @@ def unobserved_bodies(rows: Array, stated: Disturbances, noise: Array, gain: Arr
         Gain of the estimator.
     """
     still = np.all(np.abs(stated.spots) < UNOBSERVED * np.sqrt(np.diag(noise))[:, None], axis=0)
-    found = split(rows, stated, noise, gain)
-    shares = found.after / np.where(found.sigma > 0.0, found.sigma**2, np.inf)[:, None]
+    contributions = split(rows, stated, noise, gain)
+    shares = contributions.after / np.where(contributions.sigma > 0.0, contributions.sigma**2, np.inf)[:, None]
     by_body: dict[str, Array] = {}
     for k in np.flatnonzero(still).tolist():
         by_body[stated.bodies[k]] = by_body.get(stated.bodies[k], np.zeros(len(rows))) + shares[:, k]
-    return {body: own for body, own in by_body.items() if np.max(own) > SHARE}
+    return {body: body_shares for body, body_shares in by_body.items() if np.max(body_shares) > SHARE}
 
 
 def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, degrees: float = DEGREES) -> HeavyTail:
@@ -561,7 +561,7 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
     reading = rows @ gain
     error = reading @ stated.spots - rows @ stated.parameters
     groups = list(prior_numbers(stated).values())
-    parts = np.stack([_of(error, own) for own in groups], axis=1)
+    parts = np.stack([_of(error, diagonal) for diagonal in groups], axis=1)
     # (Q, G, G) contribution of the numbers g and h together to the variance
     pairs = np.einsum("qgm,mn,qhn->qgh", parts, stated.correlation, parts)
     by_noise = np.einsum("qd,de,qe->q", reading, noise, reading)
@@ -570,22 +570,22 @@ def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, de
     sigma = np.sqrt(np.maximum(variance, 0.0))
     normal = np.sqrt(np.maximum(pairs.sum(axis=(1, 2)) + by_noise, 0.0))
     mean = degrees / (degrees - 2.0)
-    own = np.einsum("qgg->qg", pairs)
+    diagonal = np.einsum("qgg->qg", pairs)
     # the mean of 1 / sqrt(w) is Gamma((nu - 1) / 2) / Gamma(nu / 2) sqrt(nu / 2)
     root = float(np.exp(0.5 * np.log(0.5 * degrees) + gammaln(0.5 * (degrees - 1.0)) - gammaln(0.5 * degrees)))
-    across = pairs.sum(axis=(1, 2)) - own.sum(axis=1)
+    across = pairs.sum(axis=(1, 2)) - diagonal.sum(axis=1)
     return HeavyTail(
         degrees=degrees,
-        rms=np.sqrt(np.maximum(mean * own.sum(axis=1) + root**2 * across + by_noise, 0.0)),
+        rms=np.sqrt(np.maximum(mean * diagonal.sum(axis=1) + root**2 * across + by_noise, 0.0)),
         held=np.stack([_half_widths(sigma, level) for level in _LEVELS]),
         beyond=np.mean(2.0 * ndtr(-3.0 * normal / np.where(sigma > 0.0, sigma, np.inf)), axis=0),
     )
 
 
-def _of(error: Array, own: Sequence[int]) -> Array:
+def _of(error: Array, indices: Sequence[int]) -> Array:
     """Return the error (Q, M) with all but some motions set to zero."""
     out = np.zeros_like(error)
-    out[:, own] = error[:, own]
+    out[:, indices] = error[:, indices]
     return out
 
 

@@ -199,8 +199,8 @@ def observability(
     except np.linalg.LinAlgError as error:
         raise UndeterminedError("observability: covariance of the shifts is not positive definite") from error
     spots, parameters = spots * size, parameters * size
-    own = [names[k] for k in chosen]
-    _check_rank(spots[:, chosen], own)
+    family_names = [names[k] for k in chosen]
+    _check_rank(spots[:, chosen], family_names)
     white = np.linalg.solve(root, spots)
     members = white[:, chosen]
     length = np.linalg.norm(white, axis=0)
@@ -229,9 +229,9 @@ def observability(
     rank = int(np.sum(values > _RANK_TOLERANCE * values[0]))
     return ObservabilityReport(
         rank=rank,
-        family=tuple(own),
+        family=tuple(family_names),
         motions=tuple(reports),
-        statements=tuple(_statements(reports, own, rank, len(spots))),
+        statements=tuple(_statements(reports, family_names, rank, len(spots))),
     )
 
 
@@ -319,16 +319,18 @@ def _check_rank(spots: Array, names: Sequence[str] | None) -> None:
 
 
 def _jacobians(spots: ArrayLike, parameters: ArrayLike, limited: bool = True) -> tuple[Array, Array]:
-    one, two = np.asarray(spots, dtype=np.float64), np.asarray(parameters, dtype=np.float64)
-    shapes = one.ndim == 2 and two.shape == (4, one.shape[1]) and one.shape[0] > 0
-    if not shapes or one.shape[0] % 2 or one.shape[1] < 1:
-        raise ValueError(f"model fit: the Jacobians must be (2 n, P) and (4, P), found {one.shape} and {two.shape}")
-    if limited and one.shape[1] > one.shape[0]:
-        text = f"{one.shape[0]} spot coordinates cannot fix {one.shape[1]} motions; choose at most {one.shape[0]}"
+    first, second = np.asarray(spots, dtype=np.float64), np.asarray(parameters, dtype=np.float64)
+    shapes = first.ndim == 2 and second.shape == (4, first.shape[1]) and first.shape[0] > 0
+    if not shapes or first.shape[0] % 2 or first.shape[1] < 1:
+        raise ValueError(
+            f"model fit: the Jacobians must be (2 n, P) and (4, P), found {first.shape} and {second.shape}"
+        )
+    if limited and first.shape[1] > first.shape[0]:
+        text = f"{first.shape[0]} spot coordinates cannot fix {first.shape[1]} motions; choose at most {first.shape[0]}"
         raise ValueError(f"model fit: {text}")
-    if not (np.all(np.isfinite(one)) and np.all(np.isfinite(two))):
+    if not (np.all(np.isfinite(first)) and np.all(np.isfinite(second))):
         raise ValueError("model fit: Jacobians must be finite")
-    return one, two
+    return first, second
 
 
 _NOTHING = 1e-12
@@ -365,14 +367,14 @@ def _unobservable(stated: Disturbances) -> Array:
     """Return the covariance of the motions if each law's share of the spots were known, (M, M)."""
     out = np.zeros_like(stated.correlation)
     for law in dict.fromkeys(stated.laws):
-        own = np.flatnonzero([one == law for one in stated.laws])
-        here = np.ix_(own, own)
-        prior, spots = stated.correlation[here], stated.spots[:, own]
+        indices = np.flatnonzero([other == law for other in stated.laws])
+        block = np.ix_(indices, indices)
+        prior, spots = stated.correlation[block], stated.spots[:, indices]
         scale = np.abs(spots).max(axis=1)
         seen = spots[scale > 0.0] / scale[scale > 0.0, None]
         across = prior @ seen.T
         inverse = np.linalg.pinv(seen @ across, rcond=_NOTHING, hermitian=True) if len(seen) else np.zeros((0, 0))
-        out[here] = prior - across @ inverse @ across.T
+        out[block] = prior - across @ inverse @ across.T
     return out
 
 

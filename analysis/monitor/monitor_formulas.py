@@ -379,20 +379,20 @@ def exact(
             "intersection angle: the cameras look the same way, their angle has no direction to change in"
         )
     rotations = (forward.d_alpha_rad, forward.d_beta_rad, backward.d_alpha_rad, backward.d_beta_rad)
-    given = np.stack(np.broadcast_arrays(*(np.asarray(one, np.float64) for one in rotations)))
+    angles_now = np.stack(np.broadcast_arrays(*(np.asarray(angle, np.float64) for angle in rotations)))
     # the angle at the rotations, and with a step forward and back in each
     step = 1e-5
     moves = np.concatenate([np.zeros((1, 4)), step * np.eye(4), -step * np.eye(4)]).T
-    d_alpha, d_beta, other_alpha, other_beta = given[:, None] + moves.reshape(4, 9, *(1,) * (given.ndim - 1))
+    d_alpha, d_beta, other_alpha, other_beta = angles_now[:, None] + moves.reshape(4, 9, *(1,) * (angles_now.ndim - 1))
     angles = _between(
         _line_of_sight(d_alpha, d_beta, forward_look_rad), _line_of_sight(other_alpha, other_beta, backward_look_rad)
     )
     each = (angles[1:5] - angles[5:]) / (2 * step)
     slopes = [np.stack([each[2 * k], each[2 * k + 1]], axis=-1) for k in range(2)]
 
-    def sigma(own: tuple[Array, Array], shared: Array | None) -> Array:
+    def sigma(covariances: tuple[Array, Array], shared: Array | None) -> Array:
         variance: Any = 0.0
-        for slope, covariance in zip(slopes, own, strict=True):
+        for slope, covariance in zip(slopes, covariances, strict=True):
             variance = variance + np.einsum("...i,...ij,...j->...", slope, covariance[..., :2, :2], slope)
         if shared is not None:
             variance = variance + 2 * np.einsum("...i,...ij,...j->...", slopes[0], shared[..., :2, :2], slopes[1])
@@ -529,9 +529,9 @@ class GroundGeometry:
             normal += square
             right.append(square @ change * far)
         # points are located with the nominal rays, hence minus the effect of the change
-        found = -np.linalg.solve(normal, np.concatenate(right, axis=1))
-        found[2] *= -1.0  # up
-        return found
+        matrix = -np.linalg.solve(normal, np.concatenate(right, axis=1))
+        matrix[2] *= -1.0  # up
+        return matrix
 
     def rows(self, principal_distances_m: tuple[float, float]) -> Array:
         """Return the matrices, (places, 3, 8), for d_f in metres.
@@ -564,11 +564,11 @@ class GroundGeometry:
             turn = incidence - look
             c, s = math.cos(turn), math.sin(turn)
             level = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-            real, taken = (np.asarray(v, np.float64)[..., k, :] @ level.T for v in (true, assumed))
-            down = np.linalg.norm(taken, axis=-1, keepdims=True)
-            taken = taken / down
+            real, ray = (np.asarray(v, np.float64)[..., k, :] @ level.T for v in (true, assumed))
+            down = np.linalg.norm(ray, axis=-1, keepdims=True)
+            ray = ray / down
             station = -far * real / np.linalg.norm(real, axis=-1, keepdims=True)
-            square = np.eye(3) - taken[..., :, None] * taken[..., None, :]
+            square = np.eye(3) - ray[..., :, None] * ray[..., None, :]
             normal = normal + square
             right = right + np.einsum("...ij,...j->...i", square, station)
         out = np.linalg.solve(normal, right[..., None])[..., 0]

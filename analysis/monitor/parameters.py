@@ -230,5 +230,5 @@ def rows_of(camera: CameraCalibration) -> Array:
     camera : CameraCalibration
         Calibration of the camera.
     """
-    made_of = ((one.per_si, one.of) for one in CAMERA_PARAMETERS.values() if one.of is not None)
+    made_of = ((parameter.per_si, parameter.of) for parameter in CAMERA_PARAMETERS.values() if parameter.of is not None)
     return np.array([unit * np.array(of(camera) if callable(of) else of) for unit, of in made_of])

@@ -109,7 +109,7 @@ class SpotEvidence:
         parts : sequence of SpotEvidence
             At least one.
         """
-        return cls(parts[0].before, FitStates.joined([one.after for one in parts]))
+        return cls(parts[0].before, FitStates.joined([part.after for part in parts]))
 
     @property
     def holds(self) -> NDArray[np.bool_]:
@@ -136,8 +136,8 @@ class SpotEvidence:
         names : sequence of str
             Names of the spots.
         """
-        told, bad = self.doubt(self.worst, names), int(np.count_nonzero(~self.holds))
-        return None if told is None else f"at {moments[self.worst]}, the worst of {bad} times: {told.text}"
+        warning, bad = self.doubt(self.worst, names), int(np.count_nonzero(~self.holds))
+        return None if warning is None else f"at {moments[self.worst]}, the worst of {bad} times: {warning.text}"
 
     def doubt(self, state: int = 0, names: Sequence[str] = ()) -> SpotWarning | None:
         """Return the reason why sigma is not valid for a state; None where it is.
@@ -322,24 +322,24 @@ def read_again(
         Coefficients of the quantities that are tested.
     """
     steps = {title: _Steps.of(reading, shift, noise, rows) for title, reading in readings.items()}
-    found = _traced_together({title: (own.model, own.x[own.far]) for title, own in steps.items()})
-    return {title: own.judged(readings[title].values, found[title]) for title, own in steps.items()}
+    traced = _traced_together({title: (step.model, step.x[step.far]) for title, step in steps.items()})
+    return {title: step.judged(readings[title].values, traced[title]) for title, step in steps.items()}
 
 
 def _traced_together(wanted: Mapping[str, tuple[MotionModel, Array]]) -> dict[str, Retraced]:
     """Return the exact effects of the amounts (S, P) of each model; models with the same trace are traced together."""
-    ways: dict[int, list[str]] = {}
+    groups: dict[int, list[str]] = {}
     for title, (model, _) in wanted.items():
-        ways.setdefault(id(model.trace), []).append(title)
+        groups.setdefault(id(model.trace), []).append(title)
     out: dict[str, Retraced] = {}
-    for titles in ways.values():
+    for titles in groups.values():
         states = [state for title in titles for state in wanted[title][0].states(wanted[title][1])]
         model = wanted[titles[0]][0]
         nothing = Retraced(np.empty((0, len(model.spots))), np.empty((0, len(model.parameters))))
-        found, end = model.trace(states) if states else nothing, 0
+        traced, end = model.trace(states) if states else nothing, 0
         for title in titles:
-            own = slice(end, end + len(wanted[title][1]))
-            out[title], end = Retraced(found.spots[own], found.parameters[own]), own.stop
+            part = slice(end, end + len(wanted[title][1]))
+            out[title], end = Retraced(traced.spots[part], traced.parameters[part]), part.stop
     return out
 
 
@@ -391,16 +391,16 @@ class _Steps:
 
     def judged(self, values: Array, traced: Retraced) -> tuple[Array, Curvature]:
         """Return the readings (S, 4 K), iterated where they are not linear, and the test, from the traced states."""
-        model, x, every = self.model, self.x, slice(None)
-        found = Retraced(x @ model.spots.T, x @ model.parameters.T)
-        found.spots[self.far], found.parameters[self.far] = traced.spots, traced.parameters
+        model, x, everything = self.model, self.x, slice(None)
+        exact = Retraced(x @ model.spots.T, x @ model.parameters.T)
+        exact.spots[self.far], exact.parameters[self.far] = traced.spots, traced.parameters
         # the two are one number where everything is linear
-        curved = found.parameters + (self.step(x, found, every) - x) @ model.parameters.T - x @ model.parameters.T
-        off = self.in_sigmas(curved, every)
+        curved = exact.parameters + (self.step(x, exact, everything) - x) @ model.parameters.T - x @ model.parameters.T
+        off = self.in_sigmas(curved, everything)
         beyond = ~np.all(off <= NONLINEAR_SIGMAS, axis=1)
         out, rests = values.copy(), ~beyond
         left = np.flatnonzero(beyond & np.all(np.isfinite(off), axis=1))
-        x, last = x[left], Retraced(found.spots[left], found.parameters[left])
+        x, last = x[left], Retraced(exact.spots[left], exact.parameters[left])
         for _ in range(_MOST_STEPS):
             if not len(left):
                 break
@@ -560,9 +560,9 @@ def judged_spots(
     threads : int
         Number of threads for the fits.
     """
-    found = measure_spots(mean, frames, calibration, centroid, threads)
-    states = fit_states(found)
-    return widened(found, states.widening), states.reshaped(calibration.template.count)
+    positions = measure_spots(mean, frames, calibration, centroid, threads)
+    states = fit_states(positions)
+    return widened(positions, states.widening), states.reshaped(calibration.template.count)
 
 
 def recover_monitor(
@@ -696,19 +696,19 @@ def recovery_of(
     spread = joint(covariance.reshape(states, spots, 2, 2))
     start = np.broadcast_to(first.position.reshape(-1, spots, 2), (states, spots, 2))
     end = second.position.reshape(states, spots, 2)
-    found = estimates(start, end, spread, calibration.cameras, disturbances, calibration.ground, motions)
+    results = estimates(start, end, spread, calibration.cameras, disturbances, calibration.ground, motions)
     return Recovery(
         before=start,
         after=end,
         sigma_before=np.broadcast_to(_sigma(first).reshape(-1, spots, 2), (states, spots, 2)),
         sigma_after=_sigma(second).reshape(states, spots, 2),
         shift_covariance=spread,
-        parameters=found.parameters,
-        angle=found.angle,
-        ground=found.ground,
+        parameters=results.parameters,
+        angle=results.angle,
+        ground=results.ground,
         parts=(noise_parts(first, calibration.noise), noise_parts(second, calibration.noise)) if keep_parts else None,
         evidence=evidence,
-        curvature=found.curvature,
+        curvature=results.curvature,
     )
 
 
@@ -822,5 +822,5 @@ def _sigma(positions: SpotPositions) -> Array:
 
 def _pair(cameras: Mapping[str, CameraCalibration]) -> tuple[str, str]:
     """Return the forward camera, the reference of the angle between two, and the other."""
-    one, two = sorted(cameras, key=lambda name: -cameras[name].look_rad)
-    return one, two
+    forward, backward = sorted(cameras, key=lambda name: -cameras[name].look_rad)
+    return forward, backward

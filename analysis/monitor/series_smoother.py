@@ -235,25 +235,25 @@ def smooth_series(
         jumps, disturbances = _Search(disturbances, when, shifts, noise, order, reference).jumps()
     model = _Process(disturbances, reference)
     width, count = len(disturbances.parameters), len(wanted)
-    found = {
+    changes = {
         which: SeriesChanges(np.empty((count, width)), np.empty((count, width, width)), np.empty((count, width, width)))
         for which in ("filtered", "smoothed")
     }
     squares = np.empty(len(when))
     for piece, window in _pieces(len(when), window_of(shifts.shape[1])):
-        own = order[window]
-        part = _Factor(model, when[window], shifts[own], noise.covariance(own))
+        indices = order[window]
+        part = _Factor(model, when[window], shifts[indices], noise.covariance(indices))
         inside = slice(piece.start - window.start, piece.stop - window.start)
-        squares[own[inside]] = part.squares[inside]
+        squares[indices[inside]] = part.squares[inside]
         # times from the first of the piece to that of the next; those before all measurements belong to the first piece
         first = -np.inf if piece.start == 0 else when[piece.start]
         last = np.inf if piece.stop == len(when) else when[piece.stop]
         mine = np.flatnonzero((wanted >= first) & (wanted < last))
         for k in range(0, len(mine), _AT_ONCE):
-            part.estimate(wanted, mine[k : k + _AT_ONCE], found["filtered"], found["smoothed"])
+            part.estimate(wanted, mine[k : k + _AT_ONCE], changes["filtered"], changes["smoothed"])
     degrees = shifts.size
     whole = Consistency(float(squares.sum()), degrees, float(limit_of(FALSE_ALARM, degrees)))
-    return SmoothedSeries(found["filtered"], found["smoothed"], squares, whole, jumps)
+    return SmoothedSeries(changes["filtered"], changes["smoothed"], squares, whole, jumps)
 
 
 def detect_jumps(
@@ -352,47 +352,47 @@ class _Search:
 
     def jumps(self) -> tuple[tuple[Jump, ...], Disturbances]:
         """Return all detected jumps with their sizes, in the order of time, and the prior with these jumps."""
-        found = self._further([])
-        if len(found) > 1:
+        detected = self._further([])
+        if len(detected) > 1:
             # the first jumps were found without knowledge of the others
-            for k in reversed(range(len(found))):
-                others = found[:k] + found[k + 1 :]
+            for k in reversed(range(len(detected))):
+                others = detected[:k] + detected[k + 1 :]
                 again = self._look(others)
-                found = others if again is None else [*found[:k], again, *found[k + 1 :]]
-            found = self._further(found)
-        found.sort(key=lambda one: one.until)
-        model = with_jumps(self.stated, found)
+                detected = others if again is None else [*detected[:k], again, *detected[k + 1 :]]
+            detected = self._further(detected)
+        detected.sort(key=lambda jump: jump.until)
+        model = with_jumps(self.stated, detected)
         if any(law.every_s is not None for law in self.stated.laws):
-            every = self._steps(model)
-            looks = len(self.may) * sum(len(one.until) for one in every)
-            model = with_subthreshold_jumps(model, every, self.stated, looks, float(self.when[-1]))
-        return tuple(self._sized(one, model) for one in found), model
+            all_steps = self._steps(model)
+            looks = len(self.may) * sum(len(jump.until) for jump in all_steps)
+            model = with_subthreshold_jumps(model, all_steps, self.stated, looks, float(self.when[-1]))
+        return tuple(self._sized(jump, model) for jump in detected), model
 
-    def _further(self, found: list[Jump]) -> list[Jump]:
-        while len(found) < MOST and (one := self._look(found)) is not None:
-            found = [*found, one]
-        return found
+    def _further(self, detected: list[Jump]) -> list[Jump]:
+        while len(detected) < MOST and (jump := self._look(detected)) is not None:
+            detected = [*detected, jump]
+        return detected
 
     def _look(self, known: list[Jump]) -> Jump | None:
         """Return the most likely further jump if it is significant; None otherwise."""
-        one = most_likely_jump(self._steps(with_jumps(self.stated, known)), self.may, self.stated)
-        return one if one is not None and one.chance <= self.stated.jump_false_alarm else None
+        jump = most_likely_jump(self._steps(with_jumps(self.stated, known)), self.may, self.stated)
+        return jump if jump is not None and jump.chance <= self.stated.jump_false_alarm else None
 
     def _steps(self, model: Disturbances) -> list[Steps]:
-        return [steps(one.root, one.white, one.when, piece, self.reference) for one, piece in self._factors(model)]
+        return [steps(part.root, part.white, part.when, piece, self.reference) for part, piece in self._factors(model)]
 
-    def _sized(self, one: Jump, model: Disturbances) -> Jump:
+    def _sized(self, jump: Jump, model: Disturbances) -> Jump:
         for part, piece in self._factors(model):
-            if one.until in part.when[piece]:
-                return with_sizes(one, self.stated, part.root, part.white, part.when, self.reference)
-        raise AssertionError(f"a jump at {one.until} s is at no measurement")
+            if jump.until in part.when[piece]:
+                return with_sizes(jump, self.stated, part.root, part.white, part.when, self.reference)
+        raise AssertionError(f"a jump at {jump.until} s is at no measurement")
 
     def _factors(self, model: Disturbances) -> Iterator[tuple[_Factor, slice]]:
         """Yield the factorised measurements of each window, and the range of them that is the window's own piece."""
         process = _Process(model, self.reference)
         for piece, window in _pieces(len(self.when), window_of(self.shifts.shape[1])):
-            own = self.order[window]
-            part = _Factor(process, self.when[window], self.shifts[own], self.noise.covariance(own))
+            indices = self.order[window]
+            part = _Factor(process, self.when[window], self.shifts[indices], self.noise.covariance(indices))
             yield part, slice(piece.start - window.start, piece.stop - window.start)
 
 
@@ -443,18 +443,18 @@ class _Process:
         """Return the covariance of the parameters at each time, (m, 4 K, 4 K)."""
         width = len(self.parts[0][3])
         out = np.zeros((len(wanted), width, width))
-        for law, _, _, own in self.parts:
+        for law, _, _, covariance in self.parts:
             share = law.covariance(wanted, wanted)
             if self.reference is not None:
                 then = law.covariance(self.reference, self.reference)
                 share = share + then - 2.0 * law.covariance(wanted, self.reference)
-            out += share[:, None, None] * own
+            out += share[:, None, None] * covariance
         return out
 
 
 def _together(parts: list[tuple[Array, Array]]) -> Array:
     """Return the sum of Kronecker products."""
-    return np.asarray(sum(np.kron(time, own) for time, own in parts))
+    return np.asarray(sum(np.kron(time, block) for time, block in parts))
 
 
 class _Factor:
@@ -494,13 +494,13 @@ class _Factor:
         prior = self.process.parameters(wanted)
         weights = solve_triangular(self.root, self.process.across(self.when, wanted), lower=True)
         weights = weights.reshape(len(weights), len(wanted), -1)
-        known = self.each * np.searchsorted(self.when, wanted, side="right")
+        lengths = self.each * np.searchsorted(self.when, wanted, side="right")
         for k, number in enumerate(at):
-            for last, out in ((known[k], filtered), (len(weights), smoothed)):
-                own = weights[:last, k]
-                out.values[number] = own.T @ self.white[:last]
-                out.noise[number] = own.T @ self.noise[:last, :last] @ own
-                out.total[number] = _positive(prior[k], own.T @ own)
+            for last, out in ((lengths[k], filtered), (len(weights), smoothed)):
+                weight = weights[:last, k]
+                out.values[number] = weight.T @ self.white[:last]
+                out.noise[number] = weight.T @ self.noise[:last, :last] @ weight
+                out.total[number] = _positive(prior[k], weight.T @ weight)
 
 
 def _positive(prior: Array, gained: Array) -> Array:

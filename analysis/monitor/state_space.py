@@ -163,9 +163,9 @@ class StateSpace:
         if self.heat is not None:
             raw[self.heat.motions] = True
         laws = list(dict.fromkeys(stated.laws))
-        own = {law: np.array([one == law for one in stated.laws]) for law in laws}
+        members = {law: np.array([other == law for other in stated.laws]) for law in laws}
         for law in laws:
-            if np.any(stated.correlation[np.ix_(own[law], ~own[law])]):
+            if np.any(stated.correlation[np.ix_(members[law], ~members[law])]):
                 raise ValueError("state space: motions with different laws in time cannot be correlated")
         out: list[_Block] = []
 
@@ -188,14 +188,14 @@ class StateSpace:
             basis, _ = _spanned(outputs[:, spanning] / scale)
             steps = []
             for law in filter(_is_level, laws):
-                mine = own[law] & ~raw
+                mine = members[law] & ~raw
                 at = basis.T @ (outputs[:, mine] / scale)
                 effect = at @ stated.correlation[np.ix_(mine, mine)] @ at.T
                 steps.append((law, 0.5 * (effect + effect.T)))
             none = np.zeros((basis.shape[1],) * 2)
             add("level", TimeLaw(), scale * basis, none, np.flatnonzero(level), tuple(steps))
         for law in laws:
-            mine = own[law] & ~raw
+            mine = members[law] & ~raw
             if not _is_level(law) and np.any(mine):
                 values, vectors = np.linalg.eigh(stated.correlation[np.ix_(mine, mine)])
                 moved = outputs[:, mine] @ (vectors * np.sqrt(np.clip(values, 0.0, None)))
@@ -203,7 +203,7 @@ class StateSpace:
                 add("law", law, scale * (basis * sizes), np.eye(basis.shape[1]), np.flatnonzero(mine))
         if self.heat is not None:
             for law in laws:
-                mine = own[law] & raw
+                mine = members[law] & raw
                 if np.any(mine):
                     correlation = stated.correlation[np.ix_(mine, mine)]
                     add("heat", law, outputs[:, mine], correlation, np.flatnonzero(mine))
@@ -234,8 +234,8 @@ class StateSpace:
         motions : sequence of int
             Indices of m motions.
         """
-        own = list(motions)
-        return np.concatenate([self.stated.spots[:, own], self.stated.parameters[:, own]])
+        indices = list(motions)
+        return np.concatenate([self.stated.spots[:, indices], self.stated.parameters[:, indices]])
 
     @property
     def level(self) -> slice:
@@ -337,8 +337,8 @@ class StateSpace:
         for at, turn in over.turned:
             turn = turn.T if back else turn
             strip = turn @ out[at]
-            own = strip[:, at] @ turn.T
-            strip[:, at] = 0.5 * (own + own.T)
+            rotated = strip[:, at] @ turn.T
+            strip[:, at] = 0.5 * (rotated + rotated.T)
             out[at], out[:, at] = strip, strip.T
         return out
 
@@ -360,12 +360,12 @@ class StateSpace:
     @cached_property
     def _turning(self) -> list[tuple[slice, float, Array, Array]]:
         """For each law with a period its states, the period, and the rotations by zero and by a quarter."""
-        own = [block for block in self._blocks if block.law.period_s is not None]
-        quarters = [np.kron([[0.0, -1.0], [1.0, 0.0]], np.eye(block.rank)) for block in own]
-        periods = [float(block.law.period_s or 0.0) for block in own]
+        blocks = [block for block in self._blocks if block.law.period_s is not None]
+        quarters = [np.kron([[0.0, -1.0], [1.0, 0.0]], np.eye(block.rank)) for block in blocks]
+        periods = [float(block.law.period_s or 0.0) for block in blocks]
         return [
             (b.at, t, np.eye(2 * b.rank), np.asarray(q, np.float64))
-            for b, t, q in zip(own, periods, quarters, strict=True)
+            for b, t, q in zip(blocks, periods, quarters, strict=True)
         ]
 
     @cached_property
@@ -402,7 +402,7 @@ class StateSpace:
     @cached_property
     def _stepping_blocks(self) -> tuple[_Block, ...]:
         """Blocks with events, whose process noise depends on the time and not on the interval alone."""
-        return tuple(one for one in self._blocks if one.law.event or any(law.event for law, _ in one.steps))
+        return tuple(block for block in self._blocks if block.law.event or any(law.event for law, _ in block.steps))
 
     def outputs(self, mean: Array, covariance: Array, time: float) -> tuple[Array, Array, Array]:
         """Return the outputs of states: values, derivatives and covariance of the second-order rest.
@@ -441,10 +441,10 @@ class StateSpace:
         values = rows @ mean
         plain = rows.copy()
         for factor, at in self._heated:
-            own = plain[:, at]
-            values += own @ (mean[factor] * mean[at] + covariance[factor, at])
-            rows[:, at] = (1.0 + mean[factor]) * own
-            rows[:, factor] = own @ mean[at]
+            heat_rows = plain[:, at]
+            values += heat_rows @ (mean[factor] * mean[at] + covariance[factor, at])
+            rows[:, at] = (1.0 + mean[factor]) * heat_rows
+            rows[:, factor] = heat_rows @ mean[at]
         return values, rows, self._second(plain, plain, covariance)
 
     def _second(self, rows: Array, others: Array, across: Array) -> Array:
@@ -478,12 +478,12 @@ class StateSpace:
             Times, s.
         """
         count, plain = len(times), [self._rows(float(time)).copy() for time in times]
-        own = [self.acting(plain[k], means[k], covariance[k, :, k]) for k in range(count)]
-        values = np.array([one for one, _, _ in own]).reshape(count, len(self.basis))
+        single = [self.acting(plain[k], means[k], covariance[k, :, k]) for k in range(count)]
+        values = np.array([one for one, _, _ in single]).reshape(count, len(self.basis))
         out = np.empty((count, len(self.basis), count, len(self.basis)))
         for i, j in itertools.product(range(count), repeat=2):
             across = covariance[i, :, j]
-            out[i, :, j] = own[i][1] @ across @ own[j][1].T + self._second(plain[i], plain[j], across)
+            out[i, :, j] = single[i][1] @ across @ single[j][1].T + self._second(plain[i], plain[j], across)
         return values, out
 
     def _rows(self, time: float) -> Array:
@@ -498,7 +498,7 @@ class StateSpace:
     @cached_property
     def _growing_blocks(self) -> tuple[_Block, ...]:
         """Blocks with trends and relaxations, whose amplitude depends on the time."""
-        return tuple(one for one in self._blocks if (one.law.trend_s, one.law.relaxation_s) != (None, None))
+        return tuple(block for block in self._blocks if (block.law.trend_s, block.law.relaxation_s) != (None, None))
 
     @cached_property
     def _rows_at(self) -> dict[float, Array]:
@@ -585,21 +585,21 @@ class StateSpace:
                     rows[motion, block.at.start + k] = _gain(block.law, time)
             if block.kind not in ("level", "law"):
                 continue
-            own = list(block.motions)
+            idx = list(block.motions)
             if block.kind == "level":
-                own = sorted({*own, *np.flatnonzero(np.diag(stepped)).tolist()})
+                idx = sorted({*idx, *np.flatnonzero(np.diag(stepped)).tolist()})
                 root = np.array(
-                    [math.sqrt(_step_variance(law, time)) if _is_level(law) else 0.0 for law in map(self._law, own)]
+                    [math.sqrt(_step_variance(law, time)) if _is_level(law) else 0.0 for law in map(self._law, idx)]
                 )
-                prior = root[:, None] * self.stated.correlation[np.ix_(own, own)] * root + stepped[np.ix_(own, own)]
+                prior = root[:, None] * self.stated.correlation[np.ix_(idx, idx)] * root + stepped[np.ix_(idx, idx)]
             else:
-                prior = _variance(block.law, time) * self.stated.correlation[np.ix_(own, own)]
-            at_states = self._coordinates(block, own)
+                prior = _variance(block.law, time) * self.stated.correlation[np.ix_(idx, idx)]
+            at_states = self._coordinates(block, idx)
             across = prior @ at_states.T
             gain = across @ np.linalg.pinv(at_states @ across, rcond=1e-10, hermitian=True)
             amplitude = _gain(block.law, time)
-            rows[np.ix_(own, range(block.at.start, block.at.start + block.rank))] += amplitude * gain
-            left[np.ix_(own, own)] += amplitude**2 * (prior - gain @ across.T)
+            rows[np.ix_(idx, range(block.at.start, block.at.start + block.rank))] += amplitude * gain
+            left[np.ix_(idx, idx)] += amplitude**2 * (prior - gain @ across.T)
         return rows, left
 
     def _law(self, motion: int) -> TimeLaw:
@@ -615,8 +615,8 @@ def _is_level(law: TimeLaw) -> bool:
 def _spanned(columns: Array) -> tuple[Array, Array]:
     """Return orthonormal vectors that span the columns, and their singular values."""
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    own = sizes > _NOTHING * max(sizes[0], 1e-300)
-    return np.asarray(left[:, own]), np.asarray(sizes[own])
+    significant = sizes > _NOTHING * max(sizes[0], 1e-300)
+    return np.asarray(left[:, significant]), np.asarray(sizes[significant])
 
 
 def _halves(at: slice) -> tuple[slice, slice]:
