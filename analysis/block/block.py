@@ -234,9 +234,9 @@ class Block:
         Scenes of these passes.
     cameras : mapping of str to LineModel
         Calibrated cameras without changes, by name.
-    known : mapping of str to CameraKnowledge
+    known : mapping of str to CameraPrior
         Prior of each camera's changes without a monitor.
-    monitored : mapping of str to CameraKnowledge, CamerasKnowledge or None
+    monitored : mapping of str to CameraPrior, JointCameraPrior or None
         Distribution of each camera's changes, or of all together, given the monitor's readings; None for no monitor.
     attitude : tuple of Term
         Error models of the attitude readings.

@@ -93,12 +93,12 @@ def check_places(block: Block) -> None:
         control += (block.points.role[rays.point[bad]] == "control").tolist()
     if not wrong:
         return
-    shown = ", ".join(wrong[:_NAMED]) + (f" and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else "")
+    listed = ", ".join(wrong[:_NAMED]) + (f" and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else "")
     hint = "are their coordinates geocentric (ITRS), in metres and in the order x, y, z?" if all(control) else (
         "do their images belong to these scenes?"
     )  # fmt: skip
     raise BlockError(
-        f"block: these points lie more than {FAR:g} rad from the directions of their images: {shown}; {hint}"
+        f"block: these points lie more than {FAR:g} rad from the directions of their images: {listed}; {hint}"
     )
 
 

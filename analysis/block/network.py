@@ -159,8 +159,8 @@ def _sizes(block: Block, names: tuple[str, ...]) -> Array:
             sizes[f"{block_pass.name} {axis}"] = size
         for axis, size in zip(("along", "across", "down"), shift, strict=True):
             sizes[f"{block_pass.name} offset {axis}"] = size
-        for camera, known in block.known.items():
-            camera_sigma = np.sqrt(np.diag(known.covariance)).reshape(-1, 4).max(axis=0)
+        for camera, prior in block.known.items():
+            camera_sigma = np.sqrt(np.diag(prior.covariance)).reshape(-1, 4).max(axis=0)
             for axis, size in zip(("d_alpha", "d_beta", "d_gamma", "d_f"), camera_sigma.tolist(), strict=True):
                 sizes[f"{block_pass.name} {camera} {axis}"] = size
     common = 1.0 if block.terrain is None else max(block.terrain.common, 1e-6)

@@ -126,17 +126,17 @@ class LineImage:
         attitude = rays.attitude[which]
         arm = ground - rays.station[which] - shift @ corrections.axes.T
         body = rotated_back(rotation, np.einsum("nji,nj->ni", attitude, arm))
-        seen = camera.seen(body, rays.image[which])
+        projection = camera.seen(body, rays.image[which])
         white = self.white[which]
-        by_body = white @ seen.by_body
+        by_body = white @ projection.by_body
         by_measured = rotated(rotation, by_body)
         by_ground = by_measured @ np.swapaxes(attitude, 1, 2)
         # a small rotation s of the body moves the arm by arm x s, and t . (arm x s) = (t x arm) . s
         by_turn = rotation_vector_derivatives(rotation, cross(by_body, body[:, None]))
         slopes = corrections.slopes(by_turn, -by_ground)
         return (
-            np.einsum("nij,nj->ni", white, seen.miss),
-            np.concatenate([slopes, white @ (seen.by_drift * self.unit)], axis=2),
+            np.einsum("nij,nj->ni", white, projection.miss),
+            np.concatenate([slopes, white @ (projection.by_drift * self.unit)], axis=2),
             by_ground,
         )
 

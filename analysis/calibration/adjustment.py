@@ -691,7 +691,7 @@ class _Problem:
         lost = state.lost | (~control & (rays < 2))
         return replace(state, weights=Weights(np.where(lost[self.place], 0.0, weight[0]), factor), lost=lost)
 
-    def equations(self, state: _Iteration, hidden: OmittedTerms | None = None) -> Equations:
+    def equations(self, state: _Iteration, omitted: OmittedTerms | None = None) -> Equations:
         """Return the equations at a state, optionally with omitted terms as unknowns."""
         return assemble(
             self.fields,
@@ -702,7 +702,7 @@ class _Problem:
             self.priors,
             state.weights,
             self.shared,
-            hidden,
+            omitted,
         )
 
     @cached_property

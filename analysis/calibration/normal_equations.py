@@ -439,8 +439,8 @@ def assemble(
             rays = shared.corrected(site.name, line, measured, state.shared)
             rays = parameters.turned(state.values, site.name, line, rays)
             camera, bias, offset = parameters.parts(state.values, site.name, line, cameras[line])
-            shown, shift = ground[rays.point], axes @ offset
-            by = partials(camera, rays, shown, bias, shift)
+            points_of_rays, shift = ground[rays.point], axes @ offset
+            by = partials(camera, rays, points_of_rays, bias, shift)
             white = np.linalg.inv(np.linalg.cholesky(ray_covariance(noise, rays, by, shared=False)))
             block = np.zeros((len(rays.point), 2, count))
             since = parameters.since_middle(site.name, rays)[:, None, None]
@@ -453,7 +453,7 @@ def assemble(
             rows.append(sparse.csr_matrix((white @ block).reshape(2 * len(block), count)))
             shared_rows.append(shared.rows(site.name, line, white, by))
             points.append(white @ by.ground)
-            misses.append(np.einsum("nij,nj->ni", white, misclosure(camera, rays, shown, bias, shift)))
+            misses.append(np.einsum("nij,nj->ni", white, misclosure(camera, rays, points_of_rays, bias, shift)))
             point_indices.append(first + rays.point)
             row += 2 * len(rays.point)
         spans[0].append((begin, row))

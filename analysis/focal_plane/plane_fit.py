@@ -142,7 +142,7 @@ class FocalPlaneFit:
         Slopes of the best focus along +X' and +Y', in radians.
     covariance : (3, 3) ndarray
         Covariance of piston, slope_x and slope_y.
-    place : (N, 2) ndarray
+    position : (N, 2) ndarray
         Positions X', Y', in metres.
     residual : (N,) ndarray
         Defocus minus plane, in metres.
@@ -164,7 +164,7 @@ class FocalPlaneFit:
     slope_x: float
     slope_y: float
     covariance: Array
-    place: Array
+    position: Array
     residual: Array
     sigma: Array
     chi_square: float
@@ -179,12 +179,12 @@ class FocalPlaneFit:
         It describes the scatter of repeated measurements of the same assembly, whose chips keep their heights.
         """
         weight = 1.0 / (self.sigma**2 + self.extra_sigma**2)
-        gain = self.covariance @ (_design(self.place) * weight[:, None]).T
+        gain = self.covariance @ (_design(self.position) * weight[:, None]).T
         return np.asarray((gain * self.sigma**2) @ gain.T)
 
-    def plane(self, place: ArrayLike) -> tuple[Array, Array]:
+    def plane(self, position: ArrayLike) -> tuple[Array, Array]:
         """Return the height (...) of the fitted plane at positions (..., 2), and its sigma (...), in metres."""
-        design = _design(np.asarray(place, np.float64))
+        design = _design(np.asarray(position, np.float64))
         height = design @ np.array([self.piston, self.slope_x, self.slope_y])
         return np.asarray(height), np.sqrt(np.einsum("...i,ij,...j->...", design, self.covariance, design))
 
@@ -195,7 +195,7 @@ class FocalPlaneFit:
         each residual is multiplied by extra_sigma^2 / (extra_sigma^2 + sigma^2), so it is zero for a true plane, and
         the covariance includes the error of the fitted plane. A measurement after the correction adds its own sigma.
         """
-        design = _design(self.place)
+        design = _design(self.position)
         weight = 1.0 / (self.sigma**2 + self.extra_sigma**2)
         hat = design @ self.covariance @ (design.T * weight)
         identity = np.eye(len(weight))
@@ -299,23 +299,23 @@ def fit_focal_plane(
         """Parameters, covariance and weighted chi-square with an extra scatter."""
         root = 1.0 / np.sqrt(spread**2 + extra**2)
         inverse = statistics.gain(design * root[:, None])
-        found = inverse @ (height * root)
-        return found, inverse @ inverse.T, float(np.sum(((height - design @ found) * root) ** 2))
+        parameters = inverse @ (height * root)
+        return parameters, inverse @ inverse.T, float(np.sum(((height - design @ parameters) * root) ** 2))
 
-    found, covariance, chi_square = solve(0.0)
+    parameters, covariance, chi_square = solve(0.0)
     extra = 0.0
     if estimate_extra and freedom > 0 and chi_square > freedom:
         # chi-square decreases with the extra scatter and is below the degrees of freedom at this upper bound
-        most = float(np.sqrt(np.sum((height - design @ found) ** 2) / freedom))
+        most = float(np.sqrt(np.sum((height - design @ parameters) ** 2) / freedom))
         extra = float(brentq(lambda s: solve(s)[2] - freedom, 0.0, most, xtol=1e-6 * most))
-        found, covariance, _ = solve(extra)
+        parameters, covariance, _ = solve(extra)
     return FocalPlaneFit(
-        piston=float(found[0]),
-        slope_x=float(found[1]),
-        slope_y=float(found[2]),
+        piston=float(parameters[0]),
+        slope_x=float(parameters[1]),
+        slope_y=float(parameters[2]),
         covariance=covariance,
-        place=spots,
-        residual=height - design @ found,
+        position=spots,
+        residual=height - design @ parameters,
         sigma=spread,
         chi_square=chi_square,
         degrees_of_freedom=freedom,
@@ -324,20 +324,20 @@ def fit_focal_plane(
     )
 
 
-def _design(place: Array) -> Array:
+def _design(position: Array) -> Array:
     """Return the columns 1, X', Y' as (..., 3)."""
-    return np.stack([np.ones(place.shape[:-1]), place[..., 0], place[..., 1]], axis=-1)
+    return np.stack([np.ones(position.shape[:-1]), position[..., 0], position[..., 1]], axis=-1)
 
 
-def _check_places(place: Array) -> None:
+def _check_places(position: Array) -> None:
     """Raise ObservabilityError, with the geometric reason, if the positions do not determine both slopes."""
-    if len(place) < 3:
+    if len(position) < 3:
         raise ObservabilityError(
-            f"focal plane: {len(place)} positions do not determine piston, slope_x, slope_y; measure at least 3"
+            f"focal plane: {len(position)} positions do not determine piston, slope_x, slope_y; measure at least 3"
         )
-    offset = place - place.mean(axis=0)
+    offset = position - position.mean(axis=0)
     _, values, axes = np.linalg.svd(offset, full_matrices=False)
-    scale = max(float(values[0]), 1e-6 * float(np.max(np.abs(place))))
+    scale = max(float(values[0]), 1e-6 * float(np.max(np.abs(position))))
     if values[-1] > _LEAST_SPREAD * scale:
         return
     if values[0] <= _LEAST_SPREAD * scale:
@@ -490,9 +490,9 @@ class ShimPlan:
         """Error of the line's level without rotation and slide, about +Z', in radians."""
         return self.shims_only.line_turn - self.wanted.line_turn
 
-    def focus_error(self, place: ArrayLike) -> Array:
+    def focus_error(self, position: ArrayLike) -> Array:
         """Return the defocus (focus minus CCD along +Z') that rounding leaves at positions (..., 2), in metres."""
-        spots = np.asarray(place, np.float64)
+        spots = np.asarray(position, np.float64)
         point = np.concatenate([spots, np.zeros((*spots.shape[:-1], 1))], axis=-1)
         return np.asarray((self.wanted.moved(point) - self.achieved.moved(point))[..., 2])
 

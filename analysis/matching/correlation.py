@@ -382,7 +382,7 @@ class Peaks:
 
     Attributes
     ----------
-    place : (n, 2) ndarray
+    position : (n, 2) ndarray
         Row and column of the templates' middles; NaN where nothing was searched.
     value : (n,) ndarray
         Correlation coefficient of the best peak, -1 to 1; NaN where nothing was searched.
@@ -394,7 +394,7 @@ class Peaks:
         the window.
     """
 
-    place: Array
+    position: Array
     value: Array
     ratio: Array
     reason: NDArray[np.int8]

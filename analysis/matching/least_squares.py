@@ -353,7 +353,7 @@ class Fits:
 
     Attributes
     ----------
-    place : (n, 2) ndarray
+    position : (n, 2) ndarray
         Row and column of the templates' middles in the image.
     affine : (n, 2, 2) ndarray
         Affine matrix A: template pixels by image pixels.
@@ -384,7 +384,7 @@ class Fits:
         Differences between the positions of coarse detail and of all detail.
     """
 
-    place: Array
+    position: Array
     affine: Array
     gain: Array
     correlation: Array
@@ -679,7 +679,7 @@ def _solve(design: Array, grey: Array) -> Array:
 
 def _summary(
     grey: Array,
-    place: Array,
+    position: Array,
     affine: Array,
     linear: Array,
     design: Array,
@@ -708,7 +708,7 @@ def _summary(
     mask = np.where(unfitted, np.nan, 1.0)
     spread = window_checks.residual_correlation(*fitted, side, template_noise_effect.inverse)
     return Fits(
-        place * mask[:, None],
+        position * mask[:, None],
         affine * mask[:, None, None],
         linear[:, 1] * mask,
         correlation * mask,

@@ -42,7 +42,7 @@ class Matches:
 
     Attributes
     ----------
-    place : (n, 2) ndarray
+    position : (n, 2) ndarray
         Row and column of the templates' middles in the image; NaN without a least squares fit.
     covariance : (n, 2, 2) ndarray
         Covariance from noise and displacements within the window, in px^2; see `analysis.matching.least_squares`.
@@ -56,7 +56,7 @@ class Matches:
         Codes of `Reason`.
     """
 
-    place: Array
+    position: Array
     covariance: Array
     correlation: Array
     ratio: Array
@@ -135,7 +135,7 @@ def match_windows(
     >>> matches = analysis.match_windows(second, windows, points, search_radius=3)
     >>> print(matches.text)
     7 of 7 accepted
-    >>> np.round(np.mean(matches.place - points, axis=0), 2)
+    >>> np.round(np.mean(matches.position - points, axis=0), 2)
     array([ 0.3, -0.7])
     >>> bool(matches.sigma.max() < 0.05)
     True
@@ -145,7 +145,7 @@ def match_windows(
     expected = checked_positions(predicted, len(windows), "match windows")
     limits = options or MatchOptions()
     peaks = search(plane, windows, expected, search_radius)
-    fits = least_squares(plane, windows, peaks.place, limits)
+    fits = least_squares(plane, windows, peaks.position, limits)
     # points without a peak have no start position, which the fit reports as a bad template
     reason = np.where(peaks.reason != 0, peaks.reason, fits.reason).astype(np.int8)
     weak = np.where(np.isfinite(fits.correlation), fits.correlation, peaks.value) < limits.least_correlation
@@ -164,7 +164,7 @@ def match_windows(
     if _block_ratio(plane) > _BLOCKY:
         reason[_open(reason)] = Reason.BLOCKS
     return Matches(
-        place=fits.place,
+        position=fits.position,
         covariance=covariance,
         correlation=np.where(np.isfinite(fits.correlation), fits.correlation, peaks.value),
         ratio=peaks.ratio,
@@ -252,7 +252,7 @@ class DisplacementField:
     degree: int
     heights: tuple[float, float] | None
 
-    def __call__(self, place: ArrayLike, height: ArrayLike | None = None) -> Array:
+    def __call__(self, position: ArrayLike, height: ArrayLike | None = None) -> Array:
         """Return the displacement (n, 2) at positions (n, 2) and heights (n,), in pixels.
 
         Raises
@@ -260,7 +260,7 @@ class DisplacementField:
         ValueError
             Heights are present although the fit had none, or missing although it had some.
         """
-        positions = checked_positions(place, None, "displacement field")
+        positions = checked_positions(position, None, "displacement field")
         if (height is None) != (self.heights is None):
             raise ValueError("displacement field: give heights if, and only if, the fit had them")
         return _terms(positions, height, self) @ self.coefficients
@@ -378,12 +378,12 @@ def consensus(
             f"consensus: {int(usable.sum())} usable matches are too few for {terms} terms; need {max(2 * terms, 5)}: "
             "match more points or lower the degree"
         )
-    given = heights[usable] if heights is not None else None
-    empty = _unfitted_field(place[usable], given, degree, terms)
-    design, way, noise = _terms(place[usable], given, empty), (to - place)[usable], spread[usable]
+    used_heights = heights[usable] if heights is not None else None
+    empty = _unfitted_field(place[usable], used_heights, degree, terms)
+    design, displacement, noise = _terms(place[usable], used_heights, empty), (to - place)[usable], spread[usable]
     limit = math.sqrt(-2.0 * math.log(false_alarm))
-    coefficients = _best_candidate(design, way, np.random.default_rng(0))
-    inside, coefficients, scatter, distance = _converged(design, way, noise, coefficients, limit)
+    coefficients = _best_candidate(design, displacement, np.random.default_rng(0))
+    inside, coefficients, scatter, distance = _converged(design, displacement, noise, coefficients, limit)
     accepted, apart = np.zeros(len(place), bool), np.full(len(place), np.nan)
     accepted[usable], apart[usable] = inside, distance
     share = (

@@ -530,8 +530,8 @@ class Parameters:
 
 def _edge(fields: Sequence[CalibrationField], line: str, camera: LineModel) -> float:
     """Return the distance from the middle of a line to its ends or its outermost image point, in metres."""
-    places = [float(np.abs(f.rays[line].image[:, 1]).max(initial=0.0)) for f in fields if line in f.rays]
-    return max(camera.half_length, *places, _SHORTEST * float(camera.interior[0]))
+    extents = [float(np.abs(f.rays[line].image[:, 1]).max(initial=0.0)) for f in fields if line in f.rays]
+    return max(camera.half_length, *extents, _SHORTEST * float(camera.interior[0]))
 
 
 def _middle(site: CalibrationField) -> float:
@@ -784,29 +784,29 @@ def free_basis(
         A fixed unknown does not exist, or the sigma of a start value is not positive.
     """
     gauge = gauge or Gauge()
-    sigma, stated = gauge.sigmas(names, scale)
-    if np.any(stated):
+    sigma, specified = gauge.sigmas(names, scale)
+    if np.any(specified):
         # scaled so that their priors, which are in `reduced`, close them
         prior_sigma = np.array([_CLOSED * (prior_sigmas or {}).get(n, np.nan) for n in names])
-        sigma = np.where(stated | np.isnan(prior_sigma), sigma, prior_sigma)
+        sigma = np.where(specified | np.isnan(prior_sigma), sigma, prior_sigma)
     opened = combinations(names, scale, _in_scale(null_vectors(reduced, sigma), sigma, scale), reduced, length)
     estimated = np.setdiff1d(np.arange(len(names)), [index(names, n) for n in gauge.held])
     within, estimated_sigma = reduced[np.ix_(estimated, estimated)], sigma[estimated]
     inside = null_vectors(within, estimated_sigma)
     # a start value of unknown accuracy is no observation
-    rows = np.where(stated[estimated], inside.T / estimated_sigma, 0.0)
+    rows = np.where(specified[estimated], inside.T / estimated_sigma, 0.0)
     # combinations that start values close then have an eigenvalue of 1 or more
-    checks = [(within + rows.T @ rows, np.where(stated[estimated], np.sqrt(2.0), 1.0) * estimated_sigma)]
-    if np.any(stated) and np.isfinite(ray):
+    checks = [(within + rows.T @ rows, np.where(specified[estimated], np.sqrt(2.0), 1.0) * estimated_sigma)]
+    if np.any(specified) and np.isfinite(ray):
         checks.append((within, LOST * ray * scale[estimated]))
     for matrix, units in checks:
         vectors = null_vectors(matrix, units)
         if vectors.shape[1]:
             if matrix is within:
                 vectors, units = inside, estimated_sigma  # list all open combinations, of which some are lost
-            shown = _in_scale(vectors, units, scale[estimated])
+            scaled_vectors = _in_scale(vectors, units, scale[estimated])
             unresolved = combinations(
-                [names[i] for i in estimated.tolist()], scale[estimated], shown, within, length[estimated]
+                [names[i] for i in estimated.tolist()], scale[estimated], scaled_vectors, within, length[estimated]
             )
             text = "; ".join(str(c) for c in unresolved)
             raise RankError(

@@ -283,11 +283,11 @@ def intersect(
         normal, right, square = np.zeros((total, 3, 3)), np.zeros((total, 3)), np.zeros(total)
         for line, row in rays.items():
             used = row.taken(intersected[row.point])
-            shown = ground[used.point]
-            by = partials(cameras[line], used, shown, small, shift)
+            points = ground[used.point]
+            by = partials(cameras[line], used, points, small, shift)
             white = np.linalg.inv(np.linalg.cholesky(ray_covariance(noise, used, by, shared=True)))
             design = white @ by.ground
-            miss = np.einsum("nij,nj->ni", white, misclosure(cameras[line], used, shown, small, shift))
+            miss = np.einsum("nij,nj->ni", white, misclosure(cameras[line], used, points, small, shift))
             np.add.at(normal, used.point, np.swapaxes(design, 1, 2) @ design)
             np.add.at(right, used.point, np.einsum("nij,ni->nj", design, miss))
             np.add.at(square, used.point, np.sum(miss**2, axis=1))

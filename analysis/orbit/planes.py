@@ -680,16 +680,16 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
     middle = middle - (middle @ plane.normal) * plane.normal
     middle = middle / np.linalg.norm(middle)
     side = np.cross(plane.normal, middle)
-    seen, interior = np.arctan2(arm @ side, arm @ middle), np.arctan(w)
+    measured, interior = np.arctan2(arm @ side, arm @ middle), np.arctan(w)
     spread = interior - interior.mean()
-    slope = float(spread @ (seen - seen.mean()) / (spread @ spread)) if np.any(spread) else 0.0
+    slope = float(spread @ (measured - measured.mean()) / (spread @ spread)) if np.any(spread) else 0.0
     if abs(abs(slope) - 1.0) > 0.1:
         raise AngleError(
             f"central ray: the points subtend {abs(slope):.3g} times the angle of their tangents; are these wrong?"
         )
     # the sigma of a point's angle is its sigma over its distance
     weight = np.sum(arm**2, axis=1) / np.trace(strip.covariance, axis1=1, axis2=2)
-    rotation = float(np.sum(weight * (seen - np.copysign(1.0, slope) * interior)) / np.sum(weight))
+    rotation = float(np.sum(weight * (measured - np.copysign(1.0, slope) * interior)) / np.sum(weight))
     central = np.cos(rotation) * middle + np.sin(rotation) * side
     side = np.copysign(1.0, slope) * np.cross(plane.normal, central)
     if bend <= 0.0 or not np.any(spread):
@@ -917,10 +917,10 @@ def sensitivity(
     start = angles_between(fits, index)
     rows = []
     for what in ("station", *strips):
-        moved = list(range(len(order))) if what == "station" else [order.index(what)]
+        indices = list(range(len(order))) if what == "station" else [order.index(what)]
         sign = 1.0 if what == "station" else -1.0
         derivative = sign * np.einsum(
-            "mki,kij->mj", start.gradient[:, moved], np.array([fits[k].station_gain for k in moved])
+            "mki,kij->mj", start.gradient[:, indices], np.array([fits[k].station_gain for k in indices])
         )
         for k, axis in enumerate(AXES):
             shifts = steps[:, None] * np.eye(3)[k]

@@ -362,8 +362,8 @@ def _start(station: Station, lines: Mapping[str, ObservedLine], zero: str) -> tu
     looks = {}
     for name in lines:
         inner, outer = (side.mean(axis=0) for side in directions(name))
-        seen = outer @ attitude
-        looks[name] = float(np.arctan2(seen[0], seen[2]) - np.arctan2(inner[0], inner[2]))
+        direction = outer @ attitude
+        looks[name] = float(np.arctan2(direction[0], direction[2]) - np.arctan2(inner[0], inner[2]))
     start = looks[zero]
     return attitude @ _pitched(start), {name: 0.0 if name == zero else look - start for name, look in looks.items()}
 

@@ -425,24 +425,26 @@ def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: 
     """
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
     rotation = bias_rotation(bias)
-    seen = camera.seen(q @ rotation, rays.image)
+    projection = camera.seen(q @ rotation, rays.image)
     x, y = (rays.image - camera.interior[1:]).T
     square = x * x + y * y
     scale = 1.0 + square * (camera.k1 + camera.k2 * square)
     slope = 2.0 * (camera.k1 + 2.0 * camera.k2 * square)
-    interior = np.empty((len(x), 2, 3), np.result_type(seen.by_drift, x))
-    interior[:, :, 0] = seen.by_drift[:, :, 3]
+    interior = np.empty((len(x), 2, 3), np.result_type(projection.by_drift, x))
+    interior[:, :, 0] = projection.by_drift[:, :, 3]
     interior[:, 0, 1], interior[:, 1, 2] = -(scale + slope * x * x), -(scale + slope * y * y)
     interior[:, 1, 1] = interior[:, 0, 2] = -(slope * x * y)
-    turned = np.stack([q @ by_bias for by_bias in _rotation_slopes(bias)], axis=-1)
-    to_measured = seen.by_body @ rotation.T  # with respect to the point in the body frame of the measured attitude
+    rotated = np.stack([q @ by_bias for by_bias in _rotation_slopes(bias)], axis=-1)
+    to_measured = (
+        projection.by_body @ rotation.T
+    )  # with respect to the point in the body frame of the measured attitude
     by_rotation = np.stack([np.cross(q, axis) for axis in _UNIT], axis=-1)
     return Partials(
         interior=interior,
-        bias=seen.by_body @ turned,
+        bias=projection.by_body @ rotated,
         ground=to_measured @ np.swapaxes(rays.attitude, 1, 2),
         attitude=to_measured @ by_rotation,
-        drift=seen.by_drift,
+        drift=projection.by_drift,
     )
 
 

@@ -110,9 +110,9 @@ def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
     for name, values in (("spot position", positions), ("angle", angles)):
         bad = np.argwhere(~np.isfinite(values))
         if bad.size:
-            place = ", ".join(str(k) for k in bad[0])
+            index = ", ".join(str(k) for k in bad[0])
             raise OrientationError(
-                f"interior orientation: {name} [{place}] is not finite ({len(bad)} in all); exclude those points"
+                f"interior orientation: {name} [{index}] is not finite ({len(bad)} in all); exclude those points"
             )
     widest = float(np.max(np.abs(angles)))
     if widest > _WIDEST:
@@ -313,12 +313,12 @@ def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> No
     )
 
 
-def _noise_matrix(given: ArrayLike, count: int, name: str) -> Array:
+def _noise_matrix(values: ArrayLike, count: int, name: str) -> Array:
     """Return a covariance (N, N) from a covariance (N, N) or from sigmas (N,) or ().
 
     Parameters
     ----------
-    given : array_like
+    values : array_like
         Covariance (N, N), or sigmas (N,) or ().
     count : int
         Number of points, N.
@@ -330,7 +330,7 @@ def _noise_matrix(given: ArrayLike, count: int, name: str) -> Array:
     OrientationError
         The shape is wrong, a value is not finite, or a sigma is negative.
     """
-    noise = np.asarray(given, dtype=np.float64)
+    noise = np.asarray(values, dtype=np.float64)
     if not np.all(np.isfinite(noise)):
         raise OrientationError(f"interior orientation: {name} is not finite")
     if noise.shape in ((), (count,)):

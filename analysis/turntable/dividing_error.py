@@ -681,10 +681,10 @@ class CalibrationSeries:
         most = chi2.isf(FALSE_ALARM / len(self.angle), freedom)
         suspect = np.zeros(len(self.angle), bool)
         for _ in range(len(self.angle)):
-            found = freedom * self.rms_after**2 > most * self._pooled(~suspect)
-            if np.array_equal(found, suspect) or np.all(found):
+            exceeding = freedom * self.rms_after**2 > most * self._pooled(~suspect)
+            if np.array_equal(exceeding, suspect) or np.all(exceeding):
                 break
-            suspect = found
+            suspect = exceeding
         return suspect
 
     @cached_property

@@ -393,15 +393,15 @@ def find_pupil(values: ArrayLike) -> Pupil:
     area = stats[:, cv2.CC_STAT_AREA]
     # spiders divide the pupil into several regions; small specks do not belong to it
     kept_labels = np.flatnonzero((area >= _SPECK * area[1:].max()) & (np.arange(count) > 0))
-    lit = np.isin(labels, kept_labels)
+    pupil_mask = np.isin(labels, kept_labels)
     # edges between unmeasured and measured pixels; the border of the map is not an edge of the pupil
-    points = np.concatenate([_ends(lit), _ends(lit.T)[:, ::-1]])
+    points = np.concatenate([_ends(pupil_mask), _ends(pupil_mask.T)[:, ::-1]])
     rng = np.random.default_rng(0)
     best, best_count = (0.0, 0.0, 0.0), -1
     for _ in range(_TRIES if len(points) >= 8 else 0):
         circle = _circle(points[rng.choice(len(points), 3, replace=False)])
         count_on_circle = (
-            int(np.count_nonzero(_off(points, circle) < _NEAR)) if circle[2] < 4.0 * max(lit.shape) else -1
+            int(np.count_nonzero(_off(points, circle) < _NEAR)) if circle[2] < 4.0 * max(pupil_mask.shape) else -1
         )
         if count_on_circle > best_count:
             best, best_count = circle, count_on_circle

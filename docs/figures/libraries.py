@@ -75,7 +75,7 @@ def _matching() -> tuple[float, float]:
         places = random.integers(60, size - 60, (40, 2))
         windows = [np.s_[r - half : r + half + 1, c - half : c + half + 1] for r, c in places]
         templates = np.array([texture[window] for window in windows])
-        ours.append(least_squares(image, templates, places.astype(float), MatchOptions()).place - places - shift)
+        ours.append(least_squares(image, templates, places.astype(float), MatchOptions()).position - places - shift)
         for window, template in zip(windows, templates, strict=True):
             theirs.append(phase_cross_correlation(image[window], template, upsample_factor=100)[0] - shift)
     return float(np.sqrt(np.mean(np.square(ours)))), float(np.sqrt(np.mean(np.square(theirs))))

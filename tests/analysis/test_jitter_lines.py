@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from analysis.orbit.jitter import JitterError, Observations, periodogram, search, fit_spline
+from analysis.orbit.jitter import JitterError, Observations, fit_spline, periodogram, search
 from tests.analysis.refusals import refuses
 
 GAPS = (0.1216, 0.1024)

@@ -29,7 +29,7 @@ LOW, HIGH = 0.8, 1.3
 def judged(pair: Pair, options: MatchOptions | None = None):
     """Accepted (n,), errors (n, 2), halves of chi-square of the accepted, and the matches."""
     found = pair.matched(options)
-    error, used = found.place - pair.true, found.accepted
+    error, used = found.position - pair.true, found.accepted
     square = np.einsum("ni,nij,nj->n", error[used], np.linalg.inv(found.covariance[used]), error[used])
     return used, error, 0.5 * square, found
 

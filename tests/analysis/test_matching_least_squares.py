@@ -54,8 +54,8 @@ def test_windows_that_leave_the_image_on_any_side_are_told(texture, clean):
     start[[10, 11], [0, 1]] = np.nan
     fits = least_squares(clean, texture.patches(places), start)
     assert np.all(fits.reason == [Reason.ACCEPTED] * 5 + [Reason.OUTSIDE] * 5 + [Reason.TEMPLATE] * 2)
-    assert np.abs(fits.place[:5] - inside).max() < 0.005
-    assert np.all(np.isnan(fits.place[5:]))
+    assert np.abs(fits.position[:5] - inside).max() < 0.005
+    assert np.all(np.isnan(fits.position[5:]))
 
 
 @pytest.mark.second
@@ -68,7 +68,7 @@ def test_affine_change_without_noise(texture, templates):
     assert used.sum() > 60
     fits = least_squares(0.6 * grey + 40.0, templates[used], inside[used] + 0.4)
     assert np.all(fits.reason == Reason.ACCEPTED)
-    assert np.abs(fits.place - inside[used]).max() < 0.006
+    assert np.abs(fits.position - inside[used]).max() < 0.006
     # the place's error over half a window of 12 px
     assert np.abs(fits.affine - matrix).max() < 1e-3
     # the second derivatives share in the gain: spline error again
@@ -85,7 +85,7 @@ def test_other_radiometry_and_sharpness(texture, clean, sharp, largest, sharpnes
     """
     other = 0.7 * texture.patches(PLACES, sharp=sharp) + 90.0
     fits = least_squares(clean, other, started(), MatchOptions(sharpness=sharpness))
-    error = fits.place - PLACES
+    error = fits.position - PLACES
     assert np.all(fits.reason == Reason.ACCEPTED)
     assert np.abs(error).max() < (largest if sharpness else 0.02)
     assert np.abs(error.mean(axis=0)).max() < 0.001
@@ -110,7 +110,7 @@ def test_scatter_reaches_the_bound(texture, clean, templates):
         scale = np.linalg.norm(design, axis=1)
         unit = design / scale[:, None]
         bounds.append(np.linalg.inv(unit @ unit.T)[:2, :2] / np.outer(scale[:2], scale[:2]))
-    bound, error = np.array(bounds), fits.place - PLACES
+    bound, error = np.array(bounds), fits.position - PLACES
     low, high = limits(error.size)
     assert low < chi_square(error, bound) < 1.03 * high
     # of noise alone: interpolation and relief are not in the bound; 100 points of some 10 per cent each

@@ -156,7 +156,7 @@ def test_reasons(texture):
     # noise alone may also peak on the window's border, which little texture explains
     assert [Reason(int(r)) for r in found.reason] == expected
     assert found.texts[3] == "pixels of the image under the template are saturated"
-    assert np.isnan(found.place[[4, 5, 6, 7, 8]]).all()
+    assert np.isnan(found.position[[4, 5, 6, 7, 8]]).all()
     # more than the reach away, and an image with missing pixels
     far = match_windows(image, texture.patches([[50.0, 50.0]]), [[50.0, 64.0]], search_radius=10)
     assert not far.accepted[0]
@@ -166,7 +166,7 @@ def test_reasons(texture):
     # at the image's side the window is cut, and the point is found all the same
     side = match_windows(image, texture.patches([[17.3, 150.4]]), [[20.0, 150.0]], search_radius=10)
     assert side.accepted[0]
-    assert side.place[0] == pytest.approx([17.3, 150.4], abs=0.15)
+    assert side.position[0] == pytest.approx([17.3, 150.4], abs=0.15)
 
 
 def test_repeated_pattern_is_ambiguous_and_an_edge_is_uncertain():
@@ -184,7 +184,7 @@ def test_search_is_good_to_tenths(texture, frame, points):
     places = points[:100] + 0.3
     peaks = search(frame, texture.patches(places), places + np.array([30.0, -30.0]), 40)
     assert np.all(peaks.reason == Reason.ACCEPTED)
-    assert np.abs(peaks.place - places).max() < 0.25
+    assert np.abs(peaks.position - places).max() < 0.25
     # noise alone leaves 0.96 of it, 0.3 px off along both axes some 0.93
     assert peaks.value.min() > 0.85
     assert peaks.ratio.max() < 0.7
@@ -206,7 +206,7 @@ def test_sigma_is_that_of_the_worst_direction():
 
 def test_no_points_are_an_empty_result(frame):
     found = match_windows(frame, np.zeros((0, 31, 31)), np.zeros((0, 2)), search_radius=10)
-    assert found.place.shape == (0, 2)
+    assert found.position.shape == (0, 2)
     assert found.covariance.shape == (0, 2, 2)
     assert found.text == "0 of 0 accepted"
 

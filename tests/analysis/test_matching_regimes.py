@@ -18,7 +18,7 @@ MOST = 1.5
 def squares(pair: Pair) -> np.ndarray:
     """Return halves of chi-square of the accepted points."""
     found = pair.matched()
-    used, error = found.accepted, found.place - pair.true
+    used, error = found.accepted, found.position - pair.true
     return 0.5 * np.einsum("ni,nij,nj->n", error[used], np.linalg.inv(found.covariance[used]), error[used])
 
 

@@ -107,7 +107,7 @@ def test_places_on_edges_keep_in_their_covariances():
     pair = edges(150, noise=2.0, faint=6.0, seed=4)
     found = pair.matched()
     used = found.accepted
-    error = (found.place - pair.true)[used]
+    error = (found.position - pair.true)[used]
     assert used.sum() > 5
     square = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance[used]), error)
     assert square.sum() < stats.chi2.isf(1e-3, 2 * int(used.sum()))

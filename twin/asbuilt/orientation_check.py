@@ -39,7 +39,7 @@ class OrientationCheck:
         Of the measurements.
     stated : Orientation
         How the file of the test says that they lie.
-    evidence : ReadingEvidence
+    evidence : OrientationEvidence
         Of every reading.
     """
 

@@ -179,7 +179,7 @@ class Shimming:
         """Sigmas of piston, slope_x and slope_y by the vertices' own error, (3,), metres and radians: the part that is
         the same in every alignment of a camera.
         """
-        reach = np.max(np.abs(self.plane.place), axis=0)
+        reach = np.max(np.abs(self.plane.position), axis=0)
         return np.array([self.vertex_error, *(self.vertex_trend / reach)])
 
     @property
@@ -209,7 +209,7 @@ class Shimming:
         metres.
         """
         left, spread = self.plane.predicted_defocus()
-        left = left + self.plan.focus_error(self.plane.place)
+        left = left + self.plan.focus_error(self.plane.position)
         worst = int(np.argmax(np.abs(left)))
         return float(np.abs(left[worst])), float(np.hypot(np.sqrt(spread[worst, worst]), self.vertex_error))
 
@@ -282,7 +282,7 @@ class SimulatedFocus(FocusRun):
         """
         plane = self.shimmings[number].plane
         weight = 1.0 / np.sqrt(plane.sigma**2 + plane.extra_sigma**2)
-        design = np.column_stack([np.ones(len(weight)), plane.place]) * weight[:, None]
+        design = np.column_stack([np.ones(len(weight)), plane.position]) * weight[:, None]
         terms, *_ = np.linalg.lstsq(design, -self.states[number].true_defocus * weight, rcond=None)
         return np.asarray(terms)
 
