@@ -53,7 +53,7 @@ def test_shifts_of_windows_are_those_of_scikit_image() -> None:
         places = np.array([[r, c] for r in (40, 80, 120) for c in (40, 80, 120)])
         windows = np.stack([first[r - 15 : r + 16, c - 15 : c + 16] for r, c in places])
         matches = analysis.match_windows(second, windows, places, search_radius=4)
-        ours = np.mean((matches.place - places)[matches.accepted], axis=0)
+        ours = np.mean((matches.position - places)[matches.accepted], axis=0)
         theirs = -registration.phase_cross_correlation(first, second, upsample_factor=100, normalization=None)[0]
         assert matches.accepted.sum() > 5
         assert np.max(np.abs(ours - theirs)) < 0.015

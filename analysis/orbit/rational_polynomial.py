@@ -19,6 +19,7 @@ from analysis.arrays import Array, UndeterminedError
 from optics.numerics.backend import one_blas_thread
 
 TERMS = 20
+"""Number of coefficients of a cubic in three coordinates."""
 _POWERS = np.array(
     [
         *((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (2, 0, 0), (0, 2, 0), (0, 0, 2)),
@@ -27,46 +28,49 @@ _POWERS = np.array(
 )
 """Powers of longitude, latitude and height in the order of RPC00B."""
 _ROUNDS = 6
+"""Number of reweighted least-squares solutions; the weights are the inverse denominators."""
 _RANK = 1e-11
-"""Smallest singular value that counts, relative to the largest. A cubic ratio has more coefficients than an image has
-shape, and the rest stay small."""
+"""Smallest singular value that is used, relative to the largest: an image determines fewer combinations than a cubic
+ratio has coefficients, and the others stay small."""
 _DAMPING = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
-"""Damping of the denominators that is tried; the last leaves polynomials."""
-
-
+"""Strengths of the regularisation of the denominators; the last one almost leaves polynomials."""
 _STEP = 1e-6
+"""Step of a numerical derivative on the ground, relative to the half extent of the ground."""
 _ARRIVED = 1e-9
+"""Newton step on the ground, relative to its half extent, below which the iteration has converged."""
 _MOST_STEPS = 30
-"""Of the ground's size: of a derivative, of the last step to the ground; and how many."""
+"""Largest number of Newton steps to the ground."""
 _COEFFICIENTS = 50844
+"""Number of the TIFF tag RPCCoefficientTag."""
 _UNSTATED = -1.0
-"""Of an error, metres."""
+"""Value of ERR_BIAS and ERR_RAND in that tag if they are not known, metres."""
 _WIDEST = 90.0
-"""Degrees of longitude."""
+"""Extent in longitude from which the ground counts as lying on a pole or the 180th meridian, degrees."""
 
 
 @dataclass(frozen=True, eq=False)
 class RationalPolynomial:
-    """The model, and how well it agrees.
+    """Rational polynomials of an image and their accuracy.
 
     Attributes
     ----------
-    offset : Array
-        Of line, sample, latitude, longitude (degrees) and height (metres), (5,).
-    scale : Array
-        likewise.
-    line_numerator, line_denominator, sample_numerator, sample_denominator : Array
-        (20,) each.
-    error_px : tuple[float, float]
-        Largest difference from the rigorous sensor at places that were not fitted, lines and samples; NaN of
-        polynomials that were read.
-    rms_px : tuple[float, float]
-        Root mean square of them.
-    bias_m : float | None
-        ERR_BIAS, metres: root mean square error on the ground of each horizontal axis that does not go with time, so
-        that points and images have it in common (GDAL's RFC 22; 68 % in STDI-0002); None where nobody states it.
-    random_m : float | None
-        ERR_RAND, likewise of what goes with time and is another in every image or point.
+    offset : (5,) ndarray
+        Offsets of line, sample, latitude, longitude (degrees) and height (metres).
+    scale : (5,) ndarray
+        Scales of the same.
+    line_numerator, line_denominator, sample_numerator, sample_denominator : (20,) ndarray
+        Coefficients in the order of RPC00B.
+    error_px : tuple of float
+        Largest error of line and sample at points that were not fitted, in pixels; NaN for polynomials read from a
+        file.
+    rms_px : tuple of float
+        Rms error at these points, in pixels.
+    bias_m : float or None
+        ERR_BIAS, in metres: rms error of each horizontal axis on the ground that does not vary with time and is common
+        to points and images (GDAL's RFC 22; 68 % in STDI-0002); None if unknown.
+    random_m : float or None
+        ERR_RAND, in metres: rms error of each horizontal axis that varies with time, another one in every image or
+        point.
     """
 
     offset: Array
@@ -81,39 +85,42 @@ class RationalPolynomial:
     random_m: float | None = None
 
     def ground(self, line: ArrayLike, sample: ArrayLike, height: ArrayLike) -> tuple[Array, Array]:
-        """Latitude and longitude (N,), degrees, that a line and a sample (N,) see at a height, metres (N,).
+        """Return latitude and longitude (degrees) that lines and samples see at heights above the ellipsoid (metres).
 
-        Newton steps from the middle of the ground; NaN where they do not arrive.
+        Newton's method starts at the middle of the ground; NaN where it does not converge. The arguments are broadcast.
         """
         wanted = np.stack(np.broadcast_arrays(line, sample), axis=-1).astype(np.float64)
         at = np.broadcast_to(np.asarray(height, np.float64), wanted.shape[:-1])
-        place = np.tile(self.offset[2:4], (len(wanted), 1))
+        position = np.broadcast_to(self.offset[2:4], wanted.shape)
         step = _STEP * self.scale[2:4]
         for _ in range(_MOST_STEPS):
             here, north, east = (
-                np.stack(self.image(place[:, 0] + up, place[:, 1] + aside, at), axis=-1)
+                np.stack(self.image(position[..., 0] + up, position[..., 1] + aside, at), axis=-1)
                 for up, aside in ((0.0, 0.0), (step[0], 0.0), (0.0, step[1]))
             )
             slope = np.stack([(north - here) / step[0], (east - here) / step[1]], axis=-1)
             move = np.linalg.solve(slope, (wanted - here)[..., None])[..., 0]
-            # a step over the whole ground leaves where the polynomials say anything
-            place = place + np.clip(move, -self.scale[2:4], self.scale[2:4])
+            # a larger step would leave the ground on which the polynomials are valid
+            position = position + np.clip(move, -self.scale[2:4], self.scale[2:4])
             if np.all(np.abs(move) < _ARRIVED * self.scale[2:4]):
                 break
-        arrived = np.all(np.abs(move) < _ARRIVED * self.scale[2:4], axis=-1)
-        found = np.where(arrived[:, None], place, np.nan)
-        return found[:, 0], found[:, 1]
+        converged = np.all(np.abs(move) < _ARRIVED * self.scale[2:4], axis=-1)
+        position = np.where(converged[..., None], position, np.nan)
+        return position[..., 0], position[..., 1]
 
     def image(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> tuple[Array, Array]:
-        """Line and sample (N,) of ground points: degrees (N,), degrees, metres above the ellipsoid."""
-        unit = (np.stack([latitude, longitude, height], axis=-1) - self.offset[2:]) / self.scale[2:]
+        """Return line and sample, in pixels, of ground points: latitude and longitude in degrees, height in metres.
+
+        The arguments are broadcast.
+        """
+        unit = (np.stack(np.broadcast_arrays(latitude, longitude, height), axis=-1) - self.offset[2:]) / self.scale[2:]
         basis = _monomials(unit)
         line = basis @ self.line_numerator / (basis @ self.line_denominator)
         sample = basis @ self.sample_numerator / (basis @ self.sample_denominator)
         return self.offset[0] + self.scale[0] * line, self.offset[1] + self.scale[1] * sample
 
     def text(self) -> str:
-        """Contents of NAME_RPC.TXT, as GDAL reads it beside NAME.tif."""
+        """Return the contents of NAME_RPC.TXT, which GDAL reads beside NAME.tif."""
         names = (("LINE", "pixels"), ("SAMP", "pixels"), ("LAT", "degrees"), ("LONG", "degrees"), ("HEIGHT", "meters"))
         errors = (("ERR_BIAS", self.bias_m), ("ERR_RAND", self.random_m))
         rows = [f"{name}: {value!r} meters" for name, value in errors if value is not None]
@@ -132,8 +139,9 @@ class RationalPolynomial:
         return "\n".join(rows) + "\n"
 
     def tags(self) -> list[tuple[Any, ...]]:
-        """The tag of a GeoTIFF that holds them (RPCCoefficientTag): errors, -1 where nobody states them, offsets,
-        scales and coefficients, in the order of RPC00B.
+        """Return the GeoTIFF tag RPCCoefficientTag, in the order of RPC00B.
+
+        Its values are the errors (-1 if unknown), offsets, scales and coefficients.
         """
         parts = (self.line_numerator, self.line_denominator, self.sample_numerator, self.sample_denominator)
         errors = (_UNSTATED if error is None else error for error in (self.bias_m, self.random_m))
@@ -144,31 +152,35 @@ class RationalPolynomial:
 def fit_rpc(
     image: ArrayLike, ground: ArrayLike, *, check: tuple[ArrayLike, ArrayLike] | None = None
 ) -> RationalPolynomial:
-    """Fit rational polynomials to places of an image and of the ground.
+    """Fit rational polynomials to image and ground coordinates of points.
 
-    Both denominators are fitted. Of several strengths of regularisation, the one with the smallest error at the check
-    places is chosen.
+    Denominators of line and sample are fitted separately. Of several strengths of regularisation, the one with the
+    smallest error at the check points is chosen.
 
     Parameters
     ----------
     image : (N, 2) array_like
         Line and sample, in pixels; the centre of the first pixel is (0, 0).
     ground : (N, 3) array_like
-        Latitude and longitude (degrees) and height above the ellipsoid (metres) that these places see. They must cover
-        several heights.
+        Latitude and longitude (degrees) and height above the ellipsoid (metres). The points must cover several heights.
     check : tuple of (M, 2) and (M, 3) array_like, optional
-        Image and ground of places between the others that are not fitted. By default every fourth place is held out.
+        Image and ground coordinates of check points between the others. By default every fourth point is a check point.
 
     Returns
     -------
     RationalPolynomial
-        The polynomials; `error_px` and `rms_px` are their largest and their rms error at the check places.
+        The polynomials, with the methods `image` and `ground`; `error_px` and `rms_px` are their errors at the check
+        points.
 
     Raises
     ------
     ValueError
-        Arrays of other shapes, values that are not finite, a coordinate that is constant, fewer than 39 places to fit,
+        Arrays of other shapes, values that are not finite, a coordinate that is constant, fewer than 39 points to fit,
         or ground on a pole or the 180th meridian.
+
+    Notes
+    -----
+    Tao and Hu, Photogramm. Eng. Remote Sens. 67, 1347 (2001); the order of the coefficients is that of NIMA STDI-0002.
 
     Examples
     --------
@@ -183,43 +195,49 @@ def fit_rpc(
     >>> rpc = analysis.fit_rpc(image, ground)
     >>> max(rpc.error_px) < 1e-6
     True
-    >>> line, sample = rpc.image([48.0], [11.0], [500.0])
-    >>> np.round(line, 3), np.round(sample, 3)
-    (array([5000.]), array([5000.]))
-    >>> latitude, longitude = rpc.ground(line, sample, [500.0])
-    >>> np.round(latitude, 6), np.round(longitude, 6)
-    (array([48.]), array([11.]))
+    >>> line, sample = rpc.image(48.0, 11.0, 500.0)
+    >>> round(float(line), 3), round(float(sample), 3)
+    (5000.0, 5000.0)
+    >>> latitude, longitude = rpc.ground(line, sample, 500.0)
+    >>> round(float(latitude), 6), round(float(longitude), 6)
+    (48.0, 11.0)
     >>> print(rpc.text()[:9])
     LINE_OFF:
     """
-    places = _places_of(image, ground)
+    points = _checked_points(image, ground)
     if check is None:
-        held = np.arange(len(places)) % 4 == 3
-        places, others = places[~held], places[held]
+        held = np.arange(len(points)) % 4 == 3
+        points, others = points[~held], points[held]
     else:
-        others = _places_of(*check)
-    ends = np.stack([np.min(places, axis=0), np.max(places, axis=0)])
+        others = _checked_points(*check)
+    ends = np.stack([np.min(points, axis=0), np.max(points, axis=0)])
     if ends[1, 3] - ends[0, 3] > _WIDEST:
         raise ValueError("the ground lies on the 180th meridian or a pole, where longitudes jump")
     offset, scale = np.mean(ends, axis=0), 0.5 * (ends[1] - ends[0])
-    if len(places) < 2 * TERMS - 1 or not len(others):
+    if len(points) < 2 * TERMS - 1 or not len(others):
         raise UndeterminedError(
-            f"rational polynomials: {len(places)} places to fit and {len(others)} to check; need at least"
+            f"rational polynomials: {len(points)} points to fit and {len(others)} to check; need at least"
             f" {2 * TERMS - 1} and 1"
         )
     if not np.all(scale > 0.0):
         constant = ("line", "sample", "latitude", "longitude", "height")[int(np.argmin(scale))]
         raise UndeterminedError(
-            f"rational polynomials: {constant} is constant; spread the places over every coordinate"
+            f"rational polynomials: {constant} is constant; spread the points over every coordinate"
         )
-    sides = [(_monomials((seen[:, 2:] - offset[2:]) / scale[2:]), seen) for seen in (places, others)]
+    sides = [(_monomials((seen[:, 2:] - offset[2:]) / scale[2:]), seen) for seen in (points, others)]
     best = [_best(sides, k, offset[k], scale[k]) for k in range(2)]
     (line, line_most, line_rms), (sample, sample_most, sample_rms) = best
     return RationalPolynomial(offset, scale, *line, *sample, (line_most, sample_most), (line_rms, sample_rms))
 
 
-def _places_of(image: ArrayLike, ground: ArrayLike) -> Array:
-    """Return image and ground side by side, (N, 5), checked."""
+def _checked_points(image: ArrayLike, ground: ArrayLike) -> Array:
+    """Return image and ground coordinates side by side, (N, 5).
+
+    Raises
+    ------
+    ValueError
+        Arrays of other shapes, or values that are not finite.
+    """
     left, right = np.asarray(image, np.float64), np.asarray(ground, np.float64)
     if left.ndim != 2 or left.shape[1] != 2 or right.shape != (len(left), 3):
         raise ValueError(
@@ -227,52 +245,54 @@ def _places_of(image: ArrayLike, ground: ArrayLike) -> Array:
         )
     both = np.concatenate([left, right], axis=1)
     if not np.all(np.isfinite(both)):
-        raise ValueError("rational polynomials: places must be finite; leave out those that see no ground")
+        raise ValueError("rational polynomials: coordinates must be finite; leave out other points")
     return both
 
 
 def _monomials(unit: Array) -> Array:
-    """(N, 20) terms of latitude, longitude and height (N, 3), scaled."""
-    powers = [np.stack([np.ones_like(one), one, one**2, one**3]) for one in (unit[:, 1], unit[:, 0], unit[:, 2])]
+    """Return the 20 monomials (..., 20) of scaled latitude, longitude and height (..., 3)."""
+    powers = [np.stack([np.ones_like(one), one, one**2, one**3]) for one in (unit[..., 1], unit[..., 0], unit[..., 2])]
     return np.stack([powers[0][a] * powers[1][b] * powers[2][c] for a, b, c in _POWERS], axis=-1)
 
 
 def _best(
     sides: list[tuple[Array, Array]], k: int, offset: float, scale: float
 ) -> tuple[tuple[Array, Array], float, float]:
-    """Numerator and denominator of one image coordinate, largest and root mean square error where it was not fitted.
+    """Return numerator and denominator of one image coordinate, and its largest and rms error at the check points.
 
-    Attitudes that jitter are no cubics: coefficients that follow the jitter at the fitted places go astray between
-    them. Of several degrees of smoothness the one with the least error there is taken.
+    A jittering attitude is not a cubic: coefficients that follow the jitter at the fitted points err between them. The
+    strength of regularisation with the smallest rms error at the check points is therefore chosen.
     """
     (basis, fitted), (others, checked) = sides
-    found: list[tuple[float, float, tuple[Array, Array]]] = []
+    candidates: list[tuple[float, float, tuple[Array, Array]]] = []
     for damping in _DAMPING:
         ratio = _ratio(basis, (fitted[:, k] - offset) / scale, damping)
         below = others @ ratio[1]
         if not np.all(below > 0.0):  # a pole on the ground
             continue
         away = offset + scale * (others @ ratio[0]) / below - checked[:, k]
-        found.append((float(np.sqrt(np.mean(away**2))), float(np.max(np.abs(away))), ratio))
-    if not found:
-        raise UndeterminedError("rational polynomials: every fit has a pole on the ground; use more places")
-    rms, most, ratio = min(found, key=lambda one: one[0])
+        candidates.append((float(np.sqrt(np.mean(away**2))), float(np.max(np.abs(away))), ratio))
+    if not candidates:
+        raise UndeterminedError("rational polynomials: every fit has a pole on the ground; use more points")
+    rms, most, ratio = min(candidates, key=lambda candidate: candidate[0])
     return ratio, most, rms
 
 
 @one_blas_thread()
 def _ratio(basis: Array, value: Array, damping: float) -> tuple[Array, Array]:
-    """Coefficients (20,) and (20,), the second's first being 1, whose ratio is a value (N,): least squares of the
-    ratio itself, by weights from the denominator of the round before; ``damping`` of the denominator's coefficients.
+    """Return numerator (20,) and denominator (20,), whose first coefficient is 1, of the ratio that fits values (N,).
+
+    The ratio itself is fitted by least squares: the weights follow from the previous denominator. `damping` regularises
+    the coefficients of the denominator.
     """
     weight = np.ones(len(value))
-    held = np.concatenate([np.zeros(TERMS), np.full(TERMS - 1, damping * np.sqrt(len(value)))])
-    found = np.zeros(2 * TERMS - 1)
+    damped = np.concatenate([np.zeros(TERMS), np.full(TERMS - 1, damping * np.sqrt(len(value)))])
+    solution = np.zeros(2 * TERMS - 1)
     for _ in range(_ROUNDS):
         rows = np.concatenate([basis, -value[:, None] * basis[:, 1:]], axis=1) * weight[:, None]
-        rows, right = np.concatenate([rows, np.diag(held)]), np.concatenate([value * weight, np.zeros(len(held))])
-        found = np.linalg.lstsq(rows, right, rcond=_RANK)[0]
-        weight = 1.0 / (1.0 + basis[:, 1:] @ found[TERMS:])
+        rows, right = np.concatenate([rows, np.diag(damped)]), np.concatenate([value * weight, np.zeros(len(damped))])
+        solution = np.linalg.lstsq(rows, right, rcond=_RANK)[0]
+        weight = 1.0 / (1.0 + basis[:, 1:] @ solution[TERMS:])
         if not np.all(np.isfinite(weight) & (weight > 0.0)):
             break
-    return found[:TERMS], np.concatenate([[1.0], found[TERMS:]])
+    return solution[:TERMS], np.concatenate([[1.0], solution[TERMS:]])
