@@ -69,12 +69,11 @@ def numbers(experiment: MonitorExperiment) -> list[np.ndarray]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Iterator[Path]:
-    """An empty cache of this test."""
-    before = os.environ[VARIABLE]
-    os.environ[VARIABLE] = str(tmp_path / "cache")
-    yield tmp_path / "cache"
-    os.environ[VARIABLE] = before
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache of this test, to which this process has written nothing."""
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr(calibration_cache, "_written", 0)
+    return tmp_path / "cache"
 
 
 @pytest.fixture(scope="module")
