@@ -323,7 +323,7 @@ UNMADE: Any = Ns(setup=None, test=None, camera=None, instrument=None, images={"n
 MODEL = LineModel(np.eye(3), np.ones(3), np.zeros(3))
 NOWHERE: Any = Ns(offset=np.zeros(5), scale=np.ones(5), ground=lambda line, *_: np.full((2, len(line)), np.nan))
 TIES = GroundPoints.of(["a"], np.full((1, 3), np.nan), np.zeros((3, 3)), "tie")
-OFF = Ns(sensor=lost(), place=np.ones((1, 2)), point=np.zeros(1, int))
+OFF = Ns(sensor=lost(), image=np.ones((1, 2)), point=np.zeros(1, int))
 STEEP: Any = Ns(
     images={"nadir": Ns(image_point=lambda *at: at, sensor=Ns(ground=lambda line, pixel, height: height))},
     terrain=Ns(limits=(0.0, 2.0), height=lambda east, north: 1.5 * east),

@@ -104,7 +104,7 @@ class _Reference:
 
     Attributes
     ----------
-    places : (m, 3) ndarray
+    ground : (m, 3) ndarray
         Coordinates of the points, ITRS, in metres.
     covariance : (m, 3, 3) ndarray
         Covariances of these coordinates, in metres^2.
@@ -112,7 +112,7 @@ class _Reference:
         Scene -> true change of its camera; empty for a measured block.
     """
 
-    places: np.ndarray
+    ground: np.ndarray
     covariance: np.ndarray
     change: Mapping[str, np.ndarray]
 
@@ -283,7 +283,7 @@ def _check(adjustment: BlockAdjustment, reference: _Reference) -> tuple[np.ndarr
     block = adjustment.assembly.block
     where = np.flatnonzero((block.points.role == "check") & np.isfinite(adjustment.ground).all(axis=1))
     spread = adjustment.point_covariance(where) + reference.covariance[where]
-    return where, adjustment.ground[where] - reference.places[where], spread
+    return where, adjustment.ground[where] - reference.ground[where], spread
 
 
 def _contributions(
@@ -353,7 +353,9 @@ _LOST = "a worker was lost with its share of the points; adjust the block again"
 
 @dataclass(frozen=True, eq=False)
 class PointWorkers:
-    """Workers for `analysis.block.point_reduction`, with one share of the points for each worker present at the start.
+    """Workers for `analysis.block.point_reduction`, each with one share of the points.
+
+    There is one share for each worker present at the start.
 
     Attributes
     ----------

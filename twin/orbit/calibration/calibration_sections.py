@@ -258,7 +258,8 @@ def _images(run: CalibrationRun, data: Mapping[str, Any]) -> Section:
         f"{total['check_left']} check points. The test of the neighbours rejects "
         f"{total['right_rejected_by_consensus']} correct positions, the adjustment "
         f"{total['right_rejected_by_adjustment']}. {remaining} control points remain. Their image points are weighted "
-        f"by the covariances of the matching, with {UNMODELLED_SIGMA:g} px added for errors that the fit does not show.",
+        f"by the covariances of the matching, with {UNMODELLED_SIGMA:g} px added for errors that the fit does not "
+        "show.",
     )
     first = campaign.images[0]
     figures = [

@@ -458,7 +458,7 @@ class Screening:
 
 @dataclass(frozen=True, eq=False)
 class FieldPass:
-    """One pass over one field.
+    """Pass over one field: measurements, points, rays, and the truth where it is known.
 
     Attributes
     ----------

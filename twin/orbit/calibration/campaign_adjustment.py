@@ -87,7 +87,9 @@ def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequen
 
 
 def calibrated_alone(campaign: Campaign, field_pass: FieldPass) -> Adjustment:
-    """Calibrate one field by itself: paper 003's twelve unknowns less the gauge, and a rate where the attitude drifts.
+    """Calibrate one field by itself, with paper 003's twelve unknowns less the gauge.
+
+    A rate of the attitude is added where the attitude drifts.
 
     Parameters
     ----------

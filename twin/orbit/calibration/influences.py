@@ -214,7 +214,9 @@ def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow
 
 
 def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
-    """Calibrate with a wrong datum: that of the file, or 100 m along each axis and lines 10 ms late where it has none.
+    """Calibrate with wrong datums: that of the file, or 100 m along each axis and lines 10 ms late.
+
+    The trial errors are used where the file has no wrong datum.
 
     Raises
     ------

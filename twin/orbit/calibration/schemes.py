@@ -509,7 +509,7 @@ def study_monitoring(setup: CalibrationSetup, seed: np.random.SeedSequence, adva
 
 
 def fly_with_drift(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) -> Campaign:
-    """Simulate the campaign with the file's drift times a factor, without effects on the light that would be corrected.
+    """Simulate the campaign with the file's drift times a factor, without correctable effects on the light.
 
     All other draws are those without drift. The seed is not changed.
     """
@@ -560,7 +560,7 @@ def with_monitor(campaign: Campaign) -> Treatment:
 
 
 def adjust_with_readings(campaign: Campaign) -> Adjustment:
-    """Adjust all fields at once, with the drift of every camera in every field as unknowns that the readings observe."""
+    """Adjust all fields at once, with every camera's drift in every field as unknowns that the readings observe."""
     return simultaneous(
         campaign,
         drift=True,

@@ -211,7 +211,7 @@ class SceneSource:
 
     @property
     def folder(self) -> None:
-        """None: a scene has no run folder."""
+        """Run folder: None, since a scene has none."""
         return None
 
     @property

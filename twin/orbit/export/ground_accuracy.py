@@ -165,7 +165,7 @@ class _Derivatives:
 
     Attributes
     ----------
-    place : (N, 2, 2) ndarray
+    image : (N, 2, 2) ndarray
         Derivatives by line and pixel.
     platform : (N, 2, 6) ndarray
         Derivatives by the errors of the platform.
@@ -175,7 +175,7 @@ class _Derivatives:
         Derivatives by the height.
     """
 
-    place: Array
+    image: Array
     platform: Array
     interior: Array
     height: Array
@@ -243,7 +243,7 @@ def single_accuracy(
     )
     tilt = np.concatenate([derivatives.height, np.ones((len(line), 1))], axis=1)
     heights = uncertainty.height**2 * tilt[:, :, None] * tilt[:, None, :]
-    random[:, :2, :2] = _propagate(derivatives.place, uncertainty.image)
+    random[:, :2, :2] = _propagate(derivatives.image, uncertainty.image)
     return AccuracyMap(line, pixel, longitude, latitude, height, constant, random, heights, _GRID)
 
 
@@ -291,7 +291,7 @@ def intersected_accuracy(
         if not np.any(inside):
             continue
         part = _derivatives(sensor, at[inside], which[inside], height, level[inside, :2])
-        to_image = np.linalg.inv(part.place)
+        to_image = np.linalg.inv(part.image)
         # derivatives of image position by ground position, and by the errors there
         by_ground = to_image @ np.concatenate(
             [np.tile(np.eye(2), (int(np.sum(inside)), 1, 1)), -part.height[:, :, None]], axis=2
@@ -333,7 +333,9 @@ def _propagate(rows: Array, covariance: ArrayLike) -> Array:
 def accuracy_maps(
     sensors: Mapping[str, tuple[Sensor, int, int]], uncertainty: CameraUncertainty, height: float
 ) -> dict[str, AccuracyMap]:
-    """Compute the accuracy map of each line and, where several images overlap, that of intersected points, `together`.
+    """Compute the accuracy map of each line and that of points intersected from all lines, `together`.
+
+    The map of intersected points needs several lines whose images overlap.
 
     Parameters
     ----------

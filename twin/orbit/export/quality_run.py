@@ -41,7 +41,7 @@ _COMPARED = (15, 15, 3)
 
 
 def with_quality(run: Export, uncertainty: CameraUncertainty | None, points: ControlPoints | None) -> Export:
-    """Return the export with corrected polynomials, ERR_BIAS and ERR_RAND in them, and notes in the ISD, as requested.
+    """Return the export with the requested corrections of its polynomials, ERR_BIAS, ERR_RAND and notes.
 
     Parameters
     ----------

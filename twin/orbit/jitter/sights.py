@@ -50,9 +50,9 @@ class SteadyPlatform:
     ----------
     span : tuple of float
         First and last time of the readings used.
-    place : (K, 3) ndarray
+    position_series : (K, 3) ndarray
         Chebyshev coefficients of the position, ITRS, in metres.
-    turn : (K, 3) ndarray
+    rotation_series : (K, 3) ndarray
         Chebyshev coefficients of rotation vectors from `middle`, in radians.
     middle : (3, 3) ndarray
         Mean rotation of the body against the orbital frame.
@@ -61,8 +61,8 @@ class SteadyPlatform:
     """
 
     span: tuple[float, float]
-    place: np.ndarray
-    turn: np.ndarray
+    position_series: np.ndarray
+    rotation_series: np.ndarray
     middle: np.ndarray
     law: Attitude
 
@@ -90,12 +90,12 @@ class SteadyPlatform:
 
     def position(self, seconds: Any) -> np.ndarray:
         """Return the position in the ITRS, in metres; (...) -> (..., 3)."""
-        return self._series(self.place, seconds)
+        return self._series(self.position_series, seconds)
 
     def velocity(self, seconds: Any) -> np.ndarray:
         """Return the velocity relative to the rotating Earth in axes of the ITRS, in m/s; (...) -> (..., 3)."""
         first, last = self.span
-        return self._series(chebyshev.chebder(self.place) * (2.0 / (last - first)), seconds)
+        return self._series(chebyshev.chebder(self.position_series) * (2.0 / (last - first)), seconds)
 
     def inertial_velocity(self, seconds: Any) -> np.ndarray:
         """Return the inertial velocity in axes of the ITRS, in m/s; (...) -> (..., 3)."""
@@ -104,7 +104,11 @@ class SteadyPlatform:
     def body_to_itrs(self, seconds: Any) -> np.ndarray:
         """Return the axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
         t = np.asarray(seconds, np.float64)
-        rotation = Rotation.from_rotvec(self._series(self.turn, t).reshape(-1, 3)).as_matrix().reshape(*t.shape, 3, 3)
+        rotation = (
+            Rotation.from_rotvec(self._series(self.rotation_series, t).reshape(-1, 3))
+            .as_matrix()
+            .reshape(*t.shape, 3, 3)
+        )
         return np.asarray(self._orbital(t) @ self.middle @ rotation)
 
     def _orbital(self, seconds: Any) -> np.ndarray:
@@ -186,7 +190,7 @@ class _Line:
 
     sensor: Sensor
     point: np.ndarray
-    place: np.ndarray
+    image: np.ndarray
     covariance: np.ndarray
     seconds: np.ndarray
     axes: tuple[Sensor, ...]
@@ -292,14 +296,14 @@ class _Prior:
     ----------
     tie : (n,) ndarray of bool
         True where only the height has a prior.
-    place : (n, 3) ndarray
+    ground : (n, 3) ndarray
         Prior positions, ITRS, in metres.
     root : (n, 3, 3) ndarray
         Whitening matrices of differences in position; of tie points only the first row, for the height.
     """
 
     tie: np.ndarray
-    place: np.ndarray
+    ground: np.ndarray
     root: np.ndarray
 
     @property
@@ -314,7 +318,7 @@ class _Prior:
         positions.
         """
         root = self.root[rows][:, :1] if self.tie[rows[0]] else self.root[rows]
-        return root, (root @ (self.place[rows] - place)[..., None])[..., 0]
+        return root, (root @ (self.ground[rows] - place)[..., None])[..., 0]
 
 
 def _prior_of(
@@ -322,7 +326,7 @@ def _prior_of(
 ) -> _Prior:
     place = np.full((len(measurements.ground), 3), np.nan)
     for line in lines.values():
-        ground = line.sensor.ground(line.place[:, 0], line.place[:, 1], search.height)
+        ground = line.sensor.ground(line.image[:, 0], line.image[:, 1], search.height)
         empty = np.isnan(place[line.point, 0])
         place[line.point[empty]] = ground[empty]
     tie = measurements.ground.role == "tie"
@@ -343,7 +347,7 @@ def _improved_positions(lines: Mapping[str, _Line], shared: np.ndarray, prior: _
     normal, right = prior.normal, np.zeros((len(shared), 3))
     for line in lines.values():
         which = np.searchsorted(shared, line.point)
-        residual, slope = _residual_and_slope(line, prior.place[which])
+        residual, slope = _residual_and_slope(line, prior.ground[which])
         weight = np.linalg.inv(line.covariance)
         good = np.all(np.isfinite(residual), axis=1) & np.all(np.isfinite(slope), axis=(1, 2))
         np.add.at(normal, which[good], np.einsum("nki,nkl,nlj->nij", slope, weight, slope)[good])
@@ -351,14 +355,14 @@ def _improved_positions(lines: Mapping[str, _Line], shared: np.ndarray, prior: _
     alone = np.linalg.cond(normal) > 1e14
     normal[alone] = np.eye(3)
     step = np.linalg.solve(normal, right[..., None])[..., 0]
-    return np.asarray(prior.place + np.where(alone[:, None], 0.0, step))
+    return np.asarray(prior.ground + np.where(alone[:, None], 0.0, step))
 
 
 def _residual_and_slope(line: _Line, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return measured less expected line and pixel (n, 2), and their derivatives by position (n, 2, 3), per metre."""
     expected = np.stack(line.sensor.image(place), axis=-1)
     by = [(np.stack(line.sensor.image(place + _STEP * axis), axis=-1) - expected) / _STEP for axis in np.eye(3)]
-    return line.place - expected, np.stack(by, axis=-1)
+    return line.image - expected, np.stack(by, axis=-1)
 
 
 def _whitened_observations(
@@ -383,7 +387,7 @@ def _whitened_observations(
         which = np.searchsorted(shared, line.point)
         positions = place[which]
         difference, slope = _residual_and_slope(line, positions)
-        expected = line.place - difference
+        expected = line.image - difference
         rotations = [(np.stack(s.image(positions), axis=-1) - expected) / _TURN for s in line.axes]
         good = np.all(np.isfinite(difference), axis=1) & (
             np.max(np.abs(np.nan_to_num(difference, nan=np.inf)), axis=1) < _FAR
@@ -455,7 +459,7 @@ def _moments(line: _Line, off: np.ndarray, basis: np.ndarray) -> np.ndarray:
         remainder = off - basis @ np.linalg.lstsq(basis[accepted], off[accepted], rcond=None)[0]
         accepted = np.abs(remainder) <= _NOISE * np.maximum(sigma, robust_sigma(remainder[accepted]))
     noise = np.clip(np.nan_to_num(remainder), -_NOISE * sigma, _NOISE * sigma)
-    return np.asarray(line.sensor.time(line.place[:, 0] - noise))
+    return np.asarray(line.sensor.time(line.image[:, 0] - noise))
 
 
 def _visibility_groups(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -479,7 +483,7 @@ def _basis(lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchS
     total, seen = np.zeros((len(shared), 2)), np.zeros(len(shared))
     for line in lines.values():
         which = np.searchsorted(shared, line.point)
-        np.add.at(total, which, np.stack([line.place[:, 1] / line.sensor.camera.pixels, line.seconds], axis=-1))
+        np.add.at(total, which, np.stack([line.image[:, 1] / line.sensor.camera.pixels, line.seconds], axis=-1))
         np.add.at(seen, which, 1.0)
     at = total / seen[:, None]
     low, high = at.min(axis=0), at.max(axis=0)
@@ -508,7 +512,7 @@ def _pairs(
             continue
         moved = (residual[b][theirs] - residual[a][mine])[:, ::-1]
         at = lines[a].seconds[mine]
-        x = lines[a].place[mine, 1]
+        x = lines[a].image[mine, 1]
         scaled = [(2.0 * v - v.min() - v.max()) / max(float(np.ptp(v)), 1e-9) for v in (x, at)]
         smooth = np.stack([scaled[0] ** i * scaled[1] ** j for i in range(4) for j in range(3 - min(i, 2))], axis=-1)
         good = np.all(np.isfinite(moved), axis=1)

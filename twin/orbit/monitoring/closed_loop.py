@@ -66,7 +66,7 @@ _DRAWN = 20
 
 @dataclass(frozen=True, eq=False)
 class Corrector:
-    """One correction on its instrument.
+    """Correction of one quantity, by a mechanism of the instrument or on the ground.
 
     Attributes
     ----------

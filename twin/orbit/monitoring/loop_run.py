@@ -1,4 +1,4 @@
-"""A loop closed and open along one orbit: remaining errors of pointing and focus, and heights of ground points.
+"""Closed and open loop along one orbit: remaining errors of pointing and focus, and heights of ground points.
 
 Heights come from forward intersection of exact lines of sight with the stated errors of image points, orbit and
 attitude. The lines are traced through the state that the mechanisms have corrected; the intersection uses the lines as

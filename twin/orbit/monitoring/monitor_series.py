@@ -200,7 +200,7 @@ class _NoiseSubset:
 
 
 class MonitorSeries:
-    """A monitor with its reference images.
+    """Monitor with its reference images, which reads the states of a course.
 
     With a prior of disturbances each state is estimated by `posterior`, with the changes expected since the reference;
     otherwise by `model`.

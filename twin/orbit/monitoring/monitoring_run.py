@@ -223,7 +223,7 @@ class MonitorRun(PairFlight):
         Index of the time with the largest change of the angle.
     causes : tuple of Cause
         Effect of each temperature and motion of the file alone at time index `worst`, without noise.
-    turned : Mapping[str, LineCamera]
+    rotated : Mapping[str, LineCamera]
         Camera -> its line at the reference with the whole camera rotated by 1 arcsec about its Y.
     doubts : tuple of str
         Warnings that the monitor's sigmas do not hold because its spots differ from the calibrated ones.
@@ -242,7 +242,7 @@ class MonitorRun(PairFlight):
     repeated: Readings
     worst: int
     causes: tuple[Cause, ...]
-    turned: Mapping[str, LineCamera]
+    rotated: Mapping[str, LineCamera]
     doubts: tuple[str, ...] = ()
 
     @property
@@ -378,7 +378,7 @@ class MonitorRun(PairFlight):
         up = view.ground / np.linalg.norm(view.ground, axis=1, keepdims=True)
         for i, name in enumerate(self.pair):
             pair = self.true_pair(k)
-            pair[i] = in_calibrated_form(self.turned[name], self.calibrated[name])
+            pair[i] = in_calibrated_form(self.rotated[name], self.calibrated[name])
             traced[name] = float(point_errors(pair, view, exact_data=True)[:, 2].mean() - calm)
             arm = view.exact[i].station - view.ground
             slant[name] = np.linalg.norm(arm, axis=1)
@@ -476,11 +476,11 @@ def simulate_monitoring(setup: MonitorSetup, backend: Backend, seed: int, advanc
         {body.path: body for body in experiment.instrument.assembly.tree.bodies},
     )
 
-    def turned(camera: str) -> State:
+    def rotated_state(camera: str) -> State:
         return compose(reference, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
 
     lines = tuple(traced_pair(experiment, state, pair) for state in states)
-    by_arcsec = {name: traced_pair(experiment, turned(name), pair)[name] for name in pair}
+    by_arcsec = {name: traced_pair(experiment, rotated_state(name), pair)[name] for name in pair}
     advance("monitor", 2, parts)
     angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
     worst = int(np.argmax(np.abs(angle - angle[spec.reference_index])))
